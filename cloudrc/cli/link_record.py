@@ -65,7 +65,7 @@ def execute(options: argparse.Namespace) -> int:
     halve: bool = options.halve_rtt
     if not is_run(source):
         packets = from_log(source, options.direction, halve=halve, trust_units=options.trust_units)
-        _write(packets, options.output, options.direction or "uplink", halve=halve)
+        _write(packets, options.output, options.direction or "uplink")
         return 0
     both = options.direction is None and not halve
     only: Direction = options.direction or "uplink"
@@ -74,11 +74,11 @@ def execute(options: argparse.Namespace) -> int:
     for name, packets in read:
         file = options.output
         file = file.with_stem(f"{file.stem}-{name}") if both else file
-        _write(packets, file, name, halve=halve)
+        _write(packets, file, name)
     return 0
 
 
-def _write(packets: Packets, path: Path, direction: str, *, halve: bool) -> None:
+def _write(packets: Packets, path: Path, direction: str) -> None:
     """Write one trace; print its statistics and the settings that use it."""
     from statistics import fmean, pstdev
 
@@ -89,10 +89,10 @@ def _write(packets: Packets, path: Path, direction: str, *, halve: bool) -> None
     arrived = [delay * 1e3 for delay in packets.arrived]
     mean, deviation = fmean(arrived), pstdev(arrived)
     count = len(packets.delays)
+    what = "half of each round trip" if packets.halved else "one way"
     print(
-        f"{path}: {count} packets in {packets.duration:.1f} s, {'half of ' if halve else ''}"
-        f"{'each round trip' if halve else 'one way'} {mean:.4g} ± {deviation:.3g} ms "
-        f"(mean, standard deviation), {packets.lost / count:.3g} lost"
+        f"{path}: {count} packets in {packets.duration:.1f} s, {what} {mean:.4g} ± "
+        f"{deviation:.3g} ms (mean, standard deviation), {packets.lost / count:.3g} lost"
         + "".join(f"; {note}" for note in packets.notes)
     )
     print(f"  replay:   --set link.profile=ideal --set link.{direction}.trace={path}")
@@ -251,7 +251,7 @@ def _halves(recording: Recording, path: Path) -> Packets:
     from cloudrc.link.logs import Log
 
     estimates = recording["/delay_estimate"]
-    log, previous, start_ns = Log(str(path)), None, None
+    log, previous, start_ns = Log(str(path), halved=True), None, None
     for stamp_ns, rtt, loop in _columns(estimates, "stamp_ns", "rtt", "loop_delay"):
         if isnan(rtt):
             continue

@@ -87,7 +87,7 @@ def api_address(text: str) -> Address | Path:
         return Path(text.removeprefix("unix:"))
     host, colon, port = text.rpartition(":")
     host = host if colon else LOOPBACK
-    return (host, 0) if host and port == "0" else read_address(f"{host}:{port}")
+    return (host.strip("[]"), 0) if host and port == "0" else read_address(f"{host}:{port}")
 
 
 EPILOG = """\

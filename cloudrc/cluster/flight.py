@@ -130,6 +130,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
         for key in ("uplink", "downlink")
         for name in FILE_READERS
     }
+    paths |= {"world.robot": experiment.world.robot, "world.scene": experiment.world.scene}
     for key, name in paths.items():
         if name is not None and ("/" in name or name.endswith(".py")):
             raise BadInputError(

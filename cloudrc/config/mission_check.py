@@ -72,7 +72,11 @@ def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
         else:
             name = scene.pipes[hit[index]].name
             reason = f"the robot would be within {CLEARANCE_MIN:g} m of the wall of {name}"
-        near = find_nearest_legal(scene, point, float(yaws[index]))
+        before = mission.waypoints[index - 1].position_m if index else None
+        if index == 0 and mission.start == "spawn":
+            before = scene.spawn
+        before = None if index - 1 in wrong else before
+        near = find_nearest_legal(scene, point, float(yaws[index]), before)
         if near is not None:
             reason += f"; nearest legal point found: {_point(near)}"
         path = ("waypoints", str(index), "position_m")

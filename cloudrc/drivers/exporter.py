@@ -92,6 +92,12 @@ class ProbeServer(socketserver.ThreadingTCPServer):
         )
         self._thread.start()
 
+    def server_bind(self) -> None:
+        """Bind; at the host `::` to IPv4, too."""
+        if self.address_family == socket.AF_INET6:
+            self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
+        super().server_bind()
+
     def close(self) -> None:
         """Stop the server; takes up to 0.25 s."""
         self.shutdown()

@@ -17,6 +17,7 @@ than the steady error of 32 mm with which the published gains hover."""
 STEP_MIN = 0.02
 """Shortest step along a way [m]; below it a way near a wall would take forever."""
 _SEARCH = 1.5  # [m] largest distance of a suggested legal point
+_AT_ONCE = 50  # [1] candidates whose ways are looked at together
 _FAR = 1e3  # [m] positions beyond it would overflow
 
 
@@ -90,7 +91,9 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
     return result
 
 
-def find_nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | None:
+def find_nearest_legal(
+    scene: Scene, position: Vector, yaw: float, before: Vector | None = None
+) -> Vector | None:
     """Find a legal point near a position.
 
     The search goes along the axes, and towards and away from the axes of the pipes. Candidates are
@@ -100,6 +103,7 @@ def find_nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | N
         scene: The scene.
         position: Position of the base [m], world frame, shape (3,).
         yaw: Heading [rad].
+        before: Point from which the robot comes straight [m], shape (3,); None if it is unknown.
 
     Returns:
         A point that the guard lets the robot reach, without an overlap [m], shape (3,); None if
@@ -118,11 +122,15 @@ def find_nearest_legal(scene: Scene, position: Vector, yaw: float) -> Vector | N
     candidates = np.round(around.reshape(-1, 3), 2)
     legal = ~outside_fence(candidates)
     legal &= find_overlapped_pipe(scene, candidates, np.full(len(candidates), yaw)) < 0
-    if not legal.any():
-        return None
     candidates = candidates[legal]
-    best = candidates[np.linalg.norm(candidates - start, axis=1).argmin()]
-    return float(best[0]), float(best[1]), float(best[2])
+    candidates = candidates[np.linalg.norm(candidates - start, axis=1).argsort(kind="stable")]
+    for part in np.array_split(candidates, max(1, len(candidates) // _AT_ONCE)):
+        if before is not None:
+            part = part[find_crossed_pipe(scene, np.tile(before, (len(part), 1)), part) < 0]
+        if len(part):
+            x, y, z = part[0].tolist()
+            return x, y, z
+    return None
 
 
 def _distances(scene: Scene, positions: Array, yaws: Array) -> Array:

@@ -38,6 +38,8 @@ GAP = 20
 """Shortest gap that is named, in usual distances of two packets [1]; at least `GAP_MIN`."""
 GAP_MIN = 1.0
 """Shortest gap that is named [s]."""
+STEPS_MAX = 3
+"""Most jumps back in time that are steps of the clock or sessions [1]; more mean shuffled rows."""
 _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
 """Errors that JSON of another layout can raise."""
 HALVE = (
@@ -55,11 +57,13 @@ class Packets:
         sent: When each was sent, on any clock, strictly rising [s], shape (n,).
         delays: One way [s], None for lost packets, shape (n,).
         notes: What was left out, merged or sorted, and how often.
+        halved: Whether the delays are halves of round trips.
     """
 
     sent: tuple[float, ...]
     delays: tuple[float | None, ...]
     notes: tuple[str, ...] = ()
+    halved: bool = False
 
     @property
     def arrived(self) -> list[float]:
@@ -87,6 +91,8 @@ class Log:
         counts: What was left out, merged or changed -> how often.
         unusable: Why a row cannot be used, for each such row.
         facts: Further notes.
+        halved: Whether the delays are halves of round trips.
+        clocks: What to do if the two clocks differ.
     """
 
     name: str
@@ -94,6 +100,8 @@ class Log:
     counts: Counter[str] = field(default_factory=Counter)
     unusable: list[str] = field(default_factory=list)
     facts: list[str] = field(default_factory=list)
+    halved: bool = False
+    clocks: str = _CLOCKS
 
     def packets(self) -> Packets:
         """Check the packets, sort them by the time of sending, and note what was changed.
@@ -110,7 +118,8 @@ class Log:
             )
         if (least := min(arrived)) < 0.0:
             early = f"a packet arrived {-least * 1e3:.4g} ms before it was sent"
-            raise BadInputError(f"{self.name}: {early}: {_CLOCKS}")
+            raise BadInputError(f"{self.name}: {early}: {self.clocks}")
+        self._refuse_steps()
         unique = dict(reversed(self.entries))  # of packets with the same time the first remains
         repeated = len(self.entries) - len(unique)
         same = "have the same time as another one; give times with more digits"
@@ -130,7 +139,20 @@ class Log:
             times,
             tuple(delay for _, delay in ordered),
             (*notes, *self.facts, *_gaps(times)),
+            self.halved,
         )
+
+    def _refuse_steps(self) -> None:
+        """Refuse times that go far back once or twice: sorting would mix what came apart."""
+        steps = [after - before for (before, _), (after, _) in pairwise(self.entries)]
+        far = max(GAP_MIN, GAP * median([abs(step) for step in steps] or [0.0]))
+        back = [row for row, step in enumerate(steps, 1) if step < -far]
+        if 1 <= len(back) <= STEPS_MAX:
+            by = -steps[back[0] - 1]
+            raise BadInputError(
+                f"{self.name}: after row {back[0]} the times go back by {by:.4g} s: a step of "
+                "the clock, or two sessions in one log; give the rows before or after it"
+            )
 
     def _refuse_beyond_limit(self, count: int, reason: str) -> None:
         rows = len(self.entries) + len(self.unusable)
@@ -230,9 +252,10 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
         _compare_counts(document.get("stats") or {}, trips, log)
         if not halve:
             _check_clocks(trips, name)
-        log.entries = _irtt_entries(trips, "halves" if halve else direction)
+        log.entries = _irtt_entries(trips, "halves" if halve or not direction else direction)
+        log.halved = halve
     except _NoStampsError:
-        raise refusal(f"{name} (irtt's server sent no stamps)") from None
+        raise _refusal(f"{name} (irtt's server sent no stamps)") from None
     except _MISSHAPEN as error:
         raise BadInputError(
             f"{name}: not a log of irtt ({type(error).__name__}: {error}); "
@@ -258,7 +281,9 @@ def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log
 def _check_clocks(trips: list[dict[str, Any]], name: str) -> None:
     """Reject one-way delays of clocks that differ or step; either direction shows it."""
     arrived = [trip for trip in trips if _lost(trip) == "false"]
-    least = min((_delay(trip, key) or 0 for trip in arrived for key in _WAYS), default=0)
+    least = min(
+        (_delay(trip, key) or 0 for trip in arrived for key in ("send", "receive")), default=0
+    )
     if least < 0:
         early = f"a packet arrived {-least * 1e-6:.4g} ms before it was sent"
         raise BadInputError(f"{name}: {early}: {_CLOCKS}")
@@ -276,8 +301,16 @@ def _check_clocks(trips: list[dict[str, Any]], name: str) -> None:
                 )
 
 
+_IRTT_NAMES = {
+    "halves": ("", "rtt"),
+    "uplink": ("true_down", "send"),
+    "downlink": ("true_up", "receive"),
+}
+"""What is read -> kind of loss that is left out, name of the delay."""
+
+
 def _irtt_entries(
-    trips: list[dict[str, Any]], what: Literal["halves", "uplink", "downlink"] | None
+    trips: list[dict[str, Any]], what: Literal["halves", "uplink", "downlink"]
 ) -> list[tuple[float, float | None]]:
     """Read the time of sending and the delay of each packet [s], from the first one on.
 
@@ -286,8 +319,7 @@ def _irtt_entries(
     with the median uplink delay.
     """
     clock = "monotonic" if all("monotonic" in _client(trip) for trip in trips) else "wall"
-    other = {"halves": "", "uplink": "true_down", "downlink": "true_up"}[what or "uplink"]
-    key = {"halves": "rtt", "uplink": "send", "downlink": "receive"}[what or "uplink"]
+    other, key = _IRTT_NAMES[what]
     median_up = 0
     if what == "downlink":
         ups = [_delay(trip, "send") for trip in trips if _lost(trip) == "false"]
@@ -307,9 +339,6 @@ def _irtt_entries(
     ]
 
 
-_WAYS = ("send", "receive")
-
-
 def _client(trip: dict[str, Any]) -> dict[str, Any]:
     return dict(trip["timestamps"]["client"]["send"])
 
@@ -327,7 +356,7 @@ def _delay(trip: dict[str, Any], key: str) -> int | None:
     return int(trip["delay"][key])
 
 
-def refusal(name: str) -> BadInputError:
+def _refusal(name: str) -> BadInputError:
     """Make the error for a source that has only round trips."""
     return BadInputError(f"{name}: has round trips; {HALVE}")
 
@@ -370,9 +399,10 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     delay, unit = _find(table.columns, DELAYS, name)
     if not unit:
         raise BadInputError(f"{name}: column {delay} does not say its unit; {_named(delay)}")
-    round_trip = delay.startswith("rtt")
+    log.halved = round_trip = delay.startswith("rtt")
+    log.clocks = "the two clocks differ; synchronise them, or record round trips as rtt_ms"
     if round_trip and not halve:
-        raise refusal(f"{name}, column {delay}")
+        raise _refusal(f"{name}, column {delay}")
     loss = next((column for column in LOSSES if column in table.columns), None)
     raw: list[tuple[float, float | None]] = []
     decimals = 0
@@ -397,21 +427,12 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     del log.counts[""]
     packets = log.packets()
     if not trust_units:
-        check_unit(packets, unit, f"{name}: {delay}")
+        _check_unit(packets, unit, f"{name}: {delay}")
     return packets
 
 
-def check_unit(packets: Packets, unit: str, name: str) -> None:
-    """Reject delays that are probably in another unit.
-
-    Args:
-        packets: The packets of a log.
-        unit: Unit in which the delays were read: s, ms, us or ns.
-        name: Name of the source and its column, for messages.
-
-    Raises:
-        BadInputError: If the delays are implausible; names the probable unit.
-    """
+def _check_unit(packets: Packets, unit: str, name: str) -> None:
+    """Reject delays of a column that are probably in another unit; name that unit."""
     factor = 1 / SCALES[unit]
     top, middle = max(packets.arrived), median(packets.arrived)
     remedy = "name the column after its unit, or say --trust-units"

@@ -88,7 +88,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     """
     if not halve:
         raise BadInputError(f"{name}: ping measures round trips; {HALVE}")
-    log = Log(name)
+    log = Log(name, halved=True)
     found = _read_lines(lines, log)
     replies = found.replies
     if not replies and log.unusable:

@@ -199,6 +199,7 @@ def test_a_run_does_not_end_a_flight_in_progress(
     ("settings", "words"),
     [
         (["hover", "--set", "cloud.predictor=./mine.py"], "the pods do not have this file"),
+        (["hover", "--set", "world.scene=./mine.xml"], "world.scene: /"),
         (["steps"], "mission.steps"),
     ],
 )
@@ -207,6 +208,7 @@ def test_what_pods_cannot_have_is_refused_before_the_install(
 ) -> None:
     plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
     (tmp_path / "mine.py").write_text(plugin)
+    (tmp_path / "mine.xml").write_text("<mujoco/>")
     assert main(["run", *settings, "--mode", "cluster"]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()

@@ -20,7 +20,7 @@ from tests.cluster.conftest import FakeApi, labels, pod
 from tests.cluster.test_jobs import MISSION, end, start_pod, terminated
 
 Printed = pytest.CaptureFixture[str]
-WAYPOINTS = "waypoints: [{position_m: [0.0, 0.0, 1.0]}]"
+WAYPOINTS = "waypoints: [{position_m: [0.5, 0.0, 1.0]}]"
 
 
 @pytest.fixture(autouse=True)
@@ -65,7 +65,7 @@ def made(api: FakeApi) -> list[dict[str, Any]]:
         ("waypoints: []", "waypoints: none given; give at least one"),
         ("waypoints: [{position: [0, 0, 1]}]", "did you mean position_m"),
         ("waypoints: [{position_m: [0, 0, 99]}]", "waypoints.0.position_m.*beyond the fence"),
-        ("waypoints: [{position_m: [-1.0, 2.0, 0.0]}]", "wall of pipe"),
+        ("waypoints: [{position_m: [-0.5, 2.0, 0.8]}]", "wall of pipe"),
     ],
 )
 def test_a_mission_that_cannot_be_flown_makes_no_job(

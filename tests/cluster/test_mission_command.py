@@ -15,7 +15,7 @@ MISSION = """
 start: here
 time_limit_s: 30
 waypoints:
-  - {position_m: [0.0, 0.0, 1.0], dwell_s: 0.0}
+  - {position_m: [0.5, 0.0, 1.0], dwell_s: 0.0}
 """
 VERDICT = {0: "SUCCESS: all met", 1: "FAILURE: pipe_contact"}
 Printed = pytest.CaptureFixture[str]

@@ -27,9 +27,9 @@ def served() -> Iterator[tuple[Exporter, int]]:
     exporter.close()
 
 
-def get(port: int, path: str) -> tuple[int, str]:
+def get(port: int, path: str, host: str = HOST) -> tuple[int, str]:
     try:
-        with urllib.request.urlopen(f"http://{HOST}:{port}{path}", timeout=10) as answer:
+        with urllib.request.urlopen(f"http://{host}:{port}{path}", timeout=10) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         with error:
@@ -98,6 +98,13 @@ def test_a_loop_that_stands_still_is_not_alive(
     assert get(port, "/healthz") == (503, "the loop has stood still for 0 s\n")
     monkeypatch.setattr("cloudrc.drivers.exporter.STILL_MAX", 60.0)
     assert get(port, "/healthz") == (200, "alive\n")
+
+
+def test_probes_of_both_address_families_are_answered() -> None:
+    exporter = Exporter("link")
+    port = exporter.serve(("::", 0))
+    assert {get(port, "/healthz", host)[0] for host in ("127.0.0.1", "[::1]")} == {200}
+    exporter.close()
 
 
 def test_another_path_says_which_there_are(served: tuple[Exporter, int]) -> None:

@@ -100,6 +100,16 @@ def test_the_way_from_the_spawn_is_checked() -> None:
     assert check_mission(beyond.model_copy(update={"start": "here"}), PIPES) == []
 
 
+def test_the_nearest_legal_point_is_one_to_which_a_straight_way_leads() -> None:
+    for start in ("spawn", "here"):
+        wanted = Waypoint(position_m=(0.0, 0.0, 0.8))
+        (problem,) = check_mission(Mission(start=start, waypoints=(wanted,)), PIPES)
+        offered = [float(word) for word in str(problem).rpartition("[")[2].rstrip("]").split(",")]
+        nearest = Waypoint(position_m=tuple(offered))
+        assert math.dist(offered, (0.0, 0.0, 0.8)) < 0.15
+        assert check_mission(Mission(start=start, waypoints=(nearest,)), PIPES) == []
+
+
 def test_a_robot_that_is_at_a_wall_may_move_away_from_it() -> None:
     at, away, nearer = np.array([[-0.78, 0.0, 0.8]]), (-1.0, 0.0, 0.8), (-0.7, 0.0, 0.8)
     assert hit(at[0]) == 0

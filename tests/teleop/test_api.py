@@ -16,7 +16,7 @@ import pytest
 
 from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.cli.teleop import api_address, api_counts, serve_api
-from cloudrc.config.load import load_experiment
+from cloudrc.config.load import load_experiment, load_mission
 from cloudrc.errors import BadInputError
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.messages import GuardState
@@ -138,8 +138,9 @@ def test_the_state_is_told_and_unknown_numbers_are_null(api):
 
 
 def test_only_a_mission_to_the_board_must_touch_it(api):
-    for point, contact in (([0.5, 0.0, 1.0], False), ([8.235, -6.422, 0.7], True)):
-        _, view = api.post("/v1/missions", {"waypoints": [{"position_m": point}]})
+    pipes = [point.position_m for point in load_mission("pipes").waypoints]
+    for points, contact in (([(0.5, 0.0, 1.0)], False), (pipes, True)):
+        _, view = api.post("/v1/missions", {"waypoints": [{"position_m": p} for p in points]})
         assert api.flight.teleop.book.find(view["id"]).order.contact is contact
         api.post(f"/v1/missions/{view['id']}/cancel")
 
