@@ -22,7 +22,7 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
 from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
-from cloudrc.link.tc import STRETCH, check, table
+from cloudrc.link.tc import STRETCH, check, table, try_netem
 from cloudrc.tunnel.codec import Kind
 from tests.link import conftest as lab
 from tests.link.conftest import SIZE, WITHIN, Flow, least, measure, show
@@ -245,16 +245,6 @@ def test_what_another_program_does_is_counted_once(tables: Path, words: tuple[st
     shaped.close()
 
 
-def test_a_qdisc_of_somebody_else_is_left_alone(tables: Path) -> None:
-    place = ("tc", "-n", lab.NEAR, "qdisc")
-    lab.sh(*place, "add", "dev", lab.DEVICE, "root", "handle", "1:", "prio")
-    before = lab.qdiscs()
-    with pytest.raises(MissingPrerequisiteError, match=r"wire has a qdisc already \(prio 1:\)"):
-        lab.real_netem(tables, DirectionProfile(0.02)).follow_peer(lab.FAR_PEER)
-    assert lab.qdiscs() == before
-    lab.sh(*place, "del", "dev", lab.DEVICE, "root")
-
-
 @pytest.mark.parametrize("name", names("profile"))
 def test_tc_takes_every_shipped_profile_that_is_not_refused(shaped: Netem, name: str) -> None:
     profile = link_profile(load_profile(name).uplink)
@@ -267,3 +257,47 @@ def test_tc_takes_every_shipped_profile_that_is_not_refused(shaped: Netem, name:
     listed = json.loads(lab.sh("tc", "-n", lab.NEAR, "-j", "qdisc", "show", "dev", lab.DEVICE))
     options = next(one["options"] for one in listed if one["kind"] == "netem")
     assert options.get("delay", {"delay": 0})["delay"] == pytest.approx(profile.delay)
+
+
+def test_a_long_queue_holds_what_the_rate_and_the_delay_need(shaped: Netem) -> None:
+    """200 kbit/s and 300 ms: 38 packets of 200 bytes are under way beside the queue's 100."""
+    shaped.follow_profile(DirectionProfile(delay=0.3, rate=200e3, queue_packets=100))
+    flow = Flow()
+    flow.send(130, 0.0)
+    assert len(flow.settle().arrived) == 130
+    flow = Flow()
+    flow.send(800, 0.0)
+    arrived = len(flow.settle(1.0).arrived)
+    show("at once", sent=800, arrived=arrived)
+    assert 138 <= arrived < 800
+
+
+def test_a_measured_distribution_is_applied(tables: Path, shaped: Netem) -> None:
+    drawn = np.random.default_rng(5).choice(
+        [-1.0, -0.8, 1.6, 2.0], size=2000, p=[0.3, 0.3, 0.3, 0.1]
+    )
+    values = tuple(np.sort((drawn - drawn.mean()) / drawn.std()).tolist())
+    profile = DirectionProfile(delay=0.1, jitter=0.03, distribution="table", table=values)
+    shaped.follow_profile(profile)
+    delays = measure(600, 0.004).delays()
+    near = np.abs(delays[:, None] - (0.1 + 0.03 * np.unique(values))).min(axis=1)
+    show("four delays asked", mean=delays.mean(), deviation=delays.std(), off=np.median(near))
+    assert np.median(near) < WITHIN
+    assert delays.std() == pytest.approx(0.03, abs=0.004)
+
+
+def test_what_tc_clamps_is_refused_and_the_old_conditions_stay(shaped: Netem) -> None:
+    shaped.follow_profile(DirectionProfile(delay=0.03))
+    before = lab.qdiscs()
+    with pytest.raises(BadInputError, match=r"rate: asked 0\.5, in force 0"):
+        shaped.follow_profile(DirectionProfile(rate=4.0))
+    with pytest.raises(BadInputError, match="loss: asked 1e-11, in force 0"):
+        shaped.follow_profile(DirectionProfile(loss=1e-11))
+    assert lab.qdiscs() == before
+
+
+def test_trying_netem_leaves_nothing(tables: Path) -> None:
+    listing = ("tc", "-n", lab.NEAR, "qdisc", "show", "dev", "lo")
+    before = lab.sh(*listing)
+    try_netem(lab.run_near(tables))
+    assert lab.sh(*listing) == before
