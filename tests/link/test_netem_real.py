@@ -23,7 +23,7 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
 from cloudrc.link.netem import Netem
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
-from cloudrc.link.tc import STRETCH, check, table, try_netem
+from cloudrc.link.tc import STRETCH, check, table
 from cloudrc.tunnel.codec import Kind
 from tests.link import conftest as lab
 from tests.link.conftest import SIZE, WITHIN, Flow, least, measure, show
@@ -295,13 +295,6 @@ def test_what_tc_clamps_is_refused_and_the_old_conditions_stay(shaped: Netem) ->
     with pytest.raises(BadInputError, match="loss: asked 1e-11, in force 0"):
         shaped.follow_profile(DirectionProfile(loss=1e-11))
     assert lab.qdiscs() == before
-
-
-def test_trying_netem_leaves_nothing(tables: Path) -> None:
-    listing = ("tc", "-n", lab.NEAR, "qdisc", "show", "dev", "lo")
-    before = lab.sh(*listing)
-    try_netem(lab.run_near(tables))
-    assert lab.sh(*listing) == before
 
 
 LATE = 0.1
