@@ -93,6 +93,13 @@ def _run_arguments(parser: argparse.ArgumentParser) -> None:
         help="address of the other tunnel end",
     )
     parser.add_argument(
+        "--end",
+        type=read_address,
+        metavar="HOST:PORT",
+        help="address from which this pod's tunnel end sends; the relay takes datagrams from no"
+        " other (default: from any that reaches --listen)",
+    )
+    parser.add_argument(
         "--listen",
         type=read_address,
         default=("127.0.0.1", 7401),

@@ -101,8 +101,8 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
         settle()
         if not ask_for_fifo():  # most pods lack the permission and do not need it
             log("the relay runs under SCHED_FIFO")
-        uplink = options.direction == "uplink"
-        return RelayShaper(options.listen, LinkDirection(profile, seed, uplink, origin_ns), peek)
+        direction = LinkDirection(profile, seed, options.direction == "uplink", origin_ns)
+        return RelayShaper(options.listen, direction, peek, options.end)
 
     def netem(profile: DirectionProfile, origin_ns: int) -> Netem:
         return Netem(

@@ -12,8 +12,8 @@ The relay sleeps in `select` until a datagram arrives or shortly before one is d
 the clock until that instant, since a sleeping thread wakes 15 to 50 us late. It releases what is
 due before it takes in what has arrived, which has its stamp and can wait.
 
-A socket of `Relay` is connected to its end: the kernel drops what comes from any other address,
-and this process is not even woken.
+A socket is connected to its end: the kernel drops what comes from any other address, and this
+process is not even woken.
 """
 
 from __future__ import annotations
@@ -433,20 +433,26 @@ class RelayShaper:
 
     name = "relay"
 
-    def __init__(self, listen: Address, direction: LinkDirection, peek: Peek) -> None:
+    def __init__(
+        self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
+    ) -> None:
         """Open the two sockets.
 
         Args:
             listen: Where this pod's tunnel end sends to; port 0 lets the kernel choose.
             direction: The link, its origin on the machine's monotonic clock.
             peek: Reads kind, epoch and counter of a datagram.
+            end: Where this pod's tunnel end sends from; the kernel drops what comes from others.
+                None: any sender.
 
         Raises:
-            OSError: If `listen` is in use.
+            OSError: If `listen` is in use, or cannot be reached from `end`.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._inside.bind(listen)
+            if end is not None:
+                self._inside.connect(end)
         except OSError:
             self._inside.close()
             raise

@@ -144,6 +144,7 @@ def test_the_link_is_a_native_sidecar_for_its_pods_egress() -> None:
         assert link["restartPolicy"] == "Always"
         assert f"--direction={direction}" in link["args"]
         assert f"--peer=demo-cloudrc-{peer}:7400" in link["args"]
+        assert "--end=127.0.0.1:7400" in link["args"]
         (own,) = (c for c in pods[end]["containers"] if c["name"] == end)
         assert "--route=/run/cloudrc/route" in set(link["args"]) & set(own["args"])
 

@@ -361,22 +361,6 @@ def least(error: Callable[[], float], enough: float) -> float:
     return found
 
 
-def ping() -> float:
-    """Measure the round-trip time of an ICMP echo from near to far [s]."""
-    body = b"\x08\x00" + b"\x00\x00" + b"\x12\x34\x00\x01"
-    total = sum(int.from_bytes(body[i : i + 2], "big") for i in range(0, len(body), 2))
-    total = (total & 0xFFFF) + (total >> 16)
-    body = body[:2] + (~total & 0xFFFF).to_bytes(2, "big") + body[4:]
-    with inside(NEAR):
-        raw = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_ICMP)
-    with raw:
-        raw.settimeout(5.0)
-        began = time.monotonic()
-        raw.sendto(body, (FAR_HOST, 0))
-        raw.recv(512)
-        return time.monotonic() - began
-
-
 REFUSED = BadInputError("netem cannot do delay_ms above 274000 (far); set link.mode=relay")
 
 

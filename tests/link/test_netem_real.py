@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
@@ -21,7 +22,7 @@ from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
 from cloudrc.link.netem import Netem
-from cloudrc.link.profile import DirectionProfile, GilbertElliott
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
 from cloudrc.link.tc import STRETCH, check, table
 from cloudrc.tunnel.codec import Kind
 from tests.link import conftest as lab
@@ -37,6 +38,7 @@ MINUTES = [
 ]
 """Every direction that ships, once: most profiles have the same both ways."""
 Distribution = Literal["uniform", "normal", "pareto"]
+Floats = NDArray[np.float64]
 pytestmark = pytest.mark.netem
 
 
@@ -53,7 +55,6 @@ def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped: Netem) -> None:
         return float(abs(delay - other - 0.060))
 
     assert least(off, WITHIN) < WITHIN
-    assert min(lab.ping() for _ in range(10)) < 0.020
     assert min(connect() for _ in range(10)) < 0.020, "another protocol to the same port"
 
 
@@ -245,16 +246,6 @@ def test_what_another_program_does_is_counted_once(tables: Path, words: tuple[st
     shaped.close()
 
 
-def test_a_qdisc_of_somebody_else_is_left_alone(tables: Path) -> None:
-    place = ("tc", "-n", lab.NEAR, "qdisc")
-    lab.sh(*place, "add", "dev", lab.DEVICE, "root", "handle", "1:", "prio")
-    before = lab.qdiscs()
-    with pytest.raises(MissingPrerequisiteError, match=r"wire has a qdisc already \(prio 1:\)"):
-        lab.real_netem(tables, DirectionProfile(0.02)).follow_peer(lab.FAR_PEER)
-    assert lab.qdiscs() == before
-    lab.sh(*place, "del", "dev", lab.DEVICE, "root")
-
-
 @pytest.mark.parametrize("name", names("profile"))
 def test_tc_takes_every_shipped_profile_that_is_not_refused(shaped: Netem, name: str) -> None:
     profile = link_profile(load_profile(name).uplink)
@@ -267,3 +258,93 @@ def test_tc_takes_every_shipped_profile_that_is_not_refused(shaped: Netem, name:
     listed = json.loads(lab.sh("tc", "-n", lab.NEAR, "-j", "qdisc", "show", "dev", lab.DEVICE))
     options = next(one["options"] for one in listed if one["kind"] == "netem")
     assert options.get("delay", {"delay": 0})["delay"] == pytest.approx(profile.delay)
+
+
+def test_a_long_queue_holds_what_the_rate_and_the_delay_need(shaped: Netem) -> None:
+    """200 kbit/s and 300 ms: 38 packets of 200 bytes are under way beside the queue's 100."""
+    shaped.follow_profile(DirectionProfile(delay=0.3, rate=200e3, queue_packets=100))
+    flow = Flow()
+    flow.send(130, 0.0)
+    assert len(flow.settle().arrived) == 130
+    flow = Flow()
+    flow.send(800, 0.0)
+    arrived = len(flow.settle(1.0).arrived)
+    show("at once", sent=800, arrived=arrived)
+    assert 138 <= arrived < 800
+
+
+def test_a_measured_distribution_is_applied(tables: Path, shaped: Netem) -> None:
+    drawn = np.random.default_rng(5).choice(
+        [-1.0, -0.8, 1.6, 2.0], size=2000, p=[0.3, 0.3, 0.3, 0.1]
+    )
+    values = tuple(np.sort((drawn - drawn.mean()) / drawn.std()).tolist())
+    profile = DirectionProfile(delay=0.1, jitter=0.03, distribution="table", table=values)
+    shaped.follow_profile(profile)
+    delays = measure(600, 0.004).delays()
+    near = np.abs(delays[:, None] - (0.1 + 0.03 * np.unique(values))).min(axis=1)
+    show("four delays asked", mean=delays.mean(), deviation=delays.std(), off=np.median(near))
+    assert np.median(near) < WITHIN
+    assert delays.std() == pytest.approx(0.03, abs=0.004)
+
+
+def test_what_tc_clamps_is_refused_and_the_old_conditions_stay(shaped: Netem) -> None:
+    shaped.follow_profile(DirectionProfile(delay=0.03))
+    before = lab.qdiscs()
+    with pytest.raises(BadInputError, match=r"rate: asked 0\.5, in force 0"):
+        shaped.follow_profile(DirectionProfile(rate=4.0))
+    with pytest.raises(BadInputError, match="loss: asked 1e-11, in force 0"):
+        shaped.follow_profile(DirectionProfile(loss=1e-11))
+    assert lab.qdiscs() == before
+
+
+LATE = 0.1
+"""Lateness of a step where the machine now and then stands still [s]."""
+
+
+def stepped(tables: Path, profile: DirectionProfile, count: int) -> tuple[Netem, Flow, Floats]:
+    """Follow a time line beside a flow of 50 Hz; also return the times of sending on it [s]."""
+    origin_ns = time.monotonic_ns() + 3_000_000_000  # by then it is set up
+    begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
+    netem, flow = lab.real_netem(tables, profile, origin_ns), Flow()
+    netem.follow_peer(lab.FAR_PEER)
+    sender = threading.Thread(target=flow.send, args=(count, 0.02))
+    sender.start()
+    while sender.is_alive():
+        netem.step(0.1)
+    flow.settle()
+    netem.close()
+    return netem, flow, (np.array(flow.sent_ns) - begun_ns) * 1e-9
+
+
+def test_changes_and_blackouts_take_effect_when_they_are_due(tables: Path) -> None:
+    profile = DirectionProfile(
+        delay=0.02, changes=(Change(2.5, delay=0.1),), blackouts=(Blackout(3.5, 0.3),)
+    )
+    netem, flow, since = stepped(tables, profile, 400)
+    assert (netem.steps.applied, netem.steps.passed_over) == (3, 0)
+    arrived, delays = since[flow.numbers()], flow.delays()
+    lost = np.delete(since, flow.numbers())
+    before, after = delays[arrived < 2.45], delays[arrived > 2.5 + LATE]
+    show("step", before=np.median(before), after=np.median(after), dark=np.ptp(lost))
+    assert np.median(before) == pytest.approx(0.02, abs=0.005)
+    assert np.median(after) == pytest.approx(0.1, abs=0.005)
+    assert (lost.min(), lost.max()) == pytest.approx((3.5, 3.8), abs=LATE)
+
+
+def test_a_trace_is_followed(tables: Path) -> None:
+    """60 to 140 ms in waves of 4 s, one row per 20 ms; measured at the instants of sending."""
+    times = 0.02 * np.arange(400)
+    rows = 0.1 + 0.04 * np.sin(0.5 * np.pi * times)
+    profile = DirectionProfile(trace=Trace(tuple(times.tolist()), tuple(rows.tolist())))
+
+    def off() -> float:
+        netem, flow, since = stepped(tables, profile, 600)
+        assert len(flow.arrived) == 600, "steps lose nothing"
+        on = (since[flow.numbers()] > 0.0) & (since[flow.numbers()] < times[-1])
+        asked = rows[np.searchsorted(times, since[flow.numbers()][on], side="right") - 1]
+        correlation = float(np.corrcoef(asked, flow.delays()[on])[0, 1])
+        show(netem.steps.in_words(), correlation=correlation)
+        assert netem.steps.applied + netem.steps.passed_over == len(times) - 1
+        return 1.0 - correlation
+
+    assert least(off, 0.02) < 0.02

@@ -33,7 +33,6 @@ from tools.bench_link.flow import Way, flood, run_flow
 from tools.bench_link.relays import ours
 from tools.bench_link.stages import LINK, overload
 
-pytestmark = pytest.mark.process
 linux = pytest.mark.skipif(sys.platform != "linux", reason="Linux alone has it")
 PATIENCE = 5.0
 MS, SECOND = 1_000_000, 1_000_000_000
@@ -117,7 +116,7 @@ def test_a_packet_leaves_when_the_model_says_never_earlier(bench: Callable[..., 
         (wanted,) = model.send(1, 3, n, 4, 0)
         errors.append(time.monotonic_ns() - sent - wanted)
     assert min(errors) >= 0
-    assert sorted(errors)[10] < 10_000_000
+    assert sorted(errors)[10] < 50_000_000
     assert 0 <= pair.relay.counts()["release_error_p99"] < 0.1
     until(lambda: pair.relay.released("uplink")["released"] == 20)
     assert pair.relay.released("downlink") == {}
@@ -208,6 +207,7 @@ def test_a_signal_ends_it_in_a_fifth_of_a_second(bench: Callable[..., Bench]) ->
     assert ended - rung[0] < 0.2
 
 
+@pytest.mark.process
 def test_a_flood_is_bounded_counted_and_over_in_a_second(tmp_path: Path) -> None:
     for _ in range(TRIES):
         memory, counted, recovered = overload(tmp_path, 60_000, 1.0)
@@ -218,6 +218,7 @@ def test_a_flood_is_bounded_counted_and_over_in_a_second(tmp_path: Path) -> None
     pytest.fail(str(recovered))
 
 
+@pytest.mark.process
 def test_a_flood_of_strangers_is_not_even_received(tmp_path: Path) -> None:
     relay = ours(tmp_path, LINK)
     up, down = relay.ways
@@ -230,6 +231,7 @@ def test_a_flood_of_strangers_is_not_even_received(tmp_path: Path) -> None:
     assert relay.counts()["received"] == 400
 
 
+@pytest.mark.process
 def test_5000_strangers_a_second_cost_no_hold(tmp_path: Path) -> None:
     """A local flight of a few seconds, in which strangers flood both sides of its relay."""
     holds = []
@@ -318,23 +320,16 @@ def in_a_thread(act: Callable[[], object]) -> object:
 
 
 @linux
-def test_sleeps_of_the_relay_end_when_they_are_due() -> None:
-    def slack_ns() -> object:
-        tighten_slack()
-        return ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)  # PR_GET_TIMERSLACK
-
-    assert in_a_thread(slack_ns) == 1
-
-
-@linux
-def test_a_permitted_thread_has_priority_and_its_children_do_not() -> None:
+def test_a_thread_gets_priority_if_permitted_and_exact_sleeps() -> None:
     def first() -> bool:
         return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
 
     def ask() -> object:
-        return (not ask_for_fifo()) is first(), in_a_thread(first)
+        tighten_slack()
+        slack_ns = ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)  # PR_GET_TIMERSLACK
+        return (not ask_for_fifo()) is first(), in_a_thread(first), slack_ns <= 1
 
-    assert in_a_thread(ask) == (True, False)
+    assert in_a_thread(ask) == (True, False, True), "a child thread is ordinary again"
 
 
 def test_a_refused_priority_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -101,6 +101,7 @@ auto
     - --direction={{ .direction }}
     - --mode={{ $mode }}
     - --peer={{ include "cloudrc.fullname" .root }}-{{ .peer }}:7400
+    - --end=127.0.0.1:7400
     - --listen=127.0.0.1:7401
     - --route=/run/cloudrc/route
     - "--metrics=[::]:9102"
