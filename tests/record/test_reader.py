@@ -94,7 +94,8 @@ def test_a_whole_file_is_complete(whole: Path, tmp_path: Path) -> None:
     torn = tmp_path / "index.mcap"
     torn.write_bytes(whole.read_bytes()[:-1])
     recording = Recording.read(torn)
-    assert recording.note.startswith("cut short in its index: all ")
+    assert recording.complete
+    assert recording.remarks == ("had a torn index: all its messages were read",)
     assert recording.attachments["config.yaml"] == b"seed: 1\n" * 50
     assert_equal(recording, Recording.from_records(RECORDS))
 
@@ -120,7 +121,7 @@ def test_what_follows_the_end_is_told(whole: Path, tmp_path: Path) -> None:
     [
         (b"", "is empty"),
         (bytes(100), "is empty"),
-        (b"\x89MCAP0\r\n\x01" + b"\xff" * 40, "holds no readable message: damaged"),
+        (b"\x89MCAP0\r\n\x01" + b"\xff" * 40, "holds no readable message: cut short"),
         (b"#ROSBAG V2.0\n", "is a ROS 1 bag, not an MCAP file"),
         (b"SQLite format 3\0", r"is an SQLite file, not MCAP; .*ros2 bag convert"),
         (b"PK\x03\x04 and so on", "is not an MCAP file"),
@@ -173,10 +174,11 @@ def test_another_compression_is_named(whole: Path, tmp_path: Path) -> None:
         ({"keep": lambda c, m: c.topic != "/guard"}, "it holds 0 of 1 on /guard$"),
         ({"keep": lambda c, m: m.log_time < 10**9}, r"it holds .*, .*, .* and 6 more topics$"),
         ({"rename": lambda t: f"/r2{t}"}, "it holds 0 of"),
+        ({"rename": lambda t: t.replace("/odometry", "/ground_truth")}, "/odometry, 320 of 160 on"),
         ({"metadata": False}, "the metadata of cloudrc, which names the clock, is not there"),
-        ({"shuffle": lambda all: all.extend(all[:4])}, "it holds 2 of 1 on /session"),
+        ({"shuffle": lambda all: all.extend(all[:4])}, "messages were removed or added: it holds "),
     ],
-    ids=["topic", "half", "renamed", "metadata", "doubled"],
+    ids=["topic", "half", "renamed", "joined", "metadata", "doubled"],
 )
 def test_what_other_programs_changed_is_named(
     whole: Path, tmp_path: Path, options: dict[str, Any], said: str
@@ -184,6 +186,15 @@ def test_what_other_programs_changed_is_named(
     recording = Recording.read(rewrite(whole, tmp_path / "n.mcap", **options))
     assert recording.lacking == recording.note
     assert re.search(said, recording.lacking), recording.lacking
+
+
+def test_a_torn_recording_that_others_ended_is_told(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    writer = McapWriter(stream, clock="world")
+    writer.write(RECORDS)
+    writer._mcap.finish()
+    (tmp_path / "w.mcap").write_bytes(stream.getvalue())
+    assert "another program has put an end to it" in Recording.read(tmp_path / "w.mcap").lacking
 
 
 def foreign(path: Path, topic: str, ros_type: str, text: str, data: bytes, channels: int) -> Path:
