@@ -88,7 +88,7 @@ def test_a_hello_with_a_cookie_is_answered_once(step: Doorstep) -> None:
 
 
 def test_the_memory_of_counters_is_bounded(step: Doorstep) -> None:
-    for number in range(CLOUDS_MAX + 1):
+    for number in range(CLOUDS_MAX):
         step.receive_hello(NONCE)
         step.receive_hello(b"%016d" % number)
     assert len(step.door._counters) == CLOUDS_MAX
