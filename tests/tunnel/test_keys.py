@@ -55,19 +55,6 @@ def test_keys_are_equal_by_what_they_hold() -> None:
     assert hash(A) != hash(B)
 
 
-def test_a_tag_fits_only_its_key_and_its_data() -> None:
-    tag = A.tag(b"data")
-    assert len(tag) == 16
-    assert A.verifies(b"data", tag)
-    assert not A.verifies(b"date", tag)
-    assert not B.verifies(b"data", tag)
-
-
-def test_a_derived_key_depends_on_salt_and_use() -> None:
-    derived = {A.derive(salt, use) for salt in (b"", b"s") for use in (b"u", b"v")}
-    assert len(derived) == 4
-
-
 @pytest.mark.parametrize(("keys", "accepted"), [(KeySet(A), (A,)), (KeySet(A, B), (A, B))])
 def test_a_written_key_file_parses_to_the_same_keys(keys: KeySet, accepted: tuple[Key]) -> None:
     assert write(keys).startswith("# A key of cloudrc's tunnel: keep it secret. Made by ")

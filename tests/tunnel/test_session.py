@@ -56,13 +56,6 @@ def test_the_other_end_opens_what_one_end_seals(ends: Ends) -> None:
     assert refuses(world, data, "old_epoch")
 
 
-def test_a_sealed_datagram_hides_its_body() -> None:
-    _, cloud = pair(epoch=7)
-    data = cloud.seal(Kind.COMMAND, BODY)
-    assert codec.peek(data) == (Kind.COMMAND, 7, 0)
-    assert all(BODY[i : i + 4] not in data for i in range(len(BODY) - 3))
-
-
 def test_no_sealed_end_opens_an_unsealed_datagram() -> None:
     assert refuses(pair()[0], unsealed()[1].seal(Kind.COMMAND, BODY))
     assert not make_session(Direction.UPLINK, None).sealed
