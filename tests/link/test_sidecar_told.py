@@ -13,10 +13,7 @@ from cloudrc.cli.link_run import EMPTY_STATUS, LinkStatusSource
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
 from cloudrc.link.sidecar import Near, Told, look_near, read_told, write_told
 from cloudrc.link.tc import Answer
-from cloudrc.link.verify.causes import Evidence, Findings, find_causes, of_told
-from cloudrc.link.verify.judge import Row
-from cloudrc.link.verify.standing import shown
-from tests.link.conftest import PEER, Bench, listing
+from tests.link.conftest import PEER, Bench
 
 RICH = DirectionProfile(
     0.04, 0.01, "table", loss=GilbertElliott(0.01, 0.2), duplicate=0.02, rate=2e6, table=(-1.0, 1.0)
@@ -34,12 +31,6 @@ class Tools:
     def run(self, words: Sequence[str]) -> Answer:
         told = [{"dev": self.device}] if words[0] == "ip" else list(self.qdiscs)
         return Answer(self.code, json.dumps(told), "")
-
-
-def causes(told: Told, measured: float = 0.0) -> list[str]:
-    """Codes for a direction whose mean is off."""
-    row = Row("mean", "s", 0.045, 0.045, measured, 0.043, 0.047, "off")
-    return [one.code for one in find_causes({"uplink": Findings([row], of_told(told))})]
 
 
 def test_what_is_told_is_read_as_it_was() -> None:
@@ -64,56 +55,6 @@ def test_all_netems_of_a_namespace_are_found_and_nothing_else() -> None:
 
 def test_where_there_are_no_tools_nothing_is_claimed() -> None:
     assert look_near(Tools("eth0", code=127).run, PEER[0]) is None
-    assert of_told(Told("netem", "", RICH)) == Evidence("netem", layers=1, applied=RICH)
-
-
-@pytest.mark.parametrize(
-    ("shaper", "leaves", "netems", "code"),
-    [
-        ("netem", "eth1", {"eth0": [OURS]}, "wrong_interface"),
-        ("netem", "eth0", {}, "no_qdisc"),
-        ("netem", "eth0", {"eth0": [OURS, THEIRS]}, "shaped_twice"),
-        ("relay", "eth0", {"eth0": [THEIRS]}, "shaped_twice"),
-        ("relay", "eth0", {"lo": [THEIRS]}, "shaped_twice"),
-    ],
-)
-def test_what_lies_on_the_way_of_the_flow_is_the_cause(
-    shaper: str, leaves: str, netems: dict[str, list[dict[str, Any]]], code: str
-) -> None:
-    told = Told(shaper, "link.mode=auto", DirectionProfile(0.045), Near(leaves, netems))
-    assert causes(told, 0.09) == [code]
-
-
-def test_what_lies_aside_of_it_is_none() -> None:
-    applied = DirectionProfile(0.045)
-    for told in (
-        Told("relay", "", applied, Near("eth0", {"eth1": [THEIRS]})),
-        Told("netem", "", applied, Near("eth0", {"eth0": [OURS], "lo": [THEIRS]})),
-    ):
-        assert causes(told, 0.09) == ["doubled_delay"]
-
-
-def test_of_netem_the_kernel_says_what_is_applied() -> None:
-    options = listing("limit 10 delay 90000us duplicate 3%".split())
-    near = Near("eth0", {"eth0": [{**OURS, "options": options}]})
-    assert of_told(Told("netem", "", RICH, near)).applied == DirectionProfile(
-        0.09, 0.0, "table", duplicate=0.03, table=RICH.table
-    )
-
-
-def test_what_is_applied_has_a_number_for_every_row() -> None:
-    profile = DirectionProfile(0.04, 0.01, "normal", loss=0.1, duplicate=0.02, corrupt=0.5)
-    found = shown(profile, 200, "relay")
-    assert found["mean"] == pytest.approx(0.04, rel=0.01)
-    assert found["deviation"] == pytest.approx(0.01, rel=0.01)
-    assert found["loss"] == pytest.approx(0.55), "what is damaged is refused"
-    assert found["duplicated"] == 0.02
-    assert found["reordered"] > 0.1
-    assert found["middle"] > 0.0
-    assert shown(DirectionProfile(0.04, keep_order=True), 200, "relay")["reordered"] == 0.0
-    doubled = shown(DirectionProfile(0.04, loss=0.2, duplicate=0.3), 200, "netem")
-    assert doubled["loss"] == pytest.approx(0.14), "of what is doubled and lost one copy arrives"
-    assert doubled["duplicated"] == pytest.approx(0.22, abs=0.005)
 
 
 def tells(bench: Bench, *at: float) -> list[Told | None]:
