@@ -14,7 +14,7 @@ from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.cli.link_verify_report import VerifyReport
+    from cloudrc.cli.link_verify_report import Report
     from cloudrc.config.load import ResolvedExperiment
 
 EPILOG = """\
@@ -24,15 +24,13 @@ examples:
   cloudrc link verify paper --set link.uplink.loss=0.05 -o json
 
 The command starts the link's processes on this machine, one per direction, and
-sends numbered probes of the tunnel's size through each. A relay's draws are
-known, so each probe has a predicted delay; netem is compared with 200 simulated
-links. Tolerances: max(2 ms, 5 %) of the mean delay, 10 % of the jitter, and
-max(2 percentage points, 25 %) of the loss. What is off is measured again before
-it is reported.
+sends numbered probes through each. A relay's draws are known, so each probe has
+a predicted delay; netem is compared with 200 simulated links. Tolerances:
+max(2 ms, 5 %) of the mean delay, 10 % of the jitter, max(2 percentage points,
+25 %) of the loss. What is off is measured again before it is reported.
 
 With --mode cluster the command judges the link of a release in flight by the
-tunnel's own datagrams. This takes 10 to 40 s with a relay, and up to 2 min with
-netem. It reports what it cannot judge.
+tunnel's own datagrams, which takes up to 2 min. It reports what it cannot judge.
 
 exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
 3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
@@ -90,60 +88,43 @@ def execute(options: argparse.Namespace) -> int:
     """Measure the link, print the verdict; return 0 if the link is believed."""
     if options.seconds is not None and not 1.0 <= options.seconds <= 3600.0:
         raise BadInputError(f"--seconds {options.seconds:g}: give a number from 1 to 3600")
-    from cloudrc.cli.link_verify_report import as_document, as_text
-
     interrupt_on_signals()  # on a signal, remove namespaces and processes
-    report = _of_release(options) if options.ends or options.mode == "cluster" else _local(options)
-    tell("")
-    if options.output == "table":
-        print(as_text(report))
+    if options.ends or options.mode == "cluster":
+        report = _verify_release(options)
     else:
-        print(format_document(as_document(report), options.output))
-    return 0 if report.verdict == "believed" else 1
+        from cloudrc.cli.link_verify_local import verify
+
+        experiment = find_experiment(options.target, options.settings)
+        report = verify(options.target, experiment, options.shaper, options.seconds, _tell)
+    from cloudrc.cli.link_verify_report import as_text
+
+    table = options.output == "table"
+    print(as_text(report) if table else format_document(report, options.output))
+    return 0 if report["verdict"] == "believed" else 1
 
 
-def _local(options: argparse.Namespace) -> VerifyReport:
-    """Probe a link that is started on this machine."""
-    from cloudrc.cli.link_verify_local import verify as probe
-    from cloudrc.cli.link_verify_report import NOT_JUDGED, VerifyReport, on_correlation
-
-    experiment = find_experiment(options.target, options.settings)
-    findings, plans = probe(experiment, options.shaper, options.seconds, tell)
-    probes, notes = {}, []
-    for way, plan in plans.items():
-        seconds = plan.sent[-1] - plan.sent[0]
-        probes[way] = f"{len(plan.sent)} probes of {plan.flow.size} bytes in {seconds:.0f} s"
-        if options.shaper == "netem" and plan.profile.correlation and plan.profile.jitter:
-            notes.append(on_correlation(way, plan.profile.correlation))
-        if plan.profile.rate and not plan.block:
-            notes.append(f"{way}: rate {NOT_JUDGED}: this machine itself is hardly faster")
-    return VerifyReport(options.target, findings, probes, notes)
-
-
-def _of_release(options: argparse.Namespace) -> VerifyReport:
+def _verify_release(options: argparse.Namespace) -> Report:
     """Query the ends of a release, at given hosts or through the cluster's API."""
     from cloudrc.cli.link_verify_release import END_PORT, LINK_PORT, verify
-    from cloudrc.cli.link_verify_report import VerifyReport
 
+    name, ports = options.release or "cloudrc", (END_PORT, LINK_PORT)
     with ExitStack() as stack:
-        name, urls = options.release or "cloudrc", {}
         if options.ends:
             hosts = options.ends.split(",")
             if len(hosts) != 2 or not all(hosts):
                 raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
-            for end, host in zip(("world", "cloud"), hosts, strict=True):
-                urls[end] = [f"http://{host}:{port}" for port in (END_PORT, LINK_PORT)]
+            urls = [[f"http://{host}:{port}" for port in ports] for host in hosts]
         else:
             from cloudrc.cluster.pods import find_pod, forwarded
 
-            release = release_from_flags(options)
+            release, urls = release_from_flags(options), []
             name = release.name
             for end in ("world", "cloud"):
                 pod = find_pod(release, end).metadata.name
-                ports = stack.enter_context(forwarded(release, pod, [END_PORT, LINK_PORT]))
-                urls[end] = [f"http://127.0.0.1:{ports[port]}" for port in (END_PORT, LINK_PORT)]
-        found = verify(urls, options.seconds or RELEASE_TIMEOUT, tell)
-        return VerifyReport(name, *found, more="too few datagrams so far: ask again (time: above)")
+                local = stack.enter_context(forwarded(release, pod, ports))
+                urls.append([f"http://127.0.0.1:{local[port]}" for port in ports])
+        pods = dict(zip(("world", "cloud"), urls, strict=True))
+        return verify(name, pods, options.seconds or RELEASE_TIMEOUT, _tell)
 
 
 def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
@@ -152,20 +133,22 @@ def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
     from cloudrc.config.load import read_experiment
     from cloudrc.config.schema import Experiment, Profile
 
-    is_profile = target in shipped.names("profile") and target not in shipped.names("experiment")
+    names = [*shipped.names("profile"), *shipped.names("experiment")]
+    is_profile = target not in shipped.names("experiment")
     if shipped.is_path(target):
         tree = shipped.read("profile", target, Path.cwd()).tree
         is_profile = set(tree).isdisjoint(set(Experiment.model_fields) - set(Profile.model_fields))
-        target = str(Path.cwd() / target)
-    elif target not in (known := [*shipped.names("profile"), *shipped.names("experiment")]):
-        names = ", ".join(known)
-        raise BadInputError(f"no profile or experiment named '{target}'; available: {names}")
-    if is_profile:
-        return read_experiment(DEFAULT, [f"link.profile={target}", *settings])
-    return read_experiment(target, settings)
+    elif target not in names:
+        raise BadInputError(
+            f"no profile or experiment named '{target}'; available: {', '.join(names)}"
+        )
+    if not is_profile:
+        return read_experiment(target, settings)
+    name = str(Path.cwd() / target) if shipped.is_path(target) else target
+    return read_experiment(DEFAULT, [f"link.profile={name}", *settings])
 
 
-def tell(line: str) -> None:
+def _tell(line: str) -> None:
     """Show progress in one line, on a terminal only."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{escape(line)}", end="", file=sys.stderr, flush=True)

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from cloudrc.cli.link_verify_report import NOT_JUDGED, on_correlation
+from cloudrc.cli.link_verify_report import NOT_JUDGED, Report, make_report, on_correlation
 from cloudrc.cluster.pods import METRICS, NO_PROXY
 from cloudrc.errors import TimedOutError
 from cloudrc.link.profile import DirectionProfile
@@ -26,8 +26,8 @@ from cloudrc.link.verify.monitor import PERIOD
 from cloudrc.tunnel.codec import SIZES, Kind
 
 END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]
-POLL_PERIOD, OFF_TIMEOUT = 2.0, 30.0
-"""Pause between two polls of the ends, and longest wait for the other after an "off" [s]."""
+POLL_PERIOD, OFF_TIMEOUT, HTTP_TIMEOUT = 2.0, 30.0, 3.0
+"""Pause between two polls, longest wait for a verdict once the other is "off", for a page [s]."""
 SENT_MIN = 1500
 """Counts of fewer datagrams are too inexact to compare [1]: they are updated once a second."""
 WAYS = {
@@ -35,21 +35,13 @@ WAYS = {
     "downlink": ("cloud", "world", Kind.COMMAND),
 }
 """Direction -> the end that sends in it, the end that receives, and what."""
-VALUES = ("asked", "measured", "low", "high")
-SENT = np.arange(float(RUN_LENGTH)) * PERIOD
-HTTP_TIMEOUT = 3.0
 
 Pods: TypeAlias = Mapping[str, Sequence[str]]
 """End -> URLs of its own pages and of those of its link container."""
 
 
-def verify(
-    pods: Pods, limit: float, tell: Callable[[str], None]
-) -> tuple[dict[str, Findings], dict[str, str], list[str]]:
+def verify(title: str, pods: Pods, limit: float, tell: Callable[[str], None]) -> Report:
     """Wait at most `limit` [s] for the verdicts of both ends.
-
-    Returns:
-        Findings and description of the datagrams, by direction; notes.
 
     Raises:
         TimedOutError: If an end does not answer in time.
@@ -62,25 +54,20 @@ def verify(
         for way, (_, receiver, _) in WAYS.items():
             if page := fetch(f"{pods[receiver][0]}/link.json"):
                 seen[way] = json.loads(page)
-        verdicts = [found["verdict"] for found in seen.values()]
-        off_deadline = (
-            min(off_deadline, time.monotonic() + OFF_TIMEOUT) if "off" in verdicts else inf
-        )
+        verdicts, now = [found["verdict"] for found in seen.values()], time.monotonic()
+        off_deadline = min(off_deadline, now + OFF_TIMEOUT) if "off" in verdicts else inf
         done = len(seen) == len(WAYS) and "open" not in verdicts
-        if done or time.monotonic() > min(deadline, off_deadline):
+        if done or now >= min(deadline, off_deadline):
             break
-    silent = [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]
-    if silent:
+    tell("")
+    if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
         text = f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
         raise TimedOutError(text)
     findings = {way: _findings(way, seen[way], pods, *before[way]) for way in WAYS}
     counts = {way: max([row["datagrams"] for row in seen[way]["rows"]], default=0) for way in WAYS}
     probes = {way: f"{count} of the tunnel's own datagrams" for way, count in counts.items()}
-    return (
-        findings,
-        probes,
-        [note for way in WAYS for note in _notes(way, seen[way], findings[way])],
-    )
+    notes = [note for way in WAYS for note in _notes(way, seen[way], findings[way])]
+    return make_report(title, findings, probes, notes)
 
 
 def fetch(url: str) -> str:
@@ -99,49 +86,45 @@ def _counters(way: str, pods: Pods) -> tuple[float, Metrics]:
 
 
 def _findings(
-    way: str, found: Mapping[str, Any], pods: Pods, sent: float, before: Metrics
+    way: str, found: Mapping[str, Any], pods: Pods, before: float, metrics: Metrics
 ) -> Findings:
     """Combine the receiver's verdict with what the sender's link reports."""
     sender, _, kind = WAYS[way]
-    total, metrics = _counters(way, pods)
+    total, now = _counters(way, pods)
     try:
         told = read_told(fetch(f"{pods[sender][1]}/link.json"))
     except ValueError:
         told = Told("", "", None)
-    enough = total - sent >= SENT_MIN
-    known = read_evidence(told, metrics, round(total - sent) if enough else None, before)
-    applied = Plan(DirectionProfile(), Flow(0, way == "uplink", kind, SIZES[kind]), SENT).applied(
-        known.applied
-    )
-    rows = []
+    sent = round(total - before) if total - before >= SENT_MIN else None
+    known = read_evidence(told, now, sent, metrics)
+    flow = Flow(0, way == "uplink", kind, SIZES[kind])
+    plan = Plan(DirectionProfile(), flow, np.arange(float(RUN_LENGTH)) * PERIOD)
+    applied, rows = plan.applied(known.applied), []
     for row in found["rows"]:
-        name, values = row["quantity"], [float(row.get(key, nan)) for key in VALUES]
-        asked, measured, low, high = values
-        if row["verdict"] != "told":
-            unit = UNITS.get(name, "1")
-            in_force = applied.get(name, nan)
-            rows.append(Row(name, unit, asked, in_force, measured, low, high, row["verdict"]))
-        elif name == "rate" and known.applied:  # single datagrams do not measure it
+        name, judged = row["quantity"], row["verdict"] != "told"
+        values = (row.get(key, nan) for key in ("asked", "measured", "low", "high"))
+        asked, measured, low, high = map(float, values)
+        in_force = applied.get(name, nan)
+        if name == "rate" and known.applied:  # single datagrams do not measure it
             in_force, slack = known.applied.rate or inf, tolerance("rate", asked)
-            if abs(in_force - asked) > slack:
-                rows.append(
-                    Row(name, "bit/s", asked, in_force, nan, asked - slack, asked + slack, "off")
-                )
+            judged, low, high = abs(in_force - asked) > slack, asked - slack, asked + slack
+        if judged:
+            verdict = row["verdict"] if name != "rate" else "off"
+            unit = UNITS.get(name, "1")
+            rows.append(Row(name, unit, asked, in_force, measured, low, high, verdict))
     return Findings(rows, known)
 
 
 def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> Iterator[str]:
-    """Note what was not judged, and how long it takes."""
-    rows, judged = (
-        {row["quantity"]: row for row in found["rows"]},
-        {row.name for row in finding.rows},
-    )
+    """Note what was not judged, and how much longer it takes."""
+    rows = {row["quantity"]: row for row in found["rows"]}
+    judged = {row.name for row in finding.rows}
     if not rows:
         hint = "fly a mission first" if way == "downlink" else "is the other end ready?"
         yield f"{way}: no datagrams to measure; {hint}"
-    if "round_trip" in judged:
+    elif "round_trip" in judged:
         yield f"{way}: the ends do not share a clock: judged by round trips, not one-way delays"
-    elif rows and "mean" not in judged:
+    elif "mean" not in judged:
         yield f"{way}: delays {NOT_JUDGED}: the ends do not share a clock"
     if "rate" in rows and "rate" not in judged:
         yield f"{way}: rate {NOT_JUDGED}: single datagrams do not measure it"
@@ -153,7 +136,6 @@ def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> Iterator[st
 
 
 def _patience(way: str, found: Mapping[str, Any]) -> Iterator[str]:
-    """Tell how much longer it takes, if there is no verdict yet."""
     for row in found["rows"]:
         if found["verdict"] == "open" and row["quantity"] == "datagrams":
             needs, count = round(row["asked"]), round(row["measured"])

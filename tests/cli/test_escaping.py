@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from cloudrc.cli import summary
-from cloudrc.cli.link_verify_report import VerifyReport, as_text
+from cloudrc.cli.link_verify_report import as_text, make_report
 from cloudrc.cli.main import main
 from cloudrc.cli.output import print_line, table
 from cloudrc.cli.progress import FlightView
@@ -100,7 +100,7 @@ def test_the_state_of_a_link_container() -> None:
     row = Row("mean", "s", 0.1, 0.1, 0.1, 0.1, 0.1, "off")
     known = Evidence("none", elsewhere=(EVIL,))
     ways, probes = {"uplink": Findings([row], known)}, {"uplink": EVIL}
-    text = as_text(VerifyReport(EVIL, ways, probes, [EVIL]))
+    text = as_text(make_report(EVIL, ways, probes, [EVIL]))
     assert_harmless(text)
     assert text.count(SHOWN) == 4
 

@@ -29,33 +29,21 @@ CPU_PERIOD = 0.1
 class Evidence:
     """What the machine reports about the shaper of one direction; None or "" if it is unknown.
 
-    Attributes:
-        shaper: "relay", "netem", or "none" if the kernel has none where the flow leaves.
-        why: Why this shaper, in words.
-        interface: Over which the flow leaves.
-        elsewhere: Other interfaces that have a netem qdisc.
-        layers: Number of shapers that the flow passes.
-        applied: Profile in force, by the shaper's own word.
-        sent: Number of datagrams that the end sent.
-        passed: Number of them that the shaper counted.
-        unread: Number of them that the kernel dropped because the shaper did not read them.
-        late: 99 % quantile of the release error [s].
-        throttled: Share of CPU periods in which the shaper was stopped, in [0, 1].
-        restored: How often somebody else removed or changed the qdisc.
+    Its release error is `late` [s]; its CPU limit stops it in a share `throttled` of periods [1].
     """
 
-    shaper: str = ""
-    why: str = ""
-    interface: str = ""
-    elsewhere: tuple[str, ...] = ()
-    layers: int | None = None
-    applied: DirectionProfile | None = None
-    sent: int | None = None
-    passed: int | None = None
-    unread: int | None = None
-    late: float | None = None
+    shaper: str = ""  # "relay", "netem"; "none" if the kernel has none where the flow leaves
+    why: str = ""  # why this shaper, in words
+    interface: str = ""  # over which the flow leaves
+    elsewhere: tuple[str, ...] = ()  # other interfaces that have a netem qdisc
+    layers: int | None = None  # number of shapers that the flow passes
+    applied: DirectionProfile | None = None  # in force, by the shaper's own word
+    sent: int | None = None  # datagrams that the end sent
+    passed: int | None = None  # of them, those that the shaper counted
+    unread: int | None = None  # of them, those that the shaper did not read in time
+    late: float | None = None  # 99 % quantile
     throttled: float | None = None
-    restored: int = 0
+    restored: int = 0  # times that somebody else removed or changed the qdisc
 
 
 Metrics: TypeAlias = Mapping[str, float]
@@ -152,7 +140,6 @@ _BY_NUMBERS = (
     ("wrong_delay", "mean", 0.0, inf, ""),
     ("wrong_delay", "round_trip", 0.0, inf, ""),
     ("wrong_jitter", "deviation", 0.0, inf, ": another jitter"),
-    ("nothing_arrives", "all", 0.0, inf, "not one datagram arrives: is the route open?"),
     ("no_loss", "loss", 0.0, 0.05, ": loss is not applied"),
     ("less_loss", "loss", 0.0, 1.0, ""),
     ("more_loss", "loss", 1.0, inf, ""),
@@ -166,71 +153,54 @@ _BY_NUMBERS = (
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
     """Give the first cause that holds, and beside a lack of CPU what that cannot explain."""
     off = {row.name: row for row in one.rows if row.verdict == "off"}
-    if not off:
-        return
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
-    for code, text in _of_machine(one.evidence, off, lost):
+    for code, text in _of_machine(one.evidence, off, lost) if off else ():
         yield code, text
         if code != "throttled":
             return
-        unread = (one.evidence.unread or 0) / (one.evidence.sent or 1)
-        off = {name: row for name, row in off.items() if _is_beyond(row, unread)}
-        break
+        beyond = lost > 1.2 * (one.evidence.unread or 0) / (one.evidence.sent or 1)
+        kept = {name for name, row in off.items() if (_ratio(row) < 1.0) != (name == "rate")}
+        off = {name: off[name] for name in off if name in kept or (name == "loss" and beyond)}
     for code, name, low, high, text in _BY_NUMBERS:
-        if name == "all" and lost > 0.999 and off:
-            yield code, text
-            return
         if name in off and low <= _ratio(off[name]) <= high:
-            yield code, describe(off[name]) + text
+            yield (code, describe(off[name]) + text)
             return
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
     """Look at what can be read; of the datagrams, a share `lost` [1] did not arrive."""
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
+    sent, unread, late, stopped = (
+        value or 0 for value in (known.sent, known.unread, known.late, known.throttled)
+    )
     if known.shaper == "none" and "sch_netem" in known.why:
         yield "no_sch_netem", f"{known.why}; set link.mode=relay, which needs none"
     if known.shaper == "none" and elsewhere:
         yield "wrong_interface", f"the flow leaves by {where}, but the qdisc is on {elsewhere}"
     if known.shaper == "none" or known.restored:
         yield "no_qdisc", f"somebody else removed or changed the qdisc on {where}"
-    sent, passed, unread = known.sent or 0, known.passed, known.unread or 0
-    if passed is not None and passed + unread < PASSED * sent * (1.0 - lost):
-        yield "bypassed", f"of {sent} datagrams, {passed} passed the shaper: {_OTHERS}"
+    if known.passed is not None and known.passed + unread < PASSED * sent * (1.0 - lost):
+        yield "bypassed", f"of {sent} datagrams only {known.passed} passed the shaper"
     if (known.layers or 0) > 1:
         yield "shaped_twice", f"the flow passes {known.layers} shapers: remove all but one"
-    late, stopped = known.late or 0.0, known.throttled or 0.0
     longest = max(late * (late > LATE), sqrt(stopped) * CPU_PERIOD * (stopped > STOPPED))
-    mean, excess = off.get("mean"), inf
-    if mean is not None:
-        excess = mean.measured - mean.asked
-    elif {name for name, row in off.items() if (_ratio(row) > 1.0) != (name == "rate")}:
-        excess = 0.0
-    if unread > UNREAD * sent or 0.0 <= excess < longest:
+    slower = [row for row in off.values() if (_ratio(row) > 1.0) != (row.name == "rate")]
+    excess = off["mean"].measured - off["mean"].asked if "mean" in off else 0.0
+    if unread > UNREAD * sent or (slower and 0.0 <= excess < longest):
         yield (
             "throttled",
             f"the shaper lacks CPU time ({unread} of {sent} datagrams not read; 1 % released later "
             f"than {in_unit(late, 's')}; stopped in {stopped:.0%} of the periods): raise its limit "
             "or take load off the machine",
         )
-
-
-_OTHERS = "the others took another way"
+    if lost > 0.999:
+        yield "nothing_arrives", "not one datagram arrives: is the route open?"
 
 
 def _ratio(row: Row) -> float:
     """Return the measured by the requested value [1]; a rate may be known by the shaper alone."""
     value = row.applied if isnan(row.measured) else row.measured
     return value / row.asked if row.asked else inf
-
-
-def _is_beyond(row: Row, unread: float) -> bool:
-    """Say whether a lack of CPU cannot cause this: it only adds delay, scatter and loss."""
-    if row.name == "loss":
-        return not row.low <= row.measured - unread <= row.high
-    if row.name in ("rate", "duplicated"):
-        return _ratio(row) > 1.0
-    return _ratio(row) < (0.2 if row.name == "reordered" else 1.0) and row.name != "distribution"
 
 
 def describe(row: Row) -> str:

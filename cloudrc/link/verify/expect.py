@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from math import sqrt
 from typing import NamedTuple, TypeAlias
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss, Timeline, mean_loss
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -25,8 +25,7 @@ RUNS, RUN_LENGTH = 200, 1000
 TAIL = 1e-3
 """Share of honest links below a band, and share of them above it [1]."""
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
-"""Least correlation of predicted and measured delays, and share of datagrams whose loss is as
-predicted, of a link that draws as predicted [1]."""
+"""Least correlation with predicted delays, and share of predicted losses, of a known link [1]."""
 STILL, SHAPE_FLOOR = 1e-4, 2e-3
 """Below these standard deviations delays tell nothing about draws, and the machine itself changes
 the shape of their distribution [s]."""
@@ -63,8 +62,7 @@ class Plan:
         profile: Requested conditions.
         flow: The datagrams.
         sent: When each is sent, since the link came up [s], shape (n,).
-        train: The last `train` of each `block` datagrams are sent at once, to measure a rate.
-        block: Datagrams per block [1]; 0 without trains.
+        train: Datagrams per train; each follows as many single ones. 0 without trains.
         pause: Called every few hundred microseconds, so that other threads run.
     """
 
@@ -72,16 +70,12 @@ class Plan:
     flow: Flow
     sent: Floats
     train: int = 0
-    block: int = 0
     pause: Callable[[], None] = lambda: None
 
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
-        """Draw what the link does to datagrams that leave at `sent` [s]; damaged ones are refused.
+        """Draw what the link does to datagrams sent at `sent` [s] with counters from `first` on.
 
-        Args:
-            sent: When each is sent, since the link came up [s], shape (n,).
-            epoch: Epoch in their headers.
-            first: Counter of the first.
+        A damaged datagram is refused, and so is lost.
         """
         seed, uplink, kind, size = self.flow
         link, whole = LinkDirection(self.profile, seed, uplink), bytes(size)
@@ -99,16 +93,11 @@ class Plan:
     @cached_property
     def links(self) -> list[Stream]:
         """Streams over links of other seeds, as netem realises the profile; RUN_LENGTH at most."""
-        few = RUN_LENGTH - RUN_LENGTH % max(1, self.block)
-        sent = self.sent if self.is_whole else self.sent[:few]
+        few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
+        sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
         made = replace(self, profile=netem_makes(self.profile))
         return [replace(made, flow=self.flow._replace(seed=seed)).draw(sent) for seed in seeds]
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether no part of it stands for the rest, because conditions change."""
-        return Timeline(self.profile).only() is None
 
     @cached_property
     def chance(self) -> Expected:
@@ -118,10 +107,8 @@ class Plan:
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
         """Expect what the link drew if a stream met its own draws, otherwise what others draw."""
         drawn = self.draw(measured.sent, epoch, first)
-        if self._fits(self._alone(measured), self._alone(drawn)):
+        if self._fits(self._singles(measured), self._singles(drawn)):
             return self._expect([drawn])
-        if self.is_whole:
-            return self.chance
         factor = sqrt(len(self.links[0].sent) / max(1, len(measured.sent)))
         bands = {
             name: (mean, mean - factor * (mean - low), mean + factor * (high - mean))
@@ -131,10 +118,8 @@ class Plan:
 
     def applied(self, profile: DirectionProfile | None) -> dict[str, float]:
         """Compute the quantities on a link of another profile; nothing if that is unknown."""
-        if profile is None:
-            return {}
-        other = replace(self, profile=profile)
-        return other.quantities(other.draw(self.sent), np.zeros(0))
+        other = replace(self, profile=profile or self.profile)
+        return other.quantities(other.draw(self.sent), np.zeros(0)) if profile else {}
 
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
         """Say whether datagrams met their own draws: by their delays, else by the losses."""
@@ -146,12 +131,11 @@ class Plan:
         return bool(np.mean(lost[0] == lost[1]) > SAME_LOSSES)
 
     def _expect(self, links: Sequence[Stream]) -> Expected:
-        pooled = np.sort(np.concatenate([self._shape(self._alone(link)) for link in links]))
+        pooled = np.sort(np.concatenate([self._shape(self._singles(link)) for link in links]))
         pooled = pooled[:: 1 + len(pooled) // 4096]
         found, bands = [self.quantities(link, pooled) for link in links], {}
         for name in found[0]:
-            values = np.array([one.get(name, np.nan) for one in found])
-            values = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
+            values = np.nan_to_num([one.get(name, np.nan) for one in found])
             low, high = np.quantile(values, (TAIL, 1.0 - TAIL)).tolist()
             bands[name] = (float(values.mean()), low, high)
         return Expected(bands, pooled, known=len(links) == 1)
@@ -162,16 +146,16 @@ class Plan:
         The deviation [s] is about the delay requested at each time, so it shows the jitter alone;
         the "distribution" is the distance of Kolmogorov and Smirnov from `pooled` [1].
         """
-        alone = self._alone(stream)
-        found, shape = numbers(alone), self._shape(alone)
+        singles = self._singles(stream)
+        found, shape = numbers(singles), self._shape(singles)
         measured = {
             "mean": found.mean,
             "deviation": float(shape.std()) if len(shape) else np.nan,
             "loss": found.loss,
             "reordered": found.overtaken,
-            "duplicated": float((alone.copies > 1).sum()) / max(1, len(shape)),
+            "duplicated": float((singles.copies > 1).sum()) / max(1, len(shape)),
         }
-        if self.block:
+        if self.train:
             measured["rate"] = self._rate(stream)
         if len(shape) and len(pooled) and pooled.std() > SHAPE_FLOOR:
             points, steps = np.sort(shape), np.arange(len(shape) + 1) / len(shape)
@@ -180,12 +164,11 @@ class Plan:
             measured["distribution"] = float(np.max(far))
         return measured
 
-    def _alone(self, stream: Stream) -> Stream:
-        """Select the datagrams that are not sent in trains."""
-        if not self.block:
+    def _singles(self, stream: Stream) -> Stream:
+        if not self.train:
             return stream
         parts = (stream.sent, stream.delays, stream.copies)
-        return Stream(*(one.reshape(-1, self.block)[:, : -self.train].ravel() for one in parts))
+        return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
 
     def _shape(self, stream: Stream) -> Floats:
         """Compute the delays about those requested at their time, with median 0 [s]."""
@@ -196,26 +179,20 @@ class Plan:
     def _rate(self, stream: Stream) -> float:
         """Compute the rate at which trains leave a bottleneck [bit/s].
 
-        Source: M. Jain, C. Dovrolis, "Packet-dispersion techniques and a capacity-estimation
-        methodology", IEEE/ACM Trans. Networking 12, 2004.
+        Source: M. Jain, C. Dovrolis, IEEE/ACM Trans. Networking 12, 2004: packet dispersion.
         """
-        arrival = (stream.sent + stream.delays).reshape(-1, self.block)[:, -self.train :]
+        arrival = (stream.sent + stream.delays).reshape(-1, 2 * self.train)[:, self.train :]
         arrival = arrival[np.isfinite(arrival).sum(axis=1) > self.train // 2]
         spans = np.nanmax(arrival, axis=1, initial=0.0) - np.nanmin(arrival, axis=1, initial=np.inf)
         bits = (self.train - 1) * (self.flow.size + HEADER_BYTES) * 8.0
         return float(bits / spans.mean()) if len(spans) and spans.mean() > 0.0 else np.nan
 
 
-@lru_cache(maxsize=4)
-def _pieces(profile: DirectionProfile) -> tuple[Floats, Floats]:
-    timeline = Timeline(profile)
-    delays_ns = [timeline.at(start_ns).delay_ns for start_ns in timeline.starts_ns]
-    return np.array(timeline.starts_ns) * 1e-9, np.array(delays_ns) * 1e-9
-
-
 def requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
     """Return the delay that a profile requests at each time since the link came up [s]."""
-    starts, delays = _pieces(profile)
+    timeline = Timeline(profile)
+    starts = np.array(timeline.starts_ns) * 1e-9
+    delays = np.array([timeline.at(start_ns).delay_ns for start_ns in timeline.starts_ns]) * 1e-9
     found: Floats = delays[np.maximum(np.searchsorted(starts, sent, side="right") - 1, 0)]
     return found
 
@@ -226,12 +203,10 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     netem draws delays without correlation, loses either a packet or its copy, and sends the copy
     through its losses once more. Source: Linux, net/sched/sch_netem.c.
     """
-    chance, lost = profile.duplicate, mean_loss(profile.loss)
-    twice = chance * (1.0 - lost) ** 2 / max(1e-9, 1.0 - (1.0 - chance) * lost)
-    loss: Loss = profile.loss
+    loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
+    twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)
     if isinstance(loss, GilbertElliott):
-        bad, good = ((1.0 - chance) * one for one in (loss.loss_bad, loss.loss_good))
-        loss = replace(loss, loss_bad=bad, loss_good=good)
+        loss = replace(loss, loss_bad=single * loss.loss_bad, loss_good=single * loss.loss_good)
     else:
-        loss = (1.0 - chance) * loss
+        loss *= single
     return replace(profile, correlation=0.0, loss=loss, duplicate=twice)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import isnan, nan
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from cloudrc.link.model import Stream
 from cloudrc.link.verify.expect import Expected, Plan
@@ -25,12 +25,8 @@ SHARE_TOLERANCE = (0.02, 0.25)
 """Likewise of loss, order and copies."""
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; that of a share is "1"."""
-FEWEST = 300
-"""Datagrams that a verdict takes at least [1]."""
-CHANCE_MAX = 1.5
-"""Chance may hide at most this multiple of the tolerance [1]."""
-
-Verdict: TypeAlias = Literal["ok", "off", "open", "told"]
+FEWEST, CHANCE_MAX = 300, 1.5
+"""Datagrams that a verdict takes at least [1]; tolerances that chance may hide in it [1]."""
 
 
 class Row(NamedTuple):
@@ -44,7 +40,7 @@ class Row(NamedTuple):
         measured: Measured value [unit].
         low: Lowest value that is believed [unit].
         high: Highest value that is believed [unit].
-        verdict: Of these numbers.
+        verdict: "ok", "off", "open" or "told".
     """
 
     name: str
@@ -54,7 +50,7 @@ class Row(NamedTuple):
     measured: float
     low: float
     high: float
-    verdict: Verdict
+    verdict: str
 
 
 def judge(
@@ -76,11 +72,10 @@ def judge_value(name: str, expected: Expected, value: float, applied: float = na
     Where the draws are known, a jitter may be off by half as much.
     """
     mean, low, high = expected.bands[name]
-    slack = tolerance(name, mean)
-    if expected.known and name == "deviation":
-        slack = max(TOLERANCES[name][0], 0.5 * slack)
+    half = expected.known and name == "deviation"
+    slack = max(TOLERANCES[name][0], 0.5 * tolerance(name, mean)) if half else tolerance(name, mean)
     low, high = max(0.0, low - slack), high + slack
-    verdict: Verdict = "ok" if low <= value <= high else "off"
+    verdict = "ok" if low <= value <= high else "off"
     if isnan(value) or (verdict == "ok" and hidden(name, expected) > CHANCE_MAX):
         verdict = "open"
     return Row(name, UNITS.get(name, "1"), mean, applied, value, low, high, verdict)
@@ -110,7 +105,7 @@ def look_twice(first: Sequence[Row], second: Sequence[Row]) -> list[Row]:
     return [again.get(row.name, row) if row.verdict == "off" else row for row in first]
 
 
-def verdict_of(rows: Iterable[Row]) -> Verdict:
+def verdict_of(rows: Iterable[Row]) -> str:
     """Sum up rows: "off" if one is, else "open" if one is or none is judged, else "ok"."""
     verdicts = {row.verdict for row in rows} - {"told"}
     return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"

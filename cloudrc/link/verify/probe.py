@@ -69,13 +69,13 @@ def plan_probes(
         block = np.append(np.arange(train), np.full(train, train)) * step
         starts = FIRST_PROBE + np.arange(ceil(length / (2 * train * step))) * 2 * train * step
         sent = (starts[:, None] + block).ravel()
-        return Plan(profile, flow, sent, train, 2 * train)
+        return Plan(profile, flow, sent, train)
 
     if seconds is not None:
         return plan(seconds)
     last = starts_ns[-1] * 1e-9
     found = plan(max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
-    if drawn and not found.is_whole:
+    if drawn and not last:
         found = plan(min(needed(found) * step, LONGEST) if needed(found) > COUNT else COUNT * step)
     return found
 
