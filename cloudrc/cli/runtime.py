@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cloudrc.drivers.realtime import Peer
     from cloudrc.endpoint import Endpoint
     from cloudrc.link.profile import DirectionProfile
-    from cloudrc.link.verify.monitor import StandingCheck
+    from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.record.recorder import Recorder
     from cloudrc.records import Record
 
@@ -299,7 +299,7 @@ class EndRuntime(NamedTuple):
             watched=options.feed,
             choose=_record_filter(options, flies),
             link=_link_state(options),
-            check=_standing_check(options, self.experiment, uplink=self.name == "cloud"),
+            check=_link_monitor(options, self.experiment, uplink=self.name == "cloud"),
             keys=self.keys,
         )
 
@@ -395,17 +395,17 @@ def _link_state(options: argparse.Namespace) -> Path | None:
     return link if link is not None or route is None else route.with_name("link.json")
 
 
-def _standing_check(
+def _link_monitor(
     options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
-) -> StandingCheck:
+) -> LinkMonitor:
     """Make the monitor of the direction that an end receives, following changes of its profile."""
     import json
 
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
     from cloudrc.link.traces import SIZE_MAX
-    from cloudrc.link.verify.monitor import StandingCheck
-    from cloudrc.link.verify.twin import Stream
+    from cloudrc.link.verify.expect import Flow
+    from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.tunnel.codec import SIZES, Kind
 
     def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
@@ -416,7 +416,7 @@ def _standing_check(
     file_max = TRACE_MAX if options.link is None else SIZE_MAX
     requested = link_profile(experiment.uplink), link_profile(experiment.downlink)
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
-    stream = Stream(experiment.seed, uplink, kind, SIZES[kind])
-    check = StandingCheck(uplink=uplink, stream=stream)
+    flow = Flow(experiment.seed, uplink, kind, SIZES[kind])
+    check = LinkMonitor(uplink=uplink, flow=flow)
     check.begin(requested, _link_state(options), load)
     return check

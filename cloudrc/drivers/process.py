@@ -40,7 +40,7 @@ from cloudrc.records import (
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.link.verify.monitor import StandingCheck
+    from cloudrc.link.verify.monitor import LinkMonitor
 
 
 PERIOD_NS = 100_000_000
@@ -207,7 +207,7 @@ def run_end(
     watched: bool = True,
     choose: Callable[[list[Record]], list[Record]] = list,
     link: Path | None = None,
-    check: StandingCheck | None = None,
+    check: LinkMonitor | None = None,
     keys: KeyFile | None = None,
 ) -> bool:
     """Run one end until `stop()` or `over()`, then complete its recording.
@@ -253,7 +253,7 @@ class _Observers:
         self,
         end: str,
         link: Path | None,
-        check: StandingCheck | None,
+        check: LinkMonitor | None,
         keys: KeyFile | None,
         slip_ns: Callable[[], int],
         clock_steps: Callable[[], list[float]],

@@ -10,11 +10,11 @@ import pytest
 import yaml
 
 from cloudrc.cli import run
-from cloudrc.cli.link_verify_text import VerifyReport, as_text
+from cloudrc.cli.link_verify_report import as_text, make_report
 from cloudrc.cli.main import main
 from cloudrc.cli.output import print_line, table
 from cloudrc.cli.progress import FlightView
-from cloudrc.link.verify.causes import Cause, Evidence, Findings
+from cloudrc.link.verify.causes import Evidence, Findings
 from cloudrc.link.verify.judge import Row
 from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import Fault
@@ -97,12 +97,12 @@ def test_the_events_of_a_flight() -> None:
 
 
 def test_the_state_of_a_link_container() -> None:
-    cause = Cause("wrong_interface", "uplink", EVIL)
-    row = Row("mean", "s", 0.1, 0.1, 0.1, 0.1, 0.1, "ok")
-    ways, probes = {"uplink": Findings([row], Evidence("relay"))}, {"uplink": EVIL}
-    text = as_text(VerifyReport(EVIL, EVIL, ways, probes, [EVIL], [cause]))
+    row = Row("mean", "s", 0.1, 0.1, 0.1, 0.1, 0.1, "off")
+    known = Evidence("none", elsewhere=(EVIL,))
+    ways, probes = {"uplink": Findings([row], known)}, {"uplink": EVIL}
+    text = as_text(make_report(EVIL, ways, probes, [EVIL]))
     assert_harmless(text)
-    assert text.count(SHOWN) == 5
+    assert text.count(SHOWN) == 4
 
 
 def test_a_cell_of_a_table_and_a_line(printed: Printing) -> None:

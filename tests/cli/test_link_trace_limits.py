@@ -10,7 +10,7 @@ import pytest
 from cloudrc.cli import runtime
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
-from cloudrc.link.verify.monitor import Asked, Load, StandingCheck
+from cloudrc.link.verify.monitor import Asked, LinkMonitor, Load
 
 
 @pytest.fixture
@@ -18,12 +18,12 @@ def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
     """The function with which an end loads the profile in link.json."""
     kept: list[Load] = []
 
-    def begin(self: StandingCheck, asked: Asked, path: Path | None, load: Load) -> None:
+    def begin(self: LinkMonitor, asked: Asked, path: Path | None, load: Load) -> None:
         kept.append(load)
 
-    monkeypatch.setattr(StandingCheck, "begin", begin)
+    monkeypatch.setattr(LinkMonitor, "begin", begin)
     options = argparse.Namespace(link=None, route=tmp_path / "route")
-    runtime._standing_check(options, load_experiment("paper"), uplink=False)
+    runtime._link_monitor(options, load_experiment("paper"), uplink=False)
     return kept[0]
 
 

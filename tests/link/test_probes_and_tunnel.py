@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from cloudrc.cli.link_verify_run import PROBE, TRAIN, plan
+from cloudrc.cli.link_verify_local import make_plans
 from cloudrc.config.load import load_experiment
+from cloudrc.link.verify.probe import PROBE
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from tests.tunnel.hostile import Target
 
-KINDS = (PROBE, TRAIN)
+KINDS = (PROBE,)
 
 
 def probes(kind: int) -> list[bytes]:
@@ -48,7 +49,7 @@ def test_no_kind_of_the_tunnel_is_a_probes(kind: int) -> None:
 
 
 def test_probes_are_as_long_as_what_flies_there() -> None:
-    asked = plan(load_experiment("paper"), 5.0)
+    asked = make_plans(load_experiment("paper"), 5.0, "relay")
     flies = {"uplink": Kind.TELEMETRY, "downlink": Kind.COMMAND}
     for way, kind in flies.items():
-        assert asked[way].plan.schedule.size == codec.SIZES[kind]
+        assert asked[way].flow.size == codec.SIZES[kind]

@@ -1,8 +1,7 @@
-"""Sends numbered probes through both directions of a link and notes when each copy arrives.
+"""Send numbered probes through both directions of a link and note when each copy arrives.
 
-One thread, one clock: both ends of the link are sockets of this process. Instants of sending are
-read just before the kernel takes a probe, instants of arrival are the kernel's own, so that what
-this process waits for in between is no part of a delay.
+One thread and one clock serve both ends. A probe is stamped just before the kernel takes it, and by
+the kernel when it arrives (SO_TIMESTAMPNS), so what this process waits in between is not measured.
 """
 
 from __future__ import annotations
@@ -10,191 +9,172 @@ from __future__ import annotations
 import gc
 import select
 import socket
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from math import ceil, inf
 
-from cloudrc.link.relay import ANCILLARY_SIZE, Stamps, ask_for_stamps, instant_ns
-from cloudrc.link.verify.measure import Log
+import numpy as np
 
-Address = tuple[str, int]
-Write = Callable[[int, int], bytes]
-"""Makes the header of a probe from its kind and its number."""
-Read = Callable[[bytes], tuple[int, int, int]]
-"""Kind, epoch and number of a datagram; raises ValueError if it is not one of ours."""
+from cloudrc.link.model import HEADER_BYTES, Stream
+from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.verify.expect import Flow, Plan
+from cloudrc.link.verify.judge import needed
+from cloudrc.tunnel.codec import Direction, encode_header, peek
 
-DRAIN_MAX = 64
-"""Datagrams that are read from one socket before the other has its turn."""
-_DATAGRAM_MAX = 2048
-_WAIT_MAX = 0.1
-_BUFFER = 4_000_000
-"""Asked for each socket [bytes]; the kernel may give less."""
-
-
-@dataclass(frozen=True, slots=True)
-class Volley:
-    """Probes of one kind.
-
-    Attributes:
-        kind: In their headers.
-        size: Of each, UDP payload [bytes].
-        period_ns: From one salvo to the next [ns].
-        count: Salvos.
-        length: Probes in a salvo, which leave at once; 1 where each leaves alone.
-    """
-
-    kind: int
-    size: int
-    period_ns: int
-    count: int
-    length: int = 1
+PROBE = 254
+"""Kind of datagram that only probes have; no tunnel end accepts it."""
+FIRST_PROBE = 1.0
+"""Time from the start of the link to the first probe [s]."""
+COUNT = 1500
+"""Number of probes; more where chance hides more than a tolerance."""
+LONGEST, AFTER = 120.0, 5.0
+"""Longest time to probe, and time to probe after the last change of a time line [s]."""
+RATE, LINK_SHARE = 200.0, 0.4
+"""Most probes per second [1/s], and share of a bottleneck that they fill at most, in [0, 1]."""
+RATE_MAX = 1e8
+"""Highest rate that this process can measure [bit/s]."""
+TRAIN_SIZE, TRAIN_SPAN = 1400, 0.06
+"""UDP payload of a probe of a train [bytes], one Ethernet frame, and time of a train [s]."""
+_SO_TIMESTAMPNS, _BUFFER, _DATAGRAM_MAX, _DRAIN = 35, 4_000_000, 2048, 64
 
 
-class Shore:
-    """One end of the link: a socket that sends one direction's probes and hears the other's."""
+def plan_probes(
+    profile: DirectionProfile, flow: Flow, seconds: float | None = None, *, drawn: bool = False
+) -> Plan:
+    """Choose how many probes to send: as many as decide, or as long as a time line takes.
 
-    def __init__(self, own: socket.socket, route: Address, write: Write) -> None:
-        """Set up; the socket stays the caller's to close.
-
-        Args:
-            own: Bound UDP socket.
-            route: Where it has to send.
-            write: Makes headers.
-        """
-        own.setblocking(False)
-        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        ask_for_stamps(own)
-        self.socket = own
-        self.route = route
-        self.write = write
-        self.stamps = Stamps()
-
-
-@dataclass(slots=True)
-class _Course:
-    """A volley under way."""
-
-    shore: Shore
-    volley: Volley
-    begin_ns: int
-    log: Log = field(default_factory=Log)
-    salvos: int = 0
-
-    def due_ns(self) -> int | None:
-        """When the next salvo leaves [ns]; None if all have."""
-        if self.salvos == self.volley.count:
-            return None
-        return self.begin_ns + self.salvos * self.volley.period_ns
-
-    def fire(self) -> None:
-        """Send one salvo."""
-        shore, volley, sent_ns = self.shore, self.volley, self.log.sent_ns
-        self.salvos += 1
-        for _ in range(volley.length):
-            data = shore.write(volley.kind, len(sent_ns)).ljust(volley.size, b"\0")
-            sent_ns.append(time.monotonic_ns())
-            with suppress(OSError):  # then it does not arrive
-                shore.socket.sendto(data, shore.route)
-
-
-def sound(
-    shores: Sequence[Shore],
-    volleys: Sequence[Volley | None],
-    read: Read,
-    *,
-    begin_ns: int,
-    quiet: float,
-    tell: Callable[[float], None] = lambda share: None,
-) -> list[Log]:
-    """Send a volley from each shore and listen until nothing has come for a while.
+    Probes for a bottleneck are large, and half of them leave in trains, which it draws out.
 
     Args:
-        shores: Both ends: what the first sends the second hears, and the other way round.
-        volleys: What each sends; None sends nothing.
-        read: Takes headers apart.
-        begin_ns: When the first salvos leave [ns], monotonic clock.
-        quiet: For how long nothing may come before it is over [s].
-        tell: Hears now and then which share of the time has passed, in [0, 1].
-
-    Returns:
-        One log per shore: of what it sent, and of what the other heard of it.
+        profile: Requested conditions.
+        flow: The probes.
+        seconds: Time to send them [s]; None for as long as it takes.
+        drawn: Whether the shaper draws its own chance, as netem does.
     """
-    courses = [
-        _Course(shore, volley or Volley(0, 0, 1, 0), begin_ns)
-        for shore, volley in zip(shores, volleys, strict=True)
-    ]
-    heard = {
-        shore.socket: (shore.stamps, course)
-        for shore, course in zip(shores, reversed(courses), strict=True)
-    }
-    gc.collect()
-    gc.disable()  # a collection takes milliseconds
-    try:
-        _run(courses, heard, read, round(quiet * 1e9), tell)
-    finally:
-        gc.enable()
-    return [course.log for course in courses]
+    starts_ns, train = Timeline(profile).starts_ns, 0
+    rates = [rate for at in starts_ns if (rate := Timeline(profile).at(at).rate)]
+    step: float = 1.0 / RATE
+    if rates and max(rates) <= RATE_MAX:
+        flow = flow._replace(size=TRAIN_SIZE)
+        wire = (TRAIN_SIZE + HEADER_BYTES) * 8.0 / min(rates)
+        train = max(4, min(64, profile.queue_packets // 2, ceil(TRAIN_SPAN / wire)))
+        step = max(step, wire / LINK_SHARE)
+
+    def plan(length: float) -> Plan:
+        if not train:
+            sent = FIRST_PROBE + np.arange(max(2.0, ceil(length / step))) * step
+            return Plan(profile, flow, sent)
+        block = np.append(np.arange(train), np.full(train, train)) * step
+        starts = FIRST_PROBE + np.arange(ceil(length / (2 * train * step))) * 2 * train * step
+        sent = (starts[:, None] + block).ravel()
+        return Plan(profile, flow, sent, train)
+
+    if seconds is not None:
+        return plan(seconds)
+    last = starts_ns[-1] * 1e-9
+    found = plan(max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
+    if drawn and not last:
+        found = plan(min(needed(found) * step, LONGEST) if needed(found) > COUNT else COUNT * step)
+    return found
 
 
-def _run(
-    courses: Sequence[_Course],
-    heard: _Heard,
-    read: Read,
-    quiet_ns: int,
-    tell: Callable[[float], None],
-) -> None:
-    """Send what is due and note what comes, until all is sent and nothing comes any more."""
-    begin_ns, told = courses[0].begin_ns, 0.0
-    until_ns = max(begin_ns + c.volley.count * c.volley.period_ns for c in courses)
-    while True:
-        dues = [due_ns for course in courses if (due_ns := course.due_ns()) is not None]
-        now_ns = time.monotonic_ns()
-        if not dues and now_ns > until_ns + quiet_ns:
-            break
-        wait = (min(dues) - now_ns) * 1e-9 if dues else _WAIT_MAX
-        if _listen(heard, read, min(max(wait, 0.0), _WAIT_MAX)) and not dues:
-            until_ns = max(until_ns, now_ns)
-        for course in courses:
-            due_ns = course.due_ns()
-            if due_ns is not None and due_ns <= time.monotonic_ns():
-                course.fire()
-        share = (now_ns - begin_ns) / max(1, until_ns - begin_ns)
-        if share >= told + 0.01:
-            told = share
-            tell(min(share, 1.0))
+class ProbeEnd:
+    """One end of the link: its socket, the caller's to close, and the probes that it sends."""
 
+    def __init__(
+        self, own: socket.socket, route: tuple[str, int], plan: Plan, origin_ns: int
+    ) -> None:
+        """Set up.
 
-_Heard = Mapping[socket.socket, tuple[Stamps, _Course]]
-"""By socket: how its stamps are read, and whose probes it hears."""
+        Args:
+            own: Bound socket that does not block.
+            route: Where it has to send.
+            plan: Its probes.
+            origin_ns: When the link came up, wall clock [ns].
+        """
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        if sys.platform == "linux":
+            own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self.socket, self.plan, self._route, self._origin_ns = own, plan, route, origin_ns
+        late = max(0.0, (time.time_ns() - origin_ns) * 1e-9 + 0.05 - float(plan.sent[0]))
+        self._due_ns = (origin_ns + np.rint((plan.sent + late) * 1e9)).astype(np.int64).tolist()
+        self._sent_ns, self._arrivals = list[int](), list[tuple[int, int]]()
 
+    def data(self, number: int) -> bytes:
+        """Encode a probe; its header fills all of it, so that damage shows."""
+        _, uplink, kind, size = self.plan.flow
+        way = Direction.UPLINK if uplink else Direction.DOWNLINK
+        header = encode_header(kind, way, 1, number)
+        return (header * (size // len(header) + 1))[:size]
 
-def _listen(heard: _Heard, read: Read, wait: float) -> int:
-    """Wait for probes, at most so long [s], and note them; say how many have come."""
-    readable, _, _ = select.select(list(heard), (), (), wait)
-    total = 0
-    for one in readable:
-        stamps, course = heard[one]
-        offset_ns = stamps.look_at_clocks()
-        for _ in range(DRAIN_MAX):
+    def wait(self) -> float:
+        """Return the time until the next probe is due [s]; infinite after the last."""
+        number = len(self._sent_ns)
+        return (self._due_ns[number] - time.time_ns()) * 1e-9 if number < len(self._due_ns) else inf
+
+    def send(self) -> None:
+        """Send the next probe."""
+        data = self.data(len(self._sent_ns))
+        self._sent_ns.append(time.time_ns())
+        with suppress(OSError):  # then it does not arrive
+            self.socket.sendto(data, self._route)
+
+    def receive(self, own: socket.socket) -> None:
+        """Note the probes of this end that wait in the other end's socket, nothing else."""
+        for _ in range(_DRAIN):
             try:
-                data, ancillary, _, _ = one.recvmsg(_DATAGRAM_MAX, ANCILLARY_SIZE)
+                data, ancillary, _, _ = own.recvmsg(_DATAGRAM_MAX, 64)
             except BlockingIOError:
-                break
+                return
             except OSError:  # an earlier probe found nobody listening
                 continue
-            at_ns = instant_ns(stamps.wall_ns(ancillary), offset_ns, time.monotonic_ns())
-            total += _note(course, read, data, at_ns)
-    return total
+            at_ns = time.time_ns()
+            for _, kind, stamp in ancillary:
+                if kind == _SO_TIMESTAMPNS:
+                    parts = (int.from_bytes(one, sys.byteorder) for one in (stamp[:8], stamp[8:16]))
+                    at_ns = next(parts) * 1_000_000_000 + next(parts)
+            with suppress(ValueError):
+                number = peek(data)[2]
+                if number < len(self._sent_ns) and data == self.data(number):
+                    self._arrivals.append((number, at_ns))
+
+    def stream(self) -> Stream:
+        """Return what was measured."""
+        delays, copies = np.full(len(self._sent_ns), np.inf), np.zeros(len(self._sent_ns), int)
+        for number, at_ns in self._arrivals:
+            delays[number] = min(delays[number], (at_ns - self._sent_ns[number]) * 1e-9)
+            copies[number] += 1
+        sent = (np.array(self._sent_ns, dtype=np.int64) - self._origin_ns) * 1e-9
+        return Stream(sent, np.where(copies, delays, np.nan), copies)
 
 
-def _note(course: _Course, read: Read, data: bytes, at_ns: int) -> int:
-    """Note the arrival of a probe of this course; whatever else comes is ignored."""
+def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
+    """Send the probes of both ends and listen until none can arrive any more.
+
+    Args:
+        ends: What the first sends the second receives, and the other way round.
+
+    Returns:
+        What was measured of the probes of each end.
+    """
+    heard = {end.socket: other for end, other in zip(ends, reversed(ends), strict=True)}
+    drawn = [end.plan.draw(end.plan.sent).delays for end in ends]
+    quiet = 0.5 + 2.0 * max(float(np.max(one, initial=0.0, where=one > 0.0)) for one in drawn)
+    gc.collect()
+    gc.disable()  # a collection takes milliseconds
+    last = time.monotonic()
     try:
-        kind, _, number = read(data)
-    except ValueError:
-        return 0
-    if kind != course.volley.kind or number >= len(course.log.sent_ns):
-        return 0
-    course.log.arrivals.append((number, at_ns))
-    return 1
+        while (wait := min(end.wait() for end in ends)) < inf or time.monotonic() - last < quiet:
+            readable, _, _ = select.select(list(heard), (), (), min(max(wait, 0.0), 0.05))
+            for own in readable:
+                heard[own].receive(own)
+            for end in ends:
+                while end.wait() <= 0.0:
+                    end.send()
+            if readable or wait < inf:
+                last = time.monotonic()
+    finally:
+        gc.enable()
+    return [end.stream() for end in ends]

@@ -1,0 +1,232 @@
+"""Which links are believed, which are not and why: whole links in virtual time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cloudrc.config.shipped import names
+from cloudrc.link.profile import DirectionProfile, GilbertElliott
+from cloudrc.link.tc import check
+from cloudrc.link.verify.causes import Evidence, Findings, find_causes
+from cloudrc.link.verify.expect import Flow, netem_makes
+from cloudrc.link.verify.judge import Row, look_twice, verdict_of
+from cloudrc.link.verify.probe import PROBE, plan_probes
+from tests.link.verify.conftest import (
+    VirtualNetem,
+    asked,
+    can,
+    meet,
+    random_profile,
+    rows_of,
+    verify,
+)
+
+PAPER = asked("paper-p2", "uplink")
+HANDOVER = asked("handover", "uplink")
+LOSING = DirectionProfile(0.045, 0.025, loss=0.05)
+NARROW = DirectionProfile(0.020, 0.002, rate=2e6, queue_packets=200, keep_order=True)
+NOTHING = DirectionProfile()
+
+
+def doubts(rows: list[Row]) -> list[tuple[str, str]]:
+    return [(row.name, row.verdict) for row in rows if row.verdict != "ok"]
+
+
+@pytest.mark.promise("verify-tells-the-link")
+def test_200_honest_links_of_200_are_believed(figure: Callable[..., None]) -> None:
+    rng = np.random.default_rng(1)
+    links = [asked(name, way) for name in names("profile") for way in ("uplink", "downlink")]
+    links += [random_profile(rng) for _ in range(200 - len(links))]
+    found = {link: doubts(rows_of(link, link)) for link in links}
+    found = {link: why for link, why in found.items() if why}
+    figure("honest links of 200: not believed", len(found), "==", 0)
+    assert found == {}
+
+
+def netem(**facts: object) -> Evidence:
+    return Evidence(**{"shaper": "netem", "layers": 1, **facts})  # type: ignore[arg-type]
+
+
+# Requested, found on the uplink, found on the downlink, reported by the machine.
+FAULTS: dict[str, tuple[DirectionProfile, DirectionProfile, DirectionProfile, Evidence]] = {
+    "no_qdisc": (PAPER, NOTHING, NOTHING, Evidence("none", interface="eth0")),
+    "wrong_interface": (PAPER, NOTHING, NOTHING, Evidence("none", elsewhere=("eth1",))),
+    "doubled_delay": (PAPER, *[replace(PAPER, delay=0.090)] * 2, netem(applied=PAPER)),
+    "halved_delay": (PAPER, *[replace(PAPER, delay=0.0225, jitter=0.0125)] * 2, netem()),
+    "one_direction": (PAPER, PAPER, NOTHING, netem()),
+    "wrong_jitter": (PAPER, *[replace(PAPER, jitter=0.0225)] * 2, netem(applied=PAPER)),
+    "no_loss": (LOSING, *[replace(LOSING, loss=0.0)] * 2, netem(applied=LOSING)),
+    "more_loss": (LOSING, *[replace(LOSING, loss=0.15)] * 2, netem(applied=LOSING)),
+    "bypassed": (PAPER, NOTHING, NOTHING, netem(applied=PAPER, sent=3000, passed=3)),
+    "order_kept": (PAPER, *[replace(PAPER, keep_order=True)] * 2, netem(applied=PAPER)),
+    "rate_ignored": (NARROW, *[replace(NARROW, rate=None)] * 2, netem(applied=NARROW)),
+    "no_sch_netem": (PAPER, NOTHING, NOTHING, Evidence("none", "this kernel has no sch_netem")),
+    "shaped_twice": (PAPER, *[replace(PAPER, delay=0.090)] * 2, replace(netem(), layers=2)),
+    "order_broken": (NARROW, *[replace(NARROW, keep_order=False, jitter=0.015)] * 2, netem()),
+    "wrong_duplicates": (PAPER, *[replace(PAPER, duplicate=0.1)] * 2, netem()),
+}
+
+
+@pytest.mark.promise("verify-tells-the-link")
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_seeded_fault_is_named(fault: str, figure: Callable[..., None]) -> None:
+    causes = {cause.code for cause in find_causes(verify(*FAULTS[fault]))}
+    figure("seeded faults of the link: not named", int(causes != {fault}), "==", 0)
+    assert causes == {fault}
+
+
+OFF = {
+    "slower": (PAPER, {"delay": 1.06 * PAPER.delay}, "mean"),
+    "quicker": (PAPER, {"delay": 0.94 * PAPER.delay}, "mean"),
+    "more jitter": (PAPER, {"jitter": 1.1 * PAPER.jitter}, "deviation"),
+    "less jitter": (PAPER, {"jitter": 0.9 * PAPER.jitter}, "deviation"),
+    "lossy": (PAPER, {"loss": 0.03}, "loss"),
+    "damaged": (PAPER, {"corrupt": 0.05}, "loss"),
+    "other jitter": (PAPER, {"distribution": "normal", "jitter": 0.0144}, "distribution"),
+    "more bursts": (
+        asked("lossy", "uplink"),
+        {"loss": GilbertElliott(0.02, 0.1, 0.6, 0.005, 0.04)},
+        "deviation",
+    ),
+    "another time line": (
+        HANDOVER,
+        {"changes": tuple(replace(one, delay=0.01 + (one.delay or 0)) for one in HANDOVER.changes)},
+        "mean",
+    ),
+    "faster": (NARROW, {"rate": 2.6e6}, "rate"),
+}
+
+
+@pytest.mark.parametrize("name", OFF)
+def test_a_link_beyond_its_tolerance_is_off(name: str) -> None:
+    profile, values, quantity = OFF[name]
+    assert (quantity, "off") in doubts(rows_of(profile, replace(profile, **values)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("paper-p2", "5g") else pytest.mark.full)
+        for name in names("profile")
+    ],
+)
+def test_an_honest_netem_is_believed(name: str) -> None:
+    for way in ("uplink", "downlink"):
+        profile = asked(name, way)
+        if can(profile):
+            assert doubts(rows_of(profile, VirtualNetem(profile, 7))) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "quantity"),
+    [({"delay": 0.09}, "mean"), ({"jitter": 0.026}, "deviation"), ({"loss": 0.05}, "loss")],
+)
+def test_a_wrong_netem_is_off(values: dict[str, float], quantity: str) -> None:
+    profile = DirectionProfile(0.08, 0.02, correlation=0.9)
+    rows = rows_of(profile, VirtualNetem(replace(profile, **values), 7))  # type: ignore[arg-type]
+    assert (quantity, "off") in doubts(rows)
+
+
+BURSTS = GilbertElliott(0.02, 0.2, 0.9, 0.02)
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [
+        DirectionProfile(0.08, 0.02, correlation=0.9),
+        DirectionProfile(0.08, 0.02, "pareto", 0.5, keep_order=True),
+        DirectionProfile(0.045, 0.01, loss=0.2, duplicate=0.3),
+        DirectionProfile(0.045, 0.01, loss=BURSTS, duplicate=0.4),
+        DirectionProfile(0.045, 0.0, loss=0.1, corrupt=0.1),
+    ],
+)
+def test_what_netem_makes_is_what_the_kernel_draws(profile: DirectionProfile) -> None:
+    check(profile)
+    plan = plan_probes(profile, Flow(1, True, PROBE, 203), 300.0)
+    made = replace(plan, profile=netem_makes(profile))
+    ours, theirs = (
+        plan.quantities(one, np.zeros(0))
+        for one in (made.draw(plan.sent), meet(plan, VirtualNetem(profile, 7)))
+    )
+    for name, value in theirs.items():
+        assert ours[name] == pytest.approx(value, rel=0.05, abs=0.015), name
+
+
+def test_a_draw_of_the_model_is_predicted_exactly() -> None:
+    profile = replace(asked("lossy", "uplink"), duplicate=0.1, corrupt=0.1)
+    plan = plan_probes(profile, Flow(1, True, PROBE, 203))
+    first, again = plan.draw(plan.sent), plan.draw(plan.sent[500:], 1, 500)
+    assert np.array_equal(first.delays[500:], again.delays, equal_nan=True)
+    assert plan.expected(first).known
+    assert not plan.expected(replace(plan, flow=plan.flow._replace(seed=2)).draw(plan.sent)).known
+
+
+def causes_of(rows: list[Row], known: Evidence) -> list[str]:
+    return [cause.code for cause in find_causes({"uplink": Findings(rows, known)})]
+
+
+@pytest.mark.parametrize(
+    "known",
+    [{"late": 0.039}, {"sent": 3000, "passed": 2500, "unread": 500}, {"throttled": 0.4}],
+)
+def test_a_relay_that_lacks_cpu_is_named_beside_other_faults(known: dict[str, float]) -> None:
+    late = Evidence("relay", layers=1, applied=PAPER, **known)  # type: ignore[arg-type]
+    assert causes_of(rows_of(PAPER, PAPER, stall=0.04), late) == ["throttled"]
+    losing = rows_of(PAPER, replace(PAPER, loss=0.3), stall=0.04)
+    assert causes_of(losing, late) == ["throttled", "more_loss"], "500 unread are not 900 lost"
+
+
+@pytest.mark.parametrize("fault", ["order_kept", "rate_ignored", "halved_delay", "no_loss"])
+def test_a_lack_of_cpu_hides_no_fault_that_it_cannot_cause(fault: str) -> None:
+    profile, real, _, _ = FAULTS[fault]
+    deaf = Evidence("relay", layers=1, sent=2000, unread=99)
+    assert fault in causes_of(rows_of(profile, real), deaf)
+
+
+def test_rare_throttling_is_not_the_cause_of_a_doubled_delay() -> None:
+    rows = rows_of(PAPER, replace(PAPER, delay=0.090))
+    assert causes_of(rows, netem(applied=PAPER, throttled=0.02)) == ["doubled_delay"]
+
+
+def test_a_qdisc_that_somebody_touched_is_named() -> None:
+    known = {"uplink": netem(restored=1), "downlink": netem()}
+    reals = {"uplink": NOTHING, "downlink": PAPER}
+    found = {way: Findings(rows_of(PAPER, reals[way]), one) for way, one in known.items()}
+    assert [(cause.code, cause.way) for cause in find_causes(found)] == [("no_qdisc", "uplink")]
+
+
+def test_a_cause_says_whether_the_shaper_was_told_so() -> None:
+    wrong = replace(PAPER, delay=0.090)
+    (cause,) = find_causes(verify(PAPER, wrong, wrong, netem(applied=wrong)))
+    assert (cause.way, cause.text.count("it was told so")) == ("both", 1)
+    (cause,) = find_causes(verify(PAPER, wrong, wrong, netem(applied=PAPER)))
+    assert "told so" not in cause.text
+
+
+def test_directions_are_told_apart() -> None:
+    found = find_causes(verify(PAPER, PAPER, replace(PAPER, loss=0.2), netem()))
+    assert [(cause.code, cause.way) for cause in found] == [("more_loss", "downlink")]
+    assert find_causes(verify(PAPER, PAPER, PAPER, netem())) == []
+
+
+def test_a_dead_link_is_named() -> None:
+    rows = rows_of(PAPER, replace(PAPER, loss=1.0))
+    assert ("mean", "open") in doubts(rows)
+    assert causes_of(rows, Evidence()) == ["nothing_arrives"]
+
+
+def test_too_few_probes_decide_nothing() -> None:
+    assert verdict_of(rows_of(PAPER, PAPER, seconds=1.0)) == "open"
+
+
+def test_only_what_is_off_twice_is_off() -> None:
+    good, slow, lossy = (
+        rows_of(PAPER, replace(PAPER, **values))
+        for values in ({}, {"delay": 0.09}, {"delay": 0.09, "loss": 0.5})
+    )
+    assert verdict_of(look_twice(slow, good)) == verdict_of(look_twice(good, slow)) == "ok"
+    assert doubts(look_twice(slow, lossy)) == [("mean", "off")]

@@ -1,0 +1,210 @@
+"""The monitor in flight: by the tunnel's own datagrams, drawn here without any flight."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from math import isnan, nan
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cloudrc.config.shipped import names
+from cloudrc.exposition.ends import LinkVerdict
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.state import STATE_MAX
+from cloudrc.link.verify.monitor import KEPT, Asked, LinkMonitor
+from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
+from tests.link.verify.conftest import (
+    PERIOD_NS,
+    arrivals,
+    asked,
+    can,
+    checked,
+    hearing,
+    is_believed,
+)
+
+PAPER, P1 = asked("paper-p2", "downlink"), asked("paper-p1", "downlink")
+ZERO = (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("netem", [False, True], ids=["relay", "netem"])
+@pytest.mark.parametrize("name", names("profile"))
+def test_an_honest_link_is_believed_and_never_faulted(name: str, netem: bool) -> None:
+    profile = asked(name, "uplink")
+    if netem and not can(profile):
+        return
+    seconds = 60.0 if netem or name == "handover" else 15.0
+    heard = arrivals(profile, seconds, seed=3 if netem else 1, uplink=True, netem=netem)
+    moments, faults = checked(hearing(profile, PAPER, uplink=True), heard)
+    assert faults == []
+    assert is_believed(moments[-1]), moments[-1]
+    assert ("correlation" in moments[-1]) == (netem and profile.correlation > 0.0)
+    assert ("rate" in moments[-1]) == (profile.rate is not None)
+    assert ("time_line" in moments[-1]) == (name == "handover")
+
+
+FAULTS = {
+    "mean": replace(PAPER, delay=PAPER.delay * 1.1),
+    "deviation": replace(PAPER, jitter=PAPER.jitter * 1.15),
+    "loss": replace(PAPER, loss=0.1),
+    "reordered": replace(PAPER, keep_order=True),
+    "duplicated": replace(PAPER, duplicate=0.2),
+}
+
+
+@pytest.mark.parametrize("overhead", [5e-4, nan], ids=["one clock", "two clocks"])
+@pytest.mark.parametrize("quantity", FAULTS)
+def test_a_wrong_link_is_a_fault_after_a_second_look(quantity: str, overhead: float) -> None:
+    moments, faults = checked(hearing(PAPER, PAPER), arrivals(FAULTS[quantity], overhead=overhead))
+    if isnan(overhead) and quantity in ("mean", "deviation"):
+        assert quantity not in moments[-1], "nobody knows one-way delays"
+        return
+    verdicts = [one[quantity].verdict for one in moments if quantity in one]
+    assert verdicts[0] == "open", "not said before it was looked at again"
+    assert verdicts[-1] == "off"
+    assert [fault.code for fault in faults] == ["link"], "told once"
+    assert faults[0].text.startswith("the downlink is not what was asked for: ")
+
+
+def test_one_bad_window_is_no_fault() -> None:
+    dead = range(300, 700)
+    heard = [one for one in arrivals(PAPER, 40.0) if one.counter not in dead]
+    moments, faults = checked(hearing(PAPER, PAPER), heard)
+    assert faults == []
+    assert is_believed(moments[-1])
+
+
+def test_ends_that_wake_late_are_not_the_links_fault() -> None:
+    slow = arrivals(replace(PAPER, delay=PAPER.delay + 0.0045))
+    assert checked(hearing(PAPER, PAPER), slow)[1], "of punctual ends it is"
+    heard: list[Record] = []
+    for arrival in slow:
+        heard += [arrival, Lateness(arrival.stamp_ns, "world", 0.002, 0.0002, 0)]
+    moments, faults = checked(hearing(PAPER, PAPER), heard)
+    assert faults == []
+    assert moments[-1]["mean"].verdict == "open"
+
+
+def test_one_long_stall_of_an_end_is_not_the_links_fault() -> None:
+    heard: list[Record] = []
+    begin_ns, end_ns = 20_000_000_000, 20_500_000_000
+    for arrival in arrivals(P1, 32.0):
+        late_ns = end_ns - arrival.stamp_ns if begin_ns < arrival.stamp_ns < end_ns else 0
+        stamp_ns = arrival.stamp_ns + late_ns
+        heard.append(arrival._replace(stamp_ns=stamp_ns, delay=arrival.delay + late_ns * 1e-9))
+        if not late_ns:
+            late = 0.5 if 0 < stamp_ns - end_ns < 11_000_000 else 1e-4
+            heard.append(Lateness(stamp_ns, "world", late, 1e-4, 0))
+    assert checked(hearing(P1, P1), heard)[1] == []
+
+
+def control(stamp_ns: int, rtt: float) -> Control:
+    return Control(
+        stamp_ns, 1, 0, 0, 0.0, rtt, rtt, ZERO, ZERO, (1.0, *ZERO), ZERO, ZERO, 0, ZERO, 0.0,
+        ZERO, ZERO, ZERO,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("slower", "verdict"), [(0.001, "ok"), (0.030, "off")])
+def test_cloud_judges_round_trips_without_a_common_clock(slower: float, verdict: str) -> None:
+    up, down = DirectionProfile(0.040), DirectionProfile(0.080)
+    heard: list[Record] = []
+    for arrival in arrivals(up, overhead=nan, uplink=True):
+        heard += [arrival, control(arrival.stamp_ns, 0.120 + slower + arrival.counter * 1e-9)]
+    moments, _ = checked(hearing(up, down, uplink=True), heard)
+    trip = moments[-1]["round_trip"]
+    assert (trip.asked, trip.verdict) == (pytest.approx(0.120, abs=1e-4), verdict)
+
+
+def test_a_new_profile_is_judged_from_then_on() -> None:
+    monitor, slow = hearing(PAPER, PAPER), replace(PAPER, delay=0.120)
+    assert checked(monitor, arrivals(PAPER, 20.0))[1] == []
+    monitor.follow((slow, slow))
+    later = [
+        one._replace(stamp_ns=one.stamp_ns + 20_000_000_000, counter=one.counter + 2000)
+        for one in arrivals(slow, 20.0, seed=2)
+    ]
+    moments, faults = checked(monitor, later)
+    assert faults == []
+    assert moments[-1]["mean"].asked == pytest.approx(0.120, abs=1e-3)
+
+
+@pytest.mark.parametrize("gap", [20_000, 10**6, 10**18])
+def test_a_counter_that_jumps_costs_no_memory(gap: int) -> None:
+    heard = [
+        Arrival(n * PERIOD_NS, False, 1, n + gap * (n >= 1500), 0.070, True) for n in range(3000)
+    ]
+    moments, _ = checked(hearing(*[DirectionProfile(0.070)] * 2), heard)
+    assert moments[-1]["datagrams"].measured <= KEPT
+
+
+def run(monitor: LinkMonitor, records: list[Arrival]) -> list[Record]:
+    """Pass records to a monitor with a thread; return what it says first."""
+    told, deadline = list[Record](), time.monotonic() + 20.0
+    for one in records:
+        told += monitor.after([one], one.stamp_ns)
+    while not told and time.monotonic() < deadline:
+        time.sleep(0.05)
+        told += monitor.after([], records[-1].stamp_ns)
+    return told
+
+
+def state(profile: object) -> str:
+    found: dict[str, Any] = dict.fromkeys(("reason", "mode", "direction", "since"), "")
+    return json.dumps(found | {"shaper": "relay", "since_ns": 0, "profile": profile})
+
+
+def test_the_state_file_is_followed_past_nonsense(tmp_path: Path) -> None:
+    path, slow = tmp_path / "link.json", DirectionProfile(0.070)
+
+    def load(values: object) -> Asked:
+        if values == "nonsense":
+            raise OverflowError
+        return slow, slow
+
+    monitor = hearing(PAPER, PAPER)
+    for text in ("", "nonsense", state("nonsense"), state("slow")):
+        assert monitor._asked == (PAPER, PAPER)
+        path.write_text(text)
+        monitor.look(path, load)
+    assert monitor._asked == (slow, slow)
+    path.write_text("x" * (STATE_MAX + 1))
+    monitor.look(path, load)
+    assert checked(monitor, arrivals(FAULTS["mean"], 20.0)) == ([], []), "nothing is known"
+
+
+def test_a_failure_is_told_once_and_the_monitor_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(self: LinkMonitor) -> None:
+        raise MemoryError("no\nroom")
+
+    monkeypatch.setattr(LinkMonitor, "_rows", fails)
+    monitor = hearing(PAPER, PAPER)
+    monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
+    told = run(monitor, arrivals(PAPER, 20.0))
+    text = "the monitor of the link failed (MemoryError: no room); it goes on"
+    assert [(one.code, one.text) for one in told if isinstance(one, Fault)] == [
+        ("link_check", text)
+    ]
+
+
+def test_the_thread_judges_like_the_loop() -> None:
+    monitor = hearing(PAPER, PAPER)
+    monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
+    told = run(monitor, arrivals(PAPER, 12.0))
+    assert {one.verdict for one in told if isinstance(one, LinkChecked)} == {"ok", "told"}
+
+
+def test_what_is_exposed_is_the_newest_verdict() -> None:
+    check = LinkVerdict("uplink")
+    assert check.read() == {}
+    check.see(LinkChecked(1, True, "mean", 0.04, nan, 0.03, 0.05, "open", 100))
+    assert check.read() == {}
+    for verdict in ("ok", "off"):
+        check.see(LinkChecked(2, True, verdict, 0.04, 0.09, 0.03, 0.05, verdict, 900))
+    assert check.read() == {"cloudrc_link_believed": {("uplink",): 0.0}}
+    found = json.loads(check.text())
+    assert (found["verdict"], len(found["rows"]), found["rows"][0]["datagrams"]) == ("off", 2, 900)
