@@ -157,6 +157,18 @@ def test_nobody_is_sent_straight_through_a_pipe(api):
     assert api.state_of(mission_id) == "held"
 
 
+def test_the_whole_robot_counts_from_where_it_is(api):
+    """Straight above the spawn the rear rotor would lift into the outside of pipe 1."""
+    fly(api)
+    api.post("/v1/hold")
+    at(api, (0.0, 0.0, 0.1))
+    status, refusal = api.post("/v1/goto", {"position_m": (0.0, 0.0, 1.2)})
+    assert status == 409
+    assert "wall of pipe_1" in refusal["detail"]
+    at(api, (0.0, 0.0, 1.3))
+    assert api.post("/v1/goto", {"position_m": (0.0, 0.0, 1.2)})[0] == 200
+
+
 def test_along_the_bore_and_over_the_pipe_there_is_a_way(api):
     fly(api)
     api.post("/v1/hold")
@@ -168,13 +180,13 @@ def test_along_the_bore_and_over_the_pipe_there_is_a_way(api):
 
 
 def test_a_mission_from_here_begins_with_a_free_way(api):
-    order = {"start": "here", **waypoint(position_m=WEST), "key": "again"}
-    at(api, EAST)
+    order = {"start": "here", **waypoint(position_m=EAST), "key": "again"}
+    at(api, WEST)
     status, refusal = api.post("/v1/missions", order)
     assert status == 409
     assert "through the wall of pipe_1" in refusal["detail"]
-    at(api, (-2.5, 1.0, 0.8))
+    at(api, (0.5, 1.0, 0.8))
     assert api.post("/v1/missions", order)[0] == 201
-    at(api, EAST)
+    at(api, WEST)
     assert api.post("/v1/missions", order)[0] == 200, "the mission is known, whatever the place"
     assert api.post("/v1/missions", {**order, "start": "spawn"})[0] == 409, "another plan"
