@@ -32,7 +32,7 @@ def _impossible(seed: int) -> Outcome:
         told = bool(problems) and "1" in problems[0].path
         told = told and all(f"{value:g}" in problems[0].value for value in point)
         outcome.true(f"{name}: names the waypoint's index and value", told)
-        offer = re.search(r"nearest legal point found: \[(.*)\]", " ".join(map(str, problems)))
+        offer = re.search(r"nearest legal point found: \[([^\]]*)\]", " ".join(map(str, problems)))
         offered = [tuple(map(float, offer[1].split(", ")))] if offer else []
         legal = bool(offered) and not _problems(offered, scene)
         outcome.true(f"{name}: offers another point, which is legal", legal)
