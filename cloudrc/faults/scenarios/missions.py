@@ -19,7 +19,7 @@ from cloudrc.records import Control
 
 
 def _impossible(seed: int) -> Outcome:
-    outcome, scene, first = Outcome(), load_scene("pipes"), (0.0, 0.0, 1.0)
+    outcome, scene, first = Outcome(), load_scene("pipes"), (0.5, 0.0, 0.8)
     points: dict[str, Vector] = {
         "outside the fence": (100.0, 0.0, 1.0),
         "1 m behind a wall of the fence": (fence.HIGH[0] + 1.0, 0.0, 1.0),
@@ -36,12 +36,12 @@ def _impossible(seed: int) -> Outcome:
         offered = [tuple(map(float, offer[1].split(", ")))] if offer else []
         legal = bool(offered) and not _problems(offered, scene)
         outcome.true(f"{name}: offers another point, which is legal", legal)
-    bore, beside = scene.pipes[0].centre, (0.5, 0.0, 0.8)
+    bore = scene.pipes[0].centre
     others: dict[str, list[Any]] = {
         "NaN": [(0.0, 0.0, nan)],
         "infinite": [(0.0, 0.0, inf)],
         "a word": [(0.0, 0.0, "high")],
-        "behind a wall": [bore, beside],
+        "behind a wall": [bore, first],
         "none at all": [],
         "10,001 waypoints": [first] * 10_001,
     }
