@@ -34,7 +34,8 @@ def _impossible(seed: int) -> Outcome:
         outcome.true(f"{name}: names the waypoint's index and value", told)
         offer = re.search(r"nearest legal point found: \[([^\]]*)\]", " ".join(map(str, problems)))
         offered = [tuple(map(float, offer[1].split(", ")))] if offer else []
-        legal = bool(offered) and not _problems(offered, scene)
+        ways = [offered, [first, *offered]]  # a straight way to it may lead through a wall
+        legal = bool(offered) and not all(_problems(way, scene) for way in ways)
         outcome.true(f"{name}: offers another point, which is legal", legal)
     bore = scene.pipes[0].centre
     others: dict[str, list[Any]] = {
