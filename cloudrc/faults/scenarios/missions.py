@@ -19,7 +19,7 @@ from cloudrc.records import Control
 
 
 def _impossible(seed: int) -> Outcome:
-    outcome, scene, first = Outcome(), load_scene("pipes"), (0.0, 0.0, 1.0)
+    outcome, scene, first = Outcome(), load_scene("pipes"), (0.5, 0.0, 0.8)
     points: dict[str, Vector] = {
         "outside the fence": (100.0, 0.0, 1.0),
         "1 m behind a wall of the fence": (fence.HIGH[0] + 1.0, 0.0, 1.0),
@@ -32,16 +32,17 @@ def _impossible(seed: int) -> Outcome:
         told = bool(problems) and "1" in problems[0].path
         told = told and all(f"{value:g}" in problems[0].value for value in point)
         outcome.true(f"{name}: names the waypoint's index and value", told)
-        offer = re.search(r"nearest legal point found: \[(.*)\]", " ".join(map(str, problems)))
+        offer = re.search(r"nearest legal point found: \[([^\]]*)\]", " ".join(map(str, problems)))
         offered = [tuple(map(float, offer[1].split(", ")))] if offer else []
-        legal = bool(offered) and not _problems(offered, scene)
+        ways = [offered, [first, *offered]]  # a straight way to it may lead through a wall
+        legal = bool(offered) and not all(_problems(way, scene) for way in ways)
         outcome.true(f"{name}: offers another point, which is legal", legal)
-    bore, beside = scene.pipes[0].centre, (0.5, 0.0, 0.8)
+    bore = scene.pipes[0].centre
     others: dict[str, list[Any]] = {
         "NaN": [(0.0, 0.0, nan)],
         "infinite": [(0.0, 0.0, inf)],
         "a word": [(0.0, 0.0, "high")],
-        "behind a wall": [bore, beside],
+        "behind a wall": [bore, first],
         "none at all": [],
         "10,001 waypoints": [first] * 10_001,
     }
