@@ -46,9 +46,10 @@ def serve_api(
     from cloudrc import assembly
     from cloudrc.geometry.scene import load_scene
     from cloudrc.link.state import publish
-    from cloudrc.teleop.api import ApiServer, Surroundings, create_app
+    from cloudrc.teleop.api import ApiServer, create_app
     from cloudrc.teleop.audit import Audit
     from cloudrc.teleop.auth import Gate, Tokens
+    from cloudrc.teleop.models import Surroundings
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)

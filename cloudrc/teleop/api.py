@@ -14,7 +14,6 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
 from math import radians
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -29,23 +28,20 @@ from starlette.requests import ClientDisconnect
 
 from cloudrc import __version__
 from cloudrc.config.problems import Problem, in_words
-from cloudrc.config.schema import Mission as MissionSection
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.geometry.scene import Scene
 from cloudrc.teleop import models
 from cloudrc.teleop.auth import BEARER, Gate
 from cloudrc.teleop.bridge import Bridge, Call
 from cloudrc.teleop.models import (
     RefusedError,
+    Surroundings,
     check_first_way,
     check_way,
-    leads_to_board,
     read_goto,
-    read_mission,
+    read_order,
 )
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import ConflictError, Order, UnavailableError, UnknownMissionError
-from cloudrc.teleop.wire import Plan
+from cloudrc.teleop.store import ConflictError, UnavailableError, UnknownMissionError
 
 LOOK_PERIOD = 0.1
 """Time between two checks for new events [s]."""
@@ -98,23 +94,6 @@ def _handle_errors(app: FastAPI, complain: Callable[[str], None]) -> None:
         if not isinstance(error, ClientDisconnect):
             complain(f"the API failed at {request.url.path}: {error!r}")
         return JSONResponse({"detail": "the API failed; see teleop's log"}, 500)
-
-
-@dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What the API needs to know of the experiment.
-
-    Attributes:
-        scene: The scene that waypoints are checked against.
-        time_limit: Time limit of missions that do not give one [s].
-        contact: Whether missions that do not say, and lead to the board, have to touch it.
-        plan: Makes a plan from a checked mission and its time limit [s].
-    """
-
-    scene: Scene
-    time_limit: float
-    contact: bool
-    plan: Callable[[MissionSection, float], Plan]
 
 
 def create_app(
@@ -202,7 +181,7 @@ def _add_missions(router: APIRouter, bridge: Bridge, surroundings: Surroundings)
     )
     async def create(request: Request) -> JSONResponse:
         body = await _body(request)
-        order = await run_in_threadpool(_order, body, surroundings)
+        order = await run_in_threadpool(read_order, body, surroundings)
 
         def call(service: MissionService, now_ns: int) -> tuple[dict[str, Any], bool]:
             check_first_way(service, order, surroundings.scene)
@@ -351,16 +330,6 @@ async def _stream(request: Request, bridge: Bridge, after: int) -> AsyncIterator
 
 def _events_after(number: int) -> Call:
     return lambda service, now_ns: service.book.events_after(number)
-
-
-def _order(body: bytes, surroundings: Surroundings) -> Order:
-    request, mission = read_mission(body, surroundings.scene)
-    limit = surroundings.time_limit if request.time_limit_s is None else request.time_limit_s
-    contact = request.contact
-    if contact is None:
-        contact = surroundings.contact and leads_to_board(mission, surroundings.scene)
-    plan = surroundings.plan(mission, limit)
-    return Order(plan, request.name, request.key, contact, request.queue)
 
 
 Address: TypeAlias = tuple[str, int] | Path

@@ -6,6 +6,8 @@ file: the same code checks them and words the problems.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from math import cos, radians, sin
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -24,6 +26,7 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Start, Vector
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import HELD, SHOWN, ConflictError, Order
+from cloudrc.teleop.wire import Plan
 
 Position = tuple[Finite, Finite, Finite]
 BODY_MAX = 256 * 1024
@@ -272,6 +275,23 @@ def inlined(model: type[BaseModel]) -> dict[str, Any]:
     return dict(resolve(schema))
 
 
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What an order needs to know of the experiment.
+
+    Attributes:
+        scene: The scene that waypoints are checked against.
+        time_limit: Time limit of missions that do not give one [s].
+        contact: Whether missions that do not say, and lead to the board, have to touch it.
+        plan: Makes a plan from a checked mission and its time limit [s].
+    """
+
+    scene: Scene
+    time_limit: float
+    contact: bool
+    plan: Callable[[Mission, float], Plan]
+
+
 _Request = TypeVar("_Request", bound=Section)
 
 
@@ -296,6 +316,21 @@ def read_mission(body: bytes, scene: Scene) -> tuple[MissionRequest, Mission]:
     mission = Mission(start=request.start, waypoints=request.waypoints)
     _refuse(check_mission(mission, scene))
     return request, mission
+
+
+def read_order(body: bytes, surroundings: Surroundings) -> Order:
+    """Read a mission, check it, and plan it.
+
+    Raises:
+        RefusedError: With all problems.
+    """
+    request, mission = read_mission(body, surroundings.scene)
+    limit = surroundings.time_limit if request.time_limit_s is None else request.time_limit_s
+    contact = request.contact
+    if contact is None:
+        contact = surroundings.contact and leads_to_board(mission, surroundings.scene)
+    plan = surroundings.plan(mission, limit)
+    return Order(plan, request.name, request.key, contact, request.queue)
 
 
 def read_goto(body: bytes, scene: Scene) -> GoToRequest:

@@ -23,11 +23,12 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
-from cloudrc.teleop.api import ApiServer, Surroundings, create_app
+from cloudrc.teleop.api import ApiServer, create_app
 from cloudrc.teleop.audit import Audit
 from cloudrc.teleop.auth import Gate, Tokens
 from cloudrc.teleop.bridge import STARTING, Bridge
 from cloudrc.teleop.mission import Teleop
+from cloudrc.teleop.models import Surroundings
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionStore, Order
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
