@@ -49,23 +49,22 @@ class LinkChanged(NamedTuple):
 class LinkChecked(NamedTuple):
     """Driver, in real time only: one measured quantity of the link, judged. Topic /link_check.
 
-    Cloud judges the uplink, world the downlink, from the tunnel's own datagrams of up to 250 s.
+    Cloud judges the uplink, world the downlink, from the tunnel's own datagrams of up to 60 s.
 
     Attributes:
         stamp_ns: Time of the check [ns], own clock.
         uplink: True for the uplink, False for the downlink.
-        quantity: "mean", "deviation", "variation", "middle", "round_trip", "loss", "reordered" or
+        quantity: "mean", "deviation", "distribution", "round_trip", "loss", "reordered" or
             "duplicated". These are for information only: "datagrams" (needed, received);
-            "time_line" (share of it that was observed and as requested); "rate" (single datagrams
-            cannot measure it); "jitter_share" (usual and present tolerance of the jitter);
-            "correlation" (requested of netem, which has none); and "mean_takes" and the like
-            (number of datagrams, never reached, that would decide the quantity).
+            "time_line" (it is not judged in flight); "rate" (single datagrams cannot measure it);
+            "correlation" (requested of netem, which has none).
         asked: Expected value: delays [s], shares in [0, 1].
         measured: Measured value, likewise.
         low: Lowest accepted value, likewise.
         high: Highest accepted value, likewise.
-        verdict: "ok" or "off"; "open" if there were too few datagrams, or if the ends woke too late
-            to judge the link; "told" for information only.
+        verdict: "ok" or "off"; "open" if there were too few datagrams, if what is off is still
+            looked at once more, or if the ends woke too late to judge the link; "told" for
+            information only.
         datagrams: Number of datagrams behind the measurement.
     """
 

@@ -30,7 +30,7 @@ max(2 ms, 5 %) of the mean delay, 10 % of the jitter, max(2 percentage points,
 25 %) of the loss. What is off is measured again before it is reported.
 
 With --mode cluster the command judges the link of a release in flight by the
-tunnel's own datagrams, which takes up to 2 min. It reports what it cannot judge.
+tunnel's own datagrams, within a minute. It reports what it cannot judge.
 
 exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
 3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
@@ -105,7 +105,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _verify_release(options: argparse.Namespace) -> Report:
     """Query the ends of a release, at given hosts or through the cluster's API."""
-    from cloudrc.cli.link_verify_release import END_PORT, LINK_PORT, verify
+    from cloudrc.cli.link_verify_report import END_PORT, LINK_PORT, verify
 
     name, ports = options.release or "cloudrc", (END_PORT, LINK_PORT)
     with ExitStack() as stack:

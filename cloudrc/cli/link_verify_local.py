@@ -18,8 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cloudrc.assembly import link_profile
-from cloudrc.cli.link_verify_release import WAYS, fetch
-from cloudrc.cli.link_verify_report import NOT_JUDGED, Report, make_report, on_correlation
+from cloudrc.cli.link_verify_report import (
+    NOT_JUDGED,
+    WAYS,
+    Report,
+    fetch,
+    make_report,
+    on_correlation,
+)
 from cloudrc.config.document import write_yaml
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.config.schema import Profile
@@ -83,15 +89,15 @@ def verify(
         applied: Profile in force instead of the requested one; tests inject faults with it.
         meddle: Gets the running link before the first probe; tests inject faults with it.
     """
+    tell("planning the probes")
     plans, found, notes = make_plans(experiment, seconds, shaper), dict[str, Findings](), []
     for look in ("sending probes", "looking again at what is off"):
         tell(f"{look}: {max(plan.sent[-1] for plan in plans.values()):.0f} s")
         with run_link(experiment, shaper, applied) as ways:
             meddle(ways)
             now = probe_link(ways, plans)
-        for way, one in found.items():
-            now[way] = now[way]._replace(rows=look_twice(one.rows, now[way].rows))
-        found = now
+        rows = {way: look_twice(found.get(way, now[way]).rows, now[way].rows) for way in now}
+        found = {way: now[way]._replace(rows=rows[way]) for way in now}
         if "off" not in {verdict_of(one.rows) for one in found.values()}:
             break
     tell("")
@@ -109,27 +115,22 @@ def verify(
 def make_plans(
     experiment: ResolvedExperiment, seconds: float | None, shaper: str
 ) -> dict[str, Plan]:
-    """Plan probes for `seconds` [s], as large as the tunnel's datagrams; None: as long as needed.
+    """Plan probes of the size of datagrams for `seconds` [s]; None: as long as needed.
 
     Raises:
-        BadInputError: If the shaper cannot realise the profile; names the direction.
+        BadInputError: If netem cannot realise the profile; names the direction.
     """
     plans = {}
     for way, (_, _, kind) in WAYS.items():
-        profile = link_profile(getattr(experiment, way))
-        if shaper == "netem":
-            try:
-                check(profile)
-            except BadInputError as error:
-                raise BadInputError(_advise(f"{way}: {error}")) from None
         flow = Flow(experiment.seed, way == "uplink", PROBE, SIZES[kind])
+        profile = link_profile(getattr(experiment, way))
+        try:
+            if shaper == "netem":
+                check(profile)
+        except BadInputError as error:
+            raise BadInputError(_advise(f"{way}: {error}")) from None
         plans[way] = plan_probes(profile, flow, seconds, drawn=shaper == "netem")
     return plans
-
-
-def _advise(text: str) -> str:
-    """Replace the advice for a chart by the one for this command."""
-    return text.replace("set link.mode=relay", "use --shaper relay")
 
 
 def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
@@ -195,6 +196,11 @@ def _start(name: str, way: Way, shaper: str) -> subprocess.Popen[bytes]:
             env={**os.environ, PARENT: str(os.getpid())},
             start_new_session=True,  # Ctrl-C reaches this process alone, which stops them
         )
+
+
+def _advise(text: str) -> str:
+    """Replace the advice for a chart by the one for this command."""
+    return text.replace("set link.mode=", "use --shaper ")
 
 
 def _raise(name: str, code: int, log: str) -> None:

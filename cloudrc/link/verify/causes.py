@@ -57,42 +57,35 @@ def read_metrics(text: str) -> Metrics:
     return {name: float(value) for name, (_, _, value) in zip(names, found, strict=True)}
 
 
-def read_evidence(
-    told: Told, now: Metrics, sent: int | None, before: Metrics | None = None
-) -> Evidence:
+def read_evidence(told: Told, metrics: Metrics, sent: int | None = None) -> Evidence:
     """Combine what a link's process reports of itself, its metrics and the kernel's qdiscs.
 
     Args:
         told: Its page /link.json.
-        now: Its metrics; empty without an answer.
-        sent: Datagrams that the end has sent since `before`; None if they were not counted.
-        before: Its metrics before these datagrams; None if it started with them.
+        metrics: Its metrics; empty without an answer.
+        sent: Datagrams that its end has sent; None if that was not counted since its start.
     """
-
-    def since(name: str) -> float:
-        rise = now.get(name, 0.0) - (before or {}).get(name, 0.0)
-        return rise if rise >= 0.0 else now.get(name, 0.0)  # a restarted process counts from 0
-
-    netem = told.shaper == "netem"
-    counts = ("forwarded", "lost", "held") if netem else ("received",)
-    passed = sum(since(f"cloudrc_link_datagrams_total/{one}") for one in counts)
-    periods, counted = since("cloudrc_cpu_periods_total"), sent is not None and bool(now)
+    netem, counted = told.shaper == "netem", sent is not None and bool(metrics)
+    counts = ("forwarded", "lost", "held", "unread") if netem else ("received", "unread")
+    *seen, unread = (metrics.get(f"cloudrc_link_datagrams_total/{one}", 0.0) for one in counts)
+    stopped = metrics.get("cloudrc_cpu_throttled_periods_total", 0.0)
+    periods = metrics.get("cloudrc_cpu_periods_total", 0.0)
     known = Evidence(
         told.shaper,
         told.why,
         layers=1,
         applied=told.applied and netem_makes(told.applied) if netem else told.applied,
         sent=sent,
-        passed=int(passed) if counted else None,
-        unread=int(since("cloudrc_link_datagrams_total/unread")) if counted else None,
-        late=now.get("cloudrc_link_release_error_seconds/99"),
-        throttled=since("cloudrc_cpu_throttled_periods_total") / periods if periods else None,
-        restored=int(since("cloudrc_link_restored_total")),
+        passed=int(sum(seen)) if counted else None,
+        unread=int(unread) if counted else None,
+        late=metrics.get("cloudrc_link_release_error_seconds/99"),
+        throttled=stopped / periods if periods else None,
+        restored=int(metrics.get("cloudrc_link_restored_total", 0.0)),
     )
     if (near := told.near) is None:
         return known
     here = len(near.netems.get(near.interface, ()))
-    if told.shaper == "relay":  # an end reaches it over lo
+    if not netem:  # an end reaches a relay over lo
         here += len(near.netems.get("lo", ())) if near.interface != "lo" else 0
         return replace(known, interface=near.interface, layers=1 + here)
     elsewhere = tuple(sorted(set(near.netems) - {near.interface}))

@@ -117,9 +117,11 @@ class Plan:
         return self.chance._replace(bands=bands)
 
     def applied(self, profile: DirectionProfile | None) -> dict[str, float]:
-        """Compute the quantities on a link of another profile; nothing if that is unknown."""
-        other = replace(self, profile=profile or self.profile)
-        return other.quantities(other.draw(self.sent), np.zeros(0)) if profile else {}
+        """Compute the quantities on a link of another profile, if that and the own never change."""
+        if profile is None or Timeline(self.profile).only() is None:
+            return {}
+        other = replace(self, profile=profile)
+        return other.quantities(other.draw(self.sent), np.zeros(0))
 
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
         """Say whether datagrams met their own draws: by their delays, else by the losses."""

@@ -31,7 +31,7 @@ PERIOD = 0.01
 """Period of telemetry and of commands [s]."""
 CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
 """Time between two verdicts, and from a new session or profile to the first datagram [ns]."""
-KEPT, FINAL = 12_000, 128
+KEPT, FINAL = 6000, 128
 """Datagrams that are kept, and newer ones after which a missing one counts as lost [1]."""
 ENDS = 2e-3
 """Largest delay that two punctual ends and a tick of the simulation add to a round trip [s]."""
@@ -144,7 +144,7 @@ class LinkMonitor:
         if self._fresh:  # a time line that runs is not judged: where it began is not known here
             lengths_ns = [Timeline(profile).starts_ns[-1] for profile in self._asked]
             self._since_ns = now_ns + SETTLE_NS + max(lengths_ns)
-            self._due_ns = self._since_ns + CHECK_NS
+            self._due_ns = now_ns + SETTLE_NS + CHECK_NS
             self._fresh, self._suspects = False, set()
         if now_ns < self._since_ns:
             self._forget()
@@ -179,19 +179,18 @@ class LinkMonitor:
     def _rows(self) -> list[Row]:
         """Judge by the link's own draws where they fit, otherwise by what netem makes."""
         stream, first, timed = _in_order(list(self._arrivals))
-        if len(stream.sent) < FEWEST:
-            return []
-        plan, profile = self._plans[0], self._plans[0].profile
-        expected = plan.expected(stream, self._epoch, first)
-        rows = judge(plan, stream, expected, {})
+        plan, profile, rows = self._plans[0], self._plans[0].profile, list[Row]()
+        told: dict[str, tuple[float, float]] = {"datagrams": (FEWEST, len(stream.sent))}
+        if len(stream.sent) >= FEWEST:
+            expected = plan.expected(stream, self._epoch, first)
+            rows = judge(plan, stream, expected, {})
+            if not expected.known:
+                told["datagrams"] = (needed(plan), len(stream.sent))
+                told |= {"correlation": (profile.correlation, 0)} if profile.correlation else {}
         if not timed:
             rows = [row for row in rows if row.name in UNTIMED]
             rows += self._round_trip() if len(self._trips) >= FEWEST else []
         rows = [_excused(row, np.array(self._lates)) for row in rows]
-        told: dict[str, tuple[float, float]] = {}
-        told["datagrams"] = (FEWEST if expected.known else needed(plan), len(stream.sent))
-        if not expected.known and profile.correlation and profile.jitter:
-            told["correlation"] = (profile.correlation, 0)
         if profile.rate:
             told["rate"] = (profile.rate, nan)
         if any(Timeline(one).only() is None for one in self._asked or ()):
@@ -218,20 +217,21 @@ def _in_order(arrivals: Sequence[_Heard]) -> tuple[Stream, int, bool]:
     """
     last = max((counter for _, counter, _ in arrivals), default=0) - FINAL
     arrivals = [one for one in arrivals if last - KEPT < one[1] <= last]
-    first, begin_ns = (arrivals[0][1], arrivals[0][0]) if arrivals else (last + 1, 0)
-    timed = not any(isnan(delay) for _, _, delay in arrivals)
+    first = arrivals[0][1] if arrivals else last + 1
+    arrivals = [one for one in arrivals if one[1] >= first]
     count = last - first + 1
-    sent, delays, copies = np.full(count, nan), np.full(count, nan), np.zeros(count, int)
-    for stamp_ns, counter, delay in arrivals:
-        place = counter - first
-        if place >= 0 and not copies[place]:  # the first copy comes first
-            at = (stamp_ns - begin_ns) * 1e-9
-            delays[place] = delay if timed else at - place * PERIOD
-            sent[place] = at - delays[place]
-        if place >= 0:
-            copies[place] += 1
-    known = np.flatnonzero(copies)
-    sent = np.interp(np.arange(count), known, sent[known]) if len(known) else sent
+    delays, copies = np.full(count, nan), np.zeros(count, int)
+    if not arrivals:
+        return Stream(delays, delays, copies), first, False
+    begin_ns, timed = arrivals[0][0], not any(isnan(delay) for _, _, delay in arrivals)
+    numbers, index, times = np.unique(  # the first copy comes first
+        [counter - first for _, counter, _ in arrivals], return_index=True, return_counts=True
+    )
+    stamps = np.array([(stamp_ns - begin_ns) * 1e-9 for stamp_ns, _, _ in arrivals])[index]
+    known = np.array([delay for _, _, delay in arrivals])[index]
+    delays[numbers] = known if timed else stamps - numbers * PERIOD
+    copies[numbers] = times
+    sent = np.interp(np.arange(count), numbers, stamps - delays[numbers])
     return Stream(sent, delays, copies), first, timed
 
 

@@ -32,7 +32,8 @@ COUNT = 1500
 LONGEST, AFTER = 120.0, 5.0
 """Longest time to probe, and time to probe after the last change of a time line [s]."""
 RATE, LINK_SHARE = 200.0, 0.4
-"""Most probes per second [1/s], and share of a bottleneck that they fill at most, in [0, 1]."""
+"""Most probes per second, half as many through netem [1/s], and share of a bottleneck that they
+fill at most, in [0, 1]."""
 RATE_MAX = 1e8
 """Highest rate that this process can measure [bit/s]."""
 TRAIN_SIZE, TRAIN_SPAN = 1400, 0.06
@@ -53,30 +54,24 @@ def plan_probes(
         seconds: Time to send them [s]; None for as long as it takes.
         drawn: Whether the shaper draws its own chance, as netem does.
     """
-    starts_ns, train = Timeline(profile).starts_ns, 0
-    rates = [rate for at in starts_ns if (rate := Timeline(profile).at(at).rate)]
-    step: float = 1.0 / RATE
-    if rates and max(rates) <= RATE_MAX:
+    timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
+    pieces = [timeline.at(start_ns).rate or inf for start_ns in timeline.starts_ns]
+    if (rate := min(pieces)) <= RATE_MAX:
         flow = flow._replace(size=TRAIN_SIZE)
-        wire = (TRAIN_SIZE + HEADER_BYTES) * 8.0 / min(rates)
+        wire = (TRAIN_SIZE + HEADER_BYTES) * 8.0 / rate
         train = max(4, min(64, profile.queue_packets // 2, ceil(TRAIN_SPAN / wire)))
         step = max(step, wire / LINK_SHARE)
+    block = np.minimum(np.arange(float(2 * train or 1)), train) * step
+    length = step * len(block)
 
-    def plan(length: float) -> Plan:
-        if not train:
-            sent = FIRST_PROBE + np.arange(max(2.0, ceil(length / step))) * step
-            return Plan(profile, flow, sent)
-        block = np.append(np.arange(train), np.full(train, train)) * step
-        starts = FIRST_PROBE + np.arange(ceil(length / (2 * train * step))) * 2 * train * step
-        sent = (starts[:, None] + block).ravel()
-        return Plan(profile, flow, sent, train)
+    def plan(time: float) -> Plan:
+        starts = FIRST_PROBE + np.arange(ceil(max(time, 2 * step) / length)) * length
+        return Plan(profile, flow, (starts[:, None] + block).ravel(), train)
 
-    if seconds is not None:
-        return plan(seconds)
-    last = starts_ns[-1] * 1e-9
-    found = plan(max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
-    if drawn and not last:
-        found = plan(min(needed(found) * step, LONGEST) if needed(found) > COUNT else COUNT * step)
+    last = timeline.starts_ns[-1] * 1e-9
+    found = plan(seconds or max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
+    if drawn and not last and not seconds:
+        found = plan(max(COUNT * step, min(needed(found) * step, LONGEST)))
     return found
 
 
@@ -114,12 +109,18 @@ class ProbeEnd:
         number = len(self._sent_ns)
         return (self._due_ns[number] - time.time_ns()) * 1e-9 if number < len(self._due_ns) else inf
 
-    def send(self) -> None:
-        """Send the next probe."""
+    def send(self) -> bool:
+        """Send the next probe; False if the kernel has no room for it yet."""
         data = self.data(len(self._sent_ns))
         self._sent_ns.append(time.time_ns())
-        with suppress(OSError):  # then it does not arrive
+        try:
             self.socket.sendto(data, self._route)
+        except BlockingIOError:
+            self._sent_ns.pop()
+            return False
+        except OSError:  # then it does not arrive
+            pass
+        return True
 
     def receive(self, own: socket.socket) -> None:
         """Note the probes of this end that wait in the other end's socket, nothing else."""
@@ -171,8 +172,8 @@ def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
             for own in readable:
                 heard[own].receive(own)
             for end in ends:
-                while end.wait() <= 0.0:
-                    end.send()
+                while end.wait() <= 0.0 and end.send():
+                    pass
             if readable or wait < inf:
                 last = time.monotonic()
     finally:

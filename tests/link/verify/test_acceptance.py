@@ -110,7 +110,7 @@ def test_a_link_beyond_its_tolerance_is_off(name: str) -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[] if name in ("paper-p2", "5g") else pytest.mark.full)
+        pytest.param(name, marks=[] if name == "paper-p2" else pytest.mark.full)
         for name in names("profile")
     ],
 )
