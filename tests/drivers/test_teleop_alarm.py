@@ -80,10 +80,13 @@ def test_a_full_socket_delays_an_emergency_stop_until_drained(
 
 
 class _Feed:
-    """A thread pool without threads."""
+    """A feed that nobody reads."""
 
     def ready(self) -> None:
         """It is."""
+
+    def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
+        return stop
 
 
 def test_one_that_is_taken_at_once_starts_no_thread(peers: Peers) -> None:
