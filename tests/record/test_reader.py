@@ -150,7 +150,7 @@ def test_a_folder_or_an_absent_file_is_named(tmp_path: Path) -> None:
         {"use_statistics": False, "repeat_channels": False, "use_summary_offsets": False},
         {"shuffle": lambda messages: Random(1).shuffle(messages)},
     ],
-    ids=str,
+    ids=["lz4", "plain", "no-chunks", "no-crc", "no-summary", "shuffled"],
 )
 def test_an_unusual_layout_is_read(whole: Path, tmp_path: Path, options: dict[str, Any]) -> None:
     path = rewrite(whole, tmp_path / "n.mcap", **options)
