@@ -103,6 +103,7 @@ def test_a_dead_world_does_not_come_back(handshake: ClientHandshake) -> None:
     accepted(handshake, 3)
     assert accepted(handshake, 1, NEXT_WORLD, asks=False) is None, "cloud hears its world"
     assert accepted(handshake, 4, asks=False)
+    assert accepted(handshake, 5, asks=False)
     assert accepted(handshake, 1, NEXT_WORLD), "a new process may begin with epoch 1"
     assert accepted(handshake, 9) is None
     assert accepted(handshake, 5, NEXT_WORLD, hello(handshake).nonce)
