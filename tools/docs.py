@@ -21,7 +21,7 @@ from cloudrc.config import problems, shipped
 from cloudrc.config.overrides import KINDS
 from cloudrc.config.schema import Direction, Experiment, Mission, Profile
 from cloudrc.exposition import document as metrics
-from cloudrc.record.topics import MEANINGS, SAMPLING, TOPICS, Topic
+from cloudrc.record.topics import SAMPLING, TOPICS, Topic
 from tools import chart_docs
 from tools.chart_docs import ROOT, flow, plain, table
 
@@ -280,8 +280,7 @@ def _facts(topic: Topic) -> str:
 
 def _columns(topic: Topic) -> Iterator[tuple[str, ...]]:
     for field in topic.fields:
-        meaning = MEANINGS.get((topic.name, field.name), field.text)
-        yield f"`{field.name}`", field.kind, field.unit, meaning
+        yield f"`{field.name}`", field.kind, field.unit, field.text
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from cloudrc.geometry.clearance import clearance, inside_pipe, pipe_index
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording, Table
+from cloudrc.record.topics import UNDER_WAY
 
 Array: TypeAlias = NDArray[Any]
 Columns: TypeAlias = Mapping[str, Array]
@@ -31,8 +32,6 @@ CONTROL_TOPICS = (
     "/pid",
 )
 """Topics that together record the periods of the control loop."""
-UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
-"""Events after which a mission continues; every other event ends it."""
 
 
 @dataclass(frozen=True, slots=True)

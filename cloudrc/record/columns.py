@@ -217,14 +217,6 @@ class Recording:
             self._tables[topic] = Table(TOPICS[topic], self._rows.get(topic, []))
         return self._tables[topic]
 
-    def get(self, topic: str) -> Table:
-        """Return a topic's table, like `recording[topic]`.
-
-        Args:
-            topic: A name in `TOPICS`.
-        """
-        return self[topic]
-
 
 def _column(kind: Kind, values: Iterable[Any]) -> Column:
     dtype, shape = _TYPES[kind]

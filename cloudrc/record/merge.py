@@ -16,7 +16,7 @@ in the file.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
@@ -27,12 +27,11 @@ from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import atomic_file
-from cloudrc.record.columns import Recording, Table, merged
+from cloudrc.record.columns import Recording, Table
 from cloudrc.record.reader import Contents, read_contents
 from cloudrc.record.ros import shifted
-from cloudrc.record.topics import TOPICS
+from cloudrc.record.topics import TOPICS, UNDER_WAY
 from cloudrc.record.writer import MISSING, McapWriter
-from cloudrc.records import Record
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +176,9 @@ class Mission:
             writer.note(metadata)
             for topic, log_time_ns, data in self.contents.messages:
                 writer.write_message(topic, log_time_ns, data)
-            _attach(writer, {**self.contents.attachments, **(attachments or {})})
+            for name, data in {**self.contents.attachments, **(attachments or {})}.items():
+                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+                writer.attach(name, data, media_type)
 
 
 def merge(world: Path, cloud: Path) -> Mission:
@@ -233,41 +234,6 @@ def _join(world: Contents, cloud: Contents) -> Mission:
     return Mission(joined, offset)
 
 
-def write_mission(
-    target: Path,
-    world_records: Iterable[Record],
-    cloud_records: Iterable[Record],
-    *,
-    offset: ClockOffset = SAME_CLOCK,
-    attachments: Mapping[str, bytes] | None = None,
-) -> None:
-    """Write the records of both ends as one mission on world's clock.
-
-    Args:
-        target: Replaced atomically if it exists.
-        world_records: Oldest first, on world's clock.
-        cloud_records: Oldest first, on cloud's clock.
-        offset: World's clock minus cloud's; in virtual time both clocks are the same.
-        attachments: Files to attach, by name: config.yaml, report.json.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    with atomic_file(target) as file, McapWriter(file, clock="world") as writer:
-        writer.note(offset.metadata())
-        for log_time_ns, row in merged(world_records, cloud_records, offset.offset_ns):
-            writer.write_row(row, log_time_ns)
-        _attach(writer, attachments or {})
-
-
-def _attach(writer: McapWriter, attachments: Mapping[str, bytes]) -> None:
-    for name, data in attachments.items():
-        media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
-        writer.attach(name, data, media_type)
-
-
-UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
-"""Events of a mission that continues; every other event ends it."""
 BEFORE_NS = 1_000_000_000
 """Time before a mission's start that is kept [ns]; the session and the guard's first change are in
 it."""

@@ -16,6 +16,8 @@ from cloudrc import records as rec
 from cloudrc.messages import MISSION_OVER, Cause
 from cloudrc.records import Record
 
+UNDER_WAY = ("started", "reached", "held", "resumed", "goto")
+"""Events after which a mission continues; every other event ends it."""
 Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
 Values: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = tuple[str, int, Values]
@@ -31,7 +33,7 @@ class Field:
         kind: Type of a value; vectors have shape (3,), quaternions shape (4,).
         unit: Unit of the values; "" without one.
         text: Meaning of the values.
-        path: Dotted path of the value in the record; "" if it is the name.
+        path: Dotted path of the value in the record; "" if it is the topic's part and the name.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Topic:
         text: Meaning of a row.
         fields: The columns after `stamp_ns`.
         stamp_path: Dotted path of the row's stamp in the record.
+        part: Dotted path, with its last dot, to fields that the record itself does not have.
     """
 
     name: str
@@ -62,6 +65,15 @@ class Topic:
     text: str
     fields: tuple[Field, ...]
     stamp_path: str = "stamp_ns"
+    part: str = ""
+
+    def paths(self) -> list[str]:
+        """Return the dotted path of each field's value in the record."""
+        own = self.source._fields
+        return [
+            field.path or (field.name if field.name in own else f"{self.part}{field.name}")
+            for field in self.fields
+        ]
 
 
 LINK_TOPICS = (
@@ -112,26 +124,32 @@ LINK_TOPICS = (
 """Topics of the link, whose records the drivers make."""
 
 
-__all__ = ["MEANINGS", "SAMPLING", "TOPICS", "rows"]
-
-
-def _pose_and_twist(path: str) -> tuple[Field, ...]:
-    wxyz, rates = "orientation_wxyz", "angular_velocity_body"
-    return (
-        Field("position", "vector", "m", "of the base, world frame", f"{path}position"),
-        Field(wxyz, "quaternion", "1", "of the base, body to world", f"{path}{wxyz}"),
-        Field("velocity", "vector", "m/s", "of the base, world frame", f"{path}velocity"),
-        Field(rates, "vector", "rad/s", "of the base, body frame", f"{path}{rates}"),
-    )
-
-
+_POSE_AND_TWIST = (
+    Field("position", "vector", "m", "of the base, world frame"),
+    Field("orientation_wxyz", "quaternion", "1", "of the base, body to world"),
+    Field("velocity", "vector", "m/s", "of the base, world frame"),
+    Field("angular_velocity_body", "vector", "rad/s", "of the base, body frame"),
+)
 _EPOCH = Field("epoch", "int", "", "epoch of its session")
 _COUNTER = Field("counter", "int", "", "counter in the datagram's header")
 _BASIS = Field("basis_stamp_ns", "int", "ns", "stamp of the odometry used, world's clock")
 _END = Field("end", "string", "", "who recorded it: world, cloud or link")
 _SLIP = Field("slip_ns", "int", "ns", "lag of world's clock behind the machine's monotonic clock")
 _GUARD = "0 GROUND, 1 TRACK, 2 HOLD, 3 LAND, 4 ESTOP"
+_CAUSES = "of the guard's state: " + "; ".join(f"{cause:d} {cause.words}" for cause in Cause)
 _ECHO = "stamp of the newest command applied, cloud's clock; -1 if none"
+_EVENTS = (
+    "started, reached, held, resumed, goto; at the end the outcome: done, cancelled, timed_out,"
+    " leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over, end_lost"
+)
+_CODES = (
+    "one word, for example estimator_failed, predictor_failed, controller_failed, recorder,"
+    " link_check, wall_clock, late"
+)
+_COUNTED = (
+    "what is counted, for example received, sent, malformed, late, stale, repeated, old_epoch,"
+    " range, recorder_dropped"
+)
 _ARRIVAL = (
     _EPOCH,
     _COUNTER,
@@ -146,8 +164,9 @@ _TABLE = (
         rec.TelemetrySent,
         "world",
         "Measured pose and twist as sent, at the instant of the measurement, world's clock",
-        _pose_and_twist("telemetry.odometry."),
+        _POSE_AND_TWIST,
         "telemetry.odometry.stamp_ns",
+        "telemetry.odometry.",
     ),
     Topic(
         "/telemetry",
@@ -159,20 +178,23 @@ _TABLE = (
             _EPOCH,
             _COUNTER,
             Field("odometry_stamp_ns", "int", "ns", "its odometry's stamp", "telemetry.stamp_ns"),
-            Field("tip_force", "float", "N", "on the arm's tip", "telemetry.tip_force"),
-            Field("echo_stamp_ns", "int", "ns", _ECHO, "telemetry.echo_stamp_ns"),
-            Field("echo_hold_ns", "int", "ns", "time in world", "telemetry.echo_hold_ns"),
-            Field("slip_ns", "int", "ns", _SLIP.text, "telemetry.slip_ns"),
-            Field("mission", "int", "", "last mission request acted on", "telemetry.mission"),
-            Field("guard", "int", "", _GUARD, "telemetry.guard"),
-            Field("pipe_contacts", "int", "", "begun in this mission", "telemetry.pipe_contacts"),
+            Field("tip_force", "float", "N", "on the arm's tip"),
+            Field("echo_stamp_ns", "int", "ns", _ECHO),
+            Field("echo_hold_ns", "int", "ns", "time since world applied that command; 0 if none"),
+            Field("slip_ns", "int", "ns", _SLIP.text),
+            Field("mission", "int", "", "last request of the operator that world acted on"),
+            Field("guard", "int", "", _GUARD),
+            Field("pipe_contacts", "int", "", "contacts with a pipe that began in this mission"),
             Field(
-                "touch_speed", "float", "m/s", "of the tip on the board", "telemetry.touch_speed"
+                "touch_speed", "float", "m/s", "of the tip's first touch of the board; NaN before"
             ),
-            Field("mission_id", "int", "", "of the last mission started", "telemetry.mission_id"),
-            Field("reached", "int", "", "waypoints reached, as world knows", "telemetry.reached"),
-            Field("cause", "int", "", "of the guard's state; words: /guard", "telemetry.cause"),
+            Field("mission_id", "int", "", "identity of the mission started last; 0 if none"),
+            Field(
+                "reached", "int", "", f"waypoints reached; {MISSION_OVER} if the mission is over"
+            ),
+            Field("cause", "int", "", _CAUSES),
         ),
+        part="telemetry.",
     ),
     Topic(
         "/ground_truth",
@@ -180,8 +202,9 @@ _TABLE = (
         rec.GroundTruth,
         "world",
         "True pose and twist, world's clock",
-        _pose_and_twist("odometry."),
+        _POSE_AND_TWIST,
         "odometry.stamp_ns",
+        "odometry.",
     ),
     Topic(
         "/contact_force",
@@ -197,7 +220,7 @@ _TABLE = (
         rec.GroundTruth,
         "world",
         "Velocity that the guard lets the low-level controller follow, world's clock",
-        (Field("reference", "vector", "m/s", "world frame"),),
+        (Field("reference", "vector", "m/s", "after the guard's caps, world frame"),),
     ),
     Topic(
         "/uplink_delay",
@@ -221,7 +244,10 @@ _TABLE = (
         rec.CommandApplied,
         "world",
         "A command was applied for the first time, world's clock",
-        (_EPOCH, _COUNTER, _BASIS, Field("velocity", "vector", "m/s", "before the caps")),
+        (
+            *(_EPOCH, _COUNTER, _BASIS),
+            Field("velocity", "vector", "m/s", "before the guard's caps, world frame"),
+        ),
     ),
     Topic(
         "/guard",
@@ -260,7 +286,7 @@ _TABLE = (
         "cloud",
         "Prediction that the controller used, stamped as the command, cloud's clock; it predicts"
         " for basis_stamp_ns + horizon of /delay_estimate",
-        _pose_and_twist("")[:3],
+        _POSE_AND_TWIST[:3],
     ),
     Topic(
         "/setpoint_position",
@@ -268,7 +294,7 @@ _TABLE = (
         rec.Control,
         "cloud",
         "What the controller tracks, cloud's clock",
-        (Field("setpoint", "vector", "m", "world frame"),),
+        (Field("setpoint", "vector", "m", "position to fly to, world frame"),),
     ),
     Topic(
         "/cmd_vel",
@@ -317,7 +343,7 @@ _TABLE = (
         "cloud",
         "An event of the mission, cloud's clock",
         (
-            Field("event", "string", "", "started, reached, held, resumed, cancelled, done..."),
+            Field("event", "string", "", _EVENTS),
             Field("waypoint", "int", "", "index of the waypoint concerned; -1 if none"),
             Field("text", "string", "", "the event in words"),
         ),
@@ -329,7 +355,7 @@ _TABLE = (
         "either",
         "A fault that did not stop the flight, clock of its end",
         (
-            Field("code", "string", "", "one word"),
+            Field("code", "string", "", _CODES),
             Field("text", "string", "", "what, where, what to do"),
         ),
     ),
@@ -341,7 +367,7 @@ _TABLE = (
         "A counter, clock of its end",
         (
             _END,
-            Field("name", "string", "", "what is counted"),
+            Field("name", "string", "", _COUNTED),
             Field("total", "int", "", "count since the start"),
         ),
     ),
@@ -397,42 +423,12 @@ SAMPLING: dict[str, tuple[str, str]] = {
     "/lateness": ("when the deadline was handled", "100 Hz per end"),
 }
 """Topic -> what the stamp of a row marks, and how often a row is written; for docs/topics.md."""
-MEANINGS: dict[tuple[str, str], str] = {
-    ("/telemetry", "echo_hold_ns"): "time since world applied that command; 0 if none",
-    ("/telemetry", "mission"): "number of the last request of the operator that world acted on",
-    ("/telemetry", "pipe_contacts"): "contacts with a pipe that began in this mission",
-    ("/telemetry", "touch_speed"): "of the tip when it first touched the board in this mission;"
-    " NaN before",
-    ("/telemetry", "mission_id"): "identity of the mission started last; 0 if none",
-    ("/telemetry", "reached"): "number of waypoints of that mission that world knows as reached;"
-    f" {MISSION_OVER} if the mission is over",
-    ("/telemetry", "cause"): "cause of the guard's state: "
-    + "; ".join(f"{cause:d} {cause.words}" for cause in Cause),
-    ("/command_applied", "velocity"): "as commanded, before the guard's caps, world frame",
-    ("/estimated_odometry", "position"): "predicted for the base, world frame",
-    ("/setpoint_position", "setpoint"): "position to fly to, world frame",
-    ("/reference", "reference"): "velocity after the guard's caps, world frame",
-    ("/mission", "event"): "started, reached, held, resumed, goto; at the end the outcome: done,"
-    " cancelled, timed_out, leg_timed_out, world_restarted, guard_stopped, emergency_stopped,"
-    " taken_over, end_lost",
-    ("/fault", "code"): "one word, for example estimator_failed, predictor_failed,"
-    " controller_failed, recorder, link_check, wall_clock, late",
-    ("/count", "name"): "what is counted, for example received, sent, malformed, late, stale,"
-    " repeated, old_epoch, range, recorder_dropped",
-    ("/link", "jitter"): "asked for at the time line's beginning, as in the profile",
-    ("/link", "loss"): "asked for at the time line's beginning, mean in the long run",
-    ("/link", "rate"): "asked for at the time line's beginning; NaN without a bottleneck",
-    ("/link_check", "datagrams"): "number of datagrams that the judgement rests on",
-}
-"""Topic and field -> a fuller meaning than the recorded definition has; for docs/topics.md."""
-
 _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Values]]
 
 
 def _extractor(topic: Topic) -> _Extract:
-    paths = [field.path or field.name for field in topic.fields]
-    get = attrgetter(*paths)
-    values = get if len(paths) > 1 else lambda record: (get(record),)
+    get = attrgetter(*topic.paths())
+    values = get if len(topic.fields) > 1 else lambda record: (get(record),)
     return topic.name, attrgetter(topic.stamp_path), values
 
 

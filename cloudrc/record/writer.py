@@ -171,13 +171,14 @@ class McapWriter:
         Returns:
             Number of written records that are lost.
         """
-        note, end = RecordBuilder(), RecordBuilder()
+        note: Any = RecordBuilder()  # without type annotations
+        end: Any = RecordBuilder()
         Metadata(METADATA, {MISSING: reason}).write(note)
         DataEnd(0).write(end)
         Footer(0, 0, 0).write(end)
         first = b"" if self._whole else MCAP0_MAGIC
         # Never write the end without the note: the file would look complete.
-        for rest in (first + _bytes(note) + _bytes(end) + MCAP0_MAGIC, b""):
+        for rest in (first + note.end() + end.end() + MCAP0_MAGIC, b""):
             with suppress(OSError, ValueError):  # no space: leave only the complete chunks
                 self._stream.seek(self._whole)
                 self._stream.truncate()
@@ -252,9 +253,3 @@ class _ChunkIndexes:
             channels, places = rest[: len(rest) // 2], rest[len(rest) // 2 :]
             offsets = dict(zip(channels, [start + length + at for at in places], strict=True))
             yield ChunkIndex(length, start, "zstd", packed, last, index, offsets, first, unpacked)
-
-
-def _bytes(builder: Any) -> bytes:
-    """Return the bytes of an mcap builder, which has no type annotations."""
-    data: bytes = builder.end()
-    return data

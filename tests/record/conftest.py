@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 from cloudrc import records as rec
 from cloudrc.messages import GuardState, Odometry, Telemetry
-from cloudrc.record.columns import Recording
+from cloudrc.record.columns import Recording, merged
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
@@ -104,6 +104,20 @@ def write(path: Path, records: list[Record], clock: str = "world", clock_id: str
     with McapWriter(path, clock=clock, clock_id=clock_id) as writer:
         writer.write(records)
     return path
+
+
+def write_mission(
+    path: Path,
+    world: Iterable[Record],
+    cloud: Iterable[Record],
+    attachments: Mapping[str, bytes] | None = None,
+) -> None:
+    """Record both ends as one mission, as a run in virtual time does."""
+    with McapWriter(path, clock="world") as writer:
+        for log_time_ns, row in merged(world, cloud):
+            writer.write_row(row, log_time_ns)
+        for name, data in (attachments or {}).items():
+            writer.attach(name, data)
 
 
 def rewrite(

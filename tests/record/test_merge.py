@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,11 +12,18 @@ from hypothesis import strategies as st
 from cloudrc import records as rec
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import ClockOffset, clock_offset, merge, write_mission
-from cloudrc.record.topics import TOPICS
+from cloudrc.record.merge import ClockOffset, WorldTime, clock_offset, merge
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
-from tests.record.conftest import MS, SECOND, assert_equal, cloud_records, world_records, write
+from tests.record.conftest import (
+    MS,
+    SECOND,
+    assert_equal,
+    cloud_records,
+    world_records,
+    write,
+    write_mission,
+)
 
 
 def files(
@@ -63,16 +71,14 @@ def test_the_true_offset_is_within_the_uncertainty(
     ahead: int, delays: list[tuple[int, int]]
 ) -> None:
     """World's clock is `ahead` of cloud's; the fastest packet may come later."""
-    v = (0.0, 0.0, 0.0)
+    telemetry, control = world_records(1)[2], cloud_records(1)[2]
     world: list[Record] = []
     cloud: list[Record] = []
     for n, (up, down) in enumerate(delays):
         sent = n * 10 * MS  # on cloud's clock
-        telemetry = world_records(1)[2].telemetry
-        world.append(rec.TelemetrySent(sent + ahead, 1, n, telemetry))
+        world.append(telemetry._replace(stamp_ns=sent + ahead, counter=n))
         cloud.append(rec.Arrival(sent + up, True, 1, n, 0.0, True))
-        control = cloud_records(1)[2]
-        cloud.append(rec.Control(sent, 1, n, 0, *[0.0] * 3, *control_tail(control, v)))
+        cloud.append(control._replace(stamp_ns=sent, counter=n))
         world.append(rec.Arrival(sent + down + ahead, False, 1, n, 0.0, True))
     found = clock_offset(Recording.from_records(world), Recording.from_records([], cloud))
     assert found.method == "packets"
@@ -80,10 +86,6 @@ def test_the_true_offset_is_within_the_uncertainty(
     assert abs(found.offset_ns - ahead) <= found.uncertainty_ns
     smallest = min(up for up, _ in delays) + min(down for _, down in delays)
     assert found.uncertainty_ns == (smallest + 1) // 2
-
-
-def control_tail(control: rec.Control, v: tuple[float, float, float]) -> list[object]:
-    return [v, v, control.orientation_wxyz, v, v, 0, v, 0.0, v, v, v]
 
 
 def test_the_same_clock_is_left_as_it_is(tmp_path: Path) -> None:
@@ -162,11 +164,35 @@ def test_nothing_at_all_is_bad_input(tmp_path: Path) -> None:
         merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap")
 
 
-def test_the_table_s_ends_are_the_ends_that_record() -> None:
-    for own, other, records in (
-        ("world", "cloud", world_records(9)),
-        ("cloud", "world", cloud_records(9)),
-    ):
-        recording = Recording.from_records(records)
-        assert not any(len(recording[t.name]) for t in TOPICS.values() if t.end == other)
-        assert any(len(recording[t.name]) for t in TOPICS.values() if t.end == own)
+def slipping(records: list[Record], slips_ns: list[int]) -> list[Record]:
+    """Make world's records; the n-th telemetry has the n-th slip, later ones the last slip."""
+    slips, slip, found = iter(slips_ns), 0, list[Record]()
+    for record in records:
+        if isinstance(record, rec.TelemetrySent):
+            slip = next(slips, slip)
+            record = record._replace(telemetry=record.telemetry._replace(slip_ns=slip))
+        found.append(record)
+    return found
+
+
+def test_a_slip_of_world_is_taken_out_of_clouds_stamps(tmp_path: Path) -> None:
+    world = slipping(world_records(60, 4 * SECOND), [5 * SECOND])
+    cloud = cloud_records(60, 4 * SECOND + 5 * SECOND)
+    mission = merge(*files(tmp_path, world, cloud, ("same", "same")))
+    without = Recording.from_records([], cloud_records(60, 4 * SECOND))["/delay_estimate"]
+    stamps = mission.recording()["/delay_estimate"]["stamp_ns"]
+    assert stamps.tolist() == without["stamp_ns"].tolist()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, SECOND), min_size=2, max_size=20), st.data())
+def test_time_never_runs_backwards(steps: list[int], data: st.DataObject) -> None:
+    world = slipping(world_records(60, SECOND), np.cumsum(steps).tolist())
+    time = WorldTime(Recording.from_records(world)["/telemetry"])
+    instants = st.lists(st.integers(0, 60 * SECOND), min_size=2, max_size=30)
+    machine_ns = np.array(sorted(data.draw(instants)), dtype=np.int64)
+    converted = time.at(machine_ns)
+    assert (np.diff(converted) >= 0).all()
+    assert (converted <= machine_ns).all()
+    if not any(steps):
+        assert converted.tolist() == machine_ns.tolist()

@@ -17,14 +17,13 @@ from cloudrc.cli.main import main
 from cloudrc.config.load import dump
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording, merged
-from cloudrc.record.merge import write_mission
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted, Record
 from cloudrc.report.document import Run
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
 from tests.metrics.conftest import at, flown, paper, touch
-from tests.record.conftest import rewrite
+from tests.record.conftest import rewrite, write_mission
 
 RUN = Run("virtual", "virtual", "f" * 64)
 Change = Callable[[Path, Path], object]

@@ -21,12 +21,12 @@ from cloudrc.files import open_file
 from cloudrc.link import traces
 from cloudrc.link.traces import read_trace
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
-from cloudrc.record.merge import write_mission
 from cloudrc.record.reader import read_contents
 from cloudrc.records import GroundTruth
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
 from tests.metrics.conftest import flown
+from tests.record.conftest import write_mission
 
 
 @pytest.fixture(autouse=True)

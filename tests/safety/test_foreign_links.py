@@ -16,7 +16,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.state import publish
 from cloudrc.record.columns import Recording
-from cloudrc.record.merge import write_mission
+from cloudrc.record.merge import merge
 from cloudrc.record.recover import recover
 from cloudrc.report.document import write_json
 from cloudrc.report.folder import read_run
@@ -53,12 +53,17 @@ def recovered(path: Path) -> None:
     recover(write(path.with_name("torn.mcap"), world_records(20)), path)
 
 
+def merged(path: Path) -> None:
+    ends = (write(path.with_name(f"{n}.mcap"), world_records(20)) for n in range(2))
+    merge(*ends).write(path)
+
+
 WRITERS: list[Callable[[Path], object]] = [
     lambda path: write_atomically(path, b"new"),
     lambda path: replace_durably(path, b"new"),
     lambda path: publish(path, "new"),
     lambda path: write_json(path, {}),
-    lambda path: write_mission(path, world_records(20), ()),
+    merged,
     recovered,
 ]
 

@@ -17,8 +17,8 @@ from cloudrc.cli.main import main
 from cloudrc.config.load import dump, load_experiment, read_experiment
 from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
-from cloudrc.record.merge import write_mission
 from tests.metrics.conftest import flown
+from tests.record.conftest import write_mission
 
 pytestmark = pytest.mark.promise("foreign-files-run-nothing")
 PACKAGE = Path(runtime.__file__).parents[1]
