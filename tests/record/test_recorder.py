@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,8 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.recover import recover
 from cloudrc.record.writer import McapWriter
-from cloudrc.records import Counted
+from cloudrc.records import Counted, Record
 from tests.record.conftest import MS, Shelf, assert_equal, counted, open_mcap, world_records, write
-
-NO_SPACE = OSError(errno.ENOSPC, "No space left on device")
 
 
 class Disk(io.BytesIO):
@@ -31,8 +30,22 @@ class Disk(io.BytesIO):
 
     def write(self, data: Any) -> int:
         if self.tell() + len(data) > self.room:
-            raise NO_SPACE
+            raise OSError(errno.ENOSPC, "No space left on device")
         return super().write(data)
+
+
+def on_disk(room: int, records: list[Record], path: Path, every: int) -> Recorder:
+    """Record on a disk with little room, with a flush after some records; save what is kept."""
+    disk = Disk(room)
+    recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
+    for start in range(0, len(records), every):
+        recorder.put(records[start : start + every])
+        while recorder.drain():
+            pass
+        recorder.flush()
+    recorder.close()
+    path.write_bytes(disk.getvalue())
+    return recorder
 
 
 def test_the_oldest_are_dropped_and_counted() -> None:
@@ -42,9 +55,7 @@ def test_the_oldest_are_dropped_and_counted() -> None:
         recorder.put([record])
     assert recorder.dropped == 15
     assert recorder.drain(4) == 4
-    recorder.put(records[:2])
-    assert recorder.dropped == 15
-    recorder.put(records[2:5])
+    recorder.put(records[:5])
     assert recorder.dropped == 16
     recorder.close()
     assert shelf.closed
@@ -52,55 +63,57 @@ def test_the_oldest_are_dropped_and_counted() -> None:
     assert recorder.error == ""
 
 
-def test_a_drain_takes_no_more_than_it_may() -> None:
-    recorder = Recorder(Path("x"), lambda path: Shelf())
-    recorder.put(counted(10))
-    assert [recorder.drain(4) for _ in range(4)] == [4, 4, 2, 0]
-
-
 def test_what_is_recorded_can_be_read(tmp_path: Path) -> None:
     path, records = tmp_path / "world.mcap", world_records(30)
-    recorder = Recorder(path, open_mcap)
-    recorder.put(records)
-    recorder.close()
-    assert_equal(Recording.read(path), Recording.from_records(records))
-    assert (recorder.dropped, recorder.error) == (0, "")
+    for target, recorder in ((path, Recorder(path, open_mcap)), (None, None)):
+        recorder = recorder or Recorder(Path(os.devnull), open_mcap)
+        recorder.put(records)
+        recorder.drain()
+        recorder.flush()
+        recorder.close()
+        assert (recorder.dropped, recorder.error) == (0, "")
+        if target:
+            assert_equal(Recording.read(target), Recording.from_records(records))
 
 
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
-def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
-    disk, records = Disk(60_000), world_records(400)
-    recorder = Recorder(Path("world.mcap"), lambda path: McapWriter(disk, clock="world"))
-    for record in records:
-        recorder.put([record])
-        recorder.drain()
-        recorder.flush()
-    recorder.close()
+@pytest.mark.parametrize("room", [0, 100, 1500, *range(20_000, 60_800, 2_720)])
+def test_on_a_full_disk_all_is_kept_or_counted(tmp_path: Path, room: int) -> None:
+    path, records = tmp_path / "w.mcap", counted(3000)
+    recorder = on_disk(room, records, path, 30)
     assert recorder.error == (
-        "world.mcap: recording stopped: disk full;"
-        " make room or choose another folder; the flight goes on"
+        f"{path}: recording stopped: disk full; make room or choose another folder;"
+        " the flight goes on"
     )
-    assert 0 < recorder.dropped < len(records)
-    path = tmp_path / "kept.mcap"
-    path.write_bytes(disk.getvalue())
-    assert len(Recording.read(path)["/odometry"]) > 50
+    kept = 0
+    with suppress(BadInputError):
+        recording = Recording.read(path)
+        kept = len(recording["/count"])
+        recovery = recover(path, tmp_path / "clean.mcap")
+        assert recovery.bytes_lost == 0, "the file ends with a whole chunk"
+        told = "disk full" in recording.note
+        assert told or room - path.stat().st_size < 200, "told, if there is room"
+    assert kept + recorder.dropped == len(records)
+    assert kept < len(records)
 
 
-@pytest.mark.parametrize("room", range(60_000, 60_800, 80))
-def test_on_a_full_disk_the_file_ends_with_a_whole_chunk(tmp_path: Path, room: int) -> None:
-    disk = Disk(room)
-    recorder = Recorder(Path("world.mcap"), lambda path: McapWriter(disk, clock="world"))
-    for record in world_records(400):
-        recorder.put([record])
-        recorder.drain()
-        recorder.flush()
-    recorder.close()
-    path = tmp_path / "kept.mcap"
-    path.write_bytes(disk.getvalue())
-    recovery = recover(path, tmp_path / "clean.mcap")
-    assert (recovery.bytes_lost, recovery.dropped) == (0, {})
-    note = Recording.read(path).note
-    assert "disk full" in note or room - len(disk.getvalue()) < 200, "told, if there is room"
+def test_without_room_for_the_index_all_chunks_are_kept(tmp_path: Path) -> None:
+    path, records = tmp_path / "w.mcap", counted(20)
+    size = write(path, records).stat().st_size
+    recorder = on_disk(size - 100, records, path, 30)
+    assert "disk full" in recorder.error
+    assert (len(Recording.read(path)["/count"]), recorder.dropped) == (20, 0)
+
+
+def failing(step: str, error: OSError) -> Shelf:
+    """Make a sink whose `step` fails."""
+
+    def refuse(*_: object) -> None:
+        raise error
+
+    shelf = Shelf()
+    setattr(shelf, step, refuse)
+    return shelf
 
 
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
@@ -114,17 +127,8 @@ def test_on_a_full_disk_the_file_ends_with_a_whole_chunk(tmp_path: Path, room: i
         (errno.EIO, "Input/output error"),
     ],
 )
-def test_disk_errors_are_reported_to_the_user_and_never_raised(
-    step: str, code: int, words: str
-) -> None:
-    class Refusing(Shelf):
-        pass
-
-    def refuse(*_: object) -> None:
-        raise OSError(code, "Input/output error")
-
-    shelf = Refusing()
-    setattr(shelf, step, refuse)
+def test_disk_errors_are_told_and_never_raised(step: str, code: int, words: str) -> None:
+    shelf = failing(step, OSError(code, "Input/output error"))
     recorder = Recorder(Path("w.mcap"), lambda path: shelf)
     recorder.put(counted(3))
     recorder.drain()
@@ -133,22 +137,6 @@ def test_disk_errors_are_reported_to_the_user_and_never_raised(
     recorder.close()
     assert f"w.mcap: recording stopped: {words};" in recorder.error
     assert recorder.dropped == (0 if step == "close" else 2)
-
-
-def test_a_recording_without_a_file_needs_no_disk() -> None:
-    recorder = Recorder(Path(os.devnull), open_mcap)
-    recorder.put(counted(3))
-    recorder.drain()
-    recorder.flush()
-    recorder.close()
-    assert (recorder.error, recorder.dropped) == ("", 0)
-
-
-def test_a_disk_that_fills_up_at_the_very_end_raises_nothing() -> None:
-    recorder = Recorder(Path("w.mcap"), lambda path: McapWriter(Disk(1500), clock="world"))
-    recorder.put(counted(20))
-    recorder.close()
-    assert "disk full" in recorder.error
 
 
 def test_a_folder_that_is_not_there_stops_the_recording_only(tmp_path: Path) -> None:
@@ -172,15 +160,6 @@ def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path: Path) -> No
     assert len(Recording.read(path)["/count"]) == 4
 
 
-@pytest.mark.parametrize("room", [0, 10, 100])
-def test_a_disk_without_room_for_the_head_raises_nothing(room: int) -> None:
-    recorder = Recorder(Path("w.mcap"), lambda path: McapWriter(Disk(room), clock="world"))
-    recorder.put(counted(5))
-    recorder.close()
-    assert recorder.dropped == 5
-    assert "disk full" in recorder.error
-
-
 def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> None:
     path = tmp_path / "world.mcap"
     recorder = Recorder(path, open_mcap, size_max=20_000)
@@ -196,32 +175,28 @@ def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> N
     assert Recording.read(path).note == "recording stopped: the file has reached its size limit"
 
 
-@pytest.mark.parametrize("room", [0, 1500, *range(20_000, 60_000, 7_000)])
-def test_on_a_full_disk_every_record_is_in_the_file_or_counted(tmp_path: Path, room: int) -> None:
-    disk, records, path = Disk(room), counted(3000), tmp_path / "w.mcap"
-    recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
-    for start in range(0, len(records), 30):
-        recorder.put(records[start : start + 30])
-        while recorder.drain():
-            pass
-        if start % 90 == 0:
-            recorder.flush()
-    recorder.close()
-    path.write_bytes(disk.getvalue())
-    with suppress(BadInputError):
-        kept = 0
-        kept = len(Recording.read(path)["/count"])
-    assert (kept + recorder.dropped, kept < len(records)) == (len(records), True)
+@pytest.mark.parametrize("make", [Shelf, lambda: failing("sync", OSError(errno.EIO, "broken"))])
+def test_a_sync_by_another_thread_reports_its_error_later(
+    tmp_path: Path, make: Callable[[], Shelf]
+) -> None:
+    path, shelf = tmp_path / "w.mcap", make()
+    recorder = Recorder(path, lambda path: shelf)
+    recorder.put(counted(1))
+    recorder.drain()
+    assert not recorder.sync(), "what is in no file is never safe"
+    path.touch()
+    works = type(shelf.sync).__name__ == "method"
+    assert recorder.sync() is works
+    assert not shelf.closed
+    recorder.flush(sync=False)
+    assert (shelf.closed, recorder.error == "") == (not works, works)
 
 
-def test_without_room_for_the_index_the_last_chunk_is_kept(tmp_path: Path) -> None:
-    path, records = tmp_path / "w.mcap", counted(20)
-    whole = write(path, records).read_bytes()
-    disk = Disk(len(whole) - 100)
-    recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
-    recorder.put(records)
-    recorder.close()
-    path.write_bytes(disk.getvalue())
-    assert "disk full" in recorder.error
-    assert len(Recording.read(path)["/count"]) == 20
-    assert recorder.dropped == 0
+def test_a_sync_of_a_closed_file_is_nothing(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "w.mcap", open_mcap)
+    recorder.put(counted(1))
+    recorder.drain()
+    assert recorder._sink is not None
+    recorder._sink.close()
+    assert not recorder.sync()
+    assert recorder.error == ""
