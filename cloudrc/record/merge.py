@@ -226,8 +226,9 @@ def _join(world: Contents, cloud: Contents) -> Mission:
         (topic, to_ns, shifted(data, to_ns - from_ns))
         for (topic, from_ns, data), to_ns in zip(cloud.messages, moved_ns.tolist(), strict=True)
     ]
+    in_order = heapq.merge(world.messages, moved, key=itemgetter(1))
     joined = Contents(
-        messages=list(heapq.merge(world.messages, moved, key=itemgetter(1))),
+        messages=[(topic, max(ns, 0), data) for topic, ns, data in in_order],  # MCAP's least time
         metadata={**cloud.metadata, **world.metadata, **offset.metadata()},
         attachments={**cloud.attachments, **world.attachments},
     )

@@ -140,9 +140,8 @@ class _Copy:
             lost = max(lost, records.stated - kept["messages"])
         new = []
         if records.fault and not (records.data_ended and records.cut):
-            new.append(records.fault)
-        if records.unread:
-            new.append(f"{records.unread} bytes after the last intact part were not read")
+            unread = f": {records.unread} bytes after the last intact part were not read"
+            new.append(records.fault + unread * bool(records.unread))
         if lost:
             new.append(f"{lost} messages are lost")
         notes = [self._told, *new] if self._told else new

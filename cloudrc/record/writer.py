@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from io import FileIO
-from itertools import islice
+from itertools import accumulate, islice, pairwise
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -77,6 +77,7 @@ class McapWriter:
         self._open_records = 0  # number of records written after these bytes
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
+        self._noted: dict[str, str] = {}
         self._latest_ns = 0
         self._chunk_start_ns: int | None = None
         self._number = 0  # of the last message
@@ -134,7 +135,8 @@ class McapWriter:
         Args:
             metadata: Values by key.
         """
-        self._mcap.add_metadata(METADATA, dict(metadata))
+        self._noted |= metadata
+        self._mcap.add_metadata(METADATA, dict(self._noted))
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
         """Attach a file to the recording.
@@ -225,31 +227,44 @@ class McapWriter:
 class _ChunkIndexes:
     """The writer's list of the chunks so far, compressed.
 
-    mcap's own list takes 12 MB for an hour of recording, this one half a megabyte.
+    mcap's own list takes 12 MB for an hour of recording, this one a third of a megabyte: it stores
+    differences, which compress best.
     """
 
     def __init__(self) -> None:
-        self._packed = bytearray()
+        self._blocks: list[bytes] = []
         self._compress = zlib.compressobj()
+        self._before = (0, 0, 0)  # times and position of the last chunk
 
     def append(self, index: ChunkIndex) -> None:
         """Add a chunk."""
-        start, length = index.chunk_start_offset, index.chunk_length
-        offsets = index.message_index_offsets
+        now = (index.message_start_time, index.message_end_time, index.chunk_start_offset)
+        channels = list(index.message_index_offsets)
+        places = [now[2] + index.chunk_length, *index.message_index_offsets.values()]
         row = (
-            *(index.message_start_time, index.message_end_time, start, length),
-            *(index.message_index_length, index.compressed_size, index.uncompressed_size),
-            *offsets,
-            *[offset - start - length for offset in offsets.values()],
+            *[value - before for value, before in zip(now, self._before, strict=True)],
+            *(index.chunk_length, index.message_index_length),
+            *(index.compressed_size, index.uncompressed_size),
+            *channels,
+            *[after - before for before, after in pairwise(places)],
         )
-        data = struct.pack(f"<{1 + len(row)}Q", len(row), *row)
-        self._packed += self._compress.compress(data)
+        self._before = now
+        if block := self._compress.compress(struct.pack(f"<{1 + len(row)}q", len(row), *row)):
+            self._blocks.append(block)
 
     def __iter__(self) -> Iterator[ChunkIndex]:
-        data = zlib.decompressobj().decompress(self._packed + self._compress.copy().flush())
-        values = iter(struct.unpack(f"<{len(data) // 8}Q", data))
+        packed = b"".join([*self._blocks, self._compress.copy().flush()])
+        data = zlib.decompress(packed)
+        values = iter(struct.unpack(f"<{len(data) // 8}q", data))
+        first = last = start = 0
         for size in values:
-            first, last, start, length, index, packed, unpacked, *rest = islice(values, size)
-            channels, places = rest[: len(rest) // 2], rest[len(rest) // 2 :]
-            offsets = dict(zip(channels, [start + length + at for at in places], strict=True))
-            yield ChunkIndex(length, start, "zstd", packed, last, index, offsets, first, unpacked)
+            row = list(islice(values, size))
+            first, last, start = first + row[0], last + row[1], start + row[2]
+            length, index_length, compressed, uncompressed = row[3:7]
+            count = (size - 7) // 2
+            places = accumulate(row[7 + count :], initial=start + length)
+            offsets = dict(zip(row[7 : 7 + count], islice(places, 1, None), strict=True))
+            yield ChunkIndex(
+                *(length, start, "zstd", compressed, last, index_length),
+                *(offsets, first, uncompressed),
+            )

@@ -15,6 +15,7 @@ from tests.conftest import nightly
 
 pytestmark = pytest.mark.process
 
+ENDS = ("world", "cloud")
 FLOWN = (0, 6)
 """Exit codes of a finished run, in real time or not: the machine may be busy."""
 HOVER = ["hover", "--mode", "local", "--set", "mission.waypoints.0.dwell_s={dwell}"]
@@ -239,3 +240,25 @@ def test_real_time_takes_as_long_as_virtual_time(tmp_path, attempt):
     assert local[contact]["value"] == pytest.approx(virtual[contact]["value"], rel=0.05)
     for name in ("real_time_factor", "world_lateness_p99", "cloud_lateness_p99"):
         assert local[name]["value"] > 0
+
+
+def private_memory(pid: int) -> int:
+    """Return the private memory of a process [bytes]."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return 1024 * int(status.partition("RssAnon:")[2].split()[0])
+
+
+@pytest.mark.full
+def test_an_hour_of_recording_takes_below_a_megabyte(tmp_path, figure):
+    """Measured over 25 minutes, once the first 5 have filled all buffers."""
+    run = start(tmp_path / "run", "criteria.time_limit_s=3000", dwell=2400.0)
+    pids = {name: pid for name, pid in wait_until_flying(run).items() if name in ENDS}
+    memory = []
+    for minutes in (5, 25):
+        time.sleep(60.0 * minutes)
+        memory.append({name: private_memory(pid) for name, pid in pids.items()})
+    run.terminate()
+    run.communicate(timeout=60)
+    for name in ENDS:
+        grown = (memory[1][name] - memory[0][name]) * 60 / 25
+        figure(f"{name} with a recording: memory grown in an hour", grown * 1e-6, "<=", 1.0, "MB")

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from cloudrc import records as rec
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
+from cloudrc.record.hash import messages_sha256
 from cloudrc.record.merge import ClockOffset, WorldTime, clock_offset, merge
+from cloudrc.record.reader import read_contents
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
 from tests.record.conftest import (
@@ -60,6 +62,8 @@ def test_two_clocks_are_related_by_the_packets(tmp_path: Path, start: int, ahead
     assert noted.items() <= recording.metadata.items()
     assert_equal(recording, Recording.from_records(world, cloud, ahead - 5 * MS))
     assert_equal(recording, mission.recording())
+    digest = messages_sha256(mission.contents.messages)
+    assert digest == messages_sha256(read_contents(target).messages)
 
 
 @given(

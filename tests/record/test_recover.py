@@ -122,7 +122,7 @@ def test_all_before_the_first_damage_is_kept(tmp_path: Path) -> None:
         recovery = recover(source, target)
         assert recovery.kept["chunks"] == 1
         assert recovery.share == 1 - recovery.bytes_lost / len(data)
-        assert recovery.notes[0].startswith(said)
+        assert recovery.notes[0].startswith(f"{said}: ")
         kept = Recording.read(target)
         assert kept.note == "; ".join(recovery.notes)
         assert 40 < len(kept["/odometry"]) < 80
