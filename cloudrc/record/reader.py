@@ -29,7 +29,7 @@ from cloudrc.record.writer import CLOCK, COUNTS, MISSING
 try:
     import lz4.frame
     import zstandard
-    from mcap.exceptions import EndOfFile
+    from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
     from mcap.opcode import Opcode
     from mcap.records import (
         Attachment,
@@ -53,7 +53,7 @@ UNPACKED_MAX = 64
 MESSAGE_COST = 128
 """Memory of a message's objects beside its bytes [bytes]."""
 LISTED_MAX = 3
-"""Largest number of topics that a message lists with their numbers."""
+"""Largest number of topics that a message lists."""
 HEAD_SIZE = 16
 """Number of bytes that show of which kind a file is."""
 KINDS = (
@@ -151,7 +151,7 @@ class Records:
                 self.data_ended = self.ended = True
                 self.position = self.size
                 self.fault = "damaged: a byte outside the chunks is wrong"
-        except EndOfFile:
+        except (EndOfFile, RecordLengthLimitExceeded):  # a record that ends behind the file
             self.fault, self.cut = "cut short", True
         except _TooMuchError:
             self.fault = f"unpacks to more than {UNPACKED_MAX} times its size, as no recording does"
@@ -303,8 +303,11 @@ class _Collector:
             order = sorted(range(len(messages)), key=lambda n: (messages[n][1], self._sequences[n]))
             contents.messages = messages = [messages[n] for n in order]
             contents.remarks += (f"was not in order of time: {late} messages were sorted",)
-        cut = [self._fault()] if records.cut or not records.fault else []
-        lacking = [] if cut else [self._fault()]
+        cut, lacking = list[str](), list[str]()
+        if records.data_ended and records.cut:
+            contents.remarks += ("had a torn index: all its messages were read",)
+        elif records.fault:
+            (cut if records.cut else lacking).append(self._fault())
         lacking += self._lacking(Counter(message[0] for message in messages))
         told = to_one_line(contents.metadata.get(MISSING, ""))
         contents.lacking = "; ".join(filter(None, lacking))
@@ -312,15 +315,12 @@ class _Collector:
         return contents
 
     def _fault(self) -> str:
-        """Say how far the file was read, if that is not to its end."""
-        messages, records = self._contents.messages, self._records
-        if not records.data_ended:
-            until = messages[-1][1] * 1e-9
-            count = f"{len(messages)} messages were read, the last at {until:.2f} s"
-            return f"{records.fault}: {count}"
-        if not records.ended:
-            return f"{records.fault} in its index: all {len(messages)} messages were read"
-        return records.fault
+        """Say what is wrong with the file, and how far it was read."""
+        messages, fault = self._contents.messages, self._records.fault
+        if self._records.data_ended:
+            return fault
+        until = messages[-1][1] * 1e-9
+        return f"{fault}: {len(messages)} messages were read, the last at {until:.2f} s"
 
     def _lacking(self, read: Counter[str]) -> Iterator[str]:
         """Say what other programs have removed or added.
@@ -332,8 +332,8 @@ class _Collector:
         channels = [names.get(number, ("", False)) for number in seen]
         foreign = sorted({name for name, ours in channels if not ours and name not in TOPICS})
         if foreign:
-            listed = to_one_line(", ".join(foreign))
-            self._contents.remarks += (f"has topics that cloudrc does not record: {listed}",)
+            told = f"has topics that cloudrc does not record: {_list(foreign)}"
+            self._contents.remarks += (to_one_line(told),)
         if other := sorted({name for name, ours in channels if not ours and name in TOPICS}):
             yield f"topics of another layout were left out: {', '.join(other)}"
         twice = Counter(name for name, ours in channels if ours and TOPICS[name].end != "either")
@@ -351,10 +351,14 @@ class _Collector:
                 for topic, count in counts.items()
                 if read[topic] != count
             ]
-            more = f" and {len(wrong) - LISTED_MAX} more topics" if len(wrong) > LISTED_MAX else ""
             if wrong:
-                listed = ", ".join(wrong[:LISTED_MAX])
-                yield f"messages were removed or added: it holds {listed}{more}"
+                yield f"messages were removed or added: it holds {_list(wrong)}"
+
+
+def _list(topics: list[str]) -> str:
+    """List the first topics and the number of the others."""
+    more = len(topics) - LISTED_MAX
+    return ", ".join(topics[:LISTED_MAX]) + f" and {more} more topics" * (more > 0)
 
 
 def _parse_counts(text: str) -> dict[str, int]:

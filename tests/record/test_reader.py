@@ -94,7 +94,8 @@ def test_a_whole_file_is_complete(whole: Path, tmp_path: Path) -> None:
     torn = tmp_path / "index.mcap"
     torn.write_bytes(whole.read_bytes()[:-1])
     recording = Recording.read(torn)
-    assert recording.note.startswith("cut short in its index: all ")
+    assert recording.complete
+    assert recording.remarks == ("had a torn index: all its messages were read",)
     assert recording.attachments["config.yaml"] == b"seed: 1\n" * 50
     assert_equal(recording, Recording.from_records(RECORDS))
 
@@ -120,7 +121,7 @@ def test_what_follows_the_end_is_told(whole: Path, tmp_path: Path) -> None:
     [
         (b"", "is empty"),
         (bytes(100), "is empty"),
-        (b"\x89MCAP0\r\n\x01" + b"\xff" * 40, "holds no readable message: damaged"),
+        (b"\x89MCAP0\r\n\x01" + b"\xff" * 40, "holds no readable message: cut short"),
         (b"#ROSBAG V2.0\n", "is a ROS 1 bag, not an MCAP file"),
         (b"SQLite format 3\0", r"is an SQLite file, not MCAP; .*ros2 bag convert"),
         (b"PK\x03\x04 and so on", "is not an MCAP file"),
