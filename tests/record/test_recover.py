@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -14,8 +15,6 @@ from typing import Any
 import pytest
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 
 from cloudrc.cli.main import main
@@ -57,25 +56,13 @@ CHUNKS = [(start, end) for opcode, start, end in spans(WHOLE) if opcode == Opcod
 
 def contents(data: bytes) -> list[object]:
     """Return the contents of a file, without its layout and its library's name."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    found: list[object] = []
-    for record in StreamReader(io.BytesIO(data), validate_crcs=True).records:
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, Message):
-            channel = channels[record.channel_id]
-            schema = schemas[channel.schema_id]
-            what = (schema.name, schema.encoding, schema.data, channel.topic, channel.metadata)
-            when = (record.log_time, record.publish_time, record.sequence)
-            found.append((*what, channel.message_encoding, *when, record.data))
-        elif isinstance(record, Attachment):
-            found.append(record)
-        elif isinstance(record, Metadata):
-            found.append((record.name, record.metadata))
-    return sorted(found, key=repr)
+    reader = make_reader(io.BytesIO(data), validate_crcs=True)
+    found: list[object] = [*reader.iter_attachments(), *reader.iter_metadata()]
+    for schema, channel, message in reader.iter_messages():
+        assert schema is not None
+        what = (schema.name, schema.data, channel.topic, channel.message_encoding)
+        found.append((*what, channel.metadata, message.sequence, message))
+    return sorted(re.sub("(channel_)?id=[0-9]+", "", repr(each)) for each in found)
 
 
 def rescue(folder: Path, data: bytes) -> tuple[int, bytes]:
