@@ -328,8 +328,8 @@ class _Collector:
         Args:
             read: Number of messages by topic.
         """
-        names, seen = self._channels, self._seen
-        channels = [names.get(number, ("", False)) for number in seen]
+        metadata, seen = self._contents.metadata, self._seen
+        channels = [self._channels[number] for number in seen if number in self._channels]
         foreign = sorted({name for name, ours in channels if not ours and name not in TOPICS})
         if foreign:
             told = f"has topics that cloudrc does not record: {_list(foreign)}"
@@ -339,20 +339,22 @@ class _Collector:
         twice = Counter(name for name, ours in channels if ours and TOPICS[name].end != "either")
         if double := [name for name, count in twice.items() if count > 1]:
             yield f"two robots or two recordings are in one file: {', '.join(double)}"
-        if CLOCK not in self._contents.metadata:
+        if homeless := sum(seen[number] for number in seen.keys() - self._channels.keys()):
+            yield f"{homeless} messages are of no topic"
+        if CLOCK not in metadata:
             yield "the metadata of cloudrc, which names the clock, is not there"
         stated, total = self._records.stated, seen.total()
         if self._records.ended and stated not in (None, total):
             yield f"the index states {stated} messages, {total} were read"
-        if self._records.data_ended:
-            counts = _parse_counts(self._contents.metadata.get(COUNTS, ""))
-            wrong = [
-                f"{read[topic]} of {count} on {topic}"
-                for topic, count in counts.items()
-                if read[topic] != count
-            ]
-            if wrong:
-                yield f"messages were removed or added: it holds {_list(wrong)}"
+        if not self._records.data_ended:
+            return
+        counts = _parse_counts(metadata.get(COUNTS, ""))
+        topics = [topic for topic in TOPICS if counts and read[topic] != counts.get(topic, 0)]
+        wrong = [f"{read[topic]} of {counts.get(topic, 0)} on {topic}" for topic in topics]
+        if wrong:
+            yield f"messages were removed or added: it holds {_list(wrong)}"
+        if metadata.get(COUNTS) == "" and MISSING not in metadata:
+            yield "it was torn, and another program has put an end to it"
 
 
 def _list(topics: list[str]) -> str:

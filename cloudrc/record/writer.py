@@ -47,7 +47,8 @@ MISSING = "missing"
 """Key in the metadata with what is missing from the file, in words."""
 COUNTS, SHA256 = "counts", "messages_sha256"
 """Keys in the metadata of a complete file: number of messages by topic as JSON, and their hash by
-`record.hash`. They show whether another program has changed the recording."""
+`record.hash`. They show whether another program has changed the recording. The number is "" until
+the file is complete."""
 
 
 class McapWriter:
@@ -85,7 +86,7 @@ class McapWriter:
         self._sha256 = hashlib.sha256()
         self._mcap._Writer__chunk_indices = _ChunkIndexes()  # type: ignore[attr-defined]
         self._mcap.start(profile="ros2", library=f"cloudrc {__version__}")
-        self.note({CLOCK: clock, "clock_id": clock_id, "version": __version__})
+        self.note({CLOCK: clock, "clock_id": clock_id, "version": __version__, COUNTS: ""})
 
     def write(self, records: Iterable[Record]) -> None:
         """Write all rows of the records.

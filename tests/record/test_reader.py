@@ -174,10 +174,11 @@ def test_another_compression_is_named(whole: Path, tmp_path: Path) -> None:
         ({"keep": lambda c, m: c.topic != "/guard"}, "it holds 0 of 1 on /guard$"),
         ({"keep": lambda c, m: m.log_time < 10**9}, r"it holds .*, .*, .* and 6 more topics$"),
         ({"rename": lambda t: f"/r2{t}"}, "it holds 0 of"),
+        ({"rename": lambda t: t.replace("/odometry", "/ground_truth")}, "/odometry, 320 of 160 on"),
         ({"metadata": False}, "the metadata of cloudrc, which names the clock, is not there"),
-        ({"shuffle": lambda all: all.extend(all[:4])}, "it holds 2 of 1 on /session"),
+        ({"shuffle": lambda all: all.extend(all[:4])}, "messages were removed or added: it holds "),
     ],
-    ids=["topic", "half", "renamed", "metadata", "doubled"],
+    ids=["topic", "half", "renamed", "joined", "metadata", "doubled"],
 )
 def test_what_other_programs_changed_is_named(
     whole: Path, tmp_path: Path, options: dict[str, Any], said: str
@@ -185,6 +186,15 @@ def test_what_other_programs_changed_is_named(
     recording = Recording.read(rewrite(whole, tmp_path / "n.mcap", **options))
     assert recording.lacking == recording.note
     assert re.search(said, recording.lacking), recording.lacking
+
+
+def test_a_torn_recording_that_others_ended_is_told(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    writer = McapWriter(stream, clock="world")
+    writer.write(RECORDS)
+    writer._mcap.finish()
+    (tmp_path / "w.mcap").write_bytes(stream.getvalue())
+    assert "another program has put an end to it" in Recording.read(tmp_path / "w.mcap").lacking
 
 
 def foreign(path: Path, topic: str, ros_type: str, text: str, data: bytes, channels: int) -> Path:

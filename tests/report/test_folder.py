@@ -116,7 +116,7 @@ OTHER = b"seed: 2\nmission: pipes\n"
     [
         (
             filtered(keep=lambda c, m: c.topic in ("/odometry", "/cmd_vel")),
-            "it holds 0 of 2 on /session, .* and 12 more",
+            "it holds 0 of 401 on /telemetry, .* and 12 more",
         ),
         (filtered(keep=lambda c, m: c.topic != "/guard"), "it holds 0 of 3 on /guard"),
         (filtered(keep=lambda c, m: m.log_time < at(5)), "it holds"),
