@@ -11,9 +11,12 @@ import errno
 from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from cloudrc.records import Record
+
+if TYPE_CHECKING:
+    from cloudrc.record.writer import McapWriter
 
 TROUBLE = {
     errno.ENOSPC: "disk full",
@@ -22,25 +25,6 @@ TROUBLE = {
 }
 CAPACITY = 20_000
 """Number of records that the queue holds; world or cloud makes that many in about 30 s."""
-
-
-class Sink(Protocol):
-    """The part of a writer that the recorder uses."""
-
-    def write(self, records: Iterable[Record]) -> None:
-        """Write records, oldest first."""
-
-    def flush(self) -> None:
-        """Hand all data to the operating system."""
-
-    def sync(self) -> None:
-        """Sync the flushed data to the disk."""
-
-    def abandon(self, reason: str) -> int:
-        """End the file after an error; return the number of records lost with it."""
-
-    def close(self) -> None:
-        """Complete and close the file."""
 
 
 class Recorder:
@@ -53,7 +37,7 @@ class Recorder:
     def __init__(
         self,
         path: Path,
-        open_sink: Callable[[Path], Sink],
+        open_sink: Callable[[Path], McapWriter],
         capacity: int = CAPACITY,
         size_max: int | None = None,
     ) -> None:
@@ -71,7 +55,7 @@ class Recorder:
         self._open_sink = open_sink
         self._capacity = capacity
         self._queue: deque[Record] = deque()
-        self._sink: Sink | None = None
+        self._sink: McapWriter | None = None
         self._ended = False
         self._overflowed = 0
         self._unwritten = 0
@@ -160,7 +144,7 @@ class Recorder:
             except OSError as error:
                 self._stop(error)
 
-    def _open(self) -> Sink | None:
+    def _open(self) -> McapWriter | None:
         if not self._ended:
             try:
                 self._sink = self._open_sink(self._path)
@@ -168,7 +152,7 @@ class Recorder:
                 self._stop(error)
         return self._sink
 
-    def _write(self, sink: Sink | None, record: Record) -> None:
+    def _write(self, sink: McapWriter | None, record: Record) -> None:
         if sink is None or self._ended:
             self._unwritten += 1
             return
