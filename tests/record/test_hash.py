@@ -91,13 +91,12 @@ def test_order_and_the_bounds_of_texts_count() -> None:
     assert digest(rec.Fault(1, "ab", "c")) != digest(rec.Fault(1, "a", "bc"))
 
 
-@pytest.mark.parametrize("seed", ["0", "4711"])
-def test_another_process_with_another_hash_seed_agrees(seed: str) -> None:
+def test_another_process_with_another_hash_seed_agrees() -> None:
     code = (
         "from tests.record.test_hash import *\n"
         "print(digest(*world_records(20), *cloud_records(20)))"
     )
-    environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = {**os.environ, "PYTHONHASHSEED": "4711", "PYTHONPATH": os.pathsep.join(sys.path)}
     found = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )

@@ -7,13 +7,11 @@ import tracemalloc
 from collections import defaultdict
 from pathlib import Path
 
-import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
 
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
@@ -44,17 +42,10 @@ def test_the_file_is_what_ros_tools_expect(flight: Path) -> None:
             ros_type = summary.schemas[channel.schema_id].name
             assert ros_type == TOPICS[channel.topic].ros_type
             assert channel.metadata["topic_type_hash"].startswith("RIHS01_")
-
-
-def test_chunks_are_compressed_checked_and_short(flight: Path) -> None:
-    with flight.open("rb") as stream:
-        records = StreamReader(stream, emit_chunks=True).records
-        chunks = [record for record in records if isinstance(record, Chunk)]
-    assert len(chunks) >= 6
-    for chunk in chunks:
-        assert chunk.compression == "zstd"
-        assert chunk.uncompressed_crc != 0
-        assert chunk.message_end_time - chunk.message_start_time < CHUNK_NS
+        assert len(summary.chunk_indexes) >= 6
+        for chunk in summary.chunk_indexes:
+            assert chunk.compression == "zstd"
+            assert chunk.message_end_time - chunk.message_start_time < CHUNK_NS
 
 
 def test_log_times_never_fall_on_a_topic(tmp_path: Path) -> None:
@@ -104,16 +95,6 @@ def test_attachments_and_metadata_come_back(tmp_path: Path) -> None:
     expected = {"clock": "cloud", "clock_id": "boot-1", "epoch": "2"}
     assert expected.items() <= recording.metadata.items()
     assert recording.metadata["version"]
-
-
-def test_rosbags_own_reader_agrees(flight: Path) -> None:
-    positions = []
-    with AnyReader([flight]) as reader:
-        chosen = [each for each in reader.connections if each.topic == "/odometry"]
-        for connection, _, data in reader.messages(chosen):
-            position = reader.deserialize(data, connection.msgtype).pose.pose.position
-            positions.append((position.x, position.y, position.z))
-    np.testing.assert_array_equal(positions, Recording.read(flight)["/odometry"]["position"])
 
 
 def test_another_decoder_reads_every_topic(flight: Path) -> None:
