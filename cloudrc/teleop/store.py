@@ -315,7 +315,7 @@ def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqli
 
 
 def _not_opened(path: Path | None, error: sqlite3.OperationalError) -> CloudrcError:
-    if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
+    if error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY:  # without its extension
         return StoreLockedError(
             f"{path}: another teleop has this journal open; waiting until it ends"
         )
