@@ -5,7 +5,6 @@ import concurrent.futures
 import json
 import socket
 import stat
-import statistics
 import threading
 import time
 import urllib.error
@@ -266,13 +265,6 @@ def test_a_full_api_still_serves_stop_and_hold(api):
         connection.close()
 
 
-def test_idle_connections_do_not_lock_a_stop_out(api):
-    idlers = [connect(api) for _ in range(1_500)]
-    assert api.post("/v1/estop")[0] == 200
-    for connection in idlers:
-        connection.close()
-
-
 @pytest.mark.promise("emergency-stop-gets-through")
 def test_a_stop_is_made_however_late_teleop_answers(api, monkeypatch):
     """Its loop waits for the disk; of other calls only those are made whose client still waits."""
@@ -414,29 +406,8 @@ def test_an_internal_error_is_one_line_and_500(api):
 # The server
 
 
-def answer_time(ask_once):
-    times = []
-    for _ in range(15):
-        began = time.monotonic()
-        ask_once()
-        times.append(time.monotonic() - began)
-    return statistics.median(times)
-
-
-def test_a_kept_connection_answers_as_fast_as_a_fresh_one(api):
-    """Without TCP_NODELAY the body waits for the client's delayed acknowledgement: 40 ms."""
-    with connect(api) as kept:
-        ask(kept, "GET", "/v1/state")
-
-        def ask_fresh():
-            with connect(api) as fresh:
-                ask(fresh, "GET", "/v1/state")
-
-        median = answer_time(lambda: ask(kept, "GET", "/v1/state"))
-        assert median < answer_time(ask_fresh) + 0.015
-
-
 def test_accepted_connections_have_tcp_nodelay(api):
+    """Without it a kept connection waits for delayed acknowledgements: 40 ms for each answer."""
     with connect(api) as one:
         ask(one, "GET", "/v1/state")
         transports = [each.transport for each in api.server._server.server_state.connections]
