@@ -63,6 +63,17 @@ def test_missions_are_read_back_exactly(path):
     assert os.listdir(path.parent) == ["missions"]
 
 
+HOW = {"synchronous": 2, "journal_mode": "wal", "locking_mode": "exclusive", "foreign_keys": 1}
+
+
+def test_each_commit_waits_for_the_disk_and_the_file_is_locked(tmp_path):
+    path = tmp_path / "a" / "b" / "missions"
+    open_store(path, b"").close()
+    database = connect(path)
+    assert {name: database.execute(f"PRAGMA {name}").fetchone()[0] for name in HOW} == HOW
+    database.close()
+
+
 def test_a_second_store_is_refused_until_the_first_is_closed(path):
     first = open_store(path, b"")
     with pytest.raises(StoreLockedError, match="another teleop has this journal open"):
@@ -244,7 +255,29 @@ def test_what_is_not_there_or_in_the_way_is_named():
         store.add(waits)
     with pytest.raises(ConflictError, match="cancel one"):
         store.waits_for(waits)
+    with pytest.raises(ConflictError) as refused:
+        store.waits_for(waits)
+    assert refused.value.mission == "m1"
     assert (store.with_key("key"), store.with_key("")) == (first, None)
+
+
+def test_what_is_over_and_what_was_stopped_is_known():
+    store = MissionStore(connect(), b"")
+    first, second, third = (store.add(Order(PLAN, queue=True)) for _ in range(3))
+    store.cancel(third)
+    assert store.stopped() is None
+    store.note(first, "started", "")
+    store.note(first, "emergency_stopped", "")
+    assert store.stopped() is first, "those after it have not begun"
+    assert [mission.id for mission in store.open()] == ["m2"]
+    ended = [store.has_ended(mission.number) for mission in (first, second, third)]
+    assert ended == [True, False, True]
+    assert not store.has_ended(1)
+    store.note(first, "acknowledged", "")
+    assert store.stopped() is None
+    store.note(first, "emergency_stopped", "")
+    store.note(second, "started", "")
+    assert store.stopped() is None, "the robot has flown since"
 
 
 def finish(flight):
