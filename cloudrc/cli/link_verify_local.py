@@ -78,16 +78,9 @@ def verify(
     applied: Profile | None = None,
     meddle: Callable[[Mapping[str, Way]], None] = lambda ways: None,
 ) -> Report:
-    """Measure whether a link matches its profile; what is off is looked at twice.
+    """Probe a link for `seconds` [s], None for as long as needed; look twice at what is off.
 
-    Args:
-        title: Name of the link.
-        experiment: The experiment.
-        shaper: "relay" or "netem".
-        seconds: Time to send probes [s]; None for as long as needed.
-        tell: Receives progress as text.
-        applied: Profile in force instead of the requested one; tests inject faults with it.
-        meddle: Gets the running link before the first probe; tests inject faults with it.
+    Tests inject faults: by another profile `applied`, and by a function that gets the running link.
     """
     tell("planning the probes")
     plans, found, notes = make_plans(experiment, seconds, shaper), dict[str, Findings](), []

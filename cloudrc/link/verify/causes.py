@@ -58,12 +58,9 @@ def read_metrics(text: str) -> Metrics:
 
 
 def read_evidence(told: Told, metrics: Metrics, sent: int | None = None) -> Evidence:
-    """Combine what a link's process reports of itself, its metrics and the kernel's qdiscs.
+    """Combine a link process's page /link.json, which names the qdiscs, and its metrics.
 
-    Args:
-        told: Its page /link.json.
-        metrics: Its metrics; empty without an answer.
-        sent: Datagrams that its end has sent; None if that was not counted since its start.
+    `sent` is what its end has sent since the process started; None if that was not counted.
     """
     netem, counted = told.shaper == "netem", sent is not None and bool(metrics)
     counts = ("forwarded", "lost", "held", "unread") if netem else ("received", "unread")
