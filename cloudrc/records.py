@@ -54,7 +54,7 @@ class LinkChecked(NamedTuple):
     Attributes:
         stamp_ns: Time of the check [ns], own clock.
         uplink: True for the uplink, False for the downlink.
-        quantity: "mean", "deviation", "distribution", "round_trip", "loss", "reordered" or
+        quantity: "mean", "deviation", "round_trip", "loss", "reordered" or
             "duplicated". These are for information only: "datagrams" (needed, received);
             "time_line" (it is not judged in flight); "rate" (single datagrams cannot measure it);
             "correlation" (requested of netem, which has none).

@@ -14,10 +14,11 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cloudrc.assembly import link_profile
+from cloudrc.cli.link_run import inspect_network
 from cloudrc.cli.link_verify_report import (
     NOT_JUDGED,
     WAYS,
@@ -33,7 +34,7 @@ from cloudrc.drivers.machine import interpreter
 from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.realtime import bind, free_ports, parse
 from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError, TimedOutError
-from cloudrc.link.sidecar import read_told
+from cloudrc.link.sidecar import Told, read_told
 from cloudrc.link.state import STATE_FILE, from_text
 from cloudrc.link.tc import check
 from cloudrc.link.verify.causes import Findings, read_evidence, read_metrics
@@ -78,16 +79,9 @@ def verify(
     applied: Profile | None = None,
     meddle: Callable[[Mapping[str, Way]], None] = lambda ways: None,
 ) -> Report:
-    """Measure whether a link matches its profile; what is off is looked at twice.
+    """Probe a link for `seconds` [s], None for as long as needed; look twice at what is off.
 
-    Args:
-        title: Name of the link.
-        experiment: The experiment.
-        shaper: "relay" or "netem".
-        seconds: Time to send probes [s]; None for as long as needed.
-        tell: Receives progress as text.
-        applied: Profile in force instead of the requested one; tests inject faults with it.
-        meddle: Gets the running link before the first probe; tests inject faults with it.
+    Tests inject faults: by another profile `applied`, and by a function that gets the running link.
     """
     tell("planning the probes")
     plans, found, notes = make_plans(experiment, seconds, shaper), dict[str, Findings](), []
@@ -135,16 +129,21 @@ def make_plans(
 
 def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
     """Send all probes over a running link and judge them."""
-    since_wall_ns, ends, found = time.time_ns() - time.monotonic_ns(), [], {}
+    since_wall_ns, ends, found, states = time.time_ns() - time.monotonic_ns(), [], {}, {}
     for name, way in ways.items():
-        state = from_text((way.folder / STATE_FILE).read_text(encoding="utf-8"))
+        text = (way.folder / STATE_FILE).read_text(encoding="utf-8")
+        state = states[name] = from_text(text)
         route = parse((way.folder / "route").read_text(encoding="ascii"))
         ends.append(ProbeEnd(way.own, route, plans[name], (state.origin_ns or 0) + since_wall_ns))
     streams = send_probes(ends)
     time.sleep(COUNTS_WAIT)
     for (name, way), stream in zip(ways.items(), streams, strict=True):
-        plan, told, metrics = plans[name], read_told(way.get("link.json")), way.get("metrics")
-        known = read_evidence(told, read_metrics(metrics), len(stream.sent))
+        plan, page, metrics = plans[name], way.get("link.json"), read_metrics(way.get("metrics"))
+        with inside(way.namespace):  # a process that hangs says nothing, the kernel does
+            near = inspect_network(way.peer[0])
+        told = Told(states[name].shaper, states[name].reason, None)
+        told = replace(read_told(page) if page else told, near=near)
+        known = read_evidence(told, metrics, len(stream.sent))
         rows = judge(plan, stream, plan.expected(stream), plan.applied(known.applied))
         found[name] = Findings(rows, known)
     return found

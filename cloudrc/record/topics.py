@@ -104,7 +104,7 @@ LINK_TOPICS = (
         " its end",
         (
             Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
-            Field("quantity", "string", "", "mean, deviation, distribution, round_trip, loss..."),
+            Field("quantity", "string", "", "mean, deviation, round_trip, loss..."),
             Field("asked", "float", "s or 1", "expected from the profile: a delay or a share"),
             Field("measured", "float", "s or 1", "measured: a delay or a share"),
             Field("low", "float", "s or 1", "lowest accepted value"),

@@ -58,16 +58,15 @@ def read_metrics(text: str) -> Metrics:
 
 
 def read_evidence(told: Told, metrics: Metrics, sent: int | None = None) -> Evidence:
-    """Combine what a link's process reports of itself, its metrics and the kernel's qdiscs.
+    """Combine a link process's page /link.json, which names the qdiscs, and its metrics.
 
-    Args:
-        told: Its page /link.json.
-        metrics: Its metrics; empty without an answer.
-        sent: Datagrams that its end has sent; None if that was not counted since its start.
+    `sent` is what its end has sent since the process started; None if that was not counted.
     """
     netem, counted = told.shaper == "netem", sent is not None and bool(metrics)
-    counts = ("forwarded", "lost", "held", "unread") if netem else ("received", "unread")
-    *seen, unread = (metrics.get(f"cloudrc_link_datagrams_total/{one}", 0.0) for one in counts)
+    received, unread = (
+        int(metrics.get(f"cloudrc_link_datagrams_total/{one}", 0.0)) if counted else None
+        for one in ("received", "unread")
+    )
     stopped = metrics.get("cloudrc_cpu_throttled_periods_total", 0.0)
     periods = metrics.get("cloudrc_cpu_periods_total", 0.0)
     known = Evidence(
@@ -76,21 +75,25 @@ def read_evidence(told: Told, metrics: Metrics, sent: int | None = None) -> Evid
         layers=1,
         applied=told.applied and netem_makes(told.applied) if netem else told.applied,
         sent=sent,
-        passed=int(sum(seen)) if counted else None,
-        unread=int(unread) if counted else None,
+        passed=None if netem else received,
+        unread=unread,
         late=metrics.get("cloudrc_link_release_error_seconds/99"),
         throttled=stopped / periods if periods else None,
         restored=int(metrics.get("cloudrc_link_restored_total", 0.0)),
     )
     if (near := told.near) is None:
         return known
-    here = len(near.netems.get(near.interface, ()))
+    here = list(near.netems.get(near.interface, ()))
+    known = replace(known, interface=near.interface)
     if not netem:  # an end reaches a relay over lo
-        here += len(near.netems.get("lo", ())) if near.interface != "lo" else 0
-        return replace(known, interface=near.interface, layers=1 + here)
+        here += near.netems.get("lo", ()) if near.interface != "lo" else ()
+        return replace(known, layers=1 + len(here))
     elsewhere = tuple(sorted(set(near.netems) - {near.interface}))
-    found = replace(known, interface=near.interface, elsewhere=elsewhere, layers=here or None)
-    return found if here else replace(found, shaper="none", applied=None)
+    if not here:
+        return replace(known, shaper="none", applied=None, elsewhere=elsewhere, layers=None)
+    passed = max(int(one.get("packets", 0)) + int(one.get("drops", 0)) for one in here)
+    passed_here = None if sent is None else passed
+    return replace(known, elsewhere=elsewhere, layers=len(here), passed=passed_here)
 
 
 class Cause(NamedTuple):

@@ -41,16 +41,10 @@ class Flow(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """What honest links measure.
+    """What honest links measure; if their draws are known, chance has no part in it."""
 
-    Attributes:
-        bands: Quantity -> mean, and the values that all but TAIL of the links exceed.
-        pooled: Delays of all links about the requested ones, with median 0, rising [s].
-        known: Whether the draws are known, so that chance has no part in it.
-    """
-
-    bands: dict[str, tuple[float, float, float]]
-    pooled: Floats
+    bands: dict[str, tuple[float, float, float]]  # mean, and what all but TAIL exceed
+    pooled: Floats  # delays about the requested ones, median 0, rising [s]
     known: bool
 
 

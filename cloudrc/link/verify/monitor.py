@@ -38,7 +38,9 @@ ENDS = 2e-3
 FOLLOW_PERIOD = 0.1
 """Time between two looks at the records and at the state file of the link [s]."""
 UNTIMED = ("loss", "reordered", "duplicated")
-"""Quantities that need no common clock."""
+TIMED = ("mean", "deviation", *UNTIMED)
+"""Quantities that are judged without and with a common clock; the ends' own wake-ups change the
+shape of the distribution."""
 
 Asked: TypeAlias = tuple[DirectionProfile, DirectionProfile]
 """Profiles of uplink and downlink."""
@@ -51,12 +53,7 @@ class LinkMonitor:
     """Judge what one end receives, by its records."""
 
     def __init__(self, *, uplink: bool, flow: Flow) -> None:
-        """Set up; nothing is judged before `follow`.
-
-        Args:
-            uplink: Whether this end receives the uplink, so that it is cloud.
-            flow: Draws and size of the datagrams that it receives.
-        """
+        """Set up for the end that receives a flow: cloud the uplink; then call `follow`."""
         self._uplink, self._flow = uplink, flow
         self._arrivals = deque[_Heard](maxlen=KEPT)
         self._trips, self._lates = deque[float](maxlen=KEPT), deque[float](maxlen=KEPT)
@@ -70,13 +67,7 @@ class LinkMonitor:
         self._outbox = queue.SimpleQueue[Record]()
 
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
-        """Start the monitor's thread.
-
-        Args:
-            asked: Profiles until the link itself reports others.
-            path: State file of the link, which is followed; None without one.
-            load: Reads the profiles in it.
-        """
+        """Start the thread; profiles `asked` hold until the link's state file reports others."""
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
@@ -98,7 +89,7 @@ class LinkMonitor:
         return [self._outbox.get_nowait() for _ in range(self._outbox.qsize())]
 
     def look(self, path: Path, load: Load) -> None:
-        """Follow the state file of the link once; arguments as for `begin`."""
+        """Follow the state file of the link once."""
         try:
             text = read(path, STATE_MAX).decode()
             if text != self._seen:
@@ -187,9 +178,9 @@ class LinkMonitor:
             if not expected.known:
                 told["datagrams"] = (needed(plan), len(stream.sent))
                 told |= {"correlation": (profile.correlation, 0)} if profile.correlation else {}
-        if not timed:
-            rows = [row for row in rows if row.name in UNTIMED]
-            rows += self._round_trip() if len(self._trips) >= FEWEST else []
+        rows = [row for row in rows if row.name in (TIMED if timed else UNTIMED)]
+        if not timed and len(self._trips) >= FEWEST:
+            rows += self._round_trip()
         rows = [_excused(row, np.array(self._lates)) for row in rows]
         if profile.rate:
             told["rate"] = (profile.rate, nan)
@@ -211,9 +202,8 @@ class LinkMonitor:
 def _in_order(arrivals: Sequence[_Heard]) -> tuple[Stream, int, bool]:
     """Order arrivals by their counters, with the lost ones between them.
 
-    Returns:
-        Stream, sent on the receiver's clock; without a common clock its delays have an unknown
-        offset. Counter of its first datagram. Whether the ends share a clock.
+    Returns also the first counter and whether the ends share a clock; if not, delays have an
+    unknown offset.
     """
     last = max((counter for _, counter, _ in arrivals), default=0) - FINAL
     arrivals = [one for one in arrivals if last - KEPT < one[1] <= last]
@@ -227,7 +217,9 @@ def _in_order(arrivals: Sequence[_Heard]) -> tuple[Stream, int, bool]:
     numbers, index, times = np.unique(  # the first copy comes first
         [counter - first for _, counter, _ in arrivals], return_index=True, return_counts=True
     )
-    stamps = np.array([(stamp_ns - begin_ns) * 1e-9 for stamp_ns, _, _ in arrivals])[index]
+    # A nanosecond apart: what is read in one wake has the same time, but has not lost its order.
+    stamps_ns = [one[0] - begin_ns + place for place, one in enumerate(arrivals)]
+    stamps = np.array(stamps_ns)[index] * 1e-9
     known = np.array([delay for _, _, delay in arrivals])[index]
     delays[numbers] = known if timed else stamps - numbers * PERIOD
     copies[numbers] = times

@@ -44,15 +44,10 @@ _SO_TIMESTAMPNS, _BUFFER, _DATAGRAM_MAX, _DRAIN = 35, 4_000_000, 2048, 64
 def plan_probes(
     profile: DirectionProfile, flow: Flow, seconds: float | None = None, *, drawn: bool = False
 ) -> Plan:
-    """Choose how many probes to send: as many as decide, or as long as a time line takes.
+    """Choose how many probes to send: for `seconds` [s], else as many as decide.
 
-    Probes for a bottleneck are large, and half of them leave in trains, which it draws out.
-
-    Args:
-        profile: Requested conditions.
-        flow: The probes.
-        seconds: Time to send them [s]; None for as long as it takes.
-        drawn: Whether the shaper draws its own chance, as netem does.
+    A time line is probed as a whole. Probes for a bottleneck are large, and half of them leave in
+    trains, which it draws out. `drawn`: the shaper draws its own chance, as netem does.
     """
     timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
     pieces = [timeline.at(start_ns).rate or inf for start_ns in timeline.starts_ns]
@@ -81,14 +76,7 @@ class ProbeEnd:
     def __init__(
         self, own: socket.socket, route: tuple[str, int], plan: Plan, origin_ns: int
     ) -> None:
-        """Set up.
-
-        Args:
-            own: Bound socket that does not block.
-            route: Where it has to send.
-            plan: Its probes.
-            origin_ns: When the link came up, wall clock [ns].
-        """
+        """Set up; `route` is where it sends, `origin_ns` when the link came up, wall clock [ns]."""
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         if sys.platform == "linux":
             own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
@@ -152,13 +140,9 @@ class ProbeEnd:
 
 
 def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
-    """Send the probes of both ends and listen until none can arrive any more.
+    """Send the probes of both ends and listen until none can arrive; return what each measured.
 
-    Args:
-        ends: What the first sends the second receives, and the other way round.
-
-    Returns:
-        What was measured of the probes of each end.
+    What the first end sends the second receives, and the other way round.
     """
     heard = {end.socket: other for end, other in zip(ends, reversed(ends), strict=True)}
     drawn = [end.plan.draw(end.plan.sent).delays for end in ends]

@@ -66,13 +66,10 @@ def test_metrics_report_lateness_counts_and_stops() -> None:
     assert read_evidence(told, metrics(100, 40, 2)).passed is None, "since its start"
 
 
-def test_netem_is_counted_by_its_outcomes() -> None:
-    text = "".join(
-        f'cloudrc_link_datagrams_total{{outcome="{kind}"}} {n}\n'
-        for kind, n in (("forwarded", 80), ("lost", 15), ("held", 5))
-    )
+def test_netem_is_counted_by_the_kernel() -> None:
     applied = DirectionProfile(0.045, loss=0.2, duplicate=0.3, correlation=0.5)
-    found = read_evidence(Told("netem", "", applied), read_metrics(text), 100)
+    near = Near("eth0", {"eth0": [NETEM | {"packets": 85, "drops": 15}]})
+    found = read_evidence(Told("netem", "", applied, near), {}, 100)
     assert found.passed == 100
     assert found.applied is not None
     assert (found.applied.loss, found.applied.correlation) == (pytest.approx(0.14), 0.0)
