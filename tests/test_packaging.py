@@ -20,7 +20,7 @@ SHIPPED = {".py", ".yaml", ".xml", ".typed", ".csv", ".html", ".css", ".js", ".m
 
 def test_base_dependencies_are_those_of_a_pod() -> None:
     names = {re.split(r"[<>=\[; ]", line)[0] for line in PROJECT["dependencies"]}
-    assert names == {"numpy", "pyyaml", "pydantic", "cryptography", "prometheus-client"}
+    assert names == {"numpy", "pyyaml", "pydantic", "cryptography", "prometheus-client", "rich"}
 
 
 def test_the_extras_are_the_documented_ones() -> None:

@@ -67,7 +67,7 @@ def beside(key: str) -> list[str]:
 
 def base(key: str) -> str:
     """Return the shipped experiment in which to set the key."""
-    return "steps" if key.startswith("mission.steps") else "paper"
+    return "steps" if key == "mission" or key.startswith("mission.steps") else "paper"
 
 
 def setting(key: str, value: Any) -> str:

@@ -242,11 +242,12 @@ def test_deep_nesting_is_refused(mine: Path) -> None:
         ("[{position_m: [0, 1]}]", "position_m.2: is missing; must be a number"),
         ("[{position_m: [0, 0, 1, 2]}]", "at most 3 entries"),
         ("[{tolerance_m: 1}]", "position_m: is missing; must be a list of 3 numbers [m]"),
-        ("[{position_m: [0, 0, 3]}]", "[0, 0, 3]: beyond the fence, x -3 to 9.2, y -8.5 to 5.5, "
-         "z 0 to 2.5 [m]; nearest legal point found: [0, 0, 2.5]"),
+        ("[{position_m: [0, 0, 3]}]",
+         "[0, 0, 3]: beyond the fence, or nearer than the guard flies: "
+         "x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]; nearest legal point found: [0.3, 0, 2.3]"),
         ("[{position_m: [0.5, 0, .7]}, {position_m: [-.6, 0, .8]}]",
-         "waypoints.1.position_m: [-0.6, 0, 0.8]: base box or arm overlaps the wall of pipe_1; "
-         "nearest legal point found: [-0.78, 0, 0.8]"),
+         "waypoints.1.position_m: [-0.6, 0, 0.8]: the robot would be within 0.04 m of the wall of "
+         "pipe_1; nearest legal point found: [0.08, 0, 0.8]"),
     ],
 )  # fmt: skip
 def test_an_invalid_mission_is_refused_with_the_reason(

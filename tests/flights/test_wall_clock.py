@@ -73,8 +73,10 @@ CONTROL_PATH = ("world/", "cloud/", "teleop/", "tunnel/", "link/", "endpoint", "
 ALLOWED = {
     # The kernel's stamps of datagrams are converted to an age of 0 to 50 ms at once.
     "link/relay.py": ["time.time_ns"],
+    # The kernel stamps probes by this clock.
+    "link/verify/probe.py": ["time.time_ns"] * 4,
     # Only people read the time in a line of the audit log.
-    "teleop/auth.py": ["time.time"],
+    "teleop/audit.py": ["datetime.now"],
 }
 
 

@@ -109,7 +109,7 @@ def test_only_cloud_imports_plug_ins(
 def test_only_flying_code_loads_an_experiment_with_plug_ins() -> None:
     """All other code uses `read_experiment`, which imports none."""
     flies = {"cli/run.py", "cli/sweep.py", "cli/runtime.py", "cli/bench.py"}
-    flies |= {"faults/flight.py", "faults/real/processes.py"}
+    flies |= {"faults/flight.py"}
     imports = {
         path.relative_to(PACKAGE).as_posix()
         for path in PACKAGE.rglob("*.py")

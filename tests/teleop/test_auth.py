@@ -3,6 +3,7 @@
 import json
 import os
 import stat
+import subprocess
 
 import pytest
 
@@ -69,7 +70,7 @@ def test_the_command_of_the_message_makes_a_private_token(tmp_path, capsys):
     with pytest.raises(BadInputError) as refused:
         Tokens(tmp_path)
     command = str(refused.value).partition("make one: ")[2]
-    assert os.waitstatus_to_exitcode(os.system(f"umask 022; {command}")) == 0
+    assert subprocess.run(["sh", "-c", f"umask 022; {command}"]).returncode == 0
     assert stat.S_IMODE((tmp_path / "operator").stat().st_mode) == 0o600
     warnings = []
     Tokens(tmp_path, warnings.append)
