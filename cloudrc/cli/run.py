@@ -130,7 +130,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.seeds:
         from cloudrc.cli import sweep
 
-        return sweep.fly_seeds(options, overrides)
+        return sweep.fly_seeds(options, overrides, fly)
     if options.seed is not None:
         overrides.append(f"seed={options.seed}")
     return _fly_once(options, mode, overrides)

@@ -9,7 +9,7 @@ import json
 import math
 import statistics
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -21,6 +21,10 @@ from cloudrc.metrics.verdict import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
 """The content of a `report.json`."""
+Fly: TypeAlias = Callable[..., dict[str, Any]]
+"""Function like `cloudrc.cli.run.fly`."""
+Job: TypeAlias = tuple[Fly, str, list[str], Path, int]
+"""Function that flies, experiment, overrides, folder of the sweep, seed."""
 
 CONFIDENCE = 0.95
 """Confidence level of the intervals [1]."""
@@ -97,10 +101,15 @@ def as_csv(reports: Sequence[Report]) -> str:
     return text.getvalue()
 
 
-def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
-    """Fly seeds 1 to N and give the exit code, 0 only if all succeed.
+def fly_seeds(options: argparse.Namespace, overrides: list[str], fly: Fly) -> int:
+    """Fly seeds 1 to N and return the exit code, 0 only if all succeed.
 
     If the user interrupts or a worker dies, the table covers the finished seeds.
+
+    Args:
+        options: Flags of `cloudrc run`.
+        overrides: Changes of the experiment, as `--set` takes them.
+        fly: Flies one experiment and returns its report; a function of a module.
     """
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
@@ -113,7 +122,7 @@ def fly_seeds(options: argparse.Namespace, overrides: list[str]) -> int:
     seeds = range(1, options.seeds + 1)
     reports: list[dict[str, Any]] = []
     code = 0
-    work = [(options.experiment, overrides, folder, seed) for seed in seeds]
+    work = [(fly, options.experiment, overrides, folder, seed) for seed in seeds]
     try:
         with closing(map_in_order(_fly_one, work, len(seeds))) as finished:
             for report in finished:
@@ -149,12 +158,11 @@ def _show_run(options: argparse.Namespace, report: dict[str, Any], progress: str
             )
 
 
-def _fly_one(which: tuple[str, list[str], Path, int]) -> dict[str, Any]:
-    """Fly one seed, in a worker: experiment, overrides, folder of the sweep, seed."""
-    from cloudrc.cli.run import fly
+def _fly_one(job: Job) -> dict[str, Any]:
+    """Fly one seed, in a worker."""
     from cloudrc.config.load import load_experiment
 
-    experiment, overrides, folder, seed = which
+    fly, experiment, overrides, folder, seed = job
     loaded = load_experiment(experiment, [*overrides, f"seed={seed}"])
     run_folder = folder / f"seed-{seed}"
     run_folder.mkdir()

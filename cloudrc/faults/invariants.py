@@ -1,8 +1,8 @@
 """Safety invariants, checked after every 2 ms step, independently of the guard.
 
 fence      The base stays inside the fence while the rotors turn. After an emergency stop or a hit
-           the robot may fall out of the fence, but at most `FALL_MAX` far, and the rotors turn
-           again only where it lies still inside.
+           the robot may leave the fence, but at most by `FALL_MAX`. Rotors that have stopped turn
+           again only where the robot lies still inside.
 cap, stop  The reference stays below the caps and can be stopped before the fence. In LAND the floor
            is no limit.
 stale      No command with an older basis than the limit is accepted, nor flown in TRACK.
@@ -63,6 +63,8 @@ BRAKE_NS = 200_000_000
 Source: docs/reference/plant.md, "Stop rule"."""
 REELS_NS = 1_000_000_000
 """Time after a hit in which the hit explains the robot's motion [ns]."""
+THROWN_NS = 3_000_000_000
+"""Time after a hit in which the robot may be thrown out of the fence [ns]."""
 
 Note = Callable[[int, str, str], None]
 """Takes a breach: time [ns, world's clock], kind, text."""
@@ -214,6 +216,7 @@ class MotionInvariants:
         self._landed_ns = -2 * BRAKE_NS
         self._touches, self._seen = robot.simulator.touches, 0
         self._touched: tuple[int, str] | None = None
+        self._is_thrown = False  # by a hit, and not yet back inside the fence
         self._left, self._way = ZERO, inf  # where TRACK ended, and how far the robot may go
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
@@ -275,7 +278,7 @@ class MotionInvariants:
         if touches is not self._touches:
             self._touches, self._seen = touches, 0
         for body, tip, *_ in touches[self._seen :]:
-            self._touched, self._way = (now_ns, body), inf
+            self._touched, self._way, self._is_thrown = (now_ns, body), inf, True
             # Acknowledged right above a pipe, a robot that lands cannot stop in time.
             lands = state is LAND or (state is HOLD and now_ns - self._landed_ns <= BRAKE_NS)
             low = lands or state not in FLOWN
@@ -313,7 +316,9 @@ class MotionInvariants:
         margin = min(x - xl, xh - x, y - yl, yh - y, zh - z)
         if z < zl:
             self._note(now_ns, "fence", f"base at ({x:.2f}, {y:.2f}, {z:.2f}), below the floor")
-        if self._falls or self._hit:
+        if self._is_thrown and margin >= 0.0 and self._touched is not None:
+            self._is_thrown = now_ns - self._touched[0] < THROWN_NS
+        if self._falls or self._hit or (self._is_thrown and margin < 0.0):
             if margin < -FALL_MAX:
                 self._note(now_ns, "fence", f"base fell to ({x:.2f}, {y:.2f}, {z:.2f})")
         elif margin < watch.margin:

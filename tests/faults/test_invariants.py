@@ -47,6 +47,18 @@ def test_after_a_stop_or_a_hit_it_may_fall_out_a_little(hit: bool) -> None:
     assert robot.step(ESTOP) == set() if hit else {"fence"}
 
 
+def test_a_hit_may_throw_it_out_a_little_and_for_some_seconds() -> None:
+    robot = FakeRobot()
+    robot.touch("pipe_1")
+    robot.step(TRACK)
+    robot.position = OUTSIDE
+    assert robot.step(TRACK, ms=4000) == set(), "it comes back slowly"
+    robot.position = INSIDE
+    robot.step(TRACK)
+    robot.position = OUTSIDE
+    assert robot.step(TRACK) == {"fence"}
+
+
 @pytest.mark.parametrize(
     ("position", "speed", "kinds"),
     [(INSIDE, 0.11, set()), (INSIDE, 0.13, {"fence"}), (OUTSIDE, 0.0, {"fence"})],
