@@ -459,7 +459,7 @@ class WorldEndpoint:
     def _offer(self, command: Command) -> str | None:
         """Give a command to the guard; return why the guard rejects it, None if it does not."""
         tick_ns = self._clock.tick_ns
-        rejection = self.robot.guard.offer(command, tick_ns)
+        rejection = self.robot.guard.accept_command(command, tick_ns)
         for observer in self.robot.observers:
             observer.see_command(command, rejection, tick_ns)
         return rejection

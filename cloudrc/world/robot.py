@@ -108,7 +108,7 @@ class Robot:
         ticks = range(tick_ns, until_ns, STEP_NS)
         for now_ns in ticks:
             readings = simulator.readings
-            reference = guard.tick(now_ns, readings, STEP)
+            reference = guard.step(now_ns, readings, STEP)
             if reference is None:
                 low_level.reset()
                 speeds = STOPPED

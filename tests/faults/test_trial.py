@@ -137,13 +137,13 @@ def waits_for_ever(patch: Patch) -> None:
 
 
 def needs_no_start(patch: Patch) -> None:
-    offer = Guard.offer
+    accept = Guard.accept_command
 
     def arm(guard: Guard, command: Command, now_ns: int) -> str | None:
         guard.armed = guard.armed or guard.state is GROUND
-        return offer(guard, command, now_ns)
+        return accept(guard, command, now_ns)
 
-    patch.setattr(Guard, "offer", arm)
+    patch.setattr(Guard, "accept_command", arm)
 
 
 def applies_late_commands(patch: Patch) -> None:

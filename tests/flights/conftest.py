@@ -367,16 +367,16 @@ def fly_through(
 
 def _watch(robot, trace: list[Instant], begin_ns: int) -> None:
     """Note the robot after every tick from `begin_ns` on."""
-    guard, simulator, tick = robot.guard, robot.simulator, robot.guard.tick
+    guard, simulator, step = robot.guard, robot.simulator, robot.guard.step
 
     def noting(now_ns, readings, dt):
-        reference = tick(now_ns, readings, dt)
+        reference = step(now_ns, readings, dt)
         if now_ns >= begin_ns:
             speed = hypot(*readings.velocity)
             trace.append(Instant(now_ns, guard.state, simulator.readings.position, speed))
         return reference
 
-    guard.tick = noting
+    guard.step = noting
 
 
 COUNT = 200

@@ -152,7 +152,7 @@ class Guard:
         self._invalid_ns.clear()
         self._wanted, self.yaw_rate = ZERO, 0.0
 
-    def offer(self, command: Command, now_ns: int) -> str | None:
+    def accept_command(self, command: Command, now_ns: int) -> str | None:
         """Accept or reject a command that arrived through the tunnel.
 
         Args:
@@ -221,7 +221,7 @@ class Guard:
         if self.armed and self.state is not GROUND:
             self._enter(LAND, now_ns, Cause.IMPOSSIBLE, IMPOSSIBLE)
 
-    def tick(self, now_ns: int, readings: Readings, dt: float) -> Vector | None:
+    def step(self, now_ns: int, readings: Readings, dt: float) -> Vector | None:
         """Advance by one tick and return the reference for the low-level controller.
 
         Args:

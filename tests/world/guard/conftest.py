@@ -52,14 +52,14 @@ def armed(limits: Limits = LIMITS, now_ns: int = 0) -> Guard:
 def tracking(velocity: Vector = (1.0, 0.0, 0.0), limits: Limits = LIMITS) -> Guard:
     """Return a guard in TRACK since 0 ns, by a command with a basis of 0 ns."""
     guard = armed(limits)
-    assert guard.offer(command(velocity), 0) is None
+    assert guard.accept_command(command(velocity), 0) is None
     return guard
 
 
 def run(guard, start_ns, end_ns, position=HERE, velocity=ZERO):
     """Tick with constant readings; return the references."""
     return [
-        guard.tick(now_ns, sensed(position, velocity), DT)
+        guard.step(now_ns, sensed(position, velocity), DT)
         for now_ns in range(start_ns, end_ns, TICK)
     ]
 
@@ -68,7 +68,7 @@ def feed(guard, start_ns, count, velocity=(1.0, 0.0, 0.0), every_ns=10 * MS, pos
     """Give fresh commands and tick; return the time after the last one."""
     now_ns = start_ns
     for _ in range(count):
-        guard.offer(command(velocity, basis_ns=now_ns), now_ns)
+        guard.accept_command(command(velocity, basis_ns=now_ns), now_ns)
         run(guard, now_ns, now_ns + every_ns, position)
         now_ns += every_ns
     return now_ns
@@ -86,7 +86,7 @@ def landing(limits: Limits = LIMITS):
     """Return a guard in LAND after impossible commands, at 2 s."""
     guard = holding(limits)
     for _ in range(5):
-        guard.offer(command((float("nan"), 0.0, 0.0)), 2000 * MS)
+        guard.accept_command(command((float("nan"), 0.0, 0.0)), 2000 * MS)
     assert guard.state is GuardState.LAND
     return guard
 
@@ -124,7 +124,7 @@ class Flight:
         for _ in range(round(seconds * SECOND / PERIOD_NS)):
             if policy is not None:
                 velocity = policy(self) if callable(policy) else policy
-                self.guard.offer(Command(0, self.now_ns, 0, velocity, 0.0), self.now_ns)
+                self.guard.accept_command(Command(0, self.now_ns, 0, velocity, 0.0), self.now_ns)
             self.robot.run(self.now_ns, self.now_ns + PERIOD_NS)
             self.now_ns += PERIOD_NS
             x, y, z = self.readings.position

@@ -48,15 +48,15 @@ def check_case(first, then, yaw_rate, place, velocity, change, age_ms, after_ns)
     """Fly one command, then another one or silence; return the last state."""
     guard = armed()
     position = (1.0, 1.0, 1.0) if place is None else place
-    guard.offer(command(first), 0)
-    check_flown(guard, guard.tick(0, sensed(position, velocity), 1.0), position)
+    guard.accept_command(command(first), 0)
+    check_flown(guard, guard.step(0, sensed(position, velocity), 1.0), position)
     before, limited = guard.reference, guard.counts["limited_fence"]
     for _ in range(5 if age_ms < 0 else 1):  # five commands from the future lead to LAND
-        guard.offer(command(then, after_ns - age_ms * MS, yaw_rate), after_ns)
+        guard.accept_command(command(then, after_ns - age_ms * MS, yaw_rate), after_ns)
     if place is not None:
         position = tuple(at + STEP_MAX * d for at, d in zip(position, change, strict=True))
     velocity = tuple(v + d if abs(v) < 1e3 else v for v, d in zip(velocity, change, strict=True))
-    after = guard.tick(after_ns, sensed(position, velocity), DT)
+    after = guard.step(after_ns, sensed(position, velocity), DT)
     check_flown(guard, after, position)
     if place is None and guard.state is GuardState.TRACK:
         # Far from the fence nothing grows beyond the cap. Only near it, where the robot must be

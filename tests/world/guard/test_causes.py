@@ -32,7 +32,7 @@ def told(guard: Guard) -> tuple[GuardState, Cause]:
 def test_causes_of_a_mission_from_command_to_end():
     guard = armed()
     assert told(guard) == (GROUND, Cause.SPAWN)
-    guard.offer(command(), 0)
+    guard.accept_command(command(), 0)
     assert told(guard) == (TRACK, Cause.COMMAND)
     guard.end_mission(SECOND)
     assert told(guard) == (HOLD, Cause.ENDED)
@@ -68,7 +68,7 @@ def test_a_landing_acknowledged_low_has_its_causes():
 def test_causes_of_impossible_commands_and_long_silence():
     guard = tracking()
     for _ in range(5):
-        guard.offer(command((nan, 0.0, 0.0)), 0)
+        guard.accept_command(command((nan, 0.0, 0.0)), 0)
     assert told(guard) == (LAND, Cause.IMPOSSIBLE)
     guard = holding()
     run(guard, 2 * SECOND, 61 * SECOND)

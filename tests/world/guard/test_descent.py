@@ -57,7 +57,7 @@ def test_an_acknowledgement_does_not_count_for_the_next_landing():
     guard.start_mission(3 * SECOND)
     now_ns = feed(guard, 3 * SECOND, 20)
     for _ in range(5):
-        guard.offer(command((nan, 0.0, 0.0)), now_ns)
+        guard.accept_command(command((nan, 0.0, 0.0)), now_ns)
     run(guard, now_ns, now_ns + SECOND, velocity=SINKS)
     assert guard.state is LAND
 
@@ -94,7 +94,7 @@ def test_with_the_lowest_cap_it_lands_on_the_floor():
     flight.fly(6.0, (0.0, 0.0, 0.1))
     height = flight.readings.position[2]
     for _ in range(5):
-        flight.guard.offer(command((nan, 0.0, 0.0), flight.now_ns), flight.now_ns)
+        flight.guard.accept_command(command((nan, 0.0, 0.0), flight.now_ns), flight.now_ns)
     assert flight.guard.state is LAND
     fastest = 0.0
     for _ in range(400):

@@ -44,7 +44,7 @@ def test_after_a_minute_it_lands_and_stops_its_rotors(flight):
     assert flight.guard.state is GuardState.LAND
     start = flight.readings.position
     speeds = []
-    while flight.guard.tick(flight.now_ns, flight.readings, 0.0) is not None:
+    while flight.guard.step(flight.now_ns, flight.readings, 0.0) is not None:
         flight.fly(0.1)
         speeds.append(-flight.readings.velocity[2])
         assert len(speeds) < 80

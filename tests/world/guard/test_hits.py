@@ -39,7 +39,7 @@ def test_a_robot_that_turns_over_stops_its_rotors(make, tilt_deg, stops):
     assert cos(radians(78.5)) == pytest.approx(OVERTURNED_COSINE, abs=0.001)
     guard = make()
     now_ns = 10 * MS if make is tracking else 2 * SECOND
-    assert (guard.tick(now_ns, felt(tilt_deg), DT) is None) == stops
+    assert (guard.step(now_ns, felt(tilt_deg), DT) is None) == stops
     assert (guard.state is ESTOP) == stops
 
 
@@ -47,10 +47,10 @@ def test_a_robot_that_turns_over_stops_its_rotors(make, tilt_deg, stops):
 def test_turned_over_the_rotors_stop_and_the_mission_is_over(make):
     guard = make()
     now_ns = 10 * MS if make is tracking else 2 * SECOND
-    assert guard.tick(now_ns, felt(120.0), DT) is None
+    assert guard.step(now_ns, felt(120.0), DT) is None
     assert guard.take_changes()[-1] == (now_ns, ESTOP, Cause.OVERTURNED.words)
     assert (guard.armed, guard.latched, guard.reference) == (False, True, ZERO)
-    assert guard.offer(command(basis_ns=now_ns), now_ns) is None
+    assert guard.accept_command(command(basis_ns=now_ns), now_ns) is None
     assert run(guard, now_ns + TICK, now_ns + 10 * MS) == [None] * 4
     guard.acknowledge(now_ns + 10 * MS)
     assert guard.state is GROUND
@@ -60,15 +60,15 @@ def test_between_two_checks_the_readings_are_not_used():
     """The usual tick is fast."""
     guard = tracking((0.5, 0.0, 0.0))
     run(guard, 0, 200 * MS)
-    guard.offer(command((0.5, 0.0, 0.0), 200 * MS), 200 * MS)
+    guard.accept_command(command((0.5, 0.0, 0.0), 200 * MS), 200 * MS)
     run(guard, 300 * MS, 300 * MS + TICK)
     for now_ns in (302 * MS, 310 * MS):
-        assert guard.tick(now_ns, None, DT) == (0.5, 0.0, 0.0)
+        assert guard.step(now_ns, None, DT) == (0.5, 0.0, 0.0)
 
 
 def test_a_robot_on_the_ground_may_lie_on_its_back():
     guard = armed()
-    assert guard.tick(0, felt(180.0), DT) is None
+    assert guard.step(0, felt(180.0), DT) is None
     assert guard.state is GROUND
 
 
@@ -76,7 +76,7 @@ def test_a_robot_that_has_landed_may_turn_over():
     guard = landing()
     run(guard, 2 * SECOND, 5 * SECOND, (1.0, 2.0, 0.1))
     assert guard.take_changes()[-1].cause == "touched down, rotors stopped"
-    assert guard.tick(5 * SECOND, felt(90.0), DT) is None
+    assert guard.step(5 * SECOND, felt(90.0), DT) is None
     assert guard.state is LAND
 
 
@@ -85,8 +85,8 @@ def test_a_steady_flight_notices_it_within_12_ms(flown_ticks):
     guard = armed()
     for now_ns in range(0, (flown_ticks + 7) * TICK, TICK):
         over = now_ns >= flown_ticks * TICK
-        guard.offer(command((0.0, 0.0, 0.5), now_ns), now_ns)
-        guard.tick(now_ns, felt(120.0 if over else 0.0), DT)
+        guard.accept_command(command((0.0, 0.0, 0.5), now_ns), now_ns)
+        guard.step(now_ns, felt(120.0 if over else 0.0), DT)
     changes = guard.take_changes()
     assert [change.state for change in changes] == [TRACK, ESTOP]
     assert changes[1].stamp_ns - flown_ticks * TICK <= RECHECK_NS + TICK

@@ -50,7 +50,7 @@ def test_repeated_starts_do_not_delay_the_landing():
 def test_a_mission_on_the_ground_waits_a_minute_for_its_cloud():
     """Then the state is LAND, without a touch-down."""
     guard = armed()
-    guard.offer(command(basis_ns=-300 * MS), SECOND)  # a stale command does not count
+    guard.accept_command(command(basis_ns=-300 * MS), SECOND)  # a stale command does not count
     assert run(guard, 0, 60 * SECOND + TICK)[-1] is None
     assert (guard.state, guard.armed) == (GROUND, True)
     assert run(guard, 60 * SECOND + TICK, 60 * SECOND + 2 * TICK) == [None]
@@ -69,7 +69,7 @@ def test_with_fresh_commands_it_waits_until_it_may_take_off():
     guard.acknowledge(0)
     guard.start_mission(0)
     for second in range(1, 120):
-        guard.offer(command(basis_ns=second * SECOND), second * SECOND)
+        guard.accept_command(command(basis_ns=second * SECOND), second * SECOND)
         run(guard, second * SECOND, second * SECOND + 3 * TICK, velocity=(0.2, 0.0, 0.0))
     assert (guard.state, guard.armed) == (GROUND, True)
 
@@ -102,7 +102,7 @@ def test_five_impossible_commands_within_a_second_land(bad):
     guard = tracking((0.5, 0.0, 0.0))
     for k in range(5):
         assert guard.state is TRACK
-        guard.offer(bad, k * 250 * MS)
+        guard.accept_command(bad, k * 250 * MS)
         if k < 4:
             feed(guard, k * 250 * MS, 24, (0.5, 0.0, 0.0))
     landed = (1000 * MS, LAND, "5 impossible commands within 1 s")
@@ -113,11 +113,11 @@ def test_impossible_commands_now_and_then_only_count():
     guard = tracking()
     now_ns = 0
     for _ in range(20):
-        guard.offer(command((nan, 0.0, 0.0)), now_ns)
+        guard.accept_command(command((nan, 0.0, 0.0)), now_ns)
         now_ns = feed(guard, now_ns, 26)
     assert guard.state is TRACK
     for _ in range(5):
-        guard.offer(command((nan, 0.0, 0.0)), now_ns)
+        guard.accept_command(command((nan, 0.0, 0.0)), now_ns)
     assert guard.state is LAND
 
 
@@ -126,7 +126,7 @@ def test_without_a_mission_impossible_commands_do_nothing():
     at_rest.end_mission(0)
     for guard, state in ((on_ground, GROUND), (at_rest, HOLD)):
         for k in range(50):
-            guard.offer(command((nan, 0.0, 0.0)), k * MS)
+            guard.accept_command(command((nan, 0.0, 0.0)), k * MS)
         assert guard.state is state
 
 
@@ -161,7 +161,7 @@ def test_land_from_a_fast_descent_touches_down():
     guard = tracking((0.0, 0.0, -2.0))
     assert run(guard, 0, 100 * MS, (1.0, 2.0, 1.0))[-1][2] == pytest.approx(-LAND_SPEED)
     for _ in range(5):
-        guard.offer(command((nan, 0.0, 0.0)), 100 * MS)
+        guard.accept_command(command((nan, 0.0, 0.0)), 100 * MS)
     stood = run(guard, 100 * MS, 2 * SECOND, (1.0, 2.0, 1.0))
     assert 400 * MS <= stood.index(None) * TICK < 1 * SECOND
 
@@ -199,7 +199,7 @@ def test_land_from_track_descends_where_the_robot_is():
     now_ns = feed(guard, 2 * SECOND, 20, ZERO, position=elsewhere)
     assert guard.state is TRACK
     for _ in range(5):
-        guard.offer(command((nan, 0.0, 0.0)), now_ns)
+        guard.accept_command(command((nan, 0.0, 0.0)), now_ns)
     assert guard.state is LAND
     down = run(guard, now_ns, now_ns + 1 * SECOND, elsewhere, (0.0, 0.0, -LAND_SPEED))
     assert down[-1] == (0.0, 0.0, -LAND_SPEED)

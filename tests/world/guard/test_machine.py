@@ -118,7 +118,8 @@ class GuardMachine(RuleBasedStateMachine):
     def fresh(self, velocity, count, age_ms):
         for _ in range(count):
             assert (
-                self.guard.offer(command(velocity, self.now_ns - age_ms * MS), self.now_ns) is None
+                self.guard.accept_command(command(velocity, self.now_ns - age_ms * MS), self.now_ns)
+                is None
             )
             if self.started:
                 self.newest_basis_ns = self.now_ns - age_ms * MS
@@ -129,12 +130,12 @@ class GuardMachine(RuleBasedStateMachine):
     def stale(self, count, age_ms):
         for _ in range(count):
             stale = command(basis_ns=self.now_ns - age_ms * MS)
-            assert self.guard.offer(stale, self.now_ns) == "stale"
+            assert self.guard.accept_command(stale, self.now_ns) == "stale"
         self.noted("stale")
 
     @rule(bad=st.sampled_from([command((nan, 0.0, 0.0)), command(basis_ns=1 << 62)]))
     def impossible(self, bad):
-        self.guard.offer(bad, self.now_ns)
+        self.guard.accept_command(bad, self.now_ns)
         self.noted("impossible")
         self.started &= self.state is not LAND
 
@@ -145,11 +146,11 @@ class GuardMachine(RuleBasedStateMachine):
     @rule()
     def turn_over(self):
         calm = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
-        flew = self.guard.tick(self.now_ns, calm, DT) is not None
+        flew = self.guard.step(self.now_ns, calm, DT) is not None
         self.noted("time")
         self.now_ns += RECHECK_NS + TICK  # the guard checks at the latest then
         over = calm._replace(axes=(*calm.axes[:8], -1.0))
-        self.flown = self.guard.tick(self.now_ns, over, DT)
+        self.flown = self.guard.step(self.now_ns, over, DT)
         self.noted("turn_over")
         assert self.flown is None
         assert (self.state is ESTOP) >= flew
@@ -166,7 +167,7 @@ class GuardMachine(RuleBasedStateMachine):
             sinking = 0.0 if standing else self.flown[2]
             self.climb += min(max(sinking - self.climb, -0.4), 0.4)
             readings = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
-            self.flown = self.guard.tick(self.now_ns, readings, DT)
+            self.flown = self.guard.step(self.now_ns, readings, DT)
             self.noted("time")
             self.started &= self.state is not LAND
             self.now_ns += 2 * MS

@@ -24,12 +24,12 @@ def is_finite(term):
 
 
 def test_a_command_with_one_value_out_of_range_is_rejected():
-    """Prove that `Guard.offer` rejects every value beyond COMMAND_MAX, NaN included."""
+    """Prove that `Guard.accept_command` rejects every value beyond COMMAND_MAX, NaN included."""
 
     def check(run):
         numbers = [run.fresh(name) for name in ("vx", "vy", "vz", "yaw_rate")]
         inside = z3.And([z3.fpAbs(number.term) <= COMMAND_MAX for number in numbers])
-        refused = Guard(LIMITS).offer(Command(0, 0, 0, tuple(numbers[:3]), numbers[3]), 0)
+        refused = Guard(LIMITS).accept_command(Command(0, 0, 0, tuple(numbers[:3]), numbers[3]), 0)
         assert refused in (None, "range")
         run.prove(z3.Not(inside) if refused else inside)
 

@@ -42,15 +42,15 @@ def test_ten_fresh_commands_within_half_a_second_end_a_hold():
 def test_a_hold_ends_only_within_half_a_second(took_ns, state):
     guard = holding()
     for k in range(9):
-        guard.offer(command(basis_ns=2 * SECOND + k * MS), 2 * SECOND + k * MS)
-    guard.offer(command(basis_ns=2 * SECOND + took_ns), 2 * SECOND + took_ns)
+        guard.accept_command(command(basis_ns=2 * SECOND + k * MS), 2 * SECOND + k * MS)
+    guard.accept_command(command(basis_ns=2 * SECOND + took_ns), 2 * SECOND + took_ns)
     assert guard.state is state
 
 
 def until_track(guard, start_ns):
     """Return when a stream of fresh commands from `start_ns` on ends the HOLD [ns], or None."""
     for now_ns in range(start_ns, start_ns + 3 * SECOND, 10 * MS):
-        guard.offer(command(basis_ns=now_ns), now_ns)
+        guard.accept_command(command(basis_ns=now_ns), now_ns)
         if guard.state is TRACK:
             return now_ns
     return None
@@ -79,7 +79,7 @@ def test_from_one_track_to_the_next_it_takes_a_second():
 def test_stale_commands_do_not_count():
     guard = holding()
     for k in range(30):
-        assert guard.offer(command(basis_ns=0), 2 * SECOND + k * MS) == "stale"
+        assert guard.accept_command(command(basis_ns=0), 2 * SECOND + k * MS) == "stale"
     assert guard.state is HOLD
 
 
@@ -151,7 +151,7 @@ def test_an_unstable_link_does_not_make_the_state_chatter():
     while now_ns < 20 * SECOND:
         # The basis has the largest allowed age: each burst gives one tick of TRACK.
         for _ in range(12):
-            guard.offer(command(basis_ns=now_ns - 249 * MS), now_ns)
+            guard.accept_command(command(basis_ns=now_ns - 249 * MS), now_ns)
             run(guard, now_ns, now_ns + 10 * MS)
             now_ns += 10 * MS
         run(guard, now_ns, now_ns + 20 * MS)

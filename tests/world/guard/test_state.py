@@ -41,7 +41,7 @@ def test_at_first_nothing_is_armed_and_nothing_flown():
 @pytest.mark.promise("only-the-operator-arms")
 def test_fresh_commands_alone_never_arm():
     guard = Guard(LIMITS)
-    assert guard.offer(command(), 0) is None
+    assert guard.accept_command(command(), 0) is None
     assert guard.state is GROUND
     assert run(guard, 0, 10 * MS) == [None] * 5  # the rotors are stopped
 
@@ -49,14 +49,14 @@ def test_fresh_commands_alone_never_arm():
 def test_a_started_mission_waits_for_its_first_command():
     guard = armed()
     assert run(guard, 0, 10 * MS) == [None] * 5
-    guard.offer(command(basis_ns=10 * MS), 10 * MS)
+    guard.accept_command(command(basis_ns=10 * MS), 10 * MS)
     assert guard.state is TRACK
     assert [change.cause for change in guard.take_changes()] == ["fresh command"]
 
 
 def test_commands_from_before_the_start_are_not_flown():
     guard = Guard(LIMITS)
-    guard.offer(command(), 0)
+    guard.accept_command(command(), 0)
     guard.start_mission(1 * MS)
     assert run(guard, 1 * MS, 3 * MS) == [None]
 
@@ -74,7 +74,7 @@ def test_the_fence_changes_the_reference_within_the_cap():
     before = ZERO
     for k in range(40):
         now_ns, x = 2 * MS * k, -2.8 - 0.01 * k
-        after = guard.tick(now_ns, sensed((x, -3.0, 1.3), (-5.0, 0.0, 0.0)), 0.002)
+        after = guard.step(now_ns, sensed((x, -3.0, 1.3), (-5.0, 0.0, 0.0)), 0.002)
         assert hypot(*(b - a for a, b in zip(before, after, strict=True))) <= 0.024 + 1e-15
         before = after
     assert before[0] > 0.2
@@ -87,7 +87,7 @@ def test_put_on_the_ground_nothing_is_armed_or_remembered():
     guard.put_on_ground(10 * MS, "mission starts from spawn")
     assert guard.take_changes()[-1] == (10 * MS, GROUND, "mission starts from spawn")
     assert (guard.state, guard.armed, guard.reference) == (GROUND, False, ZERO)
-    guard.offer(command(basis_ns=10 * MS), 10 * MS)
+    guard.accept_command(command(basis_ns=10 * MS), 10 * MS)
     assert guard.state is GROUND
 
 
@@ -101,7 +101,9 @@ def test_a_command_with_an_absurd_value_is_rejected(bad, axis):
     before = run(guard, 0, 100 * MS)[-1]
     values = [1.0, 1.0, 1.0, 0.1]
     values[axis] = bad
-    assert guard.offer(command(tuple(values[:3]), 100 * MS, values[3]), 100 * MS) == "range"
+    assert (
+        guard.accept_command(command(tuple(values[:3]), 100 * MS, values[3]), 100 * MS) == "range"
+    )
     assert run(guard, 100 * MS, 102 * MS) == [before]
     assert guard.yaw_rate == 0.0
 
@@ -112,7 +114,7 @@ def test_a_command_with_an_absurd_value_is_rejected(bad, axis):
 )
 def test_a_command_is_fresh_while_its_basis_is(age_ns, answer):
     now_ns = 10 * SECOND
-    assert armed().offer(command(basis_ns=now_ns - age_ns), now_ns) == answer
+    assert armed().accept_command(command(basis_ns=now_ns - age_ns), now_ns) == answer
 
 
 def test_the_speed_is_capped_and_keeps_its_direction():
@@ -126,7 +128,7 @@ def test_the_speed_is_capped_and_keeps_its_direction():
 @pytest.mark.parametrize("most", [COMMAND_MAX, -COMMAND_MAX])
 def test_a_too_fast_command_in_range_is_shortened(most):
     guard = armed()
-    assert guard.offer(command((most, most, most), yaw_rate=most), 0) is None
+    assert guard.accept_command(command((most, most, most), yaw_rate=most), 0) is None
     assert guard.counts == {"limited_speed": 1, "limited_yaw_rate": 1}
 
 
@@ -134,7 +136,7 @@ def test_a_too_fast_command_in_range_is_shortened(most):
 def test_the_yaw_rate_is_capped(asked, allowed):
     guard = armed()
     for _ in range(2):
-        guard.offer(command(yaw_rate=asked), 0)
+        guard.accept_command(command(yaw_rate=asked), 0)
     assert guard.yaw_rate == allowed
     assert guard.counts["limited_yaw_rate"] == 2 * (asked != allowed)
     guard.forget_commands()
@@ -254,11 +256,11 @@ def test_a_low_speed_cap_holds_for_hold_and_land_too():
     fastest = max(hypot(*r) for r in run(guard, 2 * SECOND, 4 * SECOND, (5.0, -2.0, 0.4)))
     assert fastest <= 0.2
     for _ in range(5):
-        guard.offer(command((nan, 0.0, 0.0)), 4 * SECOND)
+        guard.accept_command(command((nan, 0.0, 0.0)), 4 * SECOND)
     down = run(guard, 4 * SECOND, 6 * SECOND, (5.0, -2.0, 0.4), (0.0, 0.0, -0.1))
     assert max(hypot(*r) for r in down) <= 0.2
 
 
 def test_the_first_reading_may_be_anything():
     guard = tracking()
-    assert guard.tick(0, sensed((nan, nan, nan), (nan, inf, -inf)), 0.002) is not None
+    assert guard.step(0, sensed((nan, nan, nan), (nan, inf, -inf)), 0.002) is not None

@@ -52,7 +52,7 @@ def standing(now_ns=0):
 def taking_off(height=0.0, now_ns=0):
     """Return a guard in TRACK whose robot has this height since the next tick."""
     guard = standing(now_ns)
-    guard.offer(command((0.0, 0.0, 1.0), now_ns), now_ns)
+    guard.accept_command(command((0.0, 0.0, 1.0), now_ns), now_ns)
     run(guard, now_ns + TICK, now_ns + 10 * MS, above(height))
     assert guard.state is TRACK
     guard.take_changes()
@@ -200,7 +200,7 @@ def test_on_the_ground_an_unstable_link_does_not_chatter():
     """Fresh commands for a tick, then silence, repeatedly for 20 s."""
     guard, now_ns = taking_off(), 10 * MS
     while now_ns < 20 * SECOND:
-        guard.offer(command((0.0, 0.0, 1.0), now_ns - 249 * MS), now_ns)
+        guard.accept_command(command((0.0, 0.0, 1.0), now_ns - 249 * MS), now_ns)
         run(guard, now_ns, now_ns + 30 * MS, STANDS)
         now_ns += 30 * MS
     changes = guard.take_changes()
@@ -269,7 +269,7 @@ def test_a_take_off_within_one_tick_knows_its_ground():
     run(guard, 10 * MS, 1 * SECOND, STANDS)
     guard.acknowledge(1 * SECOND)
     guard.start_mission(1 * SECOND)
-    guard.offer(command((0.0, 0.0, 1.0), 1 * SECOND), 1 * SECOND)
+    guard.accept_command(command((0.0, 0.0, 1.0), 1 * SECOND), 1 * SECOND)
     assert states(guard) == [ESTOP, GROUND, TRACK]
     run(guard, 1 * SECOND, 2 * SECOND, STANDS)
     assert states(guard) == [HOLD, GROUND]
@@ -292,7 +292,7 @@ def broken_off(simulator, ticks, velocity, ended):
     now_ns = robot.run(0, 20 * MS)
     left_ns = now_ns + ticks * TICK
     while now_ns < left_ns:
-        guard.offer(Command(0, min(now_ns, left_ns - 251 * MS), 0, velocity, 0.0), now_ns)
+        guard.accept_command(Command(0, min(now_ns, left_ns - 251 * MS), 0, velocity, 0.0), now_ns)
         now_ns = robot.run(now_ns, min(now_ns + 10 * MS, left_ns))
     if ended:
         guard.end_mission(now_ns)
