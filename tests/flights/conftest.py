@@ -62,7 +62,7 @@ def bare_robot() -> SimpleNamespace:
         counts={},
         changes=[],
         reference=ZERO,
-        offer=lambda command, now_ns: None,
+        accept_command=lambda command, now_ns: None,
     )
     for name in ("forget_commands", "start_mission", "end_mission", "stop", "acknowledge"):
         setattr(guard, name, lambda *given: None)
