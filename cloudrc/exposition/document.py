@@ -56,8 +56,8 @@ QUERIES = {
 OPEN = {
     "version": "the version",
     "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
-    "defaults; in a cluster without the defaults of plug-ins, on one machine with them, as "
-    "`config_sha256` in report.json; empty for a process without configuration",
+    "defaults (on one machine with those of plug-ins, as `config_sha256` in report.json; in a "
+    "cluster without those of plug-ins); empty for a process without configuration",
 }
 """Label with an open set of values -> its description."""
 
