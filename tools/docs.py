@@ -65,7 +65,7 @@ cloudrc run ./my_experiment.yaml --mode virtual --set seed=8 --set link.profile=
 ```
 
 - **Names and paths.** `cloudrc run steps` flies a shipped experiment, `cloudrc run ./mine.yaml`
-  flies your own file. A mission, a link profile, a plug-in, a robot and a scene are also given by a
+  flies your own file. A mission, a link profile, a plug-in, a robot or a scene is given by a
   shipped name or by a path. A text is a path if it contains a slash or ends in `.yaml` (plug-ins:
   `.py`; robots and scenes: `.xml`).
 - **Relative paths** start at the folder of the file that contains them. In `--set` they start at
