@@ -53,19 +53,20 @@ class LinkContainer(Values):
 
     mode: Literal["auto", "netem", "relay"] = Field(
         "auto",
-        description="How the link is shaped; netem: by the kernel, needs NET_ADMIN; relay: by a "
-        "process without privileges; auto: relay if the namespace enforces Pod Security baseline "
+        description="What emulates the network. netem: the kernel, needs NET_ADMIN. relay: a "
+        "process without privileges. auto: relay if the namespace enforces Pod Security baseline "
         "or restricted, or is unknown at install; otherwise netem if the kernel has it, else relay",
     )
     profile: str | Profile | None = Field(
         None,
-        description="Name of a shipped profile, or a profile as in link/profiles/*.yaml. A change "
-        "acts in flight and restarts nothing. null: the experiment's own link",
+        description="Either the name of a shipped profile, or a mapping with the keys of a file in "
+        "link/profiles. A change takes effect in flight and restarts nothing. null: the "
+        "experiment's link",
     )
     traces: Texts = Field(
         {},
-        description="CSV files, as name: text, that link.profile or the experiment's link names "
-        "as trace or table",
+        description="The CSV files that link.profile or the experiment's link names as trace or "
+        "table: file name -> text of the file",
         json_schema_extra={
             "propertyNames": {
                 "pattern": r"^[-._a-zA-Z0-9]+$",
@@ -96,19 +97,21 @@ class Placement(Values):
 class WorldPod(Placement):
     """The pod of the robot."""
 
-    epochs: Texts = Field({}, description="Ignored: world needs no volume any more")
+    epochs: Texts = Field({}, description="Ignored, because world no longer needs this volume")
     resources: Resources = resources("60m", "96Mi", "1", "256Mi")
     recording_size_limit: Quantity = Field(
         "1Gi",
-        description="Size limit of the volume for recordings [bytes]; a recording ends at nine "
-        "tenths of it, together with one from before a restart",
+        description="Size limit of the volume for recordings [bytes]; a recording ends when it and "
+        "the one from before a restart together fill nine tenths of the volume",
     )
 
 
 class BackgroundLoad(Values):
     """A container that burns CPU beside the controller, for a cloud under load."""
 
-    enabled: bool = Field(False, description="Whether the pod has this container")
+    enabled: bool = Field(
+        False, description="Whether the pod has a container that only uses CPU time"
+    )
     workers: Annotated[int, Field(ge=1, le=64)] = Field(
         1,
         description="Number of busy loops [count]; each uses up to one core, within the CPU limit",
@@ -122,8 +125,8 @@ class CloudPod(Placement):
     resources: Resources = resources("60m", "64Mi", "1", "192Mi")
     recording_size_limit: Quantity = Field(
         "1Gi",
-        description="Size limit of the volume for recordings [bytes]; a recording ends at nine "
-        "tenths of it, together with one from before a restart",
+        description="Size limit of the volume for recordings [bytes]; a recording ends when it and "
+        "the one from before a restart together fill nine tenths of the volume",
     )
     background_load: BackgroundLoad = Field(
         BackgroundLoad(), description="CPU load in the cloud pod"
@@ -134,7 +137,8 @@ class Journal(Values):
     """The volume that keeps missions when the pod is replaced."""
 
     existing_claim: Name = Field(
-        "", description="Existing claim to use; empty: the chart makes one"
+        "",
+        description="Name of an existing PersistentVolumeClaim; empty: the chart makes a claim",
     )
     storage_class_name: str = Field(
         "", description="Storage class of the volume; empty: the cluster's default"
@@ -159,8 +163,8 @@ class Tokens(Values):
 
     existing_secret: Name = Field(
         "",
-        description="Existing Secret with a token under `operator`, which may command, and "
-        "optionally one under `reader`, which may only read; empty: the chart makes both once",
+        description="Name of an existing Secret. Its key `operator` has the token to command, its "
+        "optional key `reader` has the token to read. Empty: the chart makes a Secret with both",
     )
 
 
@@ -182,22 +186,27 @@ class MissionJob(Values):
 
     enabled: bool = Field(False, description="Whether to fly the mission")
     plan: str | Mission | None = Field(
-        None, description="Name of a shipped mission, or a mission; null: the experiment's"
+        None,
+        description="Either the name of a shipped mission, or a mapping with the keys of a "
+        "mission. null: the experiment's mission",
     )
     queue: bool = Field(
-        False, description="Whether to wait while another mission flies; else it is refused"
+        False,
+        description="true: the mission waits while another mission flies; false: it is refused",
     )
     active_deadline_seconds: Seconds = Field(
-        600, description="Time limit of the Job, waiting included [s]; then it fails"
+        600, description="Time limit of the Job, waiting included [s]; beyond it the Job fails"
     )
     ttl_seconds_after_finished: Seconds = Field(
         86_400,
-        description="Time for which the finished Job is kept [s]; a later upgrade flies again",
+        description="Time for which the finished Job is kept [s]; an upgrade after this time "
+        "flies the mission again",
     )
     pod_annotations: Texts = Field(
         {},
-        description="Further annotations of the pods of missions and of helm test. A mesh's "
-        'sidecar keeps a Job from ending; for Istio: sidecar.istio.io/inject: "false"',
+        description="Further annotations of the pods of missions and of helm test. With the "
+        "sidecar of a mesh, a Job never ends; to leave out Istio's sidecar: "
+        'sidecar.istio.io/inject: "false"',
     )
     resources: Resources = resources("10m", "48Mi", "500m", "128Mi")
 
@@ -205,9 +214,11 @@ class MissionJob(Values):
 class Monitor(Values):
     """An object of the Prometheus operator, made only if the cluster knows its kind."""
 
-    enabled: bool = Field(False, description="Whether to make the object")
+    enabled: bool = Field(False, description="Whether the chart makes this object")
     force: bool = Field(
-        False, description="Whether to make it even if the kind is unknown (helm template)"
+        False,
+        description="Whether the chart makes the object even if the cluster does not know its kind "
+        "(helm template)",
     )
     labels: Texts = Field({}, description="Labels by which your Prometheus selects it")
 
@@ -228,7 +239,7 @@ class Metrics(Values):
         description="Whether the pods have the annotations prometheus.io/scrape, port and path",
     )
     allow_from: tuple[Peer, ...] = Field(
-        (), description="NetworkPolicy peers that may scrape; empty: none"
+        (), description="NetworkPolicy peers that may scrape; empty: only helm test"
     )
     pod_monitor: PodMonitor = Field(
         PodMonitor(), description="PodMonitor of the Prometheus operator"
@@ -239,7 +250,7 @@ class Metrics(Values):
 class NetworkPolicy(Values):
     """NetworkPolicies: the pods exchange tunnel, DNS, API and metrics, nothing else."""
 
-    enabled: bool = Field(True, description="Whether to make the policies")
+    enabled: bool = Field(True, description="Whether the chart makes the NetworkPolicies")
     dns: tuple[Peer, ...] = Field(
         (
             Peer(
@@ -248,8 +259,8 @@ class NetworkPolicy(Values):
                 )
             ),
         ),
-        description="NetworkPolicy peers that resolve names (port 53); an ipBlock for a node-local "
-        "cache",
+        description="NetworkPolicy peers that resolve names (port 53); for a node-local cache use "
+        "an ipBlock",
     )
 
 
@@ -257,15 +268,21 @@ class Secret(Values):
     """The tunnel's pre-shared key."""
 
     existing_secret: Name = Field(
-        "", description="Existing Secret with the key file under `key`; empty: the chart makes one"
+        "",
+        description="Name of an existing Secret. Its key `key` has the key file. Empty: the chart "
+        "makes a Secret",
     )
 
 
 class ServiceAccount(Values):
     """The pods' service accounts, without tokens."""
 
-    create: bool = Field(True, description="Whether to make a service account for each pod")
-    name: Name = Field("", description="Account of both pods if none is made; empty: default")
+    create: bool = Field(True, description="Whether the chart makes an account for each pod")
+    name: Name = Field(
+        "",
+        description="Service account of both pods if the chart makes none; empty: the account "
+        "`default`",
+    )
     annotations: Texts = Field({}, description="Annotations of the accounts that the chart makes")
 
 
@@ -273,13 +290,13 @@ class ChartValues(Values):
     """All values of the chart."""
 
     fullname_override: ObjectName = Field(
-        "", description="Start of all names; empty: RELEASE-cloudrc"
+        "", description="First part of the names of all objects; empty: RELEASE-cloudrc"
     )
     image: Image = Field(Image(), description="Images of the pods")
     experiment: Experiment = Field(
         Experiment(),
-        description="The experiment, as in a file for 'cloudrc run'. Missing keys have the values "
-        "of the paper",
+        description="The experiment, with the keys of a file for 'cloudrc run'. Missing keys have "
+        "the values of the paper",
     )
     link: LinkContainer = Field(
         LinkContainer(), description="The emulated network between the pods"
@@ -298,7 +315,7 @@ class ChartValues(Values):
     )
     ip_family_policy: Literal["SingleStack", "PreferDualStack", "RequireDualStack"] | None = Field(
         "PreferDualStack",
-        description="Address families of the Services. The pods listen at both; the tunnel needs "
+        description="Address families of the Services. The pods listen on both; the tunnel needs "
         "IPv4. null: the cluster's default",
     )
     pod_security_context: dict[str, Any] | None = Field(
@@ -309,8 +326,8 @@ class ChartValues(Values):
             "fsGroup": 10_001,
             "seccompProfile": {"type": "RuntimeDefault"},
         },
-        description="Security context of all pods, as in Kubernetes. null leaves it out, for "
-        "OpenShift, which gives each namespace its own user ids",
+        description="Security context of all pods, as in Kubernetes. null: no security context, "
+        "for OpenShift, which gives each namespace its own user ids",
     )
     container_security_context: dict[str, Any] | None = Field(
         {
@@ -318,11 +335,11 @@ class ChartValues(Values):
             "readOnlyRootFilesystem": True,
             "capabilities": {"drop": ["ALL"]},
         },
-        description="Security context of all containers but a link with netem, which has its own. "
-        "null leaves it out",
+        description="Security context of all containers, except the link container with netem, "
+        "which has its own. null: no security context",
     )
     termination_grace_period_seconds: Seconds = Field(
-        10, description="Time for the pods to end [s], after which they are killed; they need 2 s"
+        10, description="Time in which the pods must end [s], else they are killed; they need 2 s"
     )
     global_: dict[str, Any] | None = Field(
         None,

@@ -37,9 +37,9 @@ EXPERIMENT = """\
 
 <!-- Written by `make docs` from cloudrc/config/schema.py: edit that, or tools/docs.py. -->
 
-An experiment file is YAML and says what to fly: the mission, the robot and its guard, the link, the
-controller in the cloud, and what counts as a success. Every key has a default, so a file names only
-what differs from it. This is a complete file:
+An experiment file is YAML and says what to fly: the mission, the robot and its guard, the link,
+the controller in the cloud, and what counts as a success. Every key has a default, so a file
+contains only the keys with other values. This is a complete file:
 
 <!-- test: my_experiment.yaml -->
 ```yaml
@@ -64,25 +64,27 @@ cloudrc run ./my_experiment.yaml --mode virtual
 cloudrc run ./my_experiment.yaml --mode virtual --set seed=8 --set link.profile=satellite
 ```
 
-- **Names and paths.** `cloudrc run steps` flies a shipped experiment, `cloudrc run ./mine.yaml` a
-  file. A mission, a link profile or a plug-in is a shipped name, or a path: a text with a slash or
-  with the ending `.yaml` (`.py` for a plug-in). Robots and scenes have shipped names only.
+- **Names and paths.** `cloudrc run steps` flies a shipped experiment, `cloudrc run ./mine.yaml`
+  flies your own file. A mission, a link profile, a plug-in, a robot or a scene is given by a
+  shipped name or by a path. A text is a path if it contains a slash or ends in `.yaml` (plug-ins:
+  `.py`; robots and scenes: `.xml`).
 - **Relative paths** start at the folder of the file that contains them. In `--set` they start at
   the working folder.
-- **`--set key=value`** sets one value after the file is read. The key has dots, the value is YAML.
-  The option may be repeated in any order. A number selects an entry of a list
-  (`mission.waypoints.0.dwell_s=2`); the number after the last entry appends one. Where the
-  value is a name, as in `controller: pid`, a longer key keeps the name and sets one of its
-  parameters: `cloud.controller.speed_max=2`.
-- **Precedence.** What stands under `link.uplink` and `link.downlink` replaces the values of the
-  profile; `--set` replaces those of every file.
-- **Errors.** An unknown key, a wrong type or a value out of range is refused before anything flies.
-  The message names the line and the nearest known key. All numbers are finite.
+- **`--set key=value`** sets one value after the file is read. Dots separate the parts of the key;
+  the value is YAML. You may give the option several times, in any order.
+  - A number selects an entry of a list (`mission.waypoints.0.dwell_s=2`). The first unused number
+    appends an entry.
+  - A name may have parameters. With `controller: pid`, the key `cloud.controller.speed_max=2` keeps
+    the name `pid` and sets a parameter of `pid`.
+- **Precedence.** A value under `link.uplink` or `link.downlink` replaces the value of the profile.
+  A value of `--set` replaces the value of any file.
+- **Errors.** An unknown key, a wrong type, a value out of range, NaN or infinity is refused before
+  anything flies. The message names the line and the nearest known key.
 - **Units** are in the name of a key and in the tables. Every delay of a link is one way.
-- **The run's folder** keeps `config.yaml`: the experiment with every value filled in. `cloudrc run`
-  with that file flies the same run again.
+- **The run's folder** contains `config.yaml`: the experiment with every value filled in.
+  `cloudrc run` with this file flies the same run again.
 
-The chart takes the same keys under `experiment`. `cloudrc list` prints all shipped names.
+The Helm chart takes the same keys under `experiment`. `cloudrc list` prints all shipped names.
 """
 
 TOPIC_HEAD = """\
@@ -90,8 +92,8 @@ TOPIC_HEAD = """\
 
 <!-- Written by `make docs` from cloudrc/record/topics.py: edit that, or tools/docs.py. -->
 
-`mission.mcap` holds ROS 2 messages (CDR). Foxglove and Lichtblick open it; Python reads it without
-ROS:
+`mission.mcap` contains ROS 2 messages (encoded as CDR). Foxglove and Lichtblick open this file.
+Python reads the file without ROS:
 
 ```python
 from pathlib import Path
@@ -102,24 +104,27 @@ recording = Recording.read(Path("runs/latest/mission.mcap"))
 recording["/odometry"]["position"]  # numpy, shape (n, 3)
 ```
 
-Every topic is a table. Its first column is `stamp_ns` [ns]; the others are listed below. An `int`
-is an int64, a `float` a float64; a `vector` has three floats, a `quaternion` four (wxyz).
+Every topic is a table with one message per row. The first column is `stamp_ns` [ns]; the sections
+below list the other columns of each topic. An `int` is an int64, a `float` is a float64. A
+`vector` has three floats, a `quaternion` has four (wxyz).
 
 - **Clocks.** Each end writes its own file (`world.mcap`, `cloud.mcap`) with stamps of its own
-  monotonic clock. `mission.mcap` merges both: there every row's stamp is on world's clock. A stamp
-  in another column stays on the clock that its meaning names.
+  monotonic clock; the sections below name this clock. `mission.mcap` merges both files. In
+  `mission.mcap`, `stamp_ns` of every row is converted to world's clock. Stamps in other columns are
+  not converted: the meaning of the column names the clock.
 - **Frames.** World frame: x forward, y left, z up. Body frame: the same axes, fixed to the robot.
-- **Modes.** `/link`, `/link_check` and `/lateness` exist in real time only. In the cluster the
-  topics with a row per period or per datagram are recorded while the robot flies and for 90 s after
-  it.
-- **Messages.** The header's stamp is the row's, its frame is `world`. The messages of
-  `cloudrc_msgs` have the columns as fields. The columns of ROS's own messages are in these fields:
+- **Modes.** `/link`, `/link_check` and `/lateness` exist in real time only. In a cluster, topics
+  with a row per period or per datagram are recorded only during a flight and for 90 s after the
+  flight.
+- **Messages.** The stamp in the header of a message is `stamp_ns`, the frame is `world`. Messages
+  of `cloudrc_msgs` have one field per column. In messages of ROS itself, the columns are in these
+  fields:
 
 | message | column | field |
 |---|---|---|
 | `nav_msgs/msg/Odometry` | `position` | `pose.pose.position` |
 | | `orientation_wxyz` | `pose.pose.orientation`, in ROS's order xyzw |
-| | `velocity` | `twist.twist.linear`, in the frame `base_link` as ROS has it |
+| | `velocity` | `twist.twist.linear`, in the frame `base_link` as ROS requires |
 | | `angular_velocity_body` | `twist.twist.angular`; NaN where the topic has no such column |
 | `geometry_msgs/msg/TwistStamped` | `reference` or `command` | `twist.linear` |
 | | `yaw_rate` | `twist.angular.z` |
@@ -212,8 +217,8 @@ def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
 def _plug_ins() -> str:
     """Write the tables of the shipped plug-ins and their parameters."""
     blocks = [
-        "A plug-in is a name, or a mapping of `name` and its parameters. A file of your own has\n"
-        "the parameters of its `build`: [plugins.md](plugins.md).\n"
+        "A plug-in is a name, or a mapping with the key `name` and one key per parameter. The\n"
+        "parameters of your own file are those of its function `build`: [plugins.md](plugins.md).\n"
     ]
     for key, kind in KINDS.items():
         rows: list[tuple[str, ...]] = []
@@ -274,7 +279,7 @@ def _facts(topic: Topic) -> str:
     stamp, often = SAMPLING[topic.name]
     return (
         f"- Message: `{topic.ros_type}`, written by {ENDS[topic.end]}, {often}.\n"
-        f"- Stamp: {stamp}. Clock: {CLOCKS[topic.end]}.\n"
+        f"- Stamp: {stamp}. Clock in the end's own file: {CLOCKS[topic.end]}.\n"
     )
 
 

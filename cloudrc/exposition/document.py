@@ -11,22 +11,25 @@ HEAD = """\
 
 <!-- Written by `make docs` from cloudrc/exposition/table.py: edit that. -->
 
-Every process serves three pages at the address of its option `--metrics HOST:PORT`: `/metrics` for
-Prometheus, `/healthz` (200 if its loop ran in the last 5 s) and `/readyz` (200 while it hears its
-peer). In the cluster the ports are 9100 for `world` and `cloud`, 9101 for `teleop` and 9102 for
-`link`.
+Every process serves three pages at the address of its option `--metrics HOST:PORT`:
 
-All values are in base units. A value that cannot be known is absent, never zero. Every label has a
-closed set of values, except the labels `version` and `config` of `cloudrc_build_info`. The page is
-made at most four times a second, so it is at most 0.25 s old. It also has the usual `process_*`
-metrics: CPU, memory, file descriptors.
+- `/metrics`: the metrics for Prometheus
+- `/healthz`: answers 200 if the loop of the process ran in the last 5 s
+- `/readyz`: answers 200 while the process hears its peer
+
+In a cluster the ports are 9100 for `world` and `cloud`, 9101 for `teleop` and 9102 for `link`.
+
+All values are in base units (s, m, rad). A value that cannot be known is absent, never zero. Every
+label has a closed set of values, except the labels `version` and `config` of `cloudrc_build_info`.
+The page `/metrics` is cached for 0.25 s. The page also contains the usual metrics `process_*`: CPU,
+memory, file descriptors.
 """
 
 QUERIES = {
     "Round trip, 95th percentile": (
         "histogram_quantile(0.95, sum by (le) (rate(cloudrc_rtt_seconds_bucket[1m])))"
     ),
-    "Mean uplink delay (the downlink has the same query)": (
+    "Mean uplink delay (for the downlink, replace `uplink` by `downlink`)": (
         "rate(cloudrc_uplink_delay_seconds_sum[1m]) / rate(cloudrc_uplink_delay_seconds_count[1m])"
     ),
     "Loss by direction": (
@@ -52,9 +55,9 @@ QUERIES = {
 }
 OPEN = {
     "version": "the version",
-    "config": "the first 12 digits of the SHA-256 of the process's configuration, with all "
-    "defaults except those of plug-ins (a run on one machine includes these too, so the digits are "
-    "those of `config_sha256` in report.json); empty for a process without configuration",
+    "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
+    "defaults (on one machine with those of plug-ins, as `config_sha256` in report.json; in a "
+    "cluster without those of plug-ins); empty for a process without configuration",
 }
 """Label with an open set of values -> its description."""
 

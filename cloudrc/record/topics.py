@@ -135,6 +135,7 @@ _END = Field("end", "string", "", "who recorded it: world, cloud or link")
 _SLIP = Field("slip_ns", "int", "ns", "lag of world's clock behind the machine's monotonic clock")
 _GUARD = "0 GROUND, 1 TRACK, 2 HOLD, 3 LAND, 4 ESTOP"
 _CAUSES = "of the guard's state: " + "; ".join(f"{cause:d} {cause.words}" for cause in Cause)
+_ODOMETRY = "stamp of its odometry, world's clock"
 _ECHO = "stamp of the newest command applied, cloud's clock; -1 if none"
 _EVENTS = (
     "started, reached, held, resumed, goto; at the end the outcome: done, cancelled, timed_out,"
@@ -175,7 +176,7 @@ _TABLE = (
         (
             _EPOCH,
             _COUNTER,
-            Field("odometry_stamp_ns", "int", "ns", "its odometry's stamp", "telemetry.stamp_ns"),
+            Field("odometry_stamp_ns", "int", "ns", _ODOMETRY, "telemetry.stamp_ns"),
             Field("tip_force", "float", "N", "on the arm's tip"),
             Field("echo_stamp_ns", "int", "ns", _ECHO),
             Field("echo_hold_ns", "int", "ns", "time since world applied that command; 0 if none"),
