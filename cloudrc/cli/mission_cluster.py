@@ -88,7 +88,7 @@ def check_on(release: Release, name: str, request: MissionRequest) -> float:
 
 
 def _experiment(release: Release) -> Experiment | None:
-    """Read the experiment of a release; None if the user's rights or this version do not allow it."""
+    """Read the experiment of a release; None if this user's rights or this version prevent it."""
     from pydantic import ValidationError
 
     from cloudrc.cluster.client import FILE, experiment_text
