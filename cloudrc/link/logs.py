@@ -38,8 +38,8 @@ LONGEST = 5.0
 UNUSABLE_MAX = 0.01
 """Largest share of rows that may be left out [1]; above this share the log is refused."""
 GAP = 20
-"""Shortest gap that a note reports, as a multiple of the median time between packets [1]. A gap must
-also be longer than `GAP_MIN`."""
+"""Shortest gap that a note reports, as a multiple of the median time between packets [1]. The gap
+must also be longer than `GAP_MIN`."""
 GAP_MIN = 1.0
 """Shortest gap that a note reports [s]."""
 STEPS_MAX = 3
@@ -380,12 +380,12 @@ _LOST_WORDS = {
 }
 """Words in the delay column that mark a lost packet."""
 _LOST_NUMBERS = (-1.0, -999.0, -9999.0)
-"""Numbers in the delay column that mark a lost packet [unit of the column]. Such a number counts as a
-mark only if the column has no other negative number."""
+"""Numbers in the delay column that mark a lost packet [unit of the column]. Such a number counts as
+a mark only if the column has no other negative number."""
 _FLAGS = {"0": False, "1": True, "false": False, "true": True, "no": False, "yes": True}
 _LATE = {"s": 1e11, "ms": 1e14, "us": 1e17}
-"""Unit -> largest plausible time since 1970, about the year 5000. A larger value means that the true
-unit is finer than the column's name says."""
+"""Unit -> largest plausible time since 1970, about the year 5000. A larger value means that the
+true unit is finer than the column's name says."""
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:

@@ -55,7 +55,7 @@ _LISTED = {
 _UNITS = {"us": 1e-6, "%": 1e-2, "gbit": 1.25e8, "bit": 0.125, "": 1.0}
 """Unit in tc's arguments -> factor to the unit in tc's listing: [s], [1], [byte/s]."""
 _SLACK = {"limit": 0.0, "rate": 0.0, "delay": 128e-9}
-"""Option -> tolerance for the rounding of tc: 128 ns for delays [s]. Options that are not listed are
+"""Option -> tolerance for tc's rounding: 128 ns for delays [s]. Options that are not listed are
 probabilities, which tc cuts to 32 bits."""
 _CHANCE = 2.0**-30
 _RELATIVE = 1e-3

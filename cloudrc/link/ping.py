@@ -220,7 +220,7 @@ def _refuse_sessions(name: str, sign: str) -> None:
 
 
 def _check_clock(found: _Found, log: Log) -> float:
-    """Check the times of sending against the numbers; return the median time between packets [s]."""
+    """Check the times of sending by the numbers; return the median time between packets [s]."""
     sent = {number: at for number, (at, _) in sorted(found.replies.items())}
     times = sent if len(sent) > 1 else {n: at for n, at in sorted(found.told.items()) if at}
     pairs = list(pairwise(times.items()))
