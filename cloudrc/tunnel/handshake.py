@@ -176,9 +176,10 @@ class ServerHandshake:
 
         The cloud gets the next epoch in these cases:
 
-        - The cloud uses the newest key, and the epoch uses an older key.
-        - The cloud repeats its hello too often, while world does not hear it, or with another key
-          than that of the epoch.
+        - The session has no epoch any more.
+        - The hello has the newest key, and the epoch has an older key.
+        - The cloud has asked more than `REPEATS_MAX` times, and either world does not hear it or
+          the hello has another key than the epoch.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
