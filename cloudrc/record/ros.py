@@ -182,7 +182,7 @@ def shifted(data: bytes, offset_ns: int) -> bytes:
 
 
 def _rotate(orientation_wxyz: Quaternion, vector: Vector) -> Vector:
-    """Rotate a vector from the body frame to the world frame: v + 2 u × (u × v + w · v).
+    """Rotate a vector from the body frame to the world frame: v + 2 · u x (u x v + w · v).
 
     This is Rodrigues' formula for the unit quaternion (w, u).
     """
