@@ -101,7 +101,7 @@ class WireCost(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Give the ratio of sealed to pickled [1]."""
+        """Return the ratio of sealed to pickled [1]."""
         return self.sealed / self.pickled
 
 
@@ -236,7 +236,7 @@ def _cost(play: Play) -> float:
 
 
 def _replay(experiment: ResolvedExperiment) -> Play:
-    """Fly once, record the controls and give the function that replays them."""
+    """Fly once, record the controls, and return the function that replays them."""
     import numpy as np
 
     from cloudrc.world.simulator import replay

@@ -1,8 +1,8 @@
 """Call teleop's API over HTTP.
 
-The API is at http://HOST:PORT, where each request carries a token, or at unix:PATH, a socket file
-that only its owner can open. The token is read from a file, so that it appears neither in the list
-of processes nor in a shell's history.
+The API is at http://HOST:PORT or at unix:PATH. At HOST:PORT each request carries a token. PATH is a
+socket file that only its owner can open. The client reads the token from a file, so that the token
+appears neither in the list of processes nor in a shell's history.
 """
 
 from __future__ import annotations

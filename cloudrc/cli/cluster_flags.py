@@ -39,7 +39,7 @@ def timeout_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def release_from_flags(options: argparse.Namespace) -> Release:
-    """Give the release that the flags name.
+    """Return the release that the flags name.
 
     Raises:
         MissingPrerequisiteError: If the Kubernetes client or a kubeconfig is missing.

@@ -1,4 +1,4 @@
-"""`cloudrc doctor`: check whether this machine can fly, and say how to fix what is missing."""
+"""`cloudrc doctor`: check whether flights work on this machine; explain how to fix problems."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def packages(extra: str) -> Check:
 
 
 def mujoco_steps() -> Check:
-    """Run one step of MuJoCo, in a separate process: a broken library can abort it."""
+    """Run a step of MuJoCo in a separate process, because a broken library can abort a process."""
     answer = subprocess.run(interpreter("-c", MUJOCO_PROGRAM), capture_output=True, text=True)
     if answer.returncode == 0:
         return Check("physics", "ok", "MuJoCo loads and steps", "", FLYING)
@@ -231,7 +231,7 @@ def timer(rounds: int = 100) -> Check:
 
 
 def cores() -> Check:
-    """Compare the cores that this process may use with the load."""
+    """Compare the machine's load with the number of cores that this process may use."""
     count = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )

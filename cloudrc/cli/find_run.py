@@ -38,7 +38,9 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
 def find_local_run(
     options: argparse.Namespace, look: Callable[[Path], _Found | None], nobody: str
 ) -> _Found | None:
-    """Find the API or the link of the run that is flying here, unless the flags name a cluster.
+    """Find the API or the link of the run that is flying on this machine.
+
+    Do nothing if the flags name a cluster.
 
     First choice is the run in ./runs/latest. Second choice is this user's only other run, whatever
     folder it was started in.
@@ -49,7 +51,7 @@ def find_local_run(
         nobody: Error text if no run is flying in the folder of `--run`.
 
     Returns:
-        The result of `look`; None if a cluster is meant, or if no run is flying here.
+        The result of `look`; None if the flags name a cluster, or if no run is flying.
 
     Raises:
         BadInputError: If `--run` is given and no run is flying in its folder, if `--run` is given
@@ -166,7 +168,7 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
 
 
 def discard(folder: Path) -> bool:
-    """Remove the folder of a run if the run has recorded nothing; return whether it did so."""
+    """Remove the folder of a run that has recorded nothing; return whether it is removed."""
     if any(path.stat().st_size for path in folder.glob("*.mcap")):
         return False
     for path in (*folder.glob("*.mcap"), folder / "config.yaml"):

@@ -1,7 +1,7 @@
 """Run the verbs of `cloudrc mission` in a cluster, where a mission is a Kubernetes Job.
 
-A mission is checked before its Job is created. The API checks it again with the same code, but only
-once the Job's pod runs.
+The command checks a mission before it creates the Job. The API checks the mission again with the
+same code, but not before the Job's pod runs.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 UNKNOWN_LIMIT = 600.0
-"""Time limit of a mission if neither it nor the release's experiment gives one [s]."""
+"""Time limit of a mission if neither the mission nor the release's experiment has a limit [s]."""
 PROBLEMS_MAX = 20
 """Largest number of problems to print; a mission in wrong units has a problem at each waypoint."""
 

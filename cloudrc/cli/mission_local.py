@@ -68,7 +68,7 @@ class MissionFollower:
         return dict(view)
 
     def follow(self, mission_id: str) -> dict[str, Any]:
-        """Write the events of a mission until it has ended.
+        """Write the events of a mission until the mission has ended.
 
         Returns:
             The verdict as the API sends it.

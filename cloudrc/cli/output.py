@@ -80,7 +80,7 @@ def paint(text: str, colour: str, stream: TextIO | None = None) -> str:
 
 
 def console(stream: TextIO) -> Console:
-    """Make a rich console that writes to a stream; use plain text if it is not a terminal."""
+    """Make a rich console that writes to a stream, in plain text if the stream is no terminal."""
     from rich.console import Console as RichConsole
 
     class Quiet(RichConsole):

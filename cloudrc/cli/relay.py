@@ -231,7 +231,7 @@ class RelayControl:
             self._applied.append((way, loaded, time.monotonic_ns()))
 
     def stop_after(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Wrap `stop`, which the relay's loop calls regularly, so that it also applies changes."""
+        """Return a function for the relay's loop: apply pending changes, then call `stop`."""
 
         def ask() -> bool:
             if self._pending:

@@ -104,7 +104,7 @@ read."""
 LOCK_PERIOD = 0.2
 """Pause between two attempts to open a journal that another teleop process has locked [s]."""
 PAUSE_LIMIT_NS = 500_000_000
-"""Longest time that teleop waits for the robot to hold before it ends [ns]."""
+"""Longest time that teleop, before it ends, waits for the robot to hold [ns]."""
 SALT_SIZE = 16
 """Size of the random salt of mission numbers [bytes]."""
 

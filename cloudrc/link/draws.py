@@ -44,7 +44,7 @@ StreamKey: TypeAlias = tuple[int, int]
 
 
 class Purpose(IntEnum):
-    """What a column of draws is for."""
+    """Purpose of a column of draws."""
 
     DELAY = 0
     COPY_DELAY = 1
@@ -243,7 +243,8 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
 
     Source: tc-netem(8) for the meaning of jitter, iproute2 netem/pareto.c for the exponent.
     Deviation: netem cuts its normal table off at ±4 and its Pareto table at 4. So netem's Pareto
-    jitter has only 0.82 of the specified standard deviation; cloudrc's has all of it.
+    jitter has only 0.82 of the specified standard deviation; cloudrc's jitter has the full
+    standard deviation.
 
     Args:
         key: Stream.

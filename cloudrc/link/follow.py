@@ -1,4 +1,4 @@
-"""Follow what changes in flight: a profile's file, a change handed to a pod, the peer's address.
+"""Follow changes in flight: of a profile's file, of a document in the pod, of the peer's address.
 
 A change of a release's ConfigMap is permanent, but a kubelet may need a minute to copy it to a pod.
 So `cloudrc link set` also writes the same files, as one document, into the folder of the route
@@ -203,7 +203,7 @@ class Profiles:
         return loaded._replace(change=read_change(handed.change))
 
     def _is_known(self, loaded: Loaded) -> bool:
-        """Store a change; return whether it has arrived before.
+        """Remember a change; return whether the same change has arrived before.
 
         `helm upgrade` changes the profile but keeps the note with the number of the previous
         change. Therefore the values count, too.

@@ -34,7 +34,7 @@ from cloudrc.link.traces import Row, Table, decimals_of, looks_lost, shown
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
 LONGEST = 5.0
-"""Longest plausible median delay [s]; above it the values are probably in another unit."""
+"""Longest plausible median delay [s]; values with a larger median are probably in another unit."""
 UNUSABLE_MAX = 0.01
 """Largest share of rows that may be left out [1]; above this share the log is refused."""
 GAP = 20
@@ -240,7 +240,7 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
         text: Content of the file.
         name: Name of the file, for messages.
         direction: Direction to read; None only with `halve`.
-        halve: Whether to use half of each round trip instead of the one-way delay.
+        halve: True: use half of each round trip. False: use the one-way delay.
 
     Raises:
         BadInputError: If the file is not such an output, if it contradicts its own counts, or if
@@ -401,8 +401,8 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     Args:
         lines: Lines of the file.
         name: Name of the file, for messages.
-        halve: Whether to use half of each round trip; if false, round trips are rejected.
-        trust_units: Whether to accept values that look like another unit.
+        halve: True: use half of each round trip. False: reject round trips.
+        trust_units: Whether to accept values that seem to be in another unit.
 
     Raises:
         BadInputError: If the log cannot be used; the text names line, value and remedy.

@@ -108,8 +108,8 @@ class LinkDirection:
             now_ns: Time of sending [ns].
 
         Returns:
-            Times of arrival [ns], never before `now_ns`: none if the packet is lost, two if it is
-            duplicated. The copy's time is second, but not necessarily later.
+            Times of arrival [ns], never before `now_ns`: no time for a lost packet, two times for a
+            duplicated packet. The second time is that of the copy; it may be the earlier one.
         """
         constant = self._always
         if constant is None:

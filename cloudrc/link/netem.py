@@ -1,13 +1,13 @@
 """Shape one direction of the link in the kernel, by `tc` on the pod's egress.
 
     interface > prio 7400: --+-- bands 1-3: everything else, as before
-                             +-- band 4 > netem 7401: what the filter sends there,
-                                          UDP to the peer's tunnel port and nothing else
+                             +-- band 4 > netem 7401: datagrams that the filter selects:
+                                          only UDP to the peer's tunnel port
 
-After a restart `Netem` finds its qdiscs by their handles. In flight it changes them by `tc qdisc
-change`, which keeps the queued packets. `close` removes them. `Netem` never touches a root qdisc of
-another program. If another program removes or changes the qdiscs of `Netem`, the log says so and a
-metric counts the case; `Netem` does not repair the damage.
+After a restart `Netem` finds its qdiscs by their handles. In flight it changes the qdiscs by `tc
+qdisc change`, which keeps the queued packets. `close` removes the qdiscs. `Netem` never touches a
+root qdisc of another program. If another program removes or changes the qdiscs of `Netem`, the log
+says so and a metric counts the case; `Netem` does not repair the damage.
 
 tc and the kernel clamp numbers without a message: a rate below 1 byte/s turns into no rate limit, a
 probability below 2**-32 turns into 0. So `Netem` reads back the options in force and compares them.

@@ -5,8 +5,8 @@ Local mode runs `Relay`, with both directions. In a pod, `RelayShaper` shapes wh
     world <-> [world side]  Relay  [cloud side] <-> cloud
     tunnel end > [listen]  RelayShaper  [any port] > the other pod's tunnel end
 
-Due time of a datagram = its arrival at the kernel + the delay that the model draws. The time that
-it waits for this process does not count. A datagram never leaves before it is due.
+Due time of a datagram = time of arrival at the kernel + delay that the model draws. The time in
+which the datagram waits for this process does not count. A datagram never leaves before it is due.
 
 The relay sleeps in `select` until a datagram arrives, or until shortly before the next datagram is
 due. Then it reads the clock in a loop until the due time, since a sleeping thread wakes 15 to 50 us
@@ -51,8 +51,8 @@ DATAGRAM_MAX = 2_048
 BATCH = 32
 """Limit of datagrams that a lane takes in or releases before the next lane's turn [1]."""
 SPIN_NS = 60_000
-"""How long before a due time the relay starts to read the clock in a loop [ns]. A thread that wakes
-later than this was delayed not by the timer but by another cause, such as other programs."""
+"""How long before a due time the relay starts to read the clock in a loop [ns]. If a thread wakes
+later than this, the cause is not the timer but, for example, another program."""
 STOP_PERIOD = 0.1
 """Longest time between two calls of `stop` [s]."""
 
@@ -281,7 +281,7 @@ class Lane:
                 heapq.heappush(self._in_flight, (due_ns, next(self._numbers), data))
 
     def _send(self, data: bytes) -> bool:
-        """Send one datagram; return whether the kernel took it."""
+        """Send one datagram; return whether the kernel accepted the datagram."""
         for _ in range(2):
             try:
                 self._output(data)
@@ -426,7 +426,7 @@ class Relay(Lanes):
         super().__init__(tuple(self._ways.values()), origin_ns=None)
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Forward until `stop` returns True; it is called at least every 0.1 s."""
+        """Forward datagrams until `stop` returns True; call `stop` at least every 0.1 s."""
         tighten_slack()
         while not stop():
             self.run_for(STOP_PERIOD)

@@ -256,7 +256,10 @@ class Sidecar:
             withdraw(self._released)
 
     def told(self) -> Told | None:
-        """Return shaper and conditions in force; None if none yet. Any thread may call this."""
+        """Return shaper and conditions in force; None before the first shaper.
+
+        Any thread may call this method.
+        """
         if self._in_force is None:
             return None
         state, profile = self._in_force
@@ -299,7 +302,7 @@ class Sidecar:
             shaper.close()
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
-        """Choose the shaper: by the mode, or in mode "auto" by what works; store the reason."""
+        """Choose the shaper and store the reason; in mode "auto" try netem, then use the relay."""
         machine, mode = self._machine, self._settings.mode
         self._reason = f"link.mode={mode}"
         if mode != "relay":

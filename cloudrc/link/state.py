@@ -1,7 +1,8 @@
 """Publish the state of a link direction in a file: its shaper, profile and last change.
 
 The state file is in the folder of the route file. The tunnel's end on the same machine follows the
-state file and records its changes. `cloudrc link set` reads it to see whether a change is in force.
+state file and records its changes. `cloudrc link set` reads the file to see whether a change is in
+force.
 All files are written atomically, since other processes may read them at the same time.
 """
 

@@ -5,9 +5,9 @@ their description names.
 
 The clock offset follows from the packets, since no packet arrives before it was sent. Each
 telemetry datagram shows that world's clock is ahead of cloud's by at least (sent - arrived). Each
-command datagram shows that it is ahead by at most (arrived - sent). The fastest packets of both
-directions give the narrowest interval. Its width is the sum of the fastest delays of both
-directions. After a stall, world's clock also lags the clock of its machine.
+command datagram shows that world's clock is ahead by at most (arrived - sent). The fastest packets
+of both directions give the narrowest interval; its width is the sum of both delays. After a stall,
+world's clock also lags the clock of world's machine.
 
 `cut_to_last_mission` takes one mission from a pod's recording, which may hold several. A pod's file
 is still open when it is copied, so the end of the file may be missing. The mission is complete if

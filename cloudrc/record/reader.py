@@ -315,7 +315,7 @@ class _Collector:
         return contents
 
     def _fault(self) -> str:
-        """Say what is wrong with the file, and how far it was read."""
+        """Describe the fault of the file, and how far the file was read."""
         messages, fault = self._contents.messages, self._records.fault
         if self._records.data_ended:
             return fault
@@ -323,7 +323,7 @@ class _Collector:
         return f"{fault}: {len(messages)} messages were read, the last at {until:.2f} s"
 
     def _lacking(self, read: Counter[str]) -> Iterator[str]:
-        """Say what other programs have removed or added.
+        """Describe the data that other programs have removed or added.
 
         Args:
             read: Number of messages by topic.

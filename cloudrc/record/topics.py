@@ -422,7 +422,7 @@ SAMPLING: dict[str, tuple[str, str]] = {
     "/link_check": ("end of the interval that is judged", "every 5 s per quantity"),
     "/lateness": ("when the deadline was handled", "100 Hz per end"),
 }
-"""Topic -> what the stamp of a row marks, and how often a row is written; for docs/topics.md."""
+"""Topic -> meaning of a row's stamp, and how often a row is written; for docs/topics.md."""
 _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Values]]
 
 

@@ -128,7 +128,7 @@ class SetpointSelector:
         Args:
             plan: Plan of the mission.
             mission_id: Number of the mission on board; 0 if it has none.
-            before: State before the restart of teleop; None if the mission is not a continued one.
+            before: State before the restart of teleop; None for a new mission.
         """
         self._plan = plan
         self._mission_id = mission_id
@@ -346,7 +346,7 @@ class Teleop:
         self._setpoints.select_early(0)
 
     def continue_mission(self, now_ns: int, before: Continue) -> None:
-        """Continue a mission of an earlier teleop with its current waypoint, from where it is."""
+        """Take over a mission of an earlier teleop at its current waypoint; do not reset world."""
         self._check("continue")
         self._order(before.plan, before.mission_id, now_ns - round(before.elapsed * 1e9))
         self.leg, self._continued, self._world = before.leg, before, before.world
@@ -378,7 +378,7 @@ class Teleop:
             self.start(now_ns, Plan((leg,), Start.HERE, leg.time_limit), mission_id)
 
     def hold(self, now_ns: int) -> None:
-        """Stop the robot where it is and wait, at `now_ns` [ns]."""
+        """Hold the robot at its position and interrupt the mission, at `now_ns` [ns]."""
         self._check("hold")
         self._hold(now_ns)
 

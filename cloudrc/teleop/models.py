@@ -119,7 +119,7 @@ class Verdict(_Answer):
 
 
 class Event(_Answer):
-    """Something that happened to a mission."""
+    """An event of a mission."""
 
     id: int = Field(description="Rises with every event of all missions")
     mission: str = Field(description="Whose")
@@ -150,7 +150,7 @@ class MissionSummary(_Answer):
 
 
 class MissionView(MissionSummary):
-    """A mission with everything that has happened to it."""
+    """A mission with its events."""
 
     events: list[Event] = Field(max_length=SHOWN, description="The newest of them, oldest first")
     events_left_out: int = Field(description="How many there were before those")

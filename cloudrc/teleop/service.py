@@ -206,7 +206,7 @@ class MissionService:
         return bool(self.book.missions) and not self.book.open() and self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission from an order; it starts at once or waits in the queue.
+        """Create a mission from an order; the mission starts at once or waits in the queue.
 
         Returns:
             The mission, and whether it is new. An order with a known key returns the known mission.
@@ -294,7 +294,7 @@ class MissionService:
         return mission
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
-        """Stop the rotors at once in any state; return the mission that fails by this, if any."""
+        """Stop the rotors at once in any state; return the mission that this ends, if any."""
         mission = self._start_next(now_ns)
         self._inherits_stop = self._acknowledges = False
         self._teleop.stop(now_ns)

@@ -364,7 +364,7 @@ class MissionStore:
         """Read the missions of a file.
 
         Args:
-            connection: Connection by `connect`; it is closed on an error.
+            connection: Connection from `connect`; an error closes the connection.
             salt: Random bytes for the numbers of missions.
             notice: See the attribute.
             damaged: See the attribute.
