@@ -30,7 +30,7 @@ STREAM_TIMEOUT = 30.0
 """Longest silence of an event stream before the client gives up [s]; the API sends an event or a
 comment every 10 s."""
 RETRY_STATUSES = (408, 429, 502, 503, 504)
-"""HTTP status codes after which the client repeats the request."""
+"""HTTP status codes that mean: a later attempt may succeed."""
 UNIX = "unix:"
 
 
@@ -41,7 +41,7 @@ class ApiError(CloudrcError):
 
 
 class UnreachableError(ApiError):
-    """Report that the API does not answer yet: try again."""
+    """Report that the API does not answer at present; a later attempt may succeed."""
 
 
 class Api:

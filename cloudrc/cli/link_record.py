@@ -1,6 +1,7 @@
 """Run `cloudrc link record SOURCE`: turn measured delays into a trace for a profile.
 
-The source is a run, an MCAP file, a log of ping or irtt, or a CSV file; its content says which.
+The source is a run, an MCAP file, a log of ping or irtt, or a CSV file. The command recognises the
+kind of source by its content.
 """
 
 from __future__ import annotations
@@ -128,8 +129,8 @@ def from_run(path: Path, direction: Direction, *, halve: bool) -> Packets:
     Args:
         path: Folder or file.
         direction: Direction of the link.
-        halve: Whether to take half of each round trip that cloud measured instead of the one-way
-            delay. One-way delays are known only if both ends share a clock.
+        halve: True: use half of each round trip that cloud has measured. False: use one-way delays,
+            which are known only if both ends share a clock.
 
     Raises:
         BadInputError: If the run holds no such delays.
@@ -140,7 +141,7 @@ def from_run(path: Path, direction: Direction, *, halve: bool) -> Packets:
 
 
 def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_units: bool) -> Packets:
-    """Read a log of ping or irtt, or a CSV file; its content says which.
+    """Read a log of ping or irtt, or a CSV file; recognise the kind by the content.
 
     Raises:
         BadInputError: If the file is none of these, or cannot be used.

@@ -72,7 +72,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def describe_unknown(given: str, names: Iterable[str]) -> str:
-    """Return a text: the name is unknown; then the most similar known name, or all names."""
+    """Return an error text about an unknown name, with the most similar known name or all names."""
     known = sorted(names)
     near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
     return f"no '{given}'; " + (f"did you mean '{near[0]}'?" if near else f"choose {_or(known)}")

@@ -282,8 +282,8 @@ class Surroundings:
     Attributes:
         scene: The scene for the check of waypoints.
         time_limit: Time limit of missions without their own limit [s].
-        contact: Whether a mission that leads to the board has to touch the board, unless the
-            mission itself says so.
+        contact: Whether a mission that leads to the board has to touch the board, if the mission
+            itself does not specify this.
         plan: Makes a plan from a checked mission and its time limit [s].
     """
 

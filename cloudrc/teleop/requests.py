@@ -58,7 +58,10 @@ class RequestSender:
 
     @property
     def waits(self) -> bool:
-        """Whether telemetry shows that the robot flies on no command: on ground or after an end."""
+        """Whether telemetry shows that commands do not move the robot.
+
+        Commands do not move a robot on the ground, or after a request that ends a mission.
+        """
         seen = self._seen
         if seen is None or self._next is not None:
             return False
