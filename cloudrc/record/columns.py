@@ -61,9 +61,9 @@ def merged(
     description names.
 
     Args:
-        world_records: Oldest first, on world's clock.
-        cloud_records: Oldest first, on cloud's clock.
-        offset_ns: World's clock minus cloud's [ns].
+        world_records: World's records, oldest first, on world's clock.
+        cloud_records: Cloud's records, oldest first, on cloud's clock.
+        offset_ns: World's clock minus cloud's clock [ns].
 
     Yields:
         The log time [ns] and the row; of rows with equal log times, world's rows come first.
@@ -164,9 +164,9 @@ class Recording:
         """Make a recording in memory; it equals a recording read from a merged file.
 
         Args:
-            world_records: Oldest first, on world's clock.
-            cloud_records: Oldest first, on cloud's clock.
-            offset_ns: World's clock minus cloud's [ns].
+            world_records: World's records, oldest first, on world's clock.
+            cloud_records: Cloud's records, oldest first, on cloud's clock.
+            offset_ns: World's clock minus cloud's clock [ns].
         """
         rows: _Rows = {name: [] for name in TOPICS}
         for _, (topic, stamp_ns, values) in merged(world_records, cloud_records, offset_ns):

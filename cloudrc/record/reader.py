@@ -260,7 +260,7 @@ def read_contents(path: Path) -> Contents:
 
 
 class _Collector:
-    """Selects cloudrc's own messages, metadata and attachments from the records of a file."""
+    """Collects the messages of cloudrc's topics, all metadata and all attachments of a file."""
 
     def __init__(self, records: Records) -> None:
         self._records = records

@@ -31,8 +31,8 @@ class Field:
         kind: Type of a value; vectors have shape (3,), quaternions shape (4,).
         unit: Unit of the values; "" without a unit.
         text: Meaning of the values.
-        path: Dotted path of the value in the record; "" means `part` of the topic followed by
-            `name`.
+        path: Dotted path of the value in the record. "" means the record's field `name`; if the
+            record has no such field, `part` of the topic followed by `name`.
     """
 
     name: str
@@ -54,8 +54,8 @@ class Topic:
         text: Meaning of a row.
         fields: The columns after `stamp_ns`.
         stamp_path: Dotted path of the row's stamp in the record.
-        part: Dotted path, with its last dot, to the nested record that has the fields; "" if the
-            record itself has the fields.
+        part: Dotted path, with its last dot, to the nested record with the fields that the record
+            itself does not have; "" without a nested record.
     """
 
     name: str
