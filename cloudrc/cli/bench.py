@@ -1,8 +1,9 @@
 """`cloudrc bench`: measure what the closed loop and its datagrams cost on this machine.
 
-The reference of the loop is `mj_step` in C (`mujoco.rollout`, one thread), replaying the thrusts
-and drag of the same flight; it must end in the same bits. The reference of a datagram is the
-paper's pickled ROS message. Parts are measured in turns, and the fastest time of each counts.
+The reference of the loop is `mj_step` in C (`mujoco.rollout`, one thread). It replays the thrusts
+and the drag of the same flight and must end in a bit-identical state. The reference of a datagram
+is the paper's pickled ROS message. The command measures the parts in turns; the fastest time of
+each part counts.
 """
 
 from __future__ import annotations
@@ -73,15 +74,16 @@ for _ in sys.stdin:
     cost = timeit.timeit(lambda: pickle.loads(pickle.dumps(message, 4)), number=calls) / calls
     print(len(data), cost, flush=True)
 """
-"""The paper's tunnel, run in a separate process: nothing of cloudrc may import pickle.
+"""Program that pickles messages as the paper's tunnel does.
 
-Its classes are those that ROS 1 generates, with an Odometry of the usual size (1 kB). It unpickles
-only the constants that it has just pickled.
+It runs in a separate process, because cloudrc itself must not import pickle. Its classes are those
+that ROS 1 generates; its Odometry has the usual size (1 kB). It unpickles only the constants that
+it has just pickled.
 """
 
 
 class WireCost(NamedTuple):
-    """Processor time of one odometry message, both ends together.
+    """Processor time of one odometry message, sum of both ends.
 
     Attributes:
         sealed: Encode, seal, open and decode [s].
@@ -99,12 +101,12 @@ class WireCost(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """Give the ratio of sealed to pickled [1]."""
+        """Return the ratio of sealed to pickled [1]."""
         return self.sealed / self.pickled
 
 
 def measure_wire(rounds: int = ROUNDS) -> WireCost:
-    """Measure all three in turns; the fastest round of each counts."""
+    """Measure the three times of a `WireCost` in turns; the fastest round of each counts."""
     from cloudrc.messages import GuardState, Odometry, Telemetry
     from cloudrc.tunnel import codec
     from cloudrc.tunnel.codec import Direction, Kind
@@ -234,7 +236,7 @@ def _cost(play: Play) -> float:
 
 
 def _replay(experiment: ResolvedExperiment) -> Play:
-    """Fly once, record the controls and give the function that replays them."""
+    """Fly once, record the controls, and return the function that replays them."""
     import numpy as np
 
     from cloudrc.world.simulator import replay

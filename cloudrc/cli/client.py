@@ -1,8 +1,8 @@
 """Call teleop's API over HTTP.
 
-The API is at http://HOST:PORT, where each request carries a token, or at unix:PATH, a socket file
-that only its owner can open. The token is read from a file, so that it appears neither in the list
-of processes nor in a shell's history.
+The API is at http://HOST:PORT or at unix:PATH. At HOST:PORT each request carries a token. PATH is a
+socket file that only its owner can open. The client reads the token from a file, so that the token
+appears neither in the list of processes nor in a shell's history.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ from cloudrc.files import read, readable_by_others
 REQUEST_TIMEOUT = 10.0
 """Time limit of one request [s]."""
 STREAM_TIMEOUT = 30.0
-"""Longest silence of a stream of events [s]; the API sends something every 10 s."""
+"""Longest silence of an event stream before the client gives up [s]; the API sends an event or a
+comment every 10 s."""
 RETRY_STATUSES = (408, 429, 502, 503, 504)
-"""HTTP status codes after which a request is worth repeating."""
+"""HTTP status codes that mean: a later attempt may succeed."""
 UNIX = "unix:"
 
 
@@ -40,7 +41,7 @@ class ApiError(CloudrcError):
 
 
 class UnreachableError(ApiError):
-    """Report that the API does not answer yet: try again."""
+    """Report that the API does not answer at present; a later attempt may succeed."""
 
 
 class Api:
@@ -51,7 +52,7 @@ class Api:
 
         Args:
             url: "http://HOST:PORT" or "unix:PATH".
-            token: Returns the token for each request, as it may change; "" for none.
+            token: Returns the current token; called for each request; "" for no token.
 
         Raises:
             BadInputError: If the address is invalid.
@@ -61,21 +62,21 @@ class Api:
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH")
 
     def get(self, path: str) -> Any:
-        """Send a GET request; raises like `post`."""
+        """Send a GET request; raise the same errors as `post`."""
         return self._request("GET", path)
 
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
         """Send a POST request.
 
         Raises:
-            UnreachableError: If there is no answer, or teleop is not ready or busy.
+            UnreachableError: If there is no answer, if teleop is not ready yet, or if it is busy.
             BadInputError: If a value is invalid.
-            ApiError: If the request is refused.
+            ApiError: If the API refuses the request.
         """
         return self._request("POST", path, b"" if body is None else json.dumps(body).encode())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
-        """Yield events as they happen, after the one with number `after`, until teleop ends.
+        """Yield the events after number `after` as they happen, until teleop ends.
 
         Raises:
             UnreachableError: If the connection breaks.
@@ -123,7 +124,7 @@ class Api:
         return connection, answer
 
     def _connection(self, limit: float) -> http.client.HTTPConnection:
-        """Make a connection without a proxy: the API is on this machine or in the cluster."""
+        """Make a connection; use no proxy, because the API is on this machine or in the cluster."""
         if self.url.startswith(UNIX):
             return _UnixConnection(Path(self.url.removeprefix(UNIX)), limit)
         parts = urlsplit(self.url)
@@ -142,7 +143,7 @@ def _is_http(url: str) -> bool:
 
 
 def mission_path(mission_id: str) -> str:
-    """Return the URL path of a mission; quote any character of its id."""
+    """Return the URL path of a mission; quote special characters of its id."""
     return f"/v1/missions/{quote(mission_id, safe='', errors='surrogateescape')}"
 
 
@@ -179,7 +180,7 @@ def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcEr
 
 VARIABLE = "CLOUDRC_TOKEN_FILE"
 SIZE_MAX = 4096
-"""Largest token file [bytes], with white space at its end."""
+"""Largest token file [bytes], including white space at its end."""
 _TOKEN = re.compile(r"[!-~]{16,512}")
 
 
@@ -194,16 +195,16 @@ def token_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def token_file(options: argparse.Namespace) -> Path | None:
-    """Return the token file of the command line, else of the environment, else None."""
+    """Return the token file from the command line, else from the environment, else None."""
     if options.token_file is not None:
         return Path(options.token_file)
     return Path(os.environ[VARIABLE]) if os.environ.get(VARIABLE) else None
 
 
 def token_reader(path: Path | None) -> Callable[[], str]:
-    """Make the function that reads the token anew for each request; "" without a file.
+    """Make a function that reads the token from its file at each call; "" without a file.
 
-    Warn now if others can read the file.
+    Warn at once if other users can read the file.
     """
     if path is None:
         return lambda: ""

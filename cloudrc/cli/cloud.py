@@ -50,7 +50,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _connect_teleop(folder: Path) -> Operator:
-    """Connect to the process of teleop, which may restart at any time."""
+    """Open the connection to the teleop process, which may restart at any time."""
     import time
 
     from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
 
 READY_LIMIT = 300.0
-"""Default time for the pods of a release to become ready [s]."""
+"""Default time limit for the pods of a release to become ready [s]."""
 
 
 def release_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +28,7 @@ def release_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def timeout_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare `--timeout`, the time for a release to become ready."""
+    """Declare `--timeout`, the time limit for a release to become ready."""
     parser.add_argument(
         "--timeout",
         type=_seconds,
@@ -39,7 +39,7 @@ def timeout_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def release_from_flags(options: argparse.Namespace) -> Release:
-    """Give the release that the flags name.
+    """Return the release that the flags name.
 
     Raises:
         MissingPrerequisiteError: If the Kubernetes client or a kubeconfig is missing.

@@ -78,7 +78,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def settings() -> list[str]:
-    """List the completions of `--set`: every key, and the names where a key takes one."""
+    """List the completions of `--set`: KEY=, or KEY=NAME for a key whose value is a known name."""
     from cloudrc import plugins
     from cloudrc.config import problems, shipped
     from cloudrc.config.overrides import KINDS
@@ -101,7 +101,7 @@ def settings() -> list[str]:
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Yield the actions of a parser and of its commands."""
+    """Yield the argparse actions of a parser and of its subcommands."""
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):
@@ -110,7 +110,7 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 
 
 def _candidates(metavar: str, words: list[str], files: bool) -> dict[str, Any]:
-    """Describe candidates for shtab, in the language of each shell."""
+    """Write completion candidates for shtab, in the syntax of each shell."""
     function, joined = f"_cloudrc_{metavar.partition('=')[0].lower()}", " ".join(words)
     bash = "; compgen -f -- $1" if files else ""
     zsh = "; _files -g '*.yaml'" if files else ""

@@ -1,4 +1,4 @@
-"""`cloudrc doctor`: check whether this machine can fly, and say how to fix what is missing."""
+"""`cloudrc doctor`: check whether flights work on this machine; explain how to fix problems."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class Check:
 
     Attributes:
         name: The subject of the check.
-        state: "ok", "missing", or "warn": it can fly, but see `fix`.
-        found: What was found, for people.
-        fix: What to do; empty if nothing.
-        modes: Modes that cannot run without it.
+        state: "ok"; "missing": some modes cannot run; "warn": flights work, but see `fix`.
+        found: What the check has found, as text for people.
+        fix: What the user should do; empty if nothing.
+        modes: Modes that cannot run if the check says "missing".
     """
 
     name: str
@@ -62,7 +62,7 @@ HELPFUL = {
 none of these programs."""
 MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 DOCKER_LIMIT = 5.0
-"""Time for Docker's daemon to answer [s]."""
+"""Time limit for Docker's daemon to answer [s]."""
 
 
 def programs() -> Iterator[Check]:
@@ -85,7 +85,7 @@ def programs() -> Iterator[Check]:
 
 
 def cluster(context: str | None) -> Iterator[Check]:
-    """Check the kubeconfig and whether its cluster answers.
+    """Check the kubeconfig, and check whether its cluster answers.
 
     Args:
         context: A context of the kubeconfig; None for the current one.
@@ -134,7 +134,8 @@ def _short(text: str) -> str:
 
 
 LATE_SLEEP = 2e-3
-"""Lateness that a control loop of 10 ms tolerates [s]; an idle desktop stays far below it."""
+"""Largest lateness that a control loop with a period of 10 ms tolerates [s]; an idle desktop stays
+far below."""
 
 MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
@@ -186,7 +187,7 @@ def packages(extra: str) -> Check:
 
 
 def mujoco_steps() -> Check:
-    """Run one step of MuJoCo, in a separate process: a broken library can abort it."""
+    """Run a step of MuJoCo in a separate process, because a broken library can abort a process."""
     answer = subprocess.run(interpreter("-c", MUJOCO_PROGRAM), capture_output=True, text=True)
     if answer.returncode == 0:
         return Check("physics", "ok", "MuJoCo loads and steps", "", FLYING)
@@ -230,7 +231,7 @@ def timer(rounds: int = 100) -> Check:
 
 
 def cores() -> Check:
-    """Compare the cores that this process may use with the load."""
+    """Compare the machine's load with the number of cores that this process may use."""
     count = (
         len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     )
@@ -244,7 +245,7 @@ def cores() -> Check:
 
 
 def graphics() -> Check:
-    """Check for GL, which is optional."""
+    """Check for OpenGL, which is optional."""
     found = [name for name in ("EGL", "OSMesa", "GL") if ctypes.util.find_library(name)]
     return Check("graphics", "ok", ", ".join(found) if found else "no GL; not needed")
 
@@ -264,7 +265,7 @@ def netem() -> Check:
 
 
 def cgroup() -> Check:
-    """Check for control groups, which report how long a CPU limit has stopped a process."""
+    """Check for control groups, which report how long a CPU limit has paused a process."""
     if Path("/sys/fs/cgroup/cgroup.controllers").exists():
         return Check("cgroup", "ok", "v2")
     if Path("/sys/fs/cgroup").is_dir():

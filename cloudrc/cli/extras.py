@@ -18,7 +18,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 
 
 def missing(extra: str) -> list[str]:
-    """List the modules of an extra that are not installed, without importing any."""
+    """List the modules of an extra that are not installed; import none of them."""
     return [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
 
 
@@ -26,11 +26,11 @@ def require(purpose: str, extras: Iterable[str]) -> None:
     """Check that extras are installed.
 
     Args:
-        purpose: What needs them: "mode virtual".
+        purpose: What needs the extras, such as "mode virtual".
         extras: Names in `EXTRAS`.
 
     Raises:
-        MissingPrerequisiteError: If a module is missing; says how to install it.
+        MissingPrerequisiteError: If a module is missing; the text says how to install it.
     """
     absent = {extra: missing(extra) for extra in extras}
     absent = {extra: modules for extra, modules in absent.items() if modules}

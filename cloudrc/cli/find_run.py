@@ -1,6 +1,6 @@
 """Find the run on this machine that a command refers to, and make folders for new runs.
 
-A run has a folder of its own, which no later run overwrites.
+Every run has its own folder; no later run overwrites it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 _Found = TypeVar("_Found")
 KUBECTL_PLUGIN = "kubectl-cloudrc"
-"""Name of this program when kubectl starts it."""
+"""Name of this program when kubectl starts it as a plugin."""
 CONNECT_LIMIT = 1.0
-"""Time for the API of a local run to accept a connection [s]."""
+"""Time limit for the API of a local run to accept a connection [s]."""
 QUIET_LIMIT = 5.0
-"""Time since its last write after which a relay counts as gone [s], if its run is not among the
-runs that are under way."""
+"""Longest silence of a relay whose run is not listed as under way [s]. After a longer time without
+a write to its folder, the relay counts as gone."""
 
 
 def run_argument(parser: argparse.ArgumentParser) -> None:
@@ -38,20 +38,25 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
 def find_local_run(
     options: argparse.Namespace, look: Callable[[Path], _Found | None], nobody: str
 ) -> _Found | None:
-    """Find the API or the link of the run that is flying here, unless the flags name a cluster.
+    """Find the API or the link of the run that is flying on this machine.
 
-    The run in ./runs/latest comes first, then this user's only other run, wherever it was started.
+    Do nothing if the flags name a cluster.
+
+    First choice is the run in ./runs/latest. Second choice is this user's only other run, whatever
+    folder it was started in.
 
     Args:
-        options: Parsed `run_argument` and `cluster_flags.place_arguments`.
-        look: Gives the API or link of the run in a folder; None if no run is flying there.
+        options: The parsed flags of `run_argument` and of `cluster_flags`.
+        look: Returns the API or the link of the run in a folder; None if no run is flying there.
         nobody: Error text if no run is flying in the folder of `--run`.
 
     Returns:
-        The result of `look`; None if a cluster is meant, or if no run is flying here.
+        The result of `look`; None if the flags name a cluster, or if no run is flying.
 
     Raises:
-        BadInputError: If several runs are flying, or none in the folder of `--run`.
+        BadInputError: If `--run` is given and no run is flying in its folder, if `--run` is given
+            together with flags of a cluster, or if `--run` is not given and several runs are
+            flying.
     """
     in_cluster = options.context or options.namespace or options.release
     if options.run is not None:
@@ -80,12 +85,13 @@ def find_local_run(
 def no_run_error(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
-    """Extend a cluster's error: a run on this machine would do, too.
+    """Add to a cluster's error that no run is flying on this machine either.
 
     Args:
-        options: As in `find_here`; if they name a cluster, the error stays as it is.
+        options: As in `find_local_run`. If they name a context or a namespace, the error is
+            returned unchanged.
         error: The cluster's error.
-        flags: The flags that name a local run.
+        flags: The flags that name a local run, for the text.
     """
     if options.context or options.namespace:
         return error
@@ -95,9 +101,9 @@ def no_run_error(
 
 
 def link_folder_of(run: Path) -> Path | None:
-    """Give the folder that controls the relay of a run; None if the run is not flying.
+    """Return the folder that controls the relay of a run; None if the run is not flying.
 
-    A killed run leaves this folder behind.
+    The folder alone does not prove a flight, because a killed run leaves the folder behind.
     """
     from cloudrc.drivers.local import LINK_FOLDER, under_way
 
@@ -110,10 +116,10 @@ def link_folder_of(run: Path) -> Path | None:
 
 
 def api_url_of(run: Path) -> str | None:
-    """Give the URL of the API of this user's run in a folder; None if the run is not flying.
+    """Return the URL of the API of this user's run in a folder; None if the run is not flying.
 
-    The URL comes from this user's runtime folder, never from the run's folder: that may come from
-    somebody else and name a foreign server.
+    The URL comes from this user's runtime folder, never from the run's folder: a run's folder may
+    come from somebody else and name a foreign server.
     """
     from cloudrc.drivers.local import under_way
 
@@ -122,7 +128,7 @@ def api_url_of(run: Path) -> str | None:
 
 
 def _is_gone(url: str) -> bool:
-    """Say whether nothing listens at an API's URL: a run is announced before its API is up."""
+    """Return True if no API listens at a URL: a run is announced before its API is up."""
     from cloudrc.cli.client import UNIX
 
     try:
@@ -145,10 +151,10 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
     Args:
         out: The folder that the user wants; None for the next free `runs/<name>-<n>`.
         name: Experiment, mode and seed, joined.
-        latest: Whether `runs/latest` points to it from now on.
+        latest: Whether `runs/latest` points to the new folder from now on.
 
     Raises:
-        BadInputError: If `out` exists and is not an empty folder, or if it cannot be made.
+        BadInputError: If `out` exists and is not an empty folder, or if the folder cannot be made.
     """
     try:
         folder = _new_folder(out, name)
@@ -162,7 +168,7 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
 
 
 def discard(folder: Path) -> bool:
-    """Remove the folder of a run that has recorded nothing; say whether it is removed."""
+    """Remove the folder of a run that has recorded nothing; return whether it is removed."""
     if any(path.stat().st_size for path in folder.glob("*.mcap")):
         return False
     for path in (*folder.glob("*.mcap"), folder / "config.yaml"):
@@ -193,7 +199,7 @@ def _new_folder(out: Path | None, name: str) -> Path:
 
 
 def point_latest_to(folder: Path) -> None:
-    """Point `runs/latest` to the newest run, if the file system has links."""
+    """Point `runs/latest` to the newest run, if the file system supports symbolic links."""
     latest = folder.parent / "latest"
     with contextlib.suppress(OSError):
         if latest.is_symlink():

@@ -40,7 +40,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Make a key, or drop the old one."""
+    """Make a key, or drop the previous key."""
     return _make(options) if options.verb == "new" else _drop(options.file)
 
 
@@ -78,7 +78,7 @@ def _drop(path: Path) -> int:
 
 
 def _replace(path: Path, keys: KeySet) -> None:
-    """Write keys to the target of a link, which a process may read by its own name."""
+    """Write keys to a file; if the path is a symbolic link, write to the target of that link."""
     import os
 
     from cloudrc.files import write_atomically

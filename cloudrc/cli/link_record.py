@@ -1,6 +1,7 @@
 """Run `cloudrc link record SOURCE`: turn measured delays into a trace for a profile.
 
-The source is a run, an MCAP file, a log of ping or irtt, or a CSV file; its content says which.
+The source is a run, an MCAP file, a log of ping or irtt, or a CSV file. The command recognises the
+kind of source by its content.
 """
 
 from __future__ import annotations
@@ -105,17 +106,17 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 UNPACKED_MAX = 64 << 20
 """Longest log that is unpacked [bytes]: 10 min of irtt at 100 Hz."""
 SETTLING_NS = 2_000_000_000
-"""Time before a session's last datagram in which no datagram counts as lost [ns]: it may still be
-under way."""
+"""Time before a session's last datagram in which no datagram counts as lost [ns], because a missing
+datagram may still be under way."""
 TOPICS = {
     "uplink": ("/telemetry", "/uplink_delay"),
     "downlink": ("/delay_estimate", "/downlink_delay"),
 }
-"""Topics by direction: one has a row per sent datagram, the other per arrived datagram."""
+"""Direction -> topic with a row per sent datagram, topic with a row per arrived datagram."""
 
 
 def is_run(path: Path) -> bool:
-    """Tell whether a path is a run's folder or a recording, which have both directions."""
+    """Return whether a path is a run's folder or an MCAP file; both hold both directions."""
     if path.is_dir():
         return True
     with path.open("rb") as file:
@@ -128,11 +129,11 @@ def from_run(path: Path, direction: Direction, *, halve: bool) -> Packets:
     Args:
         path: Folder or file.
         direction: Direction of the link.
-        halve: Take half of each round trip that cloud measured. One-way delays are known only if
-            both ends share a clock.
+        halve: True: use half of each round trip that cloud has measured. False: use one-way delays,
+            which are known only if both ends share a clock.
 
     Raises:
-        BadInputError: If it holds no such delays.
+        BadInputError: If the run holds no such delays.
     """
     require("a trace of a run", ("record",))
     recording = _recording(path)
@@ -140,10 +141,10 @@ def from_run(path: Path, direction: Direction, *, halve: bool) -> Packets:
 
 
 def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_units: bool) -> Packets:
-    """Read a log of ping or irtt, or a CSV file; its content says which.
+    """Read a log of ping or irtt, or a CSV file; recognise the kind by the content.
 
     Raises:
-        BadInputError: If it is none of these or cannot be used.
+        BadInputError: If the file is none of these, or cannot be used.
     """
     from cloudrc.link.logs import read_csv, read_irtt, refuse_others
     from cloudrc.link.ping import is_ping, read_ping
@@ -161,7 +162,7 @@ def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_unit
 
 
 def _unpack(path: Path) -> list[str]:
-    """Unpack a file that irtt has compressed; empty if it is not compressed."""
+    """Unpack a file that irtt has compressed; return empty bytes if it is not compressed."""
     import gzip
     import zlib
 
@@ -195,11 +196,11 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 
     Args:
         recording: Recording of both ends.
-        path: Its path, for messages.
+        path: Path of the recording, for messages.
         direction: Direction of the link.
 
     Raises:
-        BadInputError: If it holds no such delays.
+        BadInputError: If the recording holds no one-way delays.
     """
     from math import isnan
 
@@ -241,10 +242,10 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 
 
 def _halves(recording: Recording, path: Path) -> Packets:
-    """Estimate each packet's delay as half of a round trip, at the time the command was sent.
+    """Estimate each packet's delay as half of a round trip, at the time of sending the command.
 
-    Lost packets do not show. Telemetry repeats the same echo until the next command arrives;
-    such repeats count once.
+    Lost packets are not visible in this estimate. Telemetry repeats an echo until the next command
+    arrives; the repeated echoes count once.
     """
     from math import isnan
 

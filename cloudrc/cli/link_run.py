@@ -1,7 +1,7 @@
 """Run `cloudrc link run`: the sidecar with its clock, sockets, programs and threads.
 
-/link.json on the metrics port shows the state of the shaper. Each answer starts tc and ip, so it is
-renewed at most once a second.
+/link.json on the metrics port shows the state of the shaper. To build an answer, the process starts
+tc and ip. Therefore an answer is cached for one second.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from cloudrc.link.sidecar import Machine, Sidecar
 
 STATUS_PERIOD = 1.0
-"""Time for which an answer of /link.json stays valid [s]."""
+"""How long an answer of /link.json is cached [s]."""
 EMPTY_STATUS = "{}\n"
-"""Answer of /link.json before anything is shaped."""
+"""Answer of /link.json before the shaper works."""
 
 
 def run(options: argparse.Namespace) -> int:
@@ -156,7 +156,7 @@ def _start_watching(
 
 
 class Metrics:
-    """Export the metrics of a sidecar; implements `Watcher`."""
+    """Export the metrics of a sidecar; implement `Watcher`."""
 
     def __init__(self, exporter: Exporter, direction: str, mode: str) -> None:
         self._exporter, self._direction, self._mode = exporter, direction, mode
@@ -167,7 +167,7 @@ class Metrics:
         self._exporter.ready(True)
 
     def asked(self, delay: float) -> None:
-        """Export the mean of the requested delay [s]."""
+        """Export the mean `delay` [s] that the profile requests."""
         self._exporter.asked(self._direction, delay)
 
     def unresolved(self, count: int) -> None:
@@ -184,7 +184,8 @@ def inspect_network(host: str, inside: tuple[str, ...] = ()) -> Near | None:
 
     Args:
         host: IPv4 address.
-        inside: Prefix of commands, "ip netns exec NAME"; empty for this namespace.
+        inside: Prefix of commands for another namespace, such as "ip netns exec NAME"; empty for
+            the namespace of this process.
     """
     from cloudrc.drivers.iproute2 import Programs
 
@@ -196,7 +197,7 @@ def inspect_network(host: str, inside: tuple[str, ...] = ()) -> Near | None:
 
 
 class LinkStatusSource:
-    """Describe the state of a sidecar as JSON; for any thread."""
+    """Describe the state of a sidecar as JSON; any thread may call the methods."""
 
     def __init__(
         self,
@@ -208,7 +209,7 @@ class LinkStatusSource:
         self._lock, self._text, self._valid_until = threading.Lock(), EMPTY_STATUS, -STATUS_PERIOD
 
     def text(self) -> str:
-        """Return the state as JSON; the previous answer if the tools hang."""
+        """Return the state as JSON; return the previous answer if tc or ip hangs."""
         if not self._lock.acquire(timeout=STATUS_PERIOD):
             return self._text
         try:

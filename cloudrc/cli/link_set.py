@@ -39,7 +39,7 @@ KEY is a key of a direction in a profile file. With --profile, time lines start
 anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
 LOCAL_TIMEOUT = 5.0
-"""Time limit for a local relay to apply a change [s]; it needs about 0.2 s."""
+"""Time limit for a local relay to apply a change [s]; a relay needs about 0.2 s."""
 POLL_PERIOD = 0.05
 """Pause between two reads of the link's state [s]."""
 
@@ -86,11 +86,11 @@ def execute(options: argparse.Namespace) -> int:
 def _set_here(
     options: argparse.Namespace, folder: Path, number: str
 ) -> tuple[Edit, list[LinkState]]:
-    """Write a new profile where the run's relay looks for it, and wait until it has applied it.
+    """Write a new profile into the relay's folder, and wait until the relay has applied it.
 
     Raises:
         BadInputError: If the request is not valid.
-        TimedOutError: If the relay does not apply it in time.
+        TimedOutError: If the relay does not apply the profile in time.
     """
     from cloudrc.config.document import Document
     from cloudrc.config.profile_edit import DIRECTIONS, edit_profile
@@ -124,7 +124,7 @@ def _set_here(
 def _set_in_cluster(
     options: argparse.Namespace, place: ReleasePlace, number: str
 ) -> tuple[LinkParts, Sent]:
-    """Give a new profile to both link containers."""
+    """Send a new profile to both link containers."""
     from concurrent.futures import ThreadPoolExecutor
 
     with ThreadPoolExecutor(1) as pool:
@@ -141,7 +141,7 @@ def _set_in_cluster(
 
 
 def _link_of(options: argparse.Namespace, where: ReleasePlace) -> LinkParts:
-    """Read the release's link; if there is none, raise the error that says why."""
+    """Read the link of the release; if the release has none, raise an error with the reason."""
     from cloudrc.cluster.link import read_link
 
     failed: CloudrcError
@@ -167,7 +167,7 @@ def _link_of(options: argparse.Namespace, where: ReleasePlace) -> LinkParts:
 
 
 def _note(edit: Edit, number: str) -> str:
-    """Write the text of the file beside the profile: who changed it, and why."""
+    """Return the text of `CHANGE_FILE`: number, cause and restart of the change."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 
@@ -203,7 +203,7 @@ def _row(state: LinkState) -> tuple[str, ...]:
 
 
 def _other_settings(own: Mapping[str, Any]) -> Iterator[str]:
-    """Name the other settings of a direction: its time line and its impairments of packets."""
+    """Name the settings beyond delay, loss and rate: the time line and further impairments."""
     for key in ("changes", "blackouts"):
         if own.get(key):
             yield f"{len(own[key])} {key}"

@@ -35,9 +35,10 @@ DEFAULT_PACKETS = 100_000
 """Default number of packets for the statistics of a link that does not change."""
 PACKETS_MAX, RATE_MAX = 10_000_000, 10_000.0
 ROWS = 1000
-"""Fewest packets that show a trace: each of fewer rows gets several of them."""
+"""Least number of packets for the picture of a trace. If the trace has fewer rows, each row gets
+several packets."""
 SECONDS = 30.0
-"""Shortest time that the picture shows by default [s]."""
+"""Default time that the picture shows [s]; longer if the profile's time line is longer."""
 KINDS = ("png", "svg", "pdf")
 
 
@@ -101,7 +102,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse numbers outside their range."""
+    """Refuse option values outside their range."""
     if options.seconds is not None and not 0.0 < options.seconds <= 86_400.0:
         raise BadInputError(f"--seconds {options.seconds:g}: give a number above 0, at most 86400")
     if options.seed < 0:
@@ -132,7 +133,11 @@ def _profile(name: str) -> Profile:
 def _way(
     asked: Direction, name: str, options: argparse.Namespace
 ) -> tuple[DirectionSample, Numbers]:
-    """Simulate one direction; a longer stream gives the statistics of a steady link."""
+    """Simulate one direction.
+
+    If the link does not change over time, the statistics come from a longer stream than the
+    picture.
+    """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import numbers
     from cloudrc.link.profile import Timeline
@@ -160,7 +165,7 @@ def _way(
 def stream(
     profile: DirectionProfile, name: str, seed: int, count: int, rate: float = RATE_HZ
 ) -> Stream:
-    """Simulate packets of a flight's kind and size in one direction.
+    """Simulate packets in one direction, with the kind and size of a flight's datagrams.
 
     Args:
         profile: Conditions of the link.
@@ -174,7 +179,7 @@ def stream(
 
 
 def _rows(profile: DirectionProfile, trace: Trace, name: str, seed: int) -> Stream:
-    """Simulate a packet at each row of a trace, or several if it has few rows."""
+    """Simulate one packet per row of a trace, or several per row if the trace has few rows."""
     rows = [round(time * 1e9) for time in trace.times]
     share = -(-ROWS // len(rows))
     if len(rows) == 1 or share == 1:

@@ -45,7 +45,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _block(lines: dict[str, str]) -> str:
-    """Lay out names and descriptions; wrap them on a terminal only."""
+    """Lay out names and descriptions; wrap lines only on a terminal."""
     indent = max(map(len, lines), default=0) + 4
     columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     wrap = textwrap.TextWrapper(max(columns, indent + 20), subsequent_indent=" " * indent)
@@ -53,7 +53,7 @@ def _block(lines: dict[str, str]) -> str:
 
 
 def describe_all(kind: str) -> dict[str, str]:
-    """Give name -> description for everything of a kind, sorted by name."""
+    """Return name -> description for all entries of a kind, sorted by name."""
     from cloudrc import plugins
     from cloudrc.config import shipped
 
@@ -71,7 +71,7 @@ def describe_all(kind: str) -> dict[str, str]:
 
 
 def _plain(line: str, kind: str) -> str:
-    """Leave out a prefix that the heading already says, such as "Predictor: "."""
+    """Remove the prefix of a line that repeats the heading, such as "Predictor: "."""
     before, colon, rest = line.rstrip(".").partition(": ")
     repeated = colon and kind.startswith(before.lower().rpartition(" ")[2])
     return rest[:1].upper() + rest[1:] if repeated else line.rstrip(".")

@@ -30,7 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line.
 
     Args:
-        arguments: Without the program's name; default: those of this process.
+        arguments: Words of the command line without the program's name; by default those of this
+            process.
 
     Returns:
         The exit code; `cloudrc --help` lists the codes.
@@ -72,7 +73,7 @@ def _dispatch(given: Sequence[str]) -> int:
 
 
 def _explain(error: Exception) -> tuple[str, int]:
-    """Give the message and the exit code of an error."""
+    """Return the message and the exit code of an error."""
     if isinstance(error, CloudrcError):
         return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
     if isinstance(error, OSError):

@@ -1,4 +1,4 @@
-"""Run `cloudrc mission`: fly and steer missions, in a local run or a release in a cluster."""
+"""Run `cloudrc mission`: fly and steer missions, in a local run or in a cluster."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Run the verbs of `cloudrc mission` in a cluster, where a mission is a Kubernetes Job.
 
-A mission is checked before its Job is created. The API checks it again with the same code, but only
-once the Job's pod runs.
+The command checks a mission before it creates the Job. The API checks the mission again with the
+same code, but not before the Job's pod runs.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ if TYPE_CHECKING:
 
 
 UNKNOWN_LIMIT = 600.0
-"""Time limit of a mission if neither it nor the release's experiment gives one [s]."""
+"""Time limit of a mission if neither the mission nor the release's experiment has a limit [s]."""
 PROBLEMS_MAX = 20
-"""Largest number of problems to print: a mission in wrong units has one per waypoint."""
+"""Largest number of problems to print; a mission in wrong units has a problem at each waypoint."""
 
 
 def parse(name: str, mission: Mapping[str, Any]) -> MissionRequest:
-    """Check a mission without its experiment.
+    """Check the fields of a mission, without the experiment.
 
     Args:
         name: Name of the file, for messages.
         mission: Body of the request to the API.
 
     Raises:
-        BadInputError: Lists all problems.
+        BadInputError: If the mission is invalid; the text lists all problems.
     """
     from pydantic import ValidationError
 
@@ -70,10 +70,10 @@ def check_on(release: Release, name: str, request: MissionRequest) -> float:
         request: The mission.
 
     Returns:
-        Time limit of the mission, else that of the experiment [s].
+        Time limit of the mission if it has one, else of the experiment [s].
 
     Raises:
-        BadInputError: Lists all problems.
+        BadInputError: If the mission is invalid; the text lists all problems.
     """
     from cloudrc.config.mission_check import check_mission
     from cloudrc.config.schema import Mission
@@ -88,7 +88,7 @@ def check_on(release: Release, name: str, request: MissionRequest) -> float:
 
 
 def _experiment(release: Release) -> Experiment | None:
-    """Read a release's experiment; None if this user or this version cannot read it."""
+    """Read the experiment of a release; None if this user's rights or this version prevent it."""
     from pydantic import ValidationError
 
     from cloudrc.cluster.client import FILE, experiment_text

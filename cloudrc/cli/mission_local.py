@@ -1,7 +1,7 @@
 """Run the verbs of `cloudrc mission` through teleop's API.
 
-A mission that is followed prints a line per event and ends with its verdict as exit code. The API
-may be away for a while: the cloud pod may be replaced in flight.
+A command that follows a mission prints one line per event and exits with the code of the verdict.
+The API may be unreachable for a while, because the cloud pod may be replaced in flight.
 """
 
 from __future__ import annotations
@@ -23,23 +23,25 @@ from cloudrc.errors import BadInputError, CloudrcError
 POLL_PERIOD = 0.5
 """Pause between two polls of a mission [s]."""
 API_TIMEOUT = 180.0
-"""Longest absence of the API [s]: a pod on another node first loads its image."""
+"""Longest time for which the API may be unreachable [s]; a pod on another node first loads its
+image."""
 TURN_MAX = 30.0
-"""Longest time for a request and the pause after it [s]; beyond it this process stood still."""
+"""Longest time for a request and the pause after it [s]. A longer time means that this process was
+suspended."""
 TERMINATION_LOG = Path("/dev/termination-log")
-"""File in a pod whose text `kubectl describe` shows once a container has ended."""
+"""File in a pod; `kubectl describe` shows its text after the container has ended."""
 
 _Answer = TypeVar("_Answer")
 
 
 class WaitedTooLongError(CloudrcError):
-    """Report that the API was away for too long."""
+    """Report that the API was unreachable for too long."""
 
     exit_code = 4
 
 
 class MissionFollower:
-    """Follow one mission, through restarts of the API."""
+    """Follow one mission, also across restarts of the API."""
 
     def __init__(
         self,
@@ -47,28 +49,29 @@ class MissionFollower:
         write: Callable[[str], None],
         patience: float | None = None,
     ) -> None:
-        """Store the API; follow nothing yet.
+        """Store the API; follow no mission yet.
 
         Args:
             api: Teleop's API.
             write: Receives a line for each event.
-            patience: Longest absence of the API [s]; None for `PATIENCE`.
+            patience: Longest time for which the API may be unreachable [s]; None for
+                `API_TIMEOUT`.
         """
         self._api, self._write = api, write
         self._patience = API_TIMEOUT if patience is None else patience
         self._last_event = 0
 
     def post(self, mission: Mapping[str, Any]) -> dict[str, Any]:
-        """Post a mission once the API answers; raises like `Api.post`."""
+        """Wait until the API answers, and post a mission; raise the errors of `Api.post`."""
         view = self._retry(lambda: self._api.post("/v1/missions", mission))
         self._write(f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}")
         return dict(view)
 
     def follow(self, mission_id: str) -> dict[str, Any]:
-        """Write the events of a mission until it has ended.
+        """Write the events of a mission until the mission has ended.
 
         Returns:
-            The verdict in the form of the API.
+            The verdict as the API sends it.
         """
         while True:
             view = self._retry(lambda: self._api.get(mission_path(mission_id)))
@@ -81,7 +84,7 @@ class MissionFollower:
             time.sleep(POLL_PERIOD)
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
-        """Repeat a request until there is an answer, or patience ends."""
+        """Repeat a request until the API answers or was unreachable for too long."""
         deadline, reported = Deadline(self._patience, TURN_MAX), False
         while True:
             try:
@@ -119,10 +122,10 @@ INTERRUPTED = 130
 
 
 def read_mission(name: str) -> dict[str, Any]:
-    """Read a shipped mission or a mission file; the API checks its content.
+    """Read a mission that cloudrc ships, or a mission file; the API checks the content.
 
     Raises:
-        BadInputError: If the file does not exist or holds no mission.
+        BadInputError: If the file does not exist, or if it holds no mission.
     """
     from cloudrc.config import shipped
 
@@ -136,7 +139,7 @@ def read_mission(name: str) -> dict[str, Any]:
 
 
 def fly(options: argparse.Namespace) -> int:
-    """Post a mission and follow it to its verdict; cancel it on an interrupt."""
+    """Post a mission and follow it until its verdict; cancel it on Ctrl-C."""
     if options.api is None:
         raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
     interrupt_on_signals()

@@ -38,13 +38,13 @@ def format_document(document: object, form: str) -> str:
 
 
 def is_live(stream: TextIO) -> bool:
-    """Say whether a stream is a terminal that can rewrite a line in place."""
+    """Return whether a stream is a terminal that can rewrite a line in place."""
     dull = os.environ.get("TERM", "") in ("", "dumb") or bool(os.environ.get("CI"))
     return stream.isatty() and not dull
 
 
 def terminal_columns(stream: TextIO) -> int:
-    """Give the width of a stream's terminal in columns; 80 if unknown."""
+    """Return the width of a stream's terminal in columns; 80 if it is unknown."""
     try:
         return os.get_terminal_size(stream.fileno()).columns or 80
     except (OSError, ValueError):
@@ -53,9 +53,10 @@ def terminal_columns(stream: TextIO) -> int:
 
 @contextlib.contextmanager
 def ignore_closed_pipe(stream: TextIO) -> Iterator[None]:
-    """Ignore that a stream's reader, such as `head`, has closed the pipe.
+    """Ignore the error if a stream's reader, such as `head`, has closed the pipe.
 
-    Flush inside the block: buffered text would fail later, outside it.
+    The caller must flush the stream inside the block: otherwise buffered text fails after the
+    block.
     """
     try:
         yield
@@ -64,7 +65,7 @@ def ignore_closed_pipe(stream: TextIO) -> Iterator[None]:
 
 
 def discard_output(stream: TextIO) -> None:
-    """Redirect a stream to /dev/null; Python flushes it once more at exit."""
+    """Redirect a stream to /dev/null, because Python flushes the stream once more at exit."""
     with contextlib.suppress(OSError, ValueError):  # a test's stream has no file
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
@@ -79,11 +80,11 @@ def paint(text: str, colour: str, stream: TextIO | None = None) -> str:
 
 
 def console(stream: TextIO) -> Console:
-    """Make a console of rich that writes to a stream; elsewhere than on a terminal it is plain."""
+    """Make a rich console that writes to a stream, in plain text if the stream is no terminal."""
     from rich.console import Console as RichConsole
 
     class Quiet(RichConsole):
-        """A console that goes on if its reader, such as `head`, has closed the pipe."""
+        """A console that continues without error if its reader, such as `head`, closes the pipe."""
 
         def on_broken_pipe(self) -> None:
             discard_output(stream)
@@ -104,7 +105,7 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     """Align rows in columns, one line per row.
 
     Args:
-        rows: Cells, escaped here; all rows have the same length.
+        rows: Cells; this function escapes them. All rows have the same length.
         right: Indices of the columns to align right.
 
     Returns:
@@ -124,17 +125,17 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
 
 
 def escape(text: str) -> str:
-    """Escape what is not printable, so that text keeps to its line and controls no terminal."""
+    """Escape unprintable characters: the text stays in its line and cannot control a terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def print_line(line: str, stream: TextIO | None = None) -> None:
-    """Print a line, escaped and flushed at once (default: on stdout)."""
+    """Escape a line, print it (default: on stdout) and flush at once."""
     print(escape(line), file=stream, flush=True)
 
 
 def format_number(value: float) -> str:
-    """Write a value of any unit with four significant digits, without exponent if possible."""
+    """Write a value (any unit) with four significant digits, without exponent if possible."""
     if float(value).is_integer() and abs(value) < 1e5:
         return f"{value:.0f}"  # counts
     if 1e-4 <= abs(value) < 1e5:

@@ -59,10 +59,10 @@ _CHOICE = re.compile(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)
 
 
 class Parser(argparse.ArgumentParser):
-    """Raise the errors of argparse in one line, for `main` to print."""
+    """Parse a command line; raise errors of argparse as one line, which `main` prints."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise the error and name the help that explains it."""
+        """Raise the error; name the help page that explains it."""
         choice = _CHOICE.fullmatch(message)
         if choice:
             argument, given, valid = choice.groups()
@@ -72,7 +72,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def describe_unknown(given: str, names: Iterable[str]) -> str:
-    """Say that a name is unknown and suggest the nearest known one, or all."""
+    """Return an error text about an unknown name, with the most similar known name or all names."""
     known = sorted(names)
     near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
     return f"no '{given}'; " + (f"did you mean '{near[0]}'?" if near else f"choose {_or(known)}")
@@ -83,16 +83,16 @@ def _or(names: Sequence[str]) -> str:
 
 
 def read_count(text: str) -> int:
-    """Read a whole number from 1 to `COUNT_MAX`; a type for argparse."""
+    """Read a whole number from 1 to `COUNT_MAX`, as a type for argparse."""
     if not text.isdecimal() or not 1 <= int(text) <= COUNT_MAX:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1 to {COUNT_MAX}")
     return int(text)
 
 
 def input_file(text: str) -> Path:
-    """Read the path of an input file; a type for argparse.
+    """Read the path of an input file, as a type for argparse.
 
-    Refuse a pipe or a device: opening it could wait for ever.
+    Refuse pipes and devices, because opening them could block forever.
     """
     if os.path.exists(text) and not os.path.isfile(text):
         raise argparse.ArgumentTypeError(f"{text}: not a regular file")
@@ -103,8 +103,9 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
     """Build the parser.
 
     Args:
-        wanted: Commands to import; the others get their names only.
-        for_completion: Let argparse list the commands; the help lists them in groups.
+        wanted: Commands to import; for the others the parser knows only the names.
+        for_completion: Whether argparse lists the commands. Otherwise the help lists them in
+            groups.
     """
     common = Parser(add_help=False)
     common.add_argument(

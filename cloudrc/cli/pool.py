@@ -1,4 +1,4 @@
-"""Run work on several cores, and end commands and their workers on signals."""
+"""Run work on several cores; end commands and their worker processes on signals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PARENT_PERIOD = 0.5
 def interrupt_on_signals() -> None:
     """Raise KeyboardInterrupt on SIGTERM and SIGHUP, as on Ctrl-C.
 
-    A SIGHUP that is ignored from the start stays ignored: `nohup` does that.
+    If SIGHUP is ignored at the start, as under `nohup`, it stays ignored.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
@@ -39,7 +39,7 @@ def _hung_up(number: int, frame: FrameType | None) -> None:
 
 
 def exit_with_parent(parent: int) -> None:
-    """End this worker of a pool as soon as its parent has ended, even if it was killed.
+    """End this worker process soon after its parent has ended, even if the parent was killed.
 
     Args:
         parent: Process id of the process that made the pool.
@@ -56,13 +56,13 @@ def exit_with_parent(parent: int) -> None:
 Work = TypeVar("Work")
 Result = TypeVar("Result")
 BATCH_MAX = 1000
-"""Maximum number of pieces of work in a pool. Before Python 3.11.6, a pool hangs if it gets more
-than 16,384 at once (cpython issue 105829)."""
+"""Maximum number of tasks that a pool gets at once. Before Python 3.11.6, a pool hangs if it gets
+more than 16,384 tasks at once (cpython issue 105829)."""
 WORKER_KILLED = "a worker was killed, perhaps by the kernel because memory ran out"
 
 
 class WorkerDiedError(InvalidRunError):
-    """A process of the pool was killed from outside."""
+    """Report that somebody has killed a process of the pool."""
 
 
 def map_in_order(
@@ -70,12 +70,13 @@ def map_in_order(
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    Ctrl-C, and closing the generator, end the calls that are running and drop the others.
+    Ctrl-C or closing the generator ends the running calls and drops the others.
 
     Args:
-        function: A module's function: other processes call it. With one process, this one does.
-        work: Its arguments, one for each call.
-        jobs: Number of processes, at most one per core and per piece of work.
+        function: A function at module level, because worker processes call it. If `jobs` is 1, the
+            present process calls it.
+        work: Arguments of the function, one for each call.
+        jobs: Number of processes; limited to the number of cores and to the length of `work`.
 
     Yields:
         The function's results, in the order of `work`.
@@ -114,11 +115,11 @@ def map_in_order(
 
 @contextmanager
 def _isolated_start() -> Iterator[None]:
-    """Isolate processes that start inside from the terminal and from the working folder.
+    """Isolate worker processes that start inside the block.
 
-    They ignore a terminal's signals to the process group, since ignored signals stay ignored in a
-    new program; the parent ends them. They import no Python from the working folder, which may
-    come from somebody else.
+    The workers ignore the terminal's signals, since ignored signals stay ignored in a new program;
+    the parent ends the workers. The workers import no Python from the working folder, because its
+    files may come from somebody else.
     """
     numbers = (signal.SIGINT, signal.SIGHUP)
     before = [signal.signal(number, signal.SIG_IGN) for number in numbers]

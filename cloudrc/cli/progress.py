@@ -30,7 +30,7 @@ REDRAW_PERIOD = 0.1
 FILE_COLUMNS = 100
 """Maximum width of an event's line where there is no terminal."""
 DROPPED = ("factor", "delay", "position", "waypoint")
-"""Cells of the status line to drop, in this order, until it fits."""
+"""Cells that the status line drops, in this order, until the line fits."""
 
 
 class FlightView:
@@ -44,7 +44,7 @@ class FlightView:
         Args:
             stream: Where to write; never stdout if that carries JSON or YAML.
             waypoints: Number of the mission's waypoints.
-            clock: Monotonic time, for the real-time factor and the redrawing [s].
+            clock: Returns the monotonic time [s], for the real-time factor and for redrawing.
         """
         self._waypoints, self._clock = waypoints, clock
         self._console = console(stream)
@@ -58,7 +58,7 @@ class FlightView:
         self._guard, self._ended = GuardState.GROUND, False
 
     def see(self, records: Iterable[Record]) -> None:
-        """Process records of either end, oldest first."""
+        """Process records of world or cloud, oldest first."""
         for record in records:
             match record:
                 case TelemetrySent():
@@ -93,11 +93,11 @@ class FlightView:
 
     @property
     def flown(self) -> float:
-        """Give the time since the first telemetry, on world's clock [s]."""
+        """Return the time since the first telemetry, on world's clock [s]."""
         return (self._now_ns - self._first_ns) * 1e-9
 
     def line(self, width: int = 80) -> Text:
-        """Give the status line, at most `width` columns wide."""
+        """Return the status line, at most `width` columns wide."""
         elapsed = self._clock() - self._began
         moving = elapsed > 0 and self.flown > 0
         number = self._waypoint + 1
@@ -118,7 +118,7 @@ class FlightView:
         return line
 
     def _position_text(self) -> str:
-        """Give the robot's position [m]."""
+        """Return the robot's position as text [m]."""
         # Round first, then add 0.0: that turns a negative zero into a positive one.
         x, y, z = (round(coordinate, 2) + 0.0 for coordinate in self._position)
         return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
@@ -127,7 +127,7 @@ class FlightView:
         return "" if math.isnan(self._delay) else f"delay {self._delay * 1e3:3.0f} ms"
 
     def _event(self, text: str) -> None:
-        """Write an event's line, with position and delay if they fit."""
+        """Write the line of an event, with position and delay if there is room."""
         text = escape(text)
         width = self._console.width if self._status else FILE_COLUMNS
         delays = (self._delay_text(), "")

@@ -1,4 +1,4 @@
-"""`cloudrc recover FILE`: write a whole copy of a torn recording, up to its first damaged part."""
+"""`cloudrc recover FILE`: copy a torn recording into a complete file, up to the first damage."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Recover a recording; print what is kept and what is lost."""
+    """Recover a recording; print what the copy keeps and what is lost."""
     require("a recovery", ("record",))
     from cloudrc.record.recover import recover
 

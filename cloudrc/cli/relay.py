@@ -2,11 +2,11 @@
 
 With `--link DIR` the relay follows the changes of `cloudrc link set` and publishes its state:
 
-    DIR/profile.json, change.json    the requested profile; missing before the first change
-    DIR/uplink.json, downlink.json   the state in force (`cloudrc/link/state.py`)
-    DIR/uplink.released...           how late datagrams left so far, written every 2 s
+    DIR/profile.json, change.json            requested profile; missing before the first change
+    DIR/uplink.json, downlink.json           state in force (`cloudrc/link/state.py`)
+    DIR/uplink.released, downlink.released   how late datagrams left so far, written every 2 s
 
-A separate thread reads and writes these files; the relay's loop only swaps the profiles.
+A separate thread reads and writes these files; the relay's loop only replaces the profiles.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def open_relay(
     """Make the relay between the addresses of the command line.
 
     Raises:
-        BadInputError: If an address is not usable; names the flags.
+        BadInputError: If an address is not usable; the text names the flags.
     """
     from cloudrc.link.relay import Relay
     from cloudrc.tunnel.codec import peek
@@ -157,7 +157,7 @@ def _bind_side(flag: str, listen: tuple[str, int]) -> socket.socket:
 
 
 def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
-    """Read the profiles that the relay starts with, by direction."""
+    """Return the profiles that the relay starts with, by direction."""
     from cloudrc.assembly import link_profile
 
     ways = {way: getattr(experiment, way) for way in WAYS}
@@ -166,7 +166,7 @@ def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
 
 
 def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
-    """Wrap `stop`: also export the relay's counts once a second."""
+    """Wrap `stop` in a function that also exports the relay's counts once a second."""
     from cloudrc.records import Counted
 
     due_ns = 0
@@ -184,7 +184,7 @@ def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Cal
 
 
 RELEASED_PERIOD = 2.0
-"""Time between two publications of the lateness of datagrams [s]; an end reads it as often."""
+"""Time between two publications of the lateness of datagrams [s]; an end reads with this period."""
 
 
 class RelayControl:
@@ -201,11 +201,11 @@ class RelayControl:
         """Publish the initial state.
 
         Args:
-            folder: Created if missing; read for changes, gets the link's state.
-            links: "uplink" and "downlink".
-            first: The profiles that the links started with.
+            folder: Folder of the profile and of the link's state; created if missing.
+            links: The links "uplink" and "downlink".
+            first: The profiles that the links have started with.
             asked: Called with a direction and its newly requested mean delay [s].
-            relay: Takes in what has arrived before a change, and gives its lateness.
+            relay: The relay. Before a change it takes in the datagrams that have arrived.
         """
         self._folder, self._links, self._asked, self._relay = folder, links, asked, relay
         self._released_at = 0.0
@@ -231,7 +231,7 @@ class RelayControl:
             self._applied.append((way, loaded, time.monotonic_ns()))
 
     def stop_after(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Wrap `stop`, which the relay calls all the time, so that it also applies changes."""
+        """Return a function for the relay's loop: apply pending changes, then call `stop`."""
 
         def ask() -> bool:
             if self._pending:
@@ -241,7 +241,7 @@ class RelayControl:
         return ask
 
     def look(self) -> None:
-        """Check once for a requested change, and publish the applied ones."""
+        """Check once for a requested change; publish the changes that are applied."""
         for way, file in self._files.items():
             if (loaded := file.poll()) is not None:
                 self._pending.append((way, loaded))

@@ -1,4 +1,4 @@
-"""`cloudrc report RUN`: write the report of a recorded run again."""
+"""`cloudrc report RUN`: rewrite the report of a recorded run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Write the report from the recording; give the run's exit code."""
+    """Write the report from the recording; return the exit code of the run's verdict."""
     require("a report", ("record", "report"))
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")

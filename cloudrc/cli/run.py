@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from cloudrc.report.document import Run
 
 Flight = Callable[[Path, TextIO, int], dict[str, Any]]
-"""Function that flies: (folder to fill, stream for its progress, number of waypoints) -> report."""
+"""Function that flies: (run folder, stream for the progress, number of waypoints) -> report."""
 
 MODES = ("local", "virtual", "cluster")
 EXTRAS = {
@@ -41,12 +41,12 @@ EXTRAS = {
     "virtual": ("world", "record", "report"),
     "cluster": ("kube", "record", "report"),
 }
-"""The extras that each mode needs."""
+"""Mode -> the extras that it needs."""
 GRACE = 30.0
-"""Time after the mission's time limit at which the program ends a flight in any case [s]."""
+"""Time after the mission's time limit at which the program ends a flight that still runs [s]."""
 
 See = Callable[["list[Record]"], None]
-"""Function that shows records of a flight during the flight."""
+"""Function that displays records during the flight."""
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
 
 # The most important numbers -> their labels; report.html and report.json show all numbers.
@@ -179,7 +179,7 @@ def _fly_once(options: argparse.Namespace, mode: str, overrides: list[str]) -> i
 
 
 def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
-    """Prepare a flight on this machine."""
+    """Return the function that flies on this machine."""
 
     def flight(folder: Path, stream: TextIO, waypoints: int) -> dict[str, Any]:
         from cloudrc.cli.progress import FlightView
@@ -196,7 +196,7 @@ def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
 
 
 def _in_cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> Flight:
-    """Prepare a flight in the cluster that the flags name."""
+    """Return the function that flies in the cluster that the flags name."""
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files
     from cloudrc.cluster.tools import program
 
@@ -230,17 +230,19 @@ def fly(
     """Fly one experiment and fill its run folder.
 
     Args:
-        experiment: Complete and checked.
+        experiment: The experiment, complete and checked.
         mode: "virtual" or "local".
-        folder: Empty; gets configuration, recording and report.
-        see: Called with records during the flight: all in virtual mode, else a selection.
+        folder: Empty folder; receives configuration, recording and report.
+        see: Called with records during the flight: with all in virtual mode, with a selection in
+            local mode.
         page: Whether to write the HTML page with figures; the numbers are always written.
 
     Returns:
         The content of report.json.
 
     Raises:
-        CloudrcError: If the flight broke off; its recording is kept and reported as interrupted.
+        CloudrcError: If the flight broke off. The recording stays, and the report says
+            "interrupted".
     """
     from cloudrc.config.load import dump
 
@@ -339,7 +341,10 @@ def _fly_local(
 
 
 def check_own_models(experiment: ResolvedExperiment) -> None:
-    """Compile a user's own robot or scene before a process starts, which would die of a bad one."""
+    """Compile the user's own robot and scene before the processes start.
+
+    Otherwise an invalid model would end a process of the flight.
+    """
     world = experiment.world
     if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
         from cloudrc.world.scene import compile_model
@@ -356,7 +361,7 @@ def _report_ends(
 ) -> dict[str, Any]:
     """Merge the recordings of both ends and write the report.
 
-    If an interrupted run has recorded nothing, raise `failure`.
+    If a run was interrupted and has recorded nothing, raise `failure`.
     """
     from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
@@ -389,7 +394,7 @@ def _report(
 
 
 def exit_code(report: Mapping[str, Any]) -> int:
-    """Give the exit code of a report's verdict."""
+    """Return the exit code of a report's verdict."""
     from cloudrc.metrics.verdict import EXIT_CODES
 
     return EXIT_CODES[report["verdict"]]
@@ -409,7 +414,7 @@ def show(report: Mapping[str, Any], folder: Path) -> None:
 
 
 def verdict(report: Mapping[str, Any]) -> str:
-    """Give the verdict with the first failure; further failures follow, one a line."""
+    """Return the verdict with the first failure, then one line for each further failure."""
     outcome = report["verdict"]
     word = paint(outcome.upper(), COLOURS[outcome])
     failures = report["failures"]
@@ -426,7 +431,7 @@ def _further_failure(failure: Mapping[str, Any]) -> str:
 
 
 def main_numbers(report: Mapping[str, Any]) -> str:
-    """Lay out the main numbers as a table, without those that are unknown."""
+    """Lay out the main numbers as a table; leave out unknown numbers."""
     numbers = report["numbers"]
     rows = [
         (f"  {label}", *_cells(name, numbers[name]))

@@ -99,7 +99,7 @@ def end_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _target_arguments(target: argparse._MutuallyExclusiveGroup) -> None:
-    """Declare where an end sends to: a fixed peer, or a file that names it."""
+    """Declare the flags for an end's destination: a fixed peer, or a file that names the peer."""
     target.add_argument(
         "--peer",
         type=read_address,
@@ -115,9 +115,9 @@ def _target_arguments(target: argparse._MutuallyExclusiveGroup) -> None:
 
 
 def read_address(text: str) -> Address:
-    """Read HOST:PORT, with an IPv6 address in brackets; a type for argparse.
+    """Read HOST:PORT, with an IPv6 address in brackets, as a type for argparse.
 
-    [::] stands for all addresses of both families; on a machine without IPv6 for those of IPv4.
+    [::] means all IPv4 and IPv6 addresses; on a machine without IPv6, all IPv4 addresses.
     """
     host, _, port = text.rpartition(":")
     bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
@@ -129,7 +129,7 @@ def read_address(text: str) -> Address:
 
 
 def _has_ipv6() -> bool:
-    """Check whether this machine can open a socket for IPv6."""
+    """Return whether this machine can open an IPv6 socket."""
     try:
         socket.socket(socket.AF_INET6, socket.SOCK_DGRAM).close()
     except OSError:
@@ -144,10 +144,10 @@ def show_address(where: Address) -> str:
 
 
 def ipv4_addresses(name: str) -> list[str]:
-    """Give the IPv4 addresses of a host name; relay and netem shape no other.
+    """Return the IPv4 addresses of a host name; relay and netem shape only IPv4.
 
     Raises:
-        OSError: If the name has none; says so if it has IPv6 addresses alone.
+        OSError: If the name has no IPv4 address; the text tells if it has only IPv6 addresses.
     """
     return _addresses(name, socket.AF_INET)
 
@@ -175,15 +175,15 @@ def _only_ipv6(name: str) -> bool:
 
 
 def resolve_address(flag: str, where: Address, listen: Address | None = None) -> Address:
-    """Resolve an address once, before the loop, which must not wait for a name server.
+    """Resolve an address once, before the loop starts: the loop must not wait for a name server.
 
     Args:
         flag: Flag of the address, for messages.
         where: The address.
-        listen: The own address; if it is one of IPv6, `where` may be one, too.
+        listen: Own address of the process. If it is an IPv6 address, `where` may also be IPv6.
 
     Raises:
-        BadInputError: If its host cannot be resolved; names the flag.
+        BadInputError: If the host cannot be resolved; the text names the flag.
     """
     host, port = where
     own = "" if listen is None else listen[0]
@@ -200,7 +200,7 @@ def resolve_address(flag: str, where: Address, listen: Address | None = None) ->
 
 
 def read_size(text: str) -> float:
-    """Read a size as Kubernetes writes it [bytes]; a type for argparse."""
+    """Read a size in the notation of Kubernetes [bytes], as a type for argparse."""
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti)?", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 500M or 1Gi")
@@ -213,13 +213,13 @@ def read_size(text: str) -> float:
 
 
 def warn_if_exposed(listen: Address) -> None:
-    """Warn if other machines can send to an address."""
+    """Write a warning if other machines can send to an address."""
     if not listen[0].startswith("127.") and listen[0] not in LOOPBACK_NAMES:
         print(f"cloudrc: warning: {listen[0]} can be reached from outside", file=sys.stderr)
 
 
 def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
-    """Serve a process's metrics at the address of its flag; None without the flag."""
+    """Serve the metrics of a process at the address of `--metrics`; None without the flag."""
     if options.metrics is None:
         return None
     from cloudrc.drivers.exporter import Exporter
@@ -233,7 +233,7 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
 
 @contextmanager
 def listening(flag: str, listen: Address) -> Iterator[None]:
-    """Name the flag and the address if opening a socket inside fails."""
+    """Name flag and address in the error if opening a socket inside the block fails."""
     try:
         yield
     except OSError as error:
@@ -244,12 +244,12 @@ def listening(flag: str, listen: Address) -> Iterator[None]:
 
 
 TRACE_MAX = 2 << 20
-"""Maximum size of a trace file that the link's container names [bytes]. The container's own traces
-come from a ConfigMap, which holds at most 1 MiB."""
+"""Maximum size of a trace file that the state file of the link container names [bytes]. The
+container's own traces come from a ConfigMap, which holds at most 1 MiB."""
 
 
 class EndRuntime(NamedTuple):
-    """Everything that an end needs, both to be built and to fly.
+    """All that an end needs at construction and in flight.
 
     Attributes:
         options: The command's options.
@@ -280,9 +280,9 @@ class EndRuntime(NamedTuple):
         over: Callable[[], bool] = lambda: False,
         slip_ns: Callable[[], int] = lambda: 0,
     ) -> None:
-        """Run an end until it stops; `flies` says whether the robot is flying.
+        """Run an end until it stops; `flies` returns whether the robot is flying.
 
-        The other arguments are those of `process.run_end`.
+        For the other arguments see `process.run_end`.
         """
         from cloudrc.drivers.process import run_end
 
@@ -305,7 +305,7 @@ class EndRuntime(NamedTuple):
 
 
 def open_end(options: argparse.Namespace, name: str) -> EndRuntime:
-    """Open what the "world" or the "cloud" needs; an error names the flag."""
+    """Open all that the end "world" or "cloud" needs; an error names the flag."""
     from cloudrc.config.load import fingerprint, load_experiment, read_experiment
     from cloudrc.drivers.machine import clock_id
 
@@ -333,7 +333,7 @@ def _open_keys(options: argparse.Namespace) -> KeyFile:
 
 
 def _open_peer(options: argparse.Namespace) -> Peer:
-    """Bind the socket of an end, which sends to its peer or along its route."""
+    """Bind the socket of an end; the socket sends to the peer or to the address of the route."""
     from cloudrc.drivers.realtime import Peer, Route
 
     warn_if_exposed(options.listen)
@@ -349,7 +349,7 @@ def _open_peer(options: argparse.Namespace) -> Peer:
 
 
 def _open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
-    """Make the recorder of an end; without a file it writes to /dev/null."""
+    """Make the recorder of an end; without a file the recorder writes to /dev/null."""
     from cloudrc.record.recorder import Recorder
     from cloudrc.record.writer import McapWriter
 
@@ -366,9 +366,10 @@ def _open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> 
 
 
 def _keep_before(path: Path) -> int:
-    """Rename the recording of the previous process to NAME.before.mcap; give its size [bytes].
+    """Rename the recording of the previous process to NAME.before.mcap; return its size [bytes].
 
-    A restarted container finds it on its volume; it shows why the previous process ended.
+    A restarted container finds this recording on its volume. The recording shows why the previous
+    process ended.
     """
     try:
         size = path.stat().st_size if path.is_file() else 0
@@ -382,14 +383,14 @@ def _keep_before(path: Path) -> int:
 def _record_filter(
     options: argparse.Namespace, flies: Callable[[], bool]
 ) -> Callable[[list[Record]], list[Record]]:
-    """Give the function that selects the records to write."""
+    """Return the function that selects the records to write."""
     from cloudrc.drivers.recording import FlightsOnly
 
     return FlightsOnly(flies) if options.record_flights else list
 
 
 def _link_state(options: argparse.Namespace) -> Path | None:
-    """Give the file in which the link's process writes its state."""
+    """Return the state file of the link's process; None without flags for the link."""
     link: Path | None = options.link
     route: Path | None = options.route
     return link if link is not None or route is None else route.with_name("link.json")
@@ -398,7 +399,7 @@ def _link_state(options: argparse.Namespace) -> Path | None:
 def _link_monitor(
     options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
 ) -> LinkMonitor:
-    """Make the monitor of the direction that an end receives, following changes of its profile."""
+    """Make the monitor of the direction that an end receives; it follows changes of the profile."""
     import json
 
     from cloudrc.assembly import link_profile

@@ -1,4 +1,4 @@
-"""`cloudrc run --seeds N`: fly N seeds on all cores; tabulate medians with their intervals."""
+"""`cloudrc run --seeds N`: fly N seeds on all cores; tabulate medians and confidence intervals."""
 
 from __future__ import annotations
 
@@ -35,12 +35,13 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
     """Compute the confidence interval of the median, for any distribution.
 
     The k-th smallest and the k-th largest of n values enclose the median with probability
-    1 - 2 * sum_{i<k} C(n, i) / 2^n; k is the largest for which that is at least 95 %.
+    1 - 2 · sum_{i<k} C(n, i) / 2^n. k is the largest number for which the probability is at least
+    95 %.
 
     Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, section 7.1.
 
     Returns:
-        Lower and upper bound, or None for fewer than 6 values: too few for 95 %.
+        Lower and upper bound; None for fewer than 6 values, which cannot reach 95 %.
     """
     ordered, n = sorted(values), len(values)
     outside, k = 0.0, 0
@@ -53,7 +54,7 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
 
 
 def summarise(reports: Sequence[Report]) -> dict[str, Any]:
-    """Summarise reports: runs done, all runs, and statistics of each number."""
+    """Summarise reports: number of successful runs, of all runs, and statistics per number."""
     units: dict[str, str] = {}
     values: dict[str, list[float]] = {}
     for report in reports:
@@ -74,7 +75,7 @@ def summarise(reports: Sequence[Report]) -> dict[str, Any]:
 
 
 def as_table(summary: Mapping[str, Any]) -> str:
-    """Lay out a summary as a table, with the share of successful runs below."""
+    """Lay out a summary as a table; the last line is the share of successful runs."""
     rows = [("number", "median", "95 % interval", "unit")]
     for name, entry in summary["numbers"].items():
         bounds = entry["interval"]
@@ -102,9 +103,9 @@ def as_csv(reports: Sequence[Report]) -> str:
 
 
 def fly_seeds(options: argparse.Namespace, overrides: list[str], fly: Fly) -> int:
-    """Fly seeds 1 to N and return the exit code, 0 only if all succeed.
+    """Fly seeds 1 to N; return the exit code, which is 0 only if all runs succeed.
 
-    If the user interrupts or a worker dies, the table covers the finished seeds.
+    After an interrupt or the death of a worker, the table covers the finished seeds.
 
     Args:
         options: Flags of `cloudrc run`.

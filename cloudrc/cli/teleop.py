@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 FILES_MAX = 8_192
-"""Limit of open files: idle connections leave room for the one of an emergency stop, and take at
-most 64 MB."""
+"""Limit of open files. It is high enough that idle connections leave room for an emergency stop.
+Idle connections use at most 64 MB of memory."""
 
 
 def serve_api(
     options: argparse.Namespace, experiment: ResolvedExperiment, bridge: Bridge
 ) -> ApiServer:
-    """Start the API; it answers that teleop is not ready until the bridge is opened."""
+    """Start the API; until the bridge is opened, the API answers that teleop is not ready."""
     from cloudrc import assembly
     from cloudrc.geometry.scene import load_scene
     from cloudrc.link.state import publish
@@ -102,9 +102,9 @@ file, which only its owner can open. To make a token that only you can read:
 (umask 077; openssl rand -hex 32 > DIR/operator). A token in DIR/reader may only
 read."""
 LOCK_PERIOD = 0.2
-"""Pause between two attempts to open a journal that another teleop has open [s]."""
+"""Pause between two attempts to open a journal that another teleop process has locked [s]."""
 PAUSE_LIMIT_NS = 500_000_000
-"""Longest wait for the robot to hold before teleop ends [ns]."""
+"""Longest time that teleop, before it ends, waits for the robot to hold [ns]."""
 SALT_SIZE = 16
 """Size of the random salt of mission numbers [bytes]."""
 
@@ -148,7 +148,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run teleop until its mission has ended or it is told to stop."""
+    """Run teleop until its mission has ended or a signal stops the process."""
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.records import Counted
@@ -184,7 +184,10 @@ def execute(options: argparse.Namespace) -> int:
 
 
 class _Ending:
-    """Decide when teleop may end: first pause the mission, then wait until the robot holds."""
+    """Pause the mission after a stop signal; return True once the robot holds.
+
+    It also returns True after `PAUSE_LIMIT_NS`.
+    """
 
     def __init__(self, service: MissionService, asked: Callable[[], bool]) -> None:
         self._service, self._stop_asked = service, asked
@@ -246,7 +249,7 @@ def _fly(
 
 
 def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> MissionStore | None:
-    """Open the store once no other teleop holds it; None if stopped before."""
+    """Open the store once no other teleop has locked it; return None if stopped before."""
     from cloudrc.teleop.store import MissionStore, StoreLockedError, connect, open_store
 
     salt, reported = os.urandom(SALT_SIZE), False
@@ -271,7 +274,7 @@ def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> 
 def _start(
     options: argparse.Namespace, experiment: ResolvedExperiment, service: MissionService
 ) -> bool:
-    """Start the mission of the command line, if any; return whether there is one."""
+    """Start the mission of the command line, if any; return whether teleop flies it."""
     from cloudrc import assembly
     from cloudrc.teleop.store import ConflictError, Order
 

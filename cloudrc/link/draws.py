@@ -1,17 +1,18 @@
 """Draw the random impairments of each packet from counter-based random numbers.
 
-All functions are pure, with a cache for speed. Seed, direction, epoch and kind of datagram name a
+All functions are pure, with a cache for speed. Seed, direction, epoch and kind of datagram select a
 stream; the packet's counter is its place in the stream. So the impairment of a packet does not
-depend on earlier calls. Draws are made for blocks of 256 packets, one column per purpose: a purpose
-that a profile does not use needs no draws and does not shift the others.
+depend on earlier calls. The functions draw for blocks of 256 packets, with one column of numbers
+per purpose. A purpose that a profile does not use needs no draws and does not change the numbers of
+other purposes.
 
-A state that passes from packet to packet (burst, correlation) restarts from its stationary
-distribution every 64 blocks (16,384 packets, 164 s at 100 Hz). This bounds the work for any
-counter, even a forged one; the chain is interrupted once in 16,384 packets.
+A state that carries over from packet to packet (burst, correlation) restarts from its stationary
+distribution every 64 blocks (16,384 packets, 164 s at 100 Hz). The restart bounds the work for any
+counter, even a forged one. It interrupts the chain once in 16,384 packets.
 
-The impairment of a packet is a tuple with one entry per copy that arrives: () if it is lost, two
-entries if it is duplicated. An entry is what jitter and the bad state add to the delay [ns],
-possibly negative, or OVERTAKES.
+The impairment of a packet is a tuple with one entry per copy that arrives: no entry if the packet
+is lost, two entries if it is duplicated. An entry is OVERTAKES or the sum that jitter and the bad
+state add to the delay [ns]; the sum may be negative.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 BLOCK = 256
 """Number of packets whose draws are made together."""
 BLOCK_BITS = 8
-"""Number of the low bits of a counter that give the place in its block."""
+"""How many low bits of a counter give the packet's place in its block."""
 CHAIN_BLOCKS = 64
 """Number of blocks after which states restart."""
 
@@ -43,7 +44,7 @@ StreamKey: TypeAlias = tuple[int, int]
 
 
 class Purpose(IntEnum):
-    """What a column of draws is for."""
+    """Purpose of a column of draws."""
 
     DELAY = 0
     COPY_DELAY = 1
@@ -56,7 +57,7 @@ class Purpose(IntEnum):
 
 
 def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
-    """Compute the key of the stream of one kind of datagram in one session and direction.
+    """Compute the stream key for one kind of datagram in one session and direction.
 
     Args:
         seed: Seed of the experiment.
@@ -95,10 +96,10 @@ def uniforms(key: StreamKey, purpose: Purpose, block: int) -> NDArray[np.float64
 def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) -> tuple[float, ...]:
     """Draw standard normal variates, each correlated with its predecessor.
 
-    They follow the autoregression z_n = c z_(n-1) + sqrt(1 - c^2) e_n, which keeps each of them
-    exactly standard normal.
+    The variates follow the autoregression z_n = c · z_(n-1) + sqrt(1 - c²) · e_n. So every variate
+    is exactly standard normal.
 
-    Deviation: tc-netem mixes (1 - c) new + c old, which narrows the distribution.
+    Deviation: tc-netem mixes (1 - c) · new + c · old, which narrows the distribution.
 
     Args:
         key: Stream.
@@ -133,7 +134,7 @@ def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> 
         key: Stream.
         block: Number of the block.
         bad_start: Probability per packet to enter the bad state, in [0, 1].
-        bad_end: Probability per packet to leave it, in [0, 1].
+        bad_end: Probability per packet to leave the bad state, in [0, 1].
 
     Returns:
         True for packets in the bad state, shape (256,).
@@ -153,7 +154,7 @@ def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> 
 
 
 OVERTAKES = -(1 << 62)
-"""Entry of a packet that is sent at once, without queue or delay (`reorder`)."""
+"""Entry of a packet that skips queue and delay (`reorder`)."""
 
 Fate: TypeAlias = tuple[int, ...]
 
@@ -173,9 +174,9 @@ def impairments(
     """Draw the impairments of the 256 packets of a block.
 
     A lost packet is neither duplicated nor reordered. The copy of a packet has an independent
-    delay of the same distribution.
+    delay with the same distribution.
 
-    Deviation: in tc-netem a packet that is both duplicated and lost arrives once.
+    Deviation: tc-netem delivers one copy of a packet that is both duplicated and lost.
 
     Args:
         key: Stream.
@@ -206,7 +207,7 @@ def impairments(
 
 @lru_cache(maxsize=256)
 def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
-    """Draw the damaged packets of a block and the place of the flipped bit.
+    """Draw which packets of a block are damaged, and which bit is flipped.
 
     Args:
         key: Stream.
@@ -223,20 +224,27 @@ def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
 def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfile) -> list[float]:
     """Draw the jitter of a block in units of `jitter`, with mean 0.
 
-    uniform: in (-1, 1). normal: standard deviation 1. pareto: exponent 3, cut off at its 99.9 %
-    quantile, then shifted and scaled to mean 0 and standard deviation 1; it starts at -0.69, has
-    its median at -0.32, its 99 % quantile at 4.3 and ends at 12.1. (Without the cut it would
-    sometimes delay a packet by seconds, and with `keep_order` also those after it.) table: the
-    profile's values, with mean 0 and standard deviation 1.
+    The distributions:
 
-    With a correlation c the variates are computed from normal variates with correlation c, so that
-    their distribution stays exact. The correlation of uniform variates is then 6/pi asin(c/2),
-    at most 0.018 below c; that of Pareto variates is 0.39 for c = 0.5 and 0.86 for c = 0.9; that
-    of a table depends on the table.
+    - uniform: in (-1, 1).
+    - normal: standard deviation 1.
+    - pareto: exponent 3, cut off at the 99.9 % quantile, then shifted and scaled to mean 0 and
+      standard deviation 1. It ranges from -0.69 to 12.1, with median -0.32 and 99 % quantile 4.3.
+      Without the cut, jitter would sometimes delay a packet by seconds; with `keep_order`, the
+      packets behind it would also wait.
+    - table: the profile's values, with mean 0 and standard deviation 1.
+
+    With a correlation c, the function transforms normal variates that have correlation c. So the
+    distribution stays exact, but the correlation of the result differs from c:
+
+    - uniform: (6/π) · asin(c/2), at most 0.018 below c.
+    - pareto: 0.39 for c = 0.5, 0.86 for c = 0.9.
+    - table: depends on the table.
 
     Source: tc-netem(8) for the meaning of jitter, iproute2 netem/pareto.c for the exponent.
-    Deviation: netem cuts its normal table off at +-4 and its Pareto table at 4, so that the latter
-    has only 0.82 of the specified standard deviation; here it has all of it.
+    Deviation: netem cuts its normal table off at ±4 and its Pareto table at 4. So netem's Pareto
+    jitter has only 0.82 of the specified standard deviation; cloudrc's jitter has the full
+    standard deviation.
 
     Args:
         key: Stream.
@@ -273,7 +281,7 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
 def _from_table(
     key: StreamKey, purpose: Purpose, block: int, table: tuple[float, ...], correlation: float
 ) -> list[float]:
-    """Draw values of a table with equal probability; a correlation acts on their ranks."""
+    """Draw values of a table with equal probability; a correlation acts on the ranks of values."""
     shares: list[float] = uniforms(key, purpose, block).tolist()
     if correlation:
         shares = [0.5 * erfc(-_HALF_ROOT * z) for z in normals(key, purpose, block, correlation)]
@@ -293,12 +301,12 @@ def _offsets(
 
 
 def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) -> list[int]:
-    """Draw the packets of a block that an event of this probability hits."""
+    """Draw which packets of a block are hit by an event with probability `chance` (in [0, 1])."""
     return [int(n) for n in np.flatnonzero(uniforms(key, purpose, block) < chance)]
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
-    """Remove the lost packets from a table and delay those in the bad state."""
+    """Remove the lost packets from a table; delay the packets in the bad state."""
     extra = round(loss.delay_bad * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
     states = bad_states(key, block, loss.bad_start, loss.bad_end)

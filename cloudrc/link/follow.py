@@ -1,8 +1,9 @@
-"""Follow what changes in flight: a profile's file, a change handed to a pod, the peer's address.
+"""Follow changes in flight: of a profile's file, of a document in the pod, of the peer's address.
 
-A change of a release's ConfigMap lasts, but a kubelet may take a minute to bring it to a pod. So
-`cloudrc link set` also puts the same files, as one document, beside the route. The first of both
-to arrive takes effect; the other one is known by the number of the change.
+A change of a release's ConfigMap is permanent, but a kubelet may need a minute to copy it to a pod.
+So `cloudrc link set` also writes the same files, as one document, into the folder of the route
+file. Whichever of ConfigMap and document arrives first takes effect. The second one has the same
+number of the change and is ignored.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ if TYPE_CHECKING:
 
 
 PROFILE_PERIOD = 0.05
-"""Time between two looks at the profile's file [s]."""
+"""Time between two checks of the profile's file [s]."""
 PEER_PAUSE = (0.5, 1.0)
-"""Shortest and longest pause before the peer's name is resolved again [s]; it is random, so that
-the links of many releases do not ask their name server at once.
+"""Shortest and longest pause before the peer's name is resolved again [s]. The pause is random, so
+that the links of many releases do not query their name server at the same time.
 Source: docs/reference/faults.md, "F19"."""
 HANDED_FILE = "asked.json"
-"""Name of the document beside the route."""
+"""Name of the document, in the folder of the route file."""
 SIZE_MAX = 1_200_000
-"""Limit of the document [bytes]: the content of a ConfigMap, and what JSON adds."""
+"""Size limit of the document [bytes]: the content of a ConfigMap plus the overhead of JSON."""
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 _KNOWN = 64
@@ -43,12 +44,12 @@ _REFUSED = "the new profile is refused, the old one stays"
 
 
 class Loaded(NamedTuple):
-    """A profile as it was read: one direction in SI units, and the file's values for people.
+    """A profile as read from its file.
 
     Attributes:
-        direction: The one that is shaped here.
-        values: Both, as in the file, without defaults.
-        change: Who changed it last, and why.
+        direction: The direction that this process shapes, in SI units.
+        values: Both directions as in the file, without defaults, for people.
+        change: The last change of the profile: its number and cause.
     """
 
     direction: DirectionProfile
@@ -57,15 +58,15 @@ class Loaded(NamedTuple):
 
 
 Load = Callable[[Path], Loaded]
-"""Reads and checks a profile's file; raises a BadInputError."""
+"""Function that reads and checks a profile's file; it raises a BadInputError if that fails."""
 
 
 class ProfileFile:
     """A profile's file that may change.
 
-    Kubernetes mounts a ConfigMap as a folder of links to `..data`, itself a link, which it swaps in
-    one step: the file behind the path is another one then. A look is one system call, since there
-    are twenty a second beside a shaper that must not be late.
+    Kubernetes mounts a ConfigMap as a folder of links into `..data`. `..data` is also a link, and
+    Kubernetes replaces it in one step; then the path leads to another file. A check is a single
+    system call, because the process checks 20 times per second and its shaper must not be late.
     """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
@@ -74,14 +75,15 @@ class ProfileFile:
         self._seen: object = None
 
     def first(self) -> Loaded:
-        """Read the file; raises a BadInputError."""
+        """Read the file at the start; raise a BadInputError if that fails."""
         self._seen = version(self._place)
         return self._read()
 
     def poll(self) -> Loaded | None:
-        """Read the file if it has changed; None if not, or if it is refused, which is logged.
+        """Read the file if it has changed; None if it has not, or if the new profile is refused.
 
-        A file that changes while it is read is still being written, and is read again.
+        A refusal is logged. If the file changes during the read, somebody is still writing, and
+        the next call reads again.
         """
         seen = version(self._place)
         if seen == self._seen:
@@ -108,11 +110,11 @@ class ProfileFile:
 
 
 class Handed(NamedTuple):
-    """A change that is handed to a pod.
+    """A change that `cloudrc link set` writes directly into a pod, as a document.
 
     Attributes:
-        change: Who changed the profile, and why, as the text of the file beside it.
-        files: Name to text: `profile.yaml` and the traces that it names.
+        change: Number and cause of the change, as the text of `CHANGE_FILE`.
+        files: Name -> text: `profile.yaml` and the traces that it names.
     """
 
     change: str
@@ -120,15 +122,15 @@ class Handed(NamedTuple):
 
 
 def write_handed(handed: Handed) -> str:
-    """Write the document."""
+    """Return the text of a document."""
     return json.dumps(handed._asdict())
 
 
 def read_handed(text: str) -> Handed:
-    """Read the document.
+    """Parse the text of a document.
 
     Raises:
-        ValueError: If it is none, or names a file that could lie elsewhere.
+        ValueError: If the text is no such document, or if a file name could lead to another folder.
     """
     found = json.loads(text)
     try:
@@ -144,19 +146,19 @@ def read_handed(text: str) -> Handed:
 class Profiles:
     """The profile's file and the document: each change takes effect once.
 
-    A document of an earlier process is ignored: its ConfigMap has the change.
+    A document that exists at the start is ignored, because the ConfigMap has the same change.
     """
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]
     ) -> None:
-        """Follow both.
+        """Follow a profile's file and a document.
 
         Args:
             profile: The profile's file.
-            document: The document, which need not be there.
+            document: Path of the document; it need not exist.
             load: Reads a profile's file.
-            log: Gets a line when a change is refused.
+            log: Receives a line when a change is refused.
         """
         self._file, self._document = ProfileFile(profile, load, log), document
         self._load, self._log = load, log
@@ -164,13 +166,13 @@ class Profiles:
         self._known: OrderedDict[str, dict[str, Any]] = OrderedDict()
 
     def first(self) -> Loaded:
-        """Read what holds at the start; raises a BadInputError."""
+        """Read the profile at the start; raise a BadInputError if that fails."""
         loaded = self._file.first()
         self._is_known(loaded)
         return loaded
 
     def poll(self) -> Loaded | None:
-        """Read what has changed; None if nothing has."""
+        """Return the new profile after a change; None without a change."""
         for source in (self._poll_document, self._file.poll):
             loaded = source()
             if loaded is not None and not self._is_known(loaded):
@@ -178,10 +180,10 @@ class Profiles:
         return None
 
     def _poll_document(self) -> Loaded | None:
-        """Read the document if it has changed; None if not, or if it is refused, which is logged.
+        """Read the document if it has changed; None if it has not, or if it is refused.
 
-        It must be this user's: where the sidecar is root, the pod's other containers are not, and
-        they share the folder.
+        A refusal is logged. The document must belong to this user: if the sidecar runs as root,
+        the pod's other containers share the folder but do not run as root.
         """
         seen = version(self._document, follow=False)
         if seen == self._seen or seen is None:
@@ -201,9 +203,10 @@ class Profiles:
         return loaded._replace(change=read_change(handed.change))
 
     def _is_known(self, loaded: Loaded) -> bool:
-        """Note a change; return whether it has arrived before.
+        """Remember a change; return whether the same change has arrived before.
 
-        `helm upgrade` leaves the note of the change before it: then the values differ.
+        `helm upgrade` changes the profile but keeps the note with the number of the previous
+        change. Therefore the values count, too.
         """
         number = loaded.change.number
         if not number:
@@ -218,8 +221,8 @@ class Profiles:
 class PeerName:
     """The peer's name, whose address may change.
 
-    While an old and a new pod overlap, a headless Service names both: the one that came later is
-    the one that flies on.
+    While an old and a new pod overlap, a headless Service returns both addresses. The address that
+    appeared later belongs to the new pod and is used.
 
     Attributes:
         failures: Number of failed resolutions.
@@ -236,7 +239,7 @@ class PeerName:
         Args:
             peer: Name or address, and port.
             resolve: Returns the addresses of a name; raises an OSError if there is none.
-            log: Gets one line for each change.
+            log: Receives one line for each change.
         """
         self._name, self._port = peer
         self._resolve, self._log = resolve, log
@@ -245,7 +248,10 @@ class PeerName:
         self.failures = 0
 
     def poll(self) -> Address | None:
-        """Resolve the name once; None if that fails and never succeeded before."""
+        """Resolve the name once; return None before the first success.
+
+        If a later attempt fails, the known address stays.
+        """
         before = self._known[-1:]
         try:
             addresses = sorted(self._resolve(self._name))
@@ -261,7 +267,7 @@ class PeerName:
         return (self._known[-1], self._port) if self._known else None
 
     def _say(self, line: str) -> None:
-        """Log a line unless it says the same as the last one."""
+        """Log a line unless it repeats the last line."""
         what = line.partition(", was")[0]
         if what != self._said:
             self._said = what

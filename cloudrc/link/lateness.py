@@ -1,7 +1,7 @@
-"""Count how late a relay releases datagrams, and give percentiles of it.
+"""Count how late a relay releases datagrams, and return percentiles of the lateness.
 
-A bucket is at most 1.6 % wide, so that memory is bounded and a count takes well below a
-microsecond.
+The counts are a histogram. Its buckets are at most 1.6 % wide, so that memory is bounded; counting
+one datagram takes far less than a microsecond.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from collections.abc import Iterable
 
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 _BITS = 7
-"""Significant bits of a lateness that choose its bucket [1]."""
+"""How many significant bits of a lateness select the bucket [1]."""
 _RECENT = 10
-"""Calls of `Recent.counts` over which percentiles are taken [1]."""
+"""Number of calls of `Recent.counts` that the percentiles cover [1]."""
 
 
 class ReleaseErrors:
-    """Counts how long after they were due datagrams left.
+    """Histogram of the lateness: the time from when a datagram was due until it left.
 
     Attributes:
-        early: Number of datagrams that left before they were due; more than 0 is a fault.
+        early: Number of datagrams that left before they were due; above 0 is a fault.
     """
 
     __slots__ = ("_counts", "early")
@@ -55,7 +55,7 @@ class ReleaseErrors:
         return whole
 
     def since(self, before: ReleaseErrors) -> ReleaseErrors:
-        """Subtract what had been counted earlier."""
+        """Return the counts since an earlier copy: these counts minus `before`."""
         rest = ReleaseErrors()
         rest.early = self.early - before.early
         rest._counts = dict(Counter(self._counts) - Counter(before._counts))
@@ -88,7 +88,7 @@ def in_ns(errors: ReleaseErrors) -> dict[str, int]:
 
 
 class Recent:
-    """Percentiles of the last ten seconds, if `counts` is called once a second."""
+    """Percentiles over the last ten calls of `counts`: ten seconds if called once a second."""
 
     def __init__(self) -> None:
         """Start before the first datagram."""
@@ -98,11 +98,12 @@ class Recent:
         """Return the recent percentiles in whole nanoseconds.
 
         Args:
-            errors: Since the beginning; not counted into any more.
+            errors: Counts since the beginning, as a copy that no thread changes any more.
 
         Returns:
-            `released_early` since the beginning; and `release_error_p50_ns`, `_p99_ns` and
-            `_p999_ns` over the last ten calls [ns], absent if nothing left since.
+            `released_early` since the beginning; `release_error_p50_ns`, `_p99_ns` and `_p999_ns`
+            over the last ten calls [ns]. The percentiles are absent if no datagram left in that
+            time.
         """
         recent = in_ns(errors.since(self._past[0]))
         self._past.append(errors)

@@ -2,13 +2,16 @@
 
     irtt client -i 10ms -l 203 -d 1m -o irtt.json HOST
 
-A telemetry datagram has 203 bytes, a command 88. irtt measures both directions if the hosts' clocks
-agree. The columns of a CSV log name their units: `time_ms,delay_us,loss` are the time of sending,
-the one-way delay and the loss (0 or 1); `timestamp_ns,rtt_ms` has round trips, of which half is
-used if the user asks for it. `link/ping.py` reads logs of ping.
+A telemetry datagram has 203 bytes, a command datagram 88 bytes. irtt measures both directions if
+the clocks of the two hosts agree. `link/ping.py` reads logs of ping.
 
-Every reader fills a `Log`, and `Log.packets` makes the same checks for all. What is left out,
-merged or sorted is counted in `Packets.notes`. Rows that cannot be used are refused beyond 1 %.
+The columns of a CSV log name their units. `time_ms,delay_us,loss` are the time of sending, the
+one-way delay and the loss (0 or 1). `timestamp_ns,rtt_ms` has round trips; the reader takes half of
+each round trip if the user asks for that.
+
+Every reader fills a `Log`, and `Log.packets` makes the same checks for all logs. `Packets.notes`
+counts the rows that are left out, merged or sorted. A log is refused if more than 1 % of its rows
+cannot be used.
 """
 
 from __future__ import annotations
@@ -31,17 +34,19 @@ from cloudrc.link.traces import Row, Table, decimals_of, looks_lost, shown
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
 LONGEST = 5.0
-"""Longest plausible median delay [s]; above it the values are probably in another unit."""
+"""Longest plausible median delay [s]; values with a larger median are probably in another unit."""
 UNUSABLE_MAX = 0.01
-"""Largest share of rows that are left out; above it the log is refused [1]."""
+"""Largest share of rows that may be left out [1]; above this share the log is refused."""
 GAP = 20
-"""Shortest gap that is named, in usual distances of two packets [1]; at least `GAP_MIN`."""
+"""Shortest gap that a note reports, as a multiple of the median time between packets [1]. The gap
+must also be longer than `GAP_MIN`."""
 GAP_MIN = 1.0
-"""Shortest gap that is named [s]."""
+"""Shortest gap that a note reports [s]."""
 STEPS_MAX = 3
-"""Most jumps back in time that are steps of the clock or sessions [1]; more mean shuffled rows."""
+"""Up to this number of jumps back in time, a jump is a step of the clock or a new session [1]. More
+jumps mean that the rows are shuffled."""
 _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
-"""Errors that JSON of another layout can raise."""
+"""Errors that JSON with an unexpected layout can raise."""
 HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
@@ -54,8 +59,8 @@ class Packets:
     """The packets of a log in the order of sending.
 
     Attributes:
-        sent: When each was sent, on any clock, strictly rising [s], shape (n,).
-        delays: One way [s], None for lost packets, shape (n,).
+        sent: Times of sending, on any clock, strictly rising [s], shape (n,).
+        delays: One-way delays [s], None for lost packets, shape (n,).
         notes: What was left out, merged or sorted, and how often.
         halved: Whether the delays are halves of round trips.
     """
@@ -83,16 +88,16 @@ class Packets:
 
 @dataclass(slots=True)
 class Log:
-    """What a reader finds in a source.
+    """The rows that a reader finds in a source.
 
     Attributes:
         name: Name of the source, for messages.
         entries: Time of sending [s] and delay [s] (None if lost), in the order of the source.
         counts: What was left out, merged or changed -> how often.
-        unusable: Why a row cannot be used, for each such row.
+        unusable: One reason for each row that cannot be used.
         facts: Further notes.
         halved: Whether the delays are halves of round trips.
-        clocks: What to do if the two clocks differ.
+        clocks: What the user should do if the two clocks differ.
     """
 
     name: str
@@ -107,8 +112,9 @@ class Log:
         """Check the packets, sort them by the time of sending, and note what was changed.
 
         Raises:
-            BadInputError: If over 1 % of the rows cannot be used or have the time of another one,
-                no packet arrived, or a delay is negative.
+            BadInputError: If more than 1 % of the rows cannot be used, if more than 1 % repeat the
+                time of an earlier row, if no packet arrived, if a delay is negative, or if the
+                times jump back one to three times.
         """
         self._refuse_beyond_limit(len(self.unusable), self.unusable[0] if self.unusable else "")
         arrived = [delay for _, delay in self.entries if delay is not None]
@@ -143,7 +149,7 @@ class Log:
         )
 
     def _refuse_steps(self) -> None:
-        """Refuse times that go far back once or twice: sorting would mix what came apart."""
+        """Refuse times that jump far back one to three times: sorting would mix two sessions."""
         steps = [after - before for (before, _), (after, _) in pairwise(self.entries)]
         far = max(GAP_MIN, GAP * median([abs(step) for step in steps] or [0.0]))
         back = [row for row, step in enumerate(steps, 1) if step < -far]
@@ -162,7 +168,7 @@ class Log:
 
 
 def _gaps(times: tuple[float, ...]) -> list[str]:
-    """Name the longest time without a packet, if it is unusual for this log."""
+    """Report the longest time without a packet, if it is unusual for this log."""
     steps = [after - before for before, after in pairwise(times)]
     longest = max(steps, default=0.0)
     if longest <= max(GAP_MIN, GAP * median(steps or [0.0])):
@@ -175,10 +181,10 @@ def _gaps(times: tuple[float, ...]) -> list[str]:
 
 
 def trace_of(packets: Packets) -> Trace:
-    """Make a trace that gives a stream of the same rate the same delays and losses.
+    """Make a trace that reproduces the delays and losses for a stream of the same rate.
 
     Each row begins halfway between its packet and the packet before. So a replayed packet may be
-    late or early by half a period and still gets its own row. Time begins at the first packet.
+    late or early by half a period and still meets its own row. Time begins at the first packet.
 
     Returns:
         One row per packet; the losses are None if nothing was lost.
@@ -206,11 +212,11 @@ _OTHERS = {
         "the output of traceroute or mtr, which has no delay of each packet; give one of ping -D"
     ),
 }
-"""Pattern in a file's first lines -> what it is, and what to give instead."""
+"""Pattern in a file's first lines -> which tool wrote the file, and what the user should give."""
 
 
 def refuse_others(lines: list[str], name: str) -> None:
-    """Refuse by its name the output of a tool that does not measure the delay of each packet."""
+    """Refuse the output of a tool that does not measure the delay of each packet; name the tool."""
     head = "\n".join(lines[:50])
     for pattern, what in _OTHERS.items():
         if re.search(pattern, head, re.MULTILINE):
@@ -218,15 +224,15 @@ def refuse_others(lines: list[str], name: str) -> None:
 
 
 class _NoStampsError(Exception):
-    """A log of irtt has no one-way delays."""
+    """Report that a log of irtt has no one-way delays."""
 
 
 def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool) -> Packets:
     """Read the output of `irtt client -o FILE.json`.
 
-    The client stands for the robot: what it sends is the uplink. A packet that irtt reports as
-    lost without the direction counts as lost in both. Times of sending are on the client's
-    monotonic clock, which no step of the clock changes.
+    The client stands for the robot: its packets are the uplink. If irtt does not know in which
+    direction a packet was lost, the packet counts as lost in both directions. Times of sending are
+    on the client's monotonic clock, so steps of its wall clock do not matter.
 
     Source: irtt-client(1), JSON format 1.
 
@@ -234,11 +240,11 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
         text: Content of the file.
         name: Name of the file, for messages.
         direction: Direction to read; None only with `halve`.
-        halve: Whether to use half of each round trip instead of the one-way delay.
+        halve: True: use half of each round trip. False: use the one-way delay.
 
     Raises:
-        BadInputError: If it is not such a file, contradicts its own counts, or has no usable
-            one-way delays and `halve` is false.
+        BadInputError: If the file is not such an output, if it contradicts its own counts, or if
+            `halve` is false and the file has no usable one-way delays.
     """
     log = Log(name)
     try:
@@ -265,7 +271,7 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
 
 
 def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log) -> None:
-    """Compare the packets of a log of irtt with its own counts."""
+    """Compare the packets of an irtt log with the counts in the same log."""
     arrived = sum(_lost(trip) == "false" for trip in trips)
     copies = int(stats.get("duplicates", 0))
     log.counts["duplicates left out"] += copies
@@ -279,7 +285,7 @@ def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log
 
 
 def _check_clocks(trips: list[dict[str, Any]], name: str) -> None:
-    """Reject one-way delays of clocks that differ or step; either direction shows it."""
+    """Reject one-way delays if the clocks differ or step; check both directions."""
     arrived = [trip for trip in trips if _lost(trip) == "false"]
     least = min(
         (_delay(trip, key) or 0 for trip in arrived for key in ("send", "receive")), default=0
@@ -306,17 +312,19 @@ _IRTT_NAMES = {
     "uplink": ("true_down", "send"),
     "downlink": ("true_up", "receive"),
 }
-"""What is read -> kind of loss that is left out, name of the delay."""
+"""What is read -> irtt's value of `lost` for packets to leave out, irtt's name of the delay."""
 
 
 def _irtt_entries(
     trips: list[dict[str, Any]], what: Literal["halves", "uplink", "downlink"]
 ) -> list[tuple[float, float | None]]:
-    """Read the time of sending and the delay of each packet [s], from the first one on.
+    """Read the time of sending and the delay of each packet [s]; time 0 is the first packet.
 
-    Packets lost in the other direction are left out: they never reached the downlink, or their
-    uplink delay is unknown. For a packet lost on the downlink, the time of sending is estimated
-    with the median uplink delay.
+    Packets lost in the other direction are left out. A packet lost on the uplink never reached the
+    downlink; the uplink delay of a packet lost on the downlink is unknown.
+
+    For a packet lost on the downlink, the downlink's time of sending is estimated with the median
+    uplink delay.
     """
     clock = "monotonic" if all("monotonic" in _client(trip) for trip in trips) else "wall"
     other, key = _IRTT_NAMES[what]
@@ -370,29 +378,34 @@ _LOST_WORDS = {
     *("", "-", "*", "nan", "inf", "none", "null", "na", "n/a"),
     *("lost", "loss", "timeout", "timed out", "request timed out", "no answer yet"),
 }
-"""What a delay's cell says of a lost packet."""
+"""Words in the delay column that mark a lost packet."""
 _LOST_NUMBERS = (-1.0, -999.0, -9999.0)
-"""What a delay's cell says of a lost packet, if no other delay is below 0 [unit of the column]."""
+"""Numbers in the delay column that mark a lost packet [unit of the column]. Such a number counts as
+a mark only if the column has no other negative number."""
 _FLAGS = {"0": False, "1": True, "false": False, "true": True, "no": False, "yes": True}
 _LATE = {"s": 1e11, "ms": 1e14, "us": 1e17}
-"""Largest plausible time since 1970 by its unit, about the year 5000; above it the unit is finer
-than the column says."""
+"""Unit -> largest plausible time since 1970, about the year 5000. A larger value means that the
+true unit is finer than the column's name says."""
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:
     """Read a CSV log with a header; unknown columns are skipped.
 
-    A packet is lost if its delay is empty, no number or a usual mark (-1; 0 where all others are
-    far from it), or if `loss` is 1. Other values of `loss` are only allowed in a trace.
+    A packet counts as lost in these cases:
+
+    - Its delay is empty or a word for a loss, such as "timeout".
+    - Its delay is -1, -999 or -9999, and the column has no other negative number.
+    - Its delay is 0, all other delays are far from 0, and there is no column `loss`.
+    - Its `loss` is 1. Values other than 0 and 1 are only allowed in a trace.
 
     Args:
         lines: Lines of the file.
         name: Name of the file, for messages.
-        halve: Whether to use half of each round trip; if false, round trips are rejected.
-        trust_units: Whether to accept values that look like another unit.
+        halve: True: use half of each round trip. False: reject round trips.
+        trust_units: Whether to accept values that seem to be in another unit.
 
     Raises:
-        BadInputError: Names line, value and remedy.
+        BadInputError: If the log cannot be used; the text names line, value and remedy.
     """
     table, log = Table(lines, name), Log(name)
     time, time_unit = _find(table.columns, TIMES, name)
@@ -432,7 +445,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
 
 
 def _check_unit(packets: Packets, unit: str, name: str) -> None:
-    """Reject delays of a column that are probably in another unit; name that unit."""
+    """Reject delays that are probably in another unit than the column says; name the other unit."""
     factor = 1 / SCALES[unit]
     top, middle = max(packets.arrived), median(packets.arrived)
     remedy = "name the column after its unit, or say --trust-units"
@@ -449,7 +462,7 @@ def _check_unit(packets: Packets, unit: str, name: str) -> None:
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the only column of these kinds; return its name and unit, "" if it names none."""
+    """Find the only column of these kinds; return its name and its unit ("" without a unit)."""
     known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
     found = [column for column in columns if column in known]
     found = found or [column for column in columns if column in kinds]
@@ -466,7 +479,7 @@ def _named(column: str) -> str:
 
 
 def _csv_time(table: Table, row: Row, column: str, unit: str) -> float:
-    """Read a time in its column's unit; without a unit it must be a date and time [s]."""
+    """Read a time in its column's unit; if the column has no unit, read date and time [s]."""
     text = row.cells[column]
     if not unit:
         try:
@@ -484,7 +497,7 @@ def _csv_time(table: Table, row: Row, column: str, unit: str) -> float:
 
 
 def _csv_delay(table: Table, row: Row, column: str, loss: str | None) -> float | None:
-    """Read a delay in its column's unit, None if the row says that the packet was lost."""
+    """Read a delay in its column's unit; None if the row says that the packet was lost."""
     if loss is not None:
         text = row.cells[loss].lower()
         flag = table.number(text)
@@ -508,7 +521,7 @@ def _csv_delay(table: Table, row: Row, column: str, loss: str | None) -> float |
 def _marks(
     values: list[float], column: str, loss: str | None, decimals: int, log: Log
 ) -> dict[float | None, str]:
-    """Find the numbers that mark lost packets, and the note for each."""
+    """Find the numbers that mark lost packets; return number -> note for the user."""
     below = {value for value in values if value < 0.0}
     marks = [value for value in below if below == {value} and value in _LOST_NUMBERS]
     if below and not marks and column.startswith("rtt"):

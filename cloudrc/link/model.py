@@ -1,9 +1,9 @@
 """Model a link direction: compute when each packet arrives.
 
 The model has no clock, no socket and no stateful random generator. The virtual driver and the relay
-use the same model, so both get the same delays and losses. The functions `sample` and
-`numbers` send packets through the model and compute statistics of their delays and losses, so a
-profile has the same statistics there as in a flight.
+use the same model, so both get the same delays and losses. `sample` sends packets through the
+model, and `numbers` computes statistics of the delays and losses. So these statistics of a profile
+hold for a flight, too.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from cloudrc.link.draws import (
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 
 HEADER_BYTES = 28
-"""Size of the IPv4 and UDP headers, which also take time on the wire [bytes].
+"""Size of the IPv4 and UDP headers [bytes], which also take time on the wire.
 
 Source: RFC 791, RFC 768.
 """
@@ -44,13 +44,14 @@ class LinkDirection:
 
     The random impairment of a packet depends only on seed, direction, epoch, kind and counter, not
     on the order of calls, the mode or other kinds of datagram. Two effects depend on earlier
-    packets: the queue of a bottleneck (`rate`) and `keep_order`. With either of them, call `send`
-    in the order of sending.
+    packets: the queue of a bottleneck (`rate`) and `keep_order`. If the profile uses one of them,
+    call `send` in the order of sending.
 
-    Packets with the same counter get the same impairment, so repeated hellos need counters, too.
+    Packets with the same counter get the same impairment. So repeated hellos need different
+    counters.
 
     Attributes:
-        corrupts: Whether datagrams may be damaged; then `corrupted` must be called.
+        corrupts: Whether the link may damage datagrams; if true, `corrupted` must be called.
     """
 
     def __init__(
@@ -59,11 +60,11 @@ class LinkDirection:
         """Create the direction.
 
         Args:
-            profile: Its conditions.
+            profile: Conditions of the direction.
             seed: Seed of the experiment.
             uplink: True for world to cloud.
-            origin_ns: When the link came up [ns], on the clock of `send`; time line, trace and
-                blackouts count from it.
+            origin_ns: When the link came up [ns], on the clock of `send`. The times of time line,
+                trace and blackouts count from this instant.
         """
         self._seed = seed
         self._uplink = uplink
@@ -77,13 +78,13 @@ class LinkDirection:
     def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         """Replace the conditions from the next packet on.
 
-        Seed, counts and the bottleneck's queue stay. The draws are as if the link had had this
-        profile from the start.
+        Seed, counts and the bottleneck's queue stay. The random draws are the same as if the link
+        had used this profile from the start.
 
         Args:
             profile: New conditions.
-            restart: Whether their time line begins at the next packet; otherwise it keeps the start
-                of the present time line.
+            restart: True: the new time line begins at the next packet. False: the new time line
+                has the same start as the present time line.
         """
         if restart:
             self._origin_ns = None
@@ -100,15 +101,15 @@ class LinkDirection:
         """Send one packet.
 
         Args:
-            epoch: Epoch in its header.
-            kind: Message type in its header.
-            counter: Counter in its header, >= 0.
+            epoch: Epoch in the packet's header.
+            kind: Message type in the packet's header.
+            counter: Counter in the packet's header, >= 0.
             size: UDP payload [bytes].
-            now_ns: When it is sent [ns].
+            now_ns: Time of sending [ns].
 
         Returns:
-            When each copy arrives [ns], never before `now_ns`: () if it is lost, two instants if
-            it is duplicated (the copy second, not necessarily later).
+            Times of arrival [ns], never before `now_ns`: no time for a lost packet, two times for a
+            duplicated packet. The second time is that of the copy; it may be the earlier one.
         """
         constant = self._always
         if constant is None:
@@ -126,11 +127,11 @@ class LinkDirection:
     def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
         """Return a datagram as it arrives, perhaps with one bit flipped.
 
-        Call it only if `corrupts` is true. All copies of a packet are damaged alike.
+        Call this method only if `corrupts` is true. All copies of a packet have the same damage.
 
-        Source: tc-netem(8), `corrupt`. Deviation: netem flips a bit anywhere in the frame, so that
-        the receiving kernel drops most of the frames by their checksums; here the bit is in the
-        datagram.
+        Source: tc-netem(8), `corrupt`. Deviation: netem flips a bit anywhere in the frame, so the
+        receiving kernel drops most damaged frames by their checksums. This model flips a bit of
+        the datagram.
         """
         key = stream_key(self._seed, self._uplink, epoch, kind)
         place = bit_flips(key, counter >> BLOCK_BITS, self._profile.corrupt).get(
@@ -147,8 +148,9 @@ class LinkDirection:
     def counts(self) -> dict[str, int]:
         """Return the number of packets by outcome so far.
 
-        Of `passed` packets at least one copy arrives, of `duplicated` ones two. `lost`, `blackout`
-        and `queue` are the causes of those that do not arrive. `corrupted` ones were damaged.
+        Returns:
+            `passed`: at least one copy arrives; `duplicated`: two copies arrive; `lost`,
+            `blackout` and `queue`: no copy arrives, by cause; `corrupted`: damaged.
         """
         return {
             "passed": self._passed,
@@ -162,7 +164,8 @@ class LinkDirection:
     def _send_shaped(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
         """Send a packet if conditions change over time or depend on earlier packets.
 
-        As in tc-netem, losses come before the bottleneck, and a reordered packet skips it.
+        As in tc-netem, a packet is lost before the bottleneck, and a reordered packet skips the
+        bottleneck.
         """
         if self._origin_ns is None:
             self._origin_ns = now_ns
@@ -191,7 +194,7 @@ class LinkDirection:
         return self._counted(tuple(releases))
 
     def _departure(self, size: int, rate: float | None, now_ns: int) -> int | None:
-        """Queue a packet; return when it leaves the bottleneck [ns], None if the queue is full."""
+        """Queue a packet; return when it leaves the bottleneck [ns]; None if the queue is full."""
         if rate is None:
             return now_ns
         departures = self._departures
@@ -212,7 +215,7 @@ class LinkDirection:
         return releases
 
     def _delay_table(self, epoch: int, kind: int, block: int, constant: Conditions) -> list[Fate]:
-        """Compute the delays of a block if conditions never change: the fast path of `send`."""
+        """Compute the delays of a block if conditions never change; this is `send`'s fast path."""
         base = constant.delay_ns
         key = stream_key(self._seed, self._uplink, epoch, kind)
         # Nearly all packets have one copy; a special case saves time, since a relay does this live.
@@ -227,7 +230,7 @@ class LinkDirection:
         return table
 
     def _fate_table(self, key: tuple[int, int, int, float, Loss]) -> list[Fate]:
-        """Compute the impairments of a block under one jitter and loss."""
+        """Compute the impairments of a block for one jitter and one loss."""
         epoch, kind, block, jitter, loss = key
         stream = stream_key(self._seed, self._uplink, epoch, kind)
         _forget_oldest(self._fates)
@@ -236,7 +239,7 @@ class LinkDirection:
 
 
 def _forget_oldest(tables: dict[_Key, list[Fate]]) -> None:
-    """Drop the oldest table if there are too many; it can be computed again."""
+    """Drop the oldest cached table if there are too many tables."""
     if len(tables) >= _TABLES:
         del tables[next(iter(tables))]
 
@@ -249,9 +252,9 @@ class Stream:
     """The n packets of one direction in the order of sending.
 
     Attributes:
-        sent: When each was sent, since the link came up [s], shape (n,).
-        delays: One way, of the first copy to arrive [s], NaN for lost packets, shape (n,).
-        copies: Number of copies of each that arrived [1], shape (n,).
+        sent: Times of sending, since the link came up [s], shape (n,).
+        delays: One-way delays of the first copy to arrive [s], NaN for lost packets, shape (n,).
+        copies: Number of arrived copies of each packet [1], shape (n,).
     """
 
     sent: Array
@@ -273,9 +276,9 @@ class Numbers:
         correlation: Correlation of the delays of successive packets [1].
         loss: Share of packets that did not arrive, in [0, 1].
         runs: Length of each run of successive losses.
-        overtaken: Share of arrived packets that came after a packet sent later, in [0, 1].
+        overtaken: Share of arrived packets that arrived after a later sent packet, in [0, 1].
             Source: RFC 4737, section 3.
-        duplicated: Share of packets of which two copies arrived, in [0, 1].
+        duplicated: Share of packets with two arrived copies, in [0, 1].
     """
 
     mean: float
@@ -292,13 +295,13 @@ class Numbers:
 
 
 def sample(link: LinkDirection, kind: int, sent_ns: Sequence[int], size: int) -> Stream:
-    """Send packets.
+    """Send packets through a link.
 
     Args:
         link: A new direction with origin 0.
         kind: Message type in the header.
-        sent_ns: When each is sent, rising [ns], shape (n,).
-        size: UDP payload of each [bytes].
+        sent_ns: Times of sending, rising [ns], shape (n,).
+        size: UDP payload of each packet [bytes].
     """
     delays = np.full(len(sent_ns), np.nan)
     copies = np.zeros(len(sent_ns), dtype=np.int64)

@@ -1,16 +1,16 @@
 """Shape one direction of the link in the kernel, by `tc` on the pod's egress.
 
     interface > prio 7400: --+-- bands 1-3: everything else, as before
-                             +-- band 4 > netem 7401: what the filter sends there,
-                                          UDP to the peer's tunnel port and nothing else
+                             +-- band 4 > netem 7401: datagrams that the filter selects:
+                                          only UDP to the peer's tunnel port
 
-The qdiscs are found again after a restart by their handles, changed in flight by `tc qdisc change`,
-which keeps what is queued, and removed by `close`. A root qdisc of another program is left alone.
-If another program removes or changes ours, the log says so and a metric counts it; it is not
-repaired.
+After a restart `Netem` finds its qdiscs by their handles. In flight it changes the qdiscs by `tc
+qdisc change`, which keeps the queued packets. `close` removes the qdiscs. `Netem` never touches a
+root qdisc of another program. If another program removes or changes the qdiscs of `Netem`, the log
+says so and a metric counts the case; `Netem` does not repair the damage.
 
-tc and the kernel clamp numbers without a message: a rate below 1 byte/s becomes none, a chance
-below 2**-32 becomes 0. So what is in force is read back and compared.
+tc and the kernel clamp numbers without a message: a rate below 1 byte/s turns into no rate limit, a
+probability below 2**-32 turns into 0. So `Netem` reads back the options in force and compares them.
 
 Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8); iproute2 tc/q_netem.c, netem_print_opt.
 """
@@ -33,11 +33,11 @@ from cloudrc.link.tc import STEP_NS, Iproute2, Run, check, limit, options, write
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
 """Handles of the root qdisc, of its band for the tunnel's flow, and of the netem there."""
 PERIOD_NS = 1_000_000_000
-"""Time between two looks at the qdiscs [ns]."""
+"""Time between two checks of the qdiscs [ns]."""
 LATE_NS = 20_000_000
-"""Lateness above which a step counts as late [ns]: two periods of the loop."""
+"""A step counts as late if its lateness is above this [ns]: two periods of the loop."""
 _KEPT = 10_000
-"""Number of latenesses that percentiles are taken of [1]."""
+"""Number of latest steps that the percentiles cover [1]."""
 # The kernel's own default for three bands: nothing falls into the fourth by its type of service.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
 
@@ -53,23 +53,24 @@ _LISTED = {
     "rate": ("rate", ("rate",)),
 }
 _UNITS = {"us": 1e-6, "%": 1e-2, "gbit": 1.25e8, "bit": 0.125, "": 1.0}
-"""Unit of tc -> that of its listing: [s], [1], [byte/s]."""
+"""Unit in tc's arguments -> factor to the unit in tc's listing: [s], [1], [byte/s]."""
 _SLACK = {"limit": 0.0, "rate": 0.0, "delay": 128e-9}
-"""Rounding of tc's clock [s]; other options are chances, which are cut to 32 bits."""
+"""Option -> tolerance for tc's rounding: 128 ns for delays [s]. Options that are not listed are
+probabilities, which tc cuts to 32 bits."""
 _CHANCE = 2.0**-30
 _RELATIVE = 1e-3
-"""Rounding that nobody notices, as a share of the number [1]."""
+"""Relative tolerance for rounding [1]."""
 
 
 def differences(words: Sequence[str], listed: Mapping[str, Any]) -> list[str]:
-    """Compare what tc was asked for with what is in force.
+    """Compare the requested options with those in force.
 
     Args:
-        words: As `tc.options` gives them.
+        words: The requested options, from `tc.options`.
         listed: "options" of the qdisc, as `tc -j qdisc show` prints them.
 
     Returns:
-        One text per number that differs: "rate: asked 0.5, in force 0".
+        One text per number that differs, such as "rate: asked 0.5, in force 0".
     """
     found, option, index = list[str](), "", 0
     for word in words:
@@ -90,7 +91,7 @@ def differences(words: Sequence[str], listed: Mapping[str, Any]) -> list[str]:
 
 
 def is_ours(qdiscs: Sequence[dict[str, Any]]) -> bool:
-    """Say whether the root of an interface is what `Netem` puts there."""
+    """Return whether the root qdisc of an interface is from `Netem`."""
     return any(
         one.get("root") and one.get("handle") == ROOT and one.get("kind") == "prio"
         for one in qdiscs
@@ -98,17 +99,17 @@ def is_ours(qdiscs: Sequence[dict[str, Any]]) -> bool:
 
 
 def leaf_of(qdiscs: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Find `Netem`'s netem among the qdiscs of an interface; None if it is not there."""
+    """Find the netem qdisc of `Netem` among the qdiscs of an interface; None if it is missing."""
     found = (one for one in qdiscs if one.get("handle") == LEAF and one.get("kind") == "netem")
     return next(found, None) if is_ours(qdiscs) else None
 
 
 def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
-    """Read what netem has counted from the objects of `tc -s -j qdisc show`.
+    """Read netem's counts from the objects of `tc -s -j qdisc show`.
 
     Returns:
-        `forwarded`: sent on, copies included; `lost`: dropped, by chance or because the queue was
-        full; `held`: queued now. Empty without a netem.
+        `forwarded`: datagrams sent on, copies included; `lost`: datagrams dropped at random or
+        because the queue was full; `held`: datagrams queued now. Empty without a netem qdisc.
     """
     leaf = leaf_of(qdiscs)
     if leaf is None:
@@ -117,14 +118,14 @@ def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
 
 
 def damage(qdiscs: Sequence[dict[str, Any]], applied: Sequence[str]) -> str:
-    """Describe what another program has done to the qdiscs.
+    """Describe how another program has changed the qdiscs.
 
     Args:
-        qdiscs: Of the interface.
-        applied: Words that netem got last.
+        qdiscs: Qdiscs of the interface.
+        applied: Options that netem got last.
 
     Returns:
-        "" if nothing.
+        The damage in words; "" without damage.
     """
     leaf = leaf_of(qdiscs)
     if leaf is None:
@@ -138,8 +139,8 @@ class Steps:
 
     Attributes:
         applied: Number of steps that took effect.
-        late: Number of those that were later than `LATE_NS`.
-        passed_over: Number of steps that were over before their turn came.
+        late: Number of these steps with a lateness above `LATE_NS`.
+        passed_over: Number of skipped steps: the next step was due before they could take effect.
     """
 
     def __init__(self) -> None:
@@ -147,11 +148,11 @@ class Steps:
         self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
 
     def note(self, lateness_ns: int, passed_over: int) -> None:
-        """Note a step.
+        """Count a step.
 
         Args:
-            lateness_ns: From when it was due until tc reported that it is in force [ns].
-            passed_over: Number of steps between the one before and this one.
+            lateness_ns: Time from when the step was due until tc reported that it is in force [ns].
+            passed_over: Number of steps that were skipped just before this step.
         """
         self.applied += 1
         self.late += lateness_ns > LATE_NS
@@ -159,7 +160,10 @@ class Steps:
         self._lateness_ns.append(lateness_ns)
 
     def lateness_ns(self) -> tuple[int, int]:
-        """Return median and 99th percentile of the last 10,000 latenesses [ns]; 0 without any."""
+        """Return median and 99th percentile of the lateness of the last 10,000 steps [ns].
+
+        Both are 0 before the first step.
+        """
         ordered = sorted(self._lateness_ns) or [0]
         return ordered[(len(ordered) - 1) // 2], ordered[ceil(0.99 * (len(ordered) - 1))]
 
@@ -190,7 +194,7 @@ class Netem:
     """One direction of the link in the kernel; a `Shaper`.
 
     Attributes:
-        steps: How well the time line was followed so far.
+        steps: Counts and lateness of the steps along the time line so far.
     """
 
     name = "netem"
@@ -206,16 +210,16 @@ class Netem:
         tables: Path | None = None,
         log: Callable[[str], None] = lambda line: None,
     ) -> None:
-        """Set up, without touching the network yet.
+        """Set up; do not touch the network yet.
 
         Args:
             run: Runs tc and ip.
             profile: Conditions.
-            origin_ns: When the link came up [ns]; the time line counts from it.
+            origin_ns: When the link came up [ns]; the time line starts at this instant.
             clock: Returns the time on the clock of `origin_ns` [ns].
             wait: Sleeps for a time [s].
             tables: Folder of tc's tables, for a profile's measured distribution.
-            log: Gets lines for people.
+            log: Receives lines for people.
         """
         self._iproute2 = Iproute2(run)
         self._clock, self._wait = clock, wait
@@ -234,7 +238,7 @@ class Netem:
             write_measured(self._tables, profile)
 
     def follow_peer(self, peer: Address) -> Address:
-        """Shape what goes to this peer from now on, on the interface that leads to it."""
+        """Shape datagrams to this peer from now on, on the interface that leads to the peer."""
         device = self._iproute2.device(peer[0])
         if device != self._device:
             self.close()
@@ -251,11 +255,11 @@ class Netem:
         return peer
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on; what is queued leaves when it would have.
+        """Shape by this profile from now on; queued datagrams keep their delay.
 
         Args:
             profile: Conditions.
-            restart: Whether their time line starts now; otherwise it continues.
+            restart: True: the time line starts now. False: the time line continues.
         """
         check(profile)
         qdiscs = self._look()
@@ -274,7 +278,7 @@ class Netem:
             raise
 
     def step(self, timeout: float) -> None:
-        """Apply the time line as its steps come due, for `timeout` [s]."""
+        """Apply the steps of the time line when they are due, for `timeout` [s]."""
         until_ns = self._clock() + round(timeout * 1e9)
         if self._clock() - self._looked_ns >= PERIOD_NS:
             # The limit is as asked again once what was under way at a change has left.
@@ -289,25 +293,25 @@ class Netem:
                 return
 
     def counts(self) -> dict[str, int]:
-        """Return how many datagrams netem sent on, dropped (losses included) and holds.
+        """Return `counters`, the counts of `steps`, and `restored`.
 
-        Beside them the steps of the time line, and `restored`: how often another program has
-        removed or changed the qdiscs (the name is that of the metric, which is older).
+        `restored` is how often another program has removed or changed the qdiscs. Its name comes
+        from an older metric; nothing is restored.
         """
         return counters(self._look()) | self.steps.counts() | {"restored": self._damages}
 
     def released(self) -> dict[str, int]:
-        """Return nothing: the kernel does not tell when what was queued has left."""
+        """Return an empty dict: the kernel does not tell when queued datagrams have left."""
         return {}
 
     def close(self) -> None:
-        """Remove the qdiscs, if they are ours; what is queued in them is lost."""
+        """Remove the qdiscs if they are from `Netem`; queued datagrams are lost."""
         if self._device and is_ours(self._qdiscs()):
             self._iproute2.tc("qdisc", "del", "dev", self._device, "root")
         self._device, self._applied = "", []
 
     def _look(self) -> list[dict[str, Any]]:
-        """Read the qdiscs; log and count what another program has done to them."""
+        """Read the qdiscs; log and count damage by another program."""
         self._looked_ns, qdiscs = self._clock(), self._qdiscs()
         what = damage(qdiscs, self._applied) if self._applied else ""
         said = (
@@ -321,7 +325,7 @@ class Netem:
         return qdiscs
 
     def _set_up(self) -> None:
-        """Put the qdiscs in place, or take over those of an earlier process."""
+        """Add the qdiscs, or take over the qdiscs of an earlier process."""
         qdiscs, device = self._qdiscs(), self._device
         root = next((one for one in qdiscs if one.get("root")), {"handle": "0:"})
         if root["handle"] != "0:" and not is_ours(qdiscs):
@@ -344,7 +348,7 @@ class Netem:
             raise
 
     def _step(self) -> None:
-        """Apply what the time line asks for now."""
+        """Apply the present step of the time line; tolerate damage by another program."""
         try:
             self._apply("change")
         except CloudrcError:
@@ -353,7 +357,7 @@ class Netem:
                 raise
 
     def _apply(self, verb: str) -> None:
-        """Put in force what holds now, unless it is."""
+        """Bring the present conditions into force, unless they already are."""
         elapsed_ns, starts_ns = self._clock() - self._origin_ns, self._timeline.starts_ns
         before, self._piece = self._piece, max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
         wanted = options(self._profile, self._timeline.at(elapsed_ns), self._room)
@@ -369,7 +373,7 @@ class Netem:
                 self._log(self.steps.in_words())
 
     def _next_ns(self) -> int | None:
-        """Return when the next step may be taken [ns]; None after the last."""
+        """Return when the next step may take effect [ns]; None after the last step."""
         following = self._piece + 1
         if following >= len(self._timeline.starts_ns):
             return None
@@ -377,7 +381,7 @@ class Netem:
         return max(due_ns, self._stepped_ns + STEP_NS)
 
     def _confirm(self) -> None:
-        """Read back what is in force, and refuse what is not as it was asked for."""
+        """Read back the options in force; raise an error if they differ from the requested ones."""
         leaf = leaf_of(self._qdiscs())
         if leaf is None:
             raise MissingPrerequisiteError(
@@ -392,7 +396,7 @@ class Netem:
             )
 
     def _select(self, peer: Address) -> None:
-        """Send the tunnel's flow to netem: first a new filter, then without the old ones."""
+        """Direct the tunnel's flow to netem: add the new filter, then remove the old filters."""
         listed = self._iproute2.show("filter", "show", "dev", self._device, "parent", ROOT)
         old = sorted({int(one["pref"]) for one in listed})
         new = next(number for number in range(1, len(old) + 2) if number not in old)

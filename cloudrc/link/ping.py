@@ -1,8 +1,9 @@
 """Read logs of ping and fping: `ping -D -O HOST`, `ping --apple-time HOST`, in any language.
 
-A log has the times at which replies arrived, and their round trips. Lost are the numbers between
-replies, those that a line tells of ("no answer yet"), and those that only the summary counts.
-Without a summary the packets after the last line are unknown: replies may have been on their way.
+A log has the arrival times of replies and their round trips. These packets count as lost: sequence
+numbers that are missing between replies, packets with a line such as "no answer yet", and packets
+that only the summary counts. Without a summary, packets after the last line are unknown, because
+their replies may have been under way.
 
 Source: ping(8) of iputils, macOS and BusyBox; fping(8).
 """
@@ -19,20 +20,21 @@ from cloudrc.errors import BadInputError
 from cloudrc.link.logs import HALVE, Log, Packets
 
 PACKETS_MAX = 10_000_000
-"""Limit of packets in a log, three weeks at five a second, since a number may be forged."""
+"""Limit of packets in a log, because a number may be forged: three weeks at five packets a
+second."""
 STEP_BACK = 0.02
-"""Largest time by which a packet may seem sent before the one with a lower number [s]."""
+"""Largest step back in the computed times of sending between successive numbers [s]."""
 _WRAP = 1 << 16
 _STAMP = re.compile(
     r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"
     r"|(?P<date>\d{4}-\d\d-\d\d)?[T ]?(?P<hour>\d\d):(?P<minute>\d\d):(?P<second>\d\d\.\d+)\S* +"
 )
-"""Time of a line: of `ping -D`, of `ts '[%.s]'`, of `ping --apple-time`, or date and time."""
+"""Time stamp of a line: from `ping -D`, `ts '[%.s]'` or `ping --apple-time`, or date and time."""
 _NUMBER = re.compile(r"\b(?:icmp6?_)?(?:seq|req)[= ](\d{1,12})\b|(?<= : )\[(\d{1,12})\], ")
 _ROUND_TRIP = re.compile(r"(?:[=<] ?|, )(\d+(?:[.,]\d+)?) ?(?:ms|msec|msek|мс|毫秒|ミリ秒)(?=\W|$)")
 _REPLY = re.compile(r"ttl=|hlim=|bytes from", re.IGNORECASE)
 _SUMMARY = re.compile(r"xmt/rcv/%loss = (\d+)/(\d+)/|^(?!.*xmt/)\D*(\d+)\D+(\d+)\D.*%")
-"""Last lines: packets sent, packets received."""
+"""Summary at the end: packets sent, packets received."""
 _MEAN = re.compile(r"min/avg/\S+ = [\d.]+/([\d.]+)/")
 _NO_STAMPS = {
     r"(?<!_)\bseq=\d": "BusyBox's ping gives no times: ping HOST | ts '[%.s]', or use irtt",
@@ -42,20 +44,20 @@ _NO_STAMPS = {
     r"\], \d+ bytes": "run fping with -D",
     "": "run ping with -D",
 }
-"""Pattern in a log without times -> remedy for that kind of ping; the first match counts."""
+"""Pattern in a log without time stamps -> remedy for this kind of ping; the first match counts."""
 
 
 @dataclass(slots=True)
 class _Found:
-    """What the lines of a log say.
+    """Content of the lines of a log. A number is a packet's sequence number.
 
     Attributes:
         replies: Number -> time of sending and round trip [s].
-        told: Number -> time of the line about it, 0 without one [s].
-        trips: All round trips, those of duplicates included [s].
-        summaries: Packets sent and received, of each summary.
+        told: Number -> time stamp of the line about the packet, 0 without a time stamp [s].
+        trips: All round trips, including those of duplicates [s].
+        summaries: Packets sent and received, one pair per summary.
         headers: Number of lines that begin a log.
-        base: First number that this ping sends.
+        base: First number that this kind of ping sends.
     """
 
     replies: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -67,24 +69,24 @@ class _Found:
 
 
 def is_ping(lines: list[str]) -> bool:
-    """Check whether a text looks like the output of ping."""
+    """Return whether a text looks like the output of ping."""
     return any(_NUMBER.search(line) or line.startswith("PING ") for line in lines[:1000])
 
 
 def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
-    """Read the output of `ping -D` or of one of its relatives.
+    """Read the output of `ping -D` or of a similar program.
 
     Args:
         lines: Lines of the log.
         name: Name of the file, for messages.
-        halve: Whether to use half of each round trip; it must be true.
+        halve: Must be true: the user accepts half of each round trip as the one-way delay.
 
     Returns:
-        Packets with half a round trip as delay.
+        Packets; their delays are halves of the round trips.
 
     Raises:
-        BadInputError: If there are no replies, no stamps or too many packets, the log has several
-            sessions or contradicts its summary, or `halve` is false.
+        BadInputError: If `halve` is false, if the log has no replies, no time stamps, too many
+            packets or several sessions, or if it contradicts its summary.
     """
     if not halve:
         raise BadInputError(f"{name}: ping measures round trips; {HALVE}")
@@ -114,7 +116,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
 
 
 def _read_lines(lines: list[str], log: Log) -> _Found:
-    """Read the lines of a log; unwrap ping's numbers of 16 bits."""
+    """Read the lines of a log; unwrap ping's 16-bit sequence numbers."""
     found = _Found()
     wraps, newest, day, last_stamp = 0, 0, 0.0, 0.0
     for line in lines:
@@ -162,7 +164,7 @@ def _read_lines(lines: list[str], log: Log) -> _Found:
 
 
 def _read_other(line: str, found: _Found, log: Log) -> None:
-    """Read a line without a number: header, summary, or something else."""
+    """Read a line without a sequence number: header, summary, or another line."""
     summary, mean = _SUMMARY.search(line), _MEAN.search(line)
     if line.startswith(("PING ", "PING6(")):
         found.headers += 1
@@ -182,7 +184,7 @@ def _read_other(line: str, found: _Found, log: Log) -> None:
 
 
 def _seconds(stamp: re.Match[str]) -> float:
-    """Convert the stamp of a line [s], since 1970 or since midnight."""
+    """Convert the time stamp of a line to the time since 1970 or since midnight [s]."""
     if stamp["unix"]:
         return float(stamp["unix"])
     day = datetime.fromisoformat((stamp["date"] or "1970-01-01") + "T00:00:00+00:00").timestamp()
@@ -190,7 +192,7 @@ def _seconds(stamp: re.Match[str]) -> float:
 
 
 def _range(found: _Found, name: str) -> tuple[int, int]:
-    """Return the first and the last number sent; compare the log with its own summary."""
+    """Return the first and the last sequence number; compare the log with its own summary."""
     beginnings = max(found.headers, len(found.summaries))
     if beginnings > 1:
         _refuse_sessions(name, f"{beginnings} beginnings or ends")
@@ -218,7 +220,7 @@ def _refuse_sessions(name: str, sign: str) -> None:
 
 
 def _check_clock(found: _Found, log: Log) -> float:
-    """Compare the times of sending with the numbers; return the usual time between packets [s]."""
+    """Check the times of sending by the numbers; return the median time between packets [s]."""
     sent = {number: at for number, (at, _) in sorted(found.replies.items())}
     times = sent if len(sent) > 1 else {n: at for n, at in sorted(found.told.items()) if at}
     pairs = list(pairwise(times.items()))

@@ -1,10 +1,11 @@
 """Define the conditions of a link direction and how they change over time, in SI units.
 
 All delays are ONE WAY. The classes mirror `config/schema.py`, which reads files in milliseconds;
-`assembly.py` converts. The values are not checked here: `config` and `link/traces.py` do that.
+`assembly.py` converts the values. `config` and `link/traces.py` check the values; this module does
+not.
 
-A `Timeline` merges a direction's changes, trace and blackouts into one list of pieces; the model
-looks up the piece of each packet by the time since the link came up.
+A `Timeline` merges a direction's changes, trace and blackouts into one list of pieces. The model
+finds the piece for each packet by the time since the link came up.
 """
 
 from __future__ import annotations
@@ -56,13 +57,13 @@ def mean_loss(loss: Loss) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of the conditions at one instant; None keeps a value.
+    """A change of the conditions at one instant; None leaves a value unchanged.
 
     Attributes:
         at: Time since the link came up [s].
-        delay: One way [s].
+        delay: Mean delay, one way [s].
         jitter: As in `DirectionProfile` [s].
-        loss: Probability, or bursts.
+        loss: Probability of an independent loss, or loss in bursts.
         rate: Rate of the bottleneck [bit/s].
     """
 
@@ -88,18 +89,20 @@ class Blackout:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Measured conditions over time: each row holds until the next, the last one without end.
+    """Measured conditions over time: each row holds until the next row; the last row holds forever.
 
-    A trace that loops begins again after its last row, which then lasts as long as a mean row.
+    In a looping trace, the last row lasts as long as the mean of the other rows; then the trace
+    begins again.
 
-    A trace replaces `delay`, and `loss` if it has losses; jitter is added to it.
+    The delays of a trace replace the profile's `delay`; jitter is added to them. If the trace has
+    losses, they replace the profile's `loss`.
 
     Attributes:
         times: Time since the link came up, strictly rising [s], shape (n,), n >= 1. The first row
             also holds before its time.
         delays: One way [s], shape (n,).
         losses: In [0, 1], shape (n,), or None.
-        loop: Whether it begins again after its end.
+        loop: Whether the trace begins again after its end.
     """
 
     times: tuple[float, ...]
@@ -109,7 +112,7 @@ class Trace:
 
     @property
     def period(self) -> float | None:
-        """Return the time after which the trace begins again [s]; None if it does not."""
+        """Return the length of one pass of a looping trace [s]; None if the trace does not loop."""
         count = len(self.times)
         if not self.loop or count < 2:
             return None
@@ -125,20 +128,20 @@ class DirectionProfile:
         jitter: Half width (uniform) or standard deviation (normal, pareto, table) of the delay
             [s]. A delay below 0 becomes 0.
         distribution: Distribution of the delay about its mean.
-        table: For the distribution table: values drawn with equal probability, with mean 0 and
-            standard deviation 1, rising, shape (n,) [1]; otherwise ().
+        table: Values of the distribution "table" [1], drawn with equal probability: mean 0,
+            standard deviation 1, rising, shape (n,). () for other distributions.
         correlation: Correlation of the jitter of successive packets, in [0, 1].
-        loss: Probability, or bursts.
+        loss: Probability of an independent loss, or loss in bursts.
         duplicate: Probability in [0, 1] that a packet arrives twice; the copy has its own delay.
         reorder: Probability in [0, 1] that a packet skips both queue and delay.
         corrupt: Probability in [0, 1] that one bit of the datagram is flipped, in all its copies.
         keep_order: Whether packets keep their order (this disables `reorder`).
         rate: Rate of the bottleneck [bit/s]; None without a bottleneck.
-        queue_packets: Capacity of the bottleneck in packets, with the one on the wire; a packet
-            beyond it is dropped.
-        changes: Time line, strictly rising in `at`.
+        queue_packets: Capacity of the bottleneck [packets], including the packet on the wire; a
+            packet that finds the queue full is dropped.
+        changes: Changes of the conditions, strictly rising in `at`.
         trace: Measured delay over time.
-        blackouts: In any order; they may overlap.
+        blackouts: Blackouts in any order; they may overlap.
     """
 
     delay: float = 0.0
@@ -164,7 +167,7 @@ class Conditions(NamedTuple):
     Attributes:
         delay_ns: Mean delay, one way [ns].
         jitter: As in `DirectionProfile` [s].
-        loss: Probability, or bursts.
+        loss: Probability of an independent loss, or loss in bursts.
         rate: Rate of the bottleneck [bit/s]; None without a bottleneck.
         blackout: True if all packets are lost.
     """
@@ -177,18 +180,19 @@ class Conditions(NamedTuple):
 
 
 LOOP_SPAN = 3600.0
-"""Time for which a time line that loops is written out [s], for readers of `starts_ns`."""
+"""How far a looping time line is unrolled [s], for users of `starts_ns`."""
 LOOP_PIECES = 500_000
-"""Most pieces of such a time line that are written out."""
+"""Limit of the pieces of an unrolled time line; one pass is always complete."""
 
 
 class Timeline:
     """The conditions of one direction over time.
 
     Attributes:
-        starts_ns: Start of each piece, as time since the link came up, rising [ns]; of a time line
-            that loops, for `LOOP_SPAN`.
-        period_ns: Time after which `starts_ns` begins again [ns]; None if it does not.
+        starts_ns: Start of each piece, as time since the link came up, rising [ns]. A looping time
+            line is unrolled over `LOOP_SPAN`.
+        period_ns: Length of the unrolled time line [ns], after which it begins again; None if the
+            time line does not loop.
     """
 
     def __init__(self, profile: DirectionProfile) -> None:
@@ -210,7 +214,7 @@ class Timeline:
         return self._pieces[max(bisect_right(self.starts_ns, elapsed_ns) - 1, 0)]
 
     def _repeat(self, period_ns: int) -> int:
-        """Repeat the pieces for `LOOP_SPAN`; return the time that they then last [ns]."""
+        """Unroll a looping time line over `LOOP_SPAN`; return the length of the result [ns]."""
         pieces = list(zip(self.starts_ns, self._pieces, strict=True))
         pieces = [(start_ns, piece) for start_ns, piece in pieces if start_ns < period_ns]
         count = min(ceil(LOOP_SPAN * 1e9 / period_ns), max(LOOP_PIECES // len(pieces), 1))
@@ -224,7 +228,7 @@ class Timeline:
 
 
 def settled(profile: DirectionProfile) -> DirectionProfile:
-    """Return the profile of the conditions after the end of a time line."""
+    """Return a constant profile: the conditions after the end of a profile's time line."""
     timeline = Timeline(profile)
     last = timeline.at(timeline.starts_ns[-1])
     return replace(
@@ -240,7 +244,7 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
 
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
-    """Compute the conditions from `instant` [s] until the next one on the time line."""
+    """Compute the conditions from `instant` [s] until the next instant of the time line."""
     delay, jitter, loss, rate = profile.delay, profile.jitter, profile.loss, profile.rate
     for change in profile.changes:
         if change.at > instant:

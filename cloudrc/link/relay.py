@@ -5,15 +5,16 @@ Local mode runs `Relay`, with both directions. In a pod, `RelayShaper` shapes wh
     world <-> [world side]  Relay  [cloud side] <-> cloud
     tunnel end > [listen]  RelayShaper  [any port] > the other pod's tunnel end
 
-A datagram is due when the kernel received it plus the delay that the model draws, however long it
-waited for this process. It never leaves earlier.
+Due time of a datagram = time of arrival at the kernel + delay that the model draws. The time in
+which the datagram waits for this process does not count. A datagram never leaves before it is due.
 
-The relay sleeps in `select` until a datagram arrives or shortly before one is due. Then it reads
-the clock until that instant, since a sleeping thread wakes 15 to 50 us late. It releases what is
-due before it takes in what has arrived, which has its stamp and can wait.
+The relay sleeps in `select` until a datagram arrives, or until shortly before the next datagram is
+due. Then it reads the clock in a loop until the due time, since a sleeping thread wakes 15 to 50 us
+late. The relay first releases the datagrams that are due and then takes in new ones: these have the
+kernel's time stamp and can wait.
 
-A socket is connected to its end: the kernel drops what comes from any other address, and this
-process is not even woken.
+A socket is connected to its end of the tunnel. So the kernel drops datagrams from any other address
+without waking this process.
 """
 
 from __future__ import annotations
@@ -38,28 +39,29 @@ from cloudrc.link.profile import DirectionProfile
 
 Address: TypeAlias = tuple[str, int]
 Peek: TypeAlias = Callable[[bytes], tuple[int, int, int]]
-"""Returns kind, epoch and counter of a datagram; raises ValueError if it is not one of ours."""
+"""Function that returns kind, epoch and counter of a datagram; it raises a ValueError if the
+datagram is not from the tunnel."""
 Send: TypeAlias = Callable[[bytes], object]
-"""Sends a datagram; raises OSError if the kernel refuses."""
+"""Function that sends a datagram; it raises an OSError if the kernel refuses."""
 
 IN_FLIGHT_MAX = 10_000
-"""Limit of datagrams that a lane holds at once [1]; more are dropped and counted."""
+"""Limit of datagrams that a lane holds at once [1]; further datagrams are dropped and counted."""
 DATAGRAM_MAX = 2_048
 """Limit of a datagram's length [bytes], so that the memory of a lane is bounded."""
 BATCH = 32
-"""Limit of datagrams that a lane takes in, or releases, before the other lane's turn [1]."""
+"""Limit of datagrams that a lane takes in or releases before the next lane's turn [1]."""
 SPIN_NS = 60_000
-"""Longest time for which the relay reads the clock before a datagram is due [ns]. Wakes that are
-later than this have other causes than the timer, such as other programs."""
+"""How long before a due time the relay starts to read the clock in a loop [ns]. If a thread wakes
+later than this, the cause is not the timer but, for example, another program."""
 STOP_PERIOD = 0.1
 """Longest time between two calls of `stop` [s]."""
 
 ANCILLARY_SIZE = 64
-"""Size of the buffer for the kernel's stamp and its count of drops [bytes]."""
+"""Size of the buffer for the kernel's time stamp and its count of drops [bytes]."""
 AGE_MAX_NS = 50_000_000
-"""Limit of a datagram's age when it is read [ns]; an older one counts as this old."""
+"""Limit of a datagram's age when it is read [ns]; an older datagram counts as this old."""
 _STEP_MIN_NS = 1_000_000
-"""Difference of two looks at the clocks above which the wall clock was set [ns]."""
+"""If the clock offset changes by more than this between two checks, the wall clock was set [ns]."""
 _COUNT_MASK = 0xFFFF_FFFF
 # Source: Linux, include/uapi/asm-generic/socket.h; Python has no names for them.
 _SO_TIMESTAMPNS = 35
@@ -67,10 +69,10 @@ _SO_RXQ_OVFL = 40
 
 
 def ask_for_stamps(one: socket.socket) -> bool:
-    """Make the kernel stamp what arrives and count what it drops, where it can.
+    """Ask the kernel to time-stamp arriving datagrams and to count dropped ones.
 
     Returns:
-        Whether it stamps.
+        Whether the kernel stamps datagrams.
     """
     if sys.platform != "linux":
         return False
@@ -85,13 +87,14 @@ def ask_for_stamps(one: socket.socket) -> bool:
 
 
 class Stamps:
-    """Reads what the kernel says about the datagrams of one socket.
+    """Reads the kernel's time stamps and drop counts for the datagrams of one socket.
 
-    The kernel stamps arrivals (SO_TIMESTAMPNS) by the wall clock, which people and NTP set. So a
-    stamp is converted at once to an age, and the monotonic clock minus the age is what counts.
+    The kernel stamps arrivals (SO_TIMESTAMPNS) by the wall clock, which people and NTP may set. So
+    the relay converts a stamp at once to the monotonic clock.
 
     Attributes:
-        dropped: Number of datagrams that found the socket's buffer full, as far as it is known.
+        dropped: Number of datagrams that found the socket's buffer full, as last reported by the
+            kernel.
     """
 
     def __init__(self) -> None:
@@ -101,14 +104,14 @@ class Stamps:
         self._offset_ns: int | None = None
 
     def look_at_clocks(self) -> int | None:
-        """Compare the clocks, before datagrams are read in one go.
+        """Compare the wall clock with the monotonic clock, before a batch of datagrams is read.
 
-        The wall clock is read first: a pause between the two readings makes a datagram later,
-        never earlier.
+        The wall clock is read first. So a pause between the two readings makes a datagram seem
+        later, never earlier.
 
         Returns:
-            Monotonic minus wall clock [ns]; None if the wall clock was set since the last look, so
-            that a stamp gives no age.
+            Monotonic minus wall clock [ns]; None if the wall clock was set since the last call, so
+            that stamps cannot be converted.
         """
         before = self._offset_ns
         wall_ns = time.time_ns()
@@ -118,10 +121,10 @@ class Stamps:
         return offset_ns
 
     def wall_ns(self, ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
-        """Read the kernel's stamp of a datagram and its count of drops.
+        """Read the kernel's time stamp of a datagram; update `dropped`.
 
         Args:
-            ancillary: As `recvmsg` returns it.
+            ancillary: Ancillary data as `recvmsg` returns them.
 
         Returns:
             Arrival on the wall clock [ns]; None without a stamp.
@@ -158,9 +161,10 @@ class Lane:
     """Takes datagrams in, asks the model, and sends them when they are due.
 
     Attributes:
-        source: Socket at which they arrive.
+        source: Socket at which the datagrams arrive.
         direction: Model of the link.
-        origin_ns: Start of the model's time [ns], monotonic clock; None: the first datagram.
+        origin_ns: Start of the model's time [ns], monotonic clock; None before the first datagram,
+            which sets it.
         errors: How late datagrams have left.
     """
 
@@ -199,7 +203,7 @@ class Lane:
         return self._in_flight[0][0] if self._in_flight else None
 
     def take_in(self) -> None:
-        """Put what waits in the socket on the link, at most `BATCH` datagrams."""
+        """Read waiting datagrams from the socket into the model, at most `BATCH`."""
         offset_ns, read = self._stamps.look_at_clocks(), self._stamps.wall_ns
         for _ in range(BATCH):
             try:
@@ -222,7 +226,7 @@ class Lane:
                 self._put_on_link(data, *header, received_ns)
 
     def release(self) -> None:
-        """Send what is due, at most `BATCH` datagrams."""
+        """Send the datagrams that are due, at most `BATCH`."""
         for _ in range(BATCH):
             now_ns = monotonic_ns()
             if not self._in_flight or self._in_flight[0][0] > now_ns:
@@ -235,7 +239,7 @@ class Lane:
                 self._unsent += 1
 
     def counts(self) -> dict[str, int]:
-        """Count datagrams by what became of them; `Lanes.outcomes` explains the names."""
+        """Return the number of datagrams by outcome; `Lanes.outcomes` explains the names."""
         return {
             "received": self._received,
             "forwarded": self._forwarded,
@@ -250,9 +254,9 @@ class Lane:
         """Return how late datagrams left since the beginning; any thread may call this.
 
         Returns:
-            As `lateness.in_ns`, with `overflow`, the number for which there was no room, and
-            `stalled`, the number that waited for this process for `AGE_MAX_NS` or more, so that
-            they may have left later than their errors say. Empty before the first datagram.
+            The values of `lateness.in_ns`, and two numbers of datagrams. `overflow`: there was no
+            room. `stalled`: the datagram waited for this process for `AGE_MAX_NS` or longer, so it
+            may have left later than `errors` says. Empty before the first datagram.
         """
         told = in_ns(self.errors)
         return {**told, "overflow": self._overflow, "stalled": self._stalled} if told else {}
@@ -260,7 +264,7 @@ class Lane:
     def _put_on_link(
         self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
     ) -> None:
-        """Draw what becomes of a datagram, and hold it if it is not lost."""
+        """Draw the impairment of a datagram, and hold each copy until it is due."""
         if self.origin_ns is None:
             self.origin_ns = received_ns
         elapsed_ns = received_ns - self.origin_ns
@@ -277,7 +281,7 @@ class Lane:
                 heapq.heappush(self._in_flight, (due_ns, next(self._numbers), data))
 
     def _send(self, data: bytes) -> bool:
-        """Send one datagram; return whether the kernel took it."""
+        """Send one datagram; return whether the kernel accepted the datagram."""
         for _ in range(2):
             try:
                 self._output(data)
@@ -297,9 +301,9 @@ class Lanes:
         """Set up.
 
         Args:
-            lanes: At least one.
-            origin_ns: Start of their models' time [ns], monotonic clock; None: the first datagram
-                on any lane, as in virtual time.
+            lanes: The lanes, at least one.
+            origin_ns: Start of the models' time [ns], monotonic clock; None: the models' time
+                starts at the first datagram on any lane, as in virtual time.
         """
         self._lanes = tuple(lanes)
         self._sources = [lane.source for lane in self._lanes]
@@ -308,13 +312,13 @@ class Lanes:
         self._set_origin(origin_ns)
 
     def run_for(self, timeout: float) -> None:
-        """Forward for `timeout` [s], or a little longer."""
+        """Forward datagrams for `timeout` [s], or a little longer."""
         until_ns = monotonic_ns() + round(timeout * 1e9)
         while (rest_ns := until_ns - monotonic_ns()) > 0:
             self.step(rest_ns * 1e-9)
 
     def step(self, timeout: float) -> None:
-        """Wait for a datagram or a due instant, at most `timeout` [s], and handle both."""
+        """Wait at most `timeout` [s] for an arrival or a due time; read and release datagrams."""
         due_ns = min((due for lane in self._lanes if (due := lane.due_ns()) is not None), default=0)
         if due_ns:
             timeout = min(timeout, max(0.0, (due_ns - SPIN_NS - monotonic_ns()) * 1e-9))
@@ -327,9 +331,9 @@ class Lanes:
         self._release()  # what has no delay
 
     def take_in(self, readable: Collection[socket.socket] | None = None) -> None:
-        """Put on the link what waits in these sockets, by default in all.
+        """Read waiting datagrams from these sockets into the models, by default from all sockets.
 
-        Call it before a direction's profile changes.
+        Call this method before the profile of a direction changes.
         """
         for lane in self._lanes:
             if readable is None or lane.source in readable:
@@ -338,13 +342,17 @@ class Lanes:
                     self._set_origin(lane.origin_ns)
 
     def outcomes(self) -> dict[str, int]:
-        """Count the datagrams of all lanes by what became of them.
+        """Return the number of datagrams of all lanes by outcome.
 
         Returns:
-            `received`; `lost` on the link by any cause; `malformed`; `overflow` beyond
-            `in_flight_max`; `unread` because the socket's buffer was full (the kernel says so with
-            the next datagram); `unsent` because the other end is unknown or the kernel refused;
-            `forwarded`, copies included.
+            - `received`: arrived at the relay.
+            - `lost`: lost on the link by any cause.
+            - `malformed`: not from the tunnel.
+            - `overflow`: dropped because the lane already held `in_flight_max` datagrams.
+            - `unread`: dropped because the socket's buffer was full; the kernel reports this with
+              the next datagram.
+            - `unsent`: not sent because the other end is unknown or the kernel refused.
+            - `forwarded`: sent, copies included.
         """
         outcomes: Counter[str] = Counter()
         for lane in self._lanes:
@@ -352,14 +360,14 @@ class Lanes:
         return dict(outcomes)
 
     def recent(self) -> dict[str, int]:
-        """Return the recent lateness, as `Recent.counts`; call it once a second."""
+        """Return the recent lateness as from `Recent.counts`; call this method once a second."""
         return self._recent.counts(self._errors())
 
     def counts(self) -> dict[str, float]:
         """Return `outcomes`, and the lateness since the beginning.
 
-        The lateness is `released_early`, and `release_error_p50`, `_p99` and `_p999` [s], which are
-        absent before the first datagram.
+        The lateness is `released_early`, `release_error_p50`, `_p99` and `_p999` [s]. The
+        percentiles are absent before the first datagram.
         """
         errors = self._errors()
         return {**self.outcomes(), "released_early": errors.early, **errors.quantiles()}
@@ -396,9 +404,9 @@ class Relay(Lanes):
         """Connect both sockets to their ends; the caller closes them.
 
         Args:
-            uplink: World to cloud. Its time starts at the first datagram, as in virtual time,
-                however long the processes take to start: leave its origin at 0.
-            downlink: Cloud to world, likewise.
+            uplink: World to cloud, with origin 0. The relay sets the start of its time at the first
+                datagram, as in virtual time, however long the processes take to start.
+            downlink: Cloud to world, with origin 0, likewise.
             peek: Reads kind, epoch and counter of a datagram.
             world_side: Bound UDP socket that world sends to.
             cloud_side: Bound UDP socket that cloud sends to.
@@ -418,13 +426,13 @@ class Relay(Lanes):
         super().__init__(tuple(self._ways.values()), origin_ns=None)
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Forward until `stop` returns True; it is called at least every 0.1 s."""
+        """Forward datagrams until `stop` returns True; call `stop` at least every 0.1 s."""
         tighten_slack()
         while not stop():
             self.run_for(STOP_PERIOD)
 
     def released(self, way: str) -> dict[str, int]:
-        """Return how late datagrams of "uplink" or "downlink" left, as `Lane.released`."""
+        """Return how late datagrams of "uplink" or "downlink" left, as from `Lane.released`."""
         return self._ways[way].released()
 
 
@@ -439,11 +447,11 @@ class RelayShaper:
         """Open the two sockets.
 
         Args:
-            listen: Where this pod's tunnel end sends to; port 0 lets the kernel choose.
-            direction: The link, its origin on the machine's monotonic clock.
+            listen: Address to which this pod's tunnel end sends; port 0 lets the kernel choose.
+            direction: Model of the link; its origin is on the machine's monotonic clock.
             peek: Reads kind, epoch and counter of a datagram.
-            end: Where this pod's tunnel end sends from; the kernel drops what comes from others.
-                None: any sender.
+            end: Address from which this pod's tunnel end sends; the kernel drops datagrams from
+                other addresses. None accepts any sender.
 
         Raises:
             OSError: If `listen` is in use, or cannot be reached from `end`.
@@ -465,23 +473,23 @@ class RelayShaper:
         tighten_slack()
 
     def follow_peer(self, peer: Address) -> Address:
-        """Send to this peer from now on, what is in flight included."""
+        """Send to this peer from now on, including the datagrams in flight; return the route."""
         self._peer = peer
         host, port = self._inside.getsockname()
         return host, port
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on; what is in flight keeps its delay.
+        """Shape by this profile from now on; datagrams in flight keep their delay.
 
         Args:
             profile: Conditions.
-            restart: Whether their time line starts now; otherwise it continues.
+            restart: True: the time line starts now. False: the time line continues.
         """
         self._lanes.take_in()  # what has arrived until now belongs to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
 
     def step(self, timeout: float) -> None:
-        """Forward for `timeout` [s]."""
+        """Forward datagrams for `timeout` [s]."""
         self._lanes.run_for(timeout)
 
     def counts(self) -> dict[str, int]:
@@ -489,11 +497,11 @@ class RelayShaper:
         return self._lanes.outcomes() | self._lanes.recent()
 
     def released(self) -> dict[str, int]:
-        """Return how late datagrams left since the beginning, as `Lane.released`."""
+        """Return how late datagrams left since the beginning, as from `Lane.released`."""
         return self._lane.released()
 
     def close(self) -> None:
-        """Close the sockets; what is in flight is lost."""
+        """Close the sockets; datagrams in flight are lost."""
         self._inside.close()
         self._outside.close()
 
@@ -508,12 +516,13 @@ _FIFO_PRIORITY = 10
 _SWITCH_INTERVAL = 0.0002
 """Longest time for which another thread of this process keeps the interpreter [s]."""
 _COLLECT_AFTER = 50_000
-"""New objects between two garbage collections [1]; datagrams in flight are no garbage."""
+"""Number of new objects that triggers a garbage collection [1]. The number is high, because new
+objects are mostly datagrams in flight, which are not garbage."""
 _SET_TIMERSLACK = 29
 
 
 def settle() -> None:
-    """Make garbage collection rare and cheap, and turns of other threads short."""
+    """Make garbage collections rare and cheap; shorten the turns of other threads."""
     sys.setswitchinterval(_SWITCH_INTERVAL)
     gc.collect()
     gc.freeze()
@@ -521,7 +530,7 @@ def settle() -> None:
 
 
 def tighten_slack() -> None:
-    """Let sleeps of the calling thread end when they are due, not up to 50 us later.
+    """Let sleeps of the calling thread end on time, not up to 50 us late.
 
     Source: PR_SET_TIMERSLACK, prctl(2); Linux only.
     """
@@ -530,10 +539,10 @@ def tighten_slack() -> None:
 
 
 def ask_for_fifo() -> str:
-    """Give the calling thread SCHED_FIFO, if it is permitted; children do not inherit it.
+    """Give the calling thread SCHED_FIFO, if permitted; child processes do not inherit it.
 
     Returns:
-        "" if granted, else the reason.
+        "" if the thread now has SCHED_FIFO, else the reason why not.
     """
     if not hasattr(os, "SCHED_FIFO"):
         return "this system has no SCHED_FIFO"

@@ -1,6 +1,7 @@
-"""Run the `link` container of a pod: choose a shaper, publish the route, follow what changes.
+"""Run the `link` container of a pod: choose a shaper, publish the route, follow changes.
 
-Other threads leave the peer and the profile here; only the thread in `run` touches the shaper.
+Other threads set the attributes `peer` and `profile` of the `Sidecar`; only the thread in `run`
+uses the shaper.
 """
 
 from __future__ import annotations
@@ -34,52 +35,52 @@ Mode: TypeAlias = Literal["auto", "netem", "relay"]
 COUNT_PERIOD_NS = 1_000_000_000
 """Time between two updates of the metrics [ns]."""
 RELEASED_PERIOD_NS = 2_000_000_000
-"""Time between two publications of how late datagrams left [ns]; an end reads it as often."""
+"""Time between two publications of how late datagrams left [ns]; an end reads with this period."""
 STEP = 0.05
-"""Longest time in which a change that was left here is not seen [s]."""
+"""Longest time until the thread in `run` sees a new peer or profile [s]."""
 
 
 class Shaper(Protocol):
-    """Shapes what one pod's tunnel end sends to the other's: the relay, or netem."""
+    """Shapes the datagrams from this pod's tunnel end to the other pod's: relay or netem."""
 
     @property
     def name(self) -> str:
-        """As in `link.mode`: "relay" or "netem"."""
+        """Name as in the setting `link.mode`: "relay" or "netem"."""
         ...
 
     def follow_peer(self, peer: Address) -> Address:
-        """Shape what goes to this peer from now on.
+        """Shape the datagrams to this peer from now on.
 
         Returns:
-            The route: where this pod's tunnel end has to send.
+            The route: the address to which this pod's tunnel end has to send.
 
         Raises:
-            CloudrcError: If it cannot.
+            CloudrcError: If the shaper cannot do this.
         """
         ...
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on; what is in flight is not lost.
+        """Shape by this profile from now on; datagrams in flight are not lost.
 
         Args:
             profile: Conditions.
-            restart: Whether their time line starts now; otherwise it continues.
+            restart: True: the time line starts now. False: the time line continues.
 
         Raises:
-            CloudrcError: If it cannot; then the old profile stays in force.
+            CloudrcError: If the shaper cannot do this; then the old profile stays in force.
         """
         ...
 
     def step(self, timeout: float) -> None:
-        """Work or wait, at most about `timeout` [s]."""
+        """Work or wait for about `timeout` [s]."""
         ...
 
     def counts(self) -> dict[str, int]:
-        """Return how many datagrams met which outcome so far."""
+        """Return the number of datagrams so far, by outcome."""
         ...
 
     def released(self) -> dict[str, int]:
-        """Return how late datagrams left since the beginning; empty if that is not known."""
+        """Return how late datagrams left since the beginning; empty if unknown."""
         ...
 
     def close(self) -> None:
@@ -88,16 +89,17 @@ class Shaper(Protocol):
 
 
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
-"""Makes a shaper from conditions and the start of their time line [ns]."""
+"""Function that makes a shaper from conditions and the start of their time line [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """The netem qdiscs of a network namespace, whoever put them there.
+    """The netem qdiscs of a network namespace, including those of other programs.
 
     Attributes:
-        interface: The one through which the tunnel's flow leaves.
-        netems: By interface: objects of `tc -s -j qdisc show`; only where there are any.
+        interface: Interface through which the tunnel's flow leaves.
+        netems: Interface -> its netem qdiscs, as objects of `tc -s -j qdisc show`. Interfaces
+            without netem are absent.
     """
 
     interface: str
@@ -106,13 +108,13 @@ class Near:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What a link's process says of the direction that it shapes.
+    """Report of a link's process about the direction that it shapes.
 
     Attributes:
         shaper: "relay" or "netem".
-        why: Why this one, in words.
-        applied: What it was asked to apply and has applied; None while a time line runs.
-        near: What the kernel says; None where that cannot be asked.
+        why: Why this shaper was chosen, in words.
+        applied: The constant conditions in force; None while a time line runs.
+        near: The netem qdiscs that the kernel lists; None if the kernel cannot be asked.
     """
 
     shaper: str
@@ -122,7 +124,7 @@ class Told:
 
 
 def look_near(run: Run, host: str) -> Near | None:
-    """Ask the kernel for its netems, and for the way to a host; None if it cannot be asked."""
+    """Ask the kernel for its netem qdiscs and for the interface to a host; None if that fails."""
     iproute2, netems = Iproute2(run), dict[str, list[dict[str, Any]]]()
     try:
         interface = iproute2.device(host)
@@ -135,24 +137,25 @@ def look_near(run: Run, host: str) -> Near | None:
 
 
 def write_told(told: Told) -> str:
-    """Write it as JSON."""
+    """Format a `Told` as JSON."""
     return TypeAdapter(Told).dump_json(told, indent=2).decode() + "\n"
 
 
 def read_told(text: str) -> Told:
-    """Read it; raises a ValueError if it is something else."""
+    """Parse the JSON of a `Told`; raise a ValueError if the text is something else."""
     return TypeAdapter(Told).validate_json(text)
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How a sidecar is set up.
+    """Settings of a sidecar.
 
     Attributes:
-        mode: `link.mode`: "relay" and "netem" are strict, "auto" takes netem where it can.
+        mode: The setting `link.mode`: "relay" and "netem" are strict, "auto" uses netem if
+            possible.
         direction: "uplink" or "downlink", for reports.
-        route: File that tells this pod's tunnel end where it has to send.
-        state: File beside it that tells reports what shapes the link and why.
+        route: File with the address to which this pod's tunnel end has to send.
+        state: State file in the same folder, for reports.
     """
 
     mode: Mode
@@ -163,17 +166,17 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """What a sidecar needs of the machine.
+    """Functions and facts of the machine that a sidecar needs.
 
     Attributes:
         relay: Makes the relay.
-        netem: Makes netem, without touching the network yet.
+        netem: Makes the `Netem`, without touching the network yet.
         may_shape: Whether this process is root with NET_ADMIN.
-        try_netem: Raises a CloudrcError if this kernel has no netem; leaves nothing behind.
-        clock: Monotonic [ns].
-        today: Date and time in UTC as text, for reports.
+        try_netem: Raises a CloudrcError if this kernel has no netem; leaves no qdisc behind.
+        clock: Returns the time on the monotonic clock [ns].
+        today: Returns date and time in UTC as text, for reports.
         wait: Sleeps for a time [s].
-        log: Gets lines for people.
+        log: Receives lines for people.
     """
 
     relay: Make
@@ -190,24 +193,24 @@ class Watcher(Protocol):
     """Keeps the metrics of a sidecar."""
 
     def shapes(self, shaper: str) -> None:
-        """Learn that this shaper is in force from now on, and that the route is published."""
+        """Note that this shaper is in force from now on, and that the route is published."""
         ...
 
     def asked(self, delay: float) -> None:
-        """Learn the mean delay [s] that the profile in force asks for."""
+        """Note the mean delay [s] that the profile in force requests."""
         ...
 
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
-        """Learn once a second how many datagrams met which outcome so far."""
+        """Note the number of datagrams so far by outcome; called once a second."""
         ...
 
 
 class Sidecar:
-    """Shapes what one pod's tunnel end sends to the other's.
+    """Shapes the datagrams from this pod's tunnel end to the other pod's.
 
     Attributes:
-        peer: Address of the other pod's tunnel end; another thread sets it.
-        profile: What is asked for; another thread sets it.
+        peer: Address of the other pod's tunnel end; another thread sets this attribute.
+        profile: The requested profile; another thread sets this attribute.
     """
 
     def __init__(
@@ -230,12 +233,12 @@ class Sidecar:
         """Shape until `stop` returns True.
 
         Args:
-            stop: Whether to end.
-            wait_for_peer: Called once it is sure that a strict mode can be kept: from then on the
-                peer is looked for.
+            stop: Returns True when the sidecar has to end.
+            wait_for_peer: Called after the check that the shaper of a strict mode works; starts
+                the search for the peer.
 
         Raises:
-            CloudrcError: If the mode is strict and its shaper cannot do what is asked.
+            CloudrcError: If the mode is strict and its shaper cannot realise the profile.
         """
         withdraw(self._settings.route)  # an earlier process may have left one
         if self._settings.mode == "netem":
@@ -253,7 +256,10 @@ class Sidecar:
             withdraw(self._released)
 
     def told(self) -> Told | None:
-        """Say what shapes, and what is in force; None before that. Any thread may call this."""
+        """Return shaper and conditions in force; None before the first shaper.
+
+        Any thread may call this method.
+        """
         if self._in_force is None:
             return None
         state, profile = self._in_force
@@ -262,7 +268,7 @@ class Sidecar:
         return Told(state.shaper, state.reason, settled(profile) if over else None)
 
     def _check_netem(self) -> None:
-        """Find out whether netem will do, before the peer is waited for."""
+        """Check whether netem works here, before the sidecar waits for the peer."""
         if not self._machine.may_shape:
             raise MissingPrerequisiteError(
                 "link.mode=netem needs uid 0 and NET_ADMIN; give this container both, or set "
@@ -272,7 +278,7 @@ class Sidecar:
         self._machine.try_netem()
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
-        """Shape with one shaper, until `stop` or until a profile asks for another one."""
+        """Shape with one shaper until `stop`, or until a new profile needs another shaper."""
         profile = self.profile
         if self._origin_ns is None or (self._state and self._change_of(profile).restart):
             self._origin_ns = self._machine.clock()
@@ -296,7 +302,7 @@ class Sidecar:
             shaper.close()
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
-        """Take the shaper of the mode, or find out which one works; remember why."""
+        """Choose the shaper and store the reason; in mode "auto" try netem, then use the relay."""
         machine, mode = self._machine, self._settings.mode
         self._reason = f"link.mode={mode}"
         if mode != "relay":
@@ -313,7 +319,7 @@ class Sidecar:
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
-        """Apply a new profile; return False if that takes another shaper."""
+        """Apply a new profile; return False if the profile needs another shaper."""
         change = self._change_of(profile)
         try:
             shaper.follow_profile(profile.direction, restart=change.restart)
@@ -334,7 +340,7 @@ class Sidecar:
         return True
 
     def _change_of(self, profile: Loaded) -> Change:
-        """Return the change of a profile; a note that was there before is not about this one."""
+        """Return the change of a profile; an unknown change if its number is that of the last."""
         return profile.change if profile.change.number != self._number else Change()
 
     def _announce(self, shaper: Shaper, route: Address, profile: Loaded) -> None:
@@ -345,7 +351,7 @@ class Sidecar:
             self._watcher.shapes(shaper.name)
 
     def _tell(self, shaper: Shaper, profile: Loaded) -> None:
-        """Publish for ends, users and reports what shapes the link from now on."""
+        """Publish shaper and profile in force from now on, for ends, users and reports."""
         before, change, asked = self._state, self._change_of(profile), summary(profile.direction)
         for note in notes(profile.direction) if shaper.name == "netem" else ():
             self._machine.log(note)
@@ -381,7 +387,7 @@ class Sidecar:
                 publish(self._released, json.dumps(released))
 
     def _publish(self) -> None:
-        """Write the state; what a full disk does not take is written a second later."""
+        """Write the state; if the disk is full, the next attempt follows a second later."""
         if self._state is not None:
             with suppress(OSError):
                 publish(self._settings.state, to_text(self._state))
@@ -389,5 +395,5 @@ class Sidecar:
 
 
 def _cause(error: CloudrcError) -> str:
-    """Take the cause from an error, without the remedy."""
+    """Return the cause from an error's text, without the remedy."""
     return str(error).partition("; ")[0]

@@ -1,8 +1,9 @@
 """Publish the state of a link direction in a file: its shaper, profile and last change.
 
-The file lies beside the route file. The tunnel's end on the same machine follows it and records
-changes, and `cloudrc link set` reads whether a change is in force. All files are written
-atomically, since others read them at the same time.
+The state file is in the folder of the route file. The tunnel's end on the same machine follows the
+state file and records its changes. `cloudrc link set` reads the file to see whether a change is in
+force.
+All files are written atomically, since other processes may read them at the same time.
 """
 
 from __future__ import annotations
@@ -16,32 +17,32 @@ from cloudrc.files import write_atomically
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
 STATE_FILE = "link.json"
-"""Name of the state file, beside the route file."""
+"""Name of the state file, in the folder of the route file."""
 PROFILE_FILE = "profile.json"
-"""Name of the profile that a local run's relay follows, in the folder of its states."""
+"""Name of the profile file that a local run's relay follows, in the folder of its state files."""
 STATE_MAX = 1 << 16
-"""Size limit of a state file that an end of the tunnel reads [bytes], about 800 changes of a time
-line; a file of 1 MiB could block the loop for 2 s."""
+"""Size limit of a state file that an end of the tunnel reads [bytes]: room for a time line with
+about 800 changes. A file of 1 MiB could block the loop for 2 s."""
 RELEASED_SUFFIX = ".released"
-"""Suffix of the file that tells how late a relay's datagrams left so far: names and integers as
-JSON. It is a separate file, since the state file is read only when the link changes."""
+"""Suffix of the file that contains how late a relay's datagrams left so far: names and integers as
+JSON. This is a separate file, since the state file is read only when the link changes."""
 RELEASED = frozenset(
     {"released", "released_early", "overflow", "stalled"}
     | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}
 )
-"""Names in the file of `RELEASED_SUFFIX`."""
+"""Names in the file with `RELEASED_SUFFIX`."""
 CHANGE_FILE = "change.json"
-"""Name of the file beside the profile that holds the profile's last `Change`."""
+"""Name of the file with the last `Change` of a profile, in the folder of the profile."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Why a profile was changed, as `cloudrc link set` writes it beside the profile.
+    """A change of a profile, as `cloudrc link set` writes it to `CHANGE_FILE`.
 
     Attributes:
-        number: Identity of the change; "" if it is unknown.
+        number: Identity of the change; "" if unknown.
         cause: Reason, in words.
-        restart: Whether the time line restarts when the profile takes effect; otherwise it
+        restart: True: the time line restarts when the profile takes effect. False: the time line
             continues.
     """
 
@@ -56,19 +57,20 @@ class LinkState:
 
     Attributes:
         shaper: "relay" or "netem".
-        reason: Why this shaper, in words.
+        reason: Why this shaper was chosen, in words.
         mode: Shaper that the user asked for: "auto", "relay" or "netem".
         direction: "uplink" or "downlink".
         profile: Both directions, as in a profile's file, without defaults.
         since: When the profile took effect, UTC, for people.
         since_ns: The same instant on the machine's monotonic clock [ns].
         changes: Number of changes since the link came up.
-        change: Number of the last change that took effect; "" if it is unknown.
-        cause: Why it changed, in words; "" before the first change.
+        change: Identity of the last change that took effect; "" if unknown.
+        cause: Reason of this change, in words; "" before the first change.
         asked: Conditions at the start of the time line, as `summary` returns them.
-        origin_ns: Start of the time line on that clock [ns]; None if the change did not restart it.
-        refused: Number of the last change that was refused; "" if none was.
-        refusal: Why it was refused, in words.
+        origin_ns: Start of the time line on the monotonic clock [ns]; None if the change did not
+            restart the time line.
+        refused: Identity of the last refused change; "" if no change was refused.
+        refusal: Why that change was refused, in words.
     """
 
     shaper: str
@@ -93,7 +95,7 @@ def to_text(state: LinkState) -> str:
 
 
 def from_text(text: str) -> LinkState:
-    """Parse a state; raises a ValueError if the text is not valid."""
+    """Parse a state; raise a ValueError if the text is not valid."""
     found = json.loads(text)
     names = {item.name for item in fields(LinkState)}
     try:
@@ -103,7 +105,7 @@ def from_text(text: str) -> LinkState:
 
 
 def read_change(text: str) -> Change:
-    """Parse the change of a profile; an invalid text gives a change without a number."""
+    """Parse the change of a profile; return a change without a number if the text is invalid."""
     try:
         found = json.loads(text)
         return Change(str(found["number"]), str(found["cause"]), bool(found["restart"]))
@@ -115,8 +117,8 @@ def summary(profile: DirectionProfile) -> dict[str, float | None]:
     """Summarise the conditions at the start of a direction's time line.
 
     Returns:
-        `delay` and `jitter` [s], `loss` in the long run in [0, 1], and `rate` [bit/s], None
-        without a bottleneck.
+        `delay` and `jitter` [s], `loss` (long-run share in [0, 1]), and `rate` [bit/s] (None
+        without a bottleneck).
     """
     first = Timeline(profile).at(0)
     loss = 1.0 if first.blackout else mean_loss(first.loss)
@@ -135,7 +137,7 @@ def publish(path: Path, text: str) -> None:
 
 
 def publish_route(path: Path, route: tuple[str, int]) -> None:
-    """Write the route file, one line HOST:PORT, for this pod's end of the tunnel."""
+    """Write the route file for this pod's tunnel end: one line HOST:PORT."""
     publish(path, f"{route[0]}:{route[1]}\n")
 
 

@@ -1,10 +1,11 @@
-"""Ask iproute2, and translate a profile into the words and the tables of jitter of tc-netem.
+"""Call iproute2; translate a profile into options and jitter tables of tc-netem.
 
-Every option of netem is written every time: `tc qdisc change` leaves a rate and a correlation that
-are not named as they were.
+Every call gives all options of netem, because `tc qdisc change` does not reset a rate or a
+correlation that it does not name.
 
-netem draws jitter from a table of at most 16,384 integers of 16 bits; 8192 stands for the jitter.
-tc's own tables differ from the model's distributions, and there is none for the uniform one.
+netem draws jitter from a table of at most 16,384 integers of 16 bits; the entry 8192 means one
+times the jitter. The tables that come with tc differ from the model's distributions, and tc has no
+table for the uniform distribution.
 
 Source: tc-netem(8); iproute2 netem/README.distribution; Linux, net/sched/sch_netem.c (tabledist).
 """
@@ -40,17 +41,17 @@ class Answer(NamedTuple):
 
 
 Run: TypeAlias = Callable[[Sequence[str]], Answer]
-"""Runs a program to its end."""
+"""Function that runs a program to its end."""
 
 
 class Iproute2:
-    """`tc` and `ip`, each call checked."""
+    """Runs `tc` and `ip`; checks the result of each call."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
 
     def tc(self, *words: str) -> str:
-        """Run tc and return its output; raises as `explain` says."""
+        """Run tc and return its output; if it fails, raise the error that `explain` makes."""
         return self._checked("tc", words)
 
     def show(self, *words: str) -> list[dict[str, Any]]:
@@ -58,7 +59,7 @@ class Iproute2:
         return list(json.loads(self._checked("tc", ("-s", "-j", *words)) or "[]"))
 
     def device(self, host: str) -> str:
-        """Return the interface through which an address is reached."""
+        """Return the interface that leads to an address."""
         routes = json.loads(self._checked("ip", ("-j", "route", "get", host)))
         return str(routes[0]["dev"])
 
@@ -70,12 +71,12 @@ class Iproute2:
 
 
 def try_netem(run: Run) -> None:
-    """Find out whether this kernel has netem, by a qdisc on the loopback that delays nothing.
+    """Check whether this kernel has netem: add a netem without delay to the loopback interface.
 
-    A qdisc of another program is left alone: then nothing is found out.
+    If the loopback already has a qdisc of another program, nothing is changed or checked.
 
     Raises:
-        MissingPrerequisiteError: If there is none, or this container may not use it.
+        MissingPrerequisiteError: If the kernel has no netem, or this container may not use it.
     """
     iproute2 = Iproute2(run)
     root = next((q for q in iproute2.show("qdisc", "show", "dev", "lo") if q.get("root")), {})
@@ -87,7 +88,7 @@ def try_netem(run: Run) -> None:
 
 
 def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
-    """Make the error for a failed call: the cause, and what to do."""
+    """Make the error for a failed call: the cause and the remedy."""
     text = answer.error or answer.output
     kind = next((word for word in words if word in ("netem", "prio")), "")
     missing = kind and "change" not in words and "No such file or directory" in text
@@ -116,7 +117,7 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
 
 
 def may_shape(status: str) -> bool:
-    """Say whether a process is root with NET_ADMIN, from the text of its /proc/PID/status.
+    """Return whether a process is root with NET_ADMIN, from the text of its /proc/PID/status.
 
     Source: Linux, include/uapi/linux/capability.h: CAP_NET_ADMIN is bit 12.
     """
@@ -128,13 +129,13 @@ def may_shape(status: str) -> bool:
 
 
 ENTRIES = 4096
-"""Length of a table [1]."""
+"""Number of entries of a table [1]."""
 STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
-"""Factor by which a table's entries are smaller than the jitter, so that its tail fits in 16 bits;
-the jitter that tc gets is larger by the same factor."""
+"""Distribution -> factor that divides the table's entries, so that the tail fits in 16 bits. The
+jitter that tc gets is multiplied by the same factor."""
 _ONE = 8192
 _END_OF_TABLE = 32_767 / _ONE
-"""Largest entry, 16 bits, in units of the jitter [1]."""
+"""Largest 16-bit entry, in units of the jitter [1]."""
 
 
 def _pareto(share: float) -> float:
@@ -150,13 +151,13 @@ _QUANTILES: dict[str, Callable[[float], float]] = {
 
 
 def table(distribution: str) -> list[int]:
-    """Make the table of a distribution: its quantiles in the middle of 4096 equal shares.
+    """Make the table of a distribution: the quantiles at the centres of 4096 equal shares.
 
     Args:
         distribution: "uniform", in (-1, 1); "normal" or "pareto", mean 0 and standard deviation 1.
 
     Returns:
-        Entries in units of jitter / (8192 STRETCH), rising, shape (4096,).
+        Quantile · 8192 / STRETCH in units of the jitter, rounded, rising, shape (4096,).
     """
     quantile = _QUANTILES[distribution]
     values = [quantile((index + 0.5) / ENTRIES) for index in range(ENTRIES)]
@@ -168,14 +169,14 @@ def table(distribution: str) -> list[int]:
 
 
 def stretch(profile: DirectionProfile) -> int:
-    """Return the factor by which tc's jitter is larger than a profile's, as in `STRETCH`."""
+    """Return the factor that multiplies the profile's jitter for tc, as in `STRETCH`."""
     if profile.distribution != "table":
         return STRETCH[profile.distribution]
     return ceil(max(map(abs, profile.table)) / _END_OF_TABLE) or 1
 
 
 def distribution_name(profile: DirectionProfile) -> str:
-    """Name a profile's distribution for tc: one of `STRETCH`, or that of a measured table."""
+    """Return tc's name of a profile's distribution: a name in `STRETCH`, or one for its table."""
     if profile.distribution != "table":
         return profile.distribution
     # tc makes a file name of it, so only letters and digits; another table is another file.
@@ -183,13 +184,13 @@ def distribution_name(profile: DirectionProfile) -> str:
 
 
 def write_tables(folder: Path) -> None:
-    """Write all tables as tc finds them if its TC_LIB_DIR names this folder."""
+    """Write all tables into a folder; tc finds them if TC_LIB_DIR names this folder."""
     for distribution in STRETCH:
         _write(folder, distribution, table(distribution))
 
 
 def write_measured(folder: Path, profile: DirectionProfile) -> None:
-    """Write the table of a profile with a measured distribution; else do nothing."""
+    """Write the table of a profile with a measured distribution; do nothing for other profiles."""
     if profile.distribution == "table":
         unit, values = _ONE / stretch(profile), sorted(profile.table)
         picked = [values[(2 * i + 1) * len(values) // (2 * ENTRIES)] for i in range(ENTRIES)]
@@ -201,25 +202,25 @@ def _write(folder: Path, name: str, entries: Iterable[int]) -> None:
 
 
 STEP_NS = 5_000_000
-"""Shortest time between two steps of the qdisc [ns]; faster changes are passed over."""
+"""Shortest time between two steps of the qdisc [ns]; steps that follow sooner are skipped."""
 LIMIT = 10_000
-"""Limit of packets in the qdisc without a bottleneck [1], as in the relay."""
+"""Limit of packets in a qdisc without a bottleneck [1], as in the relay."""
 DELAY_MAX_NS = 274_000_000_000
 """Longest delay that tc accepts [ns]: ticks of 64 ns in 32 bits."""
 _IN_ORDER = "100gbit"
-"""A rate, however high, makes netem keep the order."""
+"""Rate that has no effect except that netem keeps the order of packets."""
 _ETHERNET_BYTES = 14
 """Length of the Ethernet header, which netem counts and the model does not [bytes]."""
 _PACKET_BITS = 8 * 116
-"""Size of a command with its headers, the smaller of the two kinds of datagram [bit]."""
+"""Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
 _PACKETS = 1_000
-"""Datagrams a second where no rate limits them, more than a tunnel or a probe sends [1/s]."""
+"""Assumed packet rate without a bottleneck [1/s], higher than that of a tunnel or a probe."""
 _TABLE_END = 4.0
-"""Longest draw of a table, in units of the jitter that tc gets [1]."""
+"""Largest entry of a table, in units of the jitter that tc gets [1]."""
 
 
 def check(profile: DirectionProfile) -> None:
-    """Raise a BadInputError that names what netem cannot do of a profile."""
+    """Raise a BadInputError if netem cannot realise a profile; the text names the reason."""
     pieces = _pieces(profile)
     if profile.trace is not None and profile.trace.loop:
         _refuse("loop", "a trace that begins again")
@@ -244,7 +245,7 @@ def _refuse(key: str, meaning: str) -> None:
 
 
 def notes(profile: DirectionProfile) -> list[str]:
-    """Say in words what netem realises differently from the profile."""
+    """Return notes about the parts of a profile that netem realises differently."""
     said = []
     if profile.jitter and profile.correlation:
         said.append(f"netem realises next to nothing of correlation {profile.correlation:g}")
@@ -264,11 +265,11 @@ def notes(profile: DirectionProfile) -> list[str]:
 
 
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
-    """Translate the conditions of one instant.
+    """Translate the conditions at one instant into options of netem.
 
     Args:
-        profile: Passed `check`.
-        conditions: That hold now.
+        profile: A profile that has passed `check`.
+        conditions: Conditions at this instant.
         room: Limit of the qdisc [packets].
 
     Returns:
@@ -292,10 +293,10 @@ def options(profile: DirectionProfile, conditions: Conditions, room: int) -> lis
 
 
 def limit(profile: DirectionProfile) -> int:
-    """Return the room for all packets under way and, behind a bottleneck, for its queue [packets].
+    """Return the limit of the qdisc: packets under way plus the queue of a bottleneck [packets].
 
-    One number for the whole time line: a step to a shorter delay must not drop packets because
-    those of the longer one are still under way.
+    The limit is the same along the whole time line. Otherwise a step to a shorter delay would drop
+    packets, because packets with the longer delay are still under way.
     """
     pieces = _pieces(profile)
     if all(piece.rate is None for piece in pieces):

@@ -1,8 +1,8 @@
 """Read and write traces: delay and loss over time as CSV, for `trace` and `table` of a profile.
 
 A trace has the header `time_s,delay_ms` or `time_s,delay_ms,loss` and one row per instant, in
-rising order of time; `delay_us` may replace `delay_ms`. Delays are one way. `link/logs.py` makes
-traces of the logs of other tools.
+rising order of time; `delay_us` may replace `delay_ms`. Delays are one way. `link/logs.py` turns
+the logs of other tools into traces.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ from cloudrc.link.profile import Trace
 SIZE_MAX = 64 << 20
 """Size limit of a file [bytes]: half a day at 100 packets a second."""
 START_MAX = 600.0
-"""Latest time of a trace's first row [s]: a flight before it would see that row alone."""
+"""Latest time of a trace's first row [s]; until then a flight would see only this row."""
 UNIX_TIME = 1e8
-"""Time from which on a first row tells Unix time [s], March 1973; it is subtracted."""
+"""If the first row has this time or a later one, times are Unix times [s] (1e8 is March 1973), and
+the first time is subtracted."""
 _TIME, _LOSS = "time_s", "loss"
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _HEADER = "the header is time_s,delay_ms[,loss]"
 _ROWS_TO_JUDGE = 10
-"""Fewest rows in which a delay of 0 may be a mark of loss [1]: shorter traces are typed."""
+"""A delay of 0 may mark a lost packet only in traces with at least this number of rows [1]; shorter
+traces are typed by hand."""
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
@@ -43,14 +45,15 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
         Times [s], delays [s] and, if the file has the column, losses in [0, 1].
 
     Raises:
-        BadInputError: If it cannot be read or is not a trace; names file, line, value and remedy.
+        BadInputError: If the file cannot be read or is not a trace; the text names file, line,
+            value and remedy.
     """
     remedy = "give a CSV file with the columns time_s,delay_ms"
     return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
 
 
 def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:
-    """Read the lines of a text file; raise a BadInputError with the remedy if that fails."""
+    """Read the lines of a text file; if that fails, raise a BadInputError with `remedy`."""
     try:
         return decode(read(path, size_max))
     except (OSError, ValueError) as error:
@@ -59,9 +62,10 @@ def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> 
 
 
 def decode(data: bytes) -> list[str]:
-    """Decode the lines of a text; raise a ValueError if it is none.
+    """Decode the lines of a text; raise a ValueError if the data are not text.
 
-    UTF-8, UTF-16 with its mark (as Windows redirects output) or one byte a character.
+    Accepted encodings: UTF-8, UTF-16 with byte order mark (redirected output on Windows), and
+    encodings with one byte per character.
     """
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16", "replace").splitlines()
@@ -74,7 +78,7 @@ def decode(data: bytes) -> list[str]:
 
 
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
-    """Read the distribution of a trace's delays, without lost packets.
+    """Read the distribution of a trace's delays; ignore lost packets.
 
     Args:
         path: The file.
@@ -84,7 +88,7 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
         The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,) [1].
 
     Raises:
-        BadInputError: As `read_trace`, and if all delays are equal.
+        BadInputError: In the cases of `read_trace`, and if all delays are equal.
     """
     trace = read_trace(path, size_max)
     losses = trace.losses or (0.0,) * len(trace.delays)
@@ -102,17 +106,17 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
 def parse_trace(lines: Iterable[str], name: str) -> Trace:
     """Read a trace from the lines of a CSV file.
 
-    Times count from the first row if they are Unix times.
+    If the times are Unix times, time 0 is the first row.
 
     Args:
         lines: Header and rows; blank lines and lines that begin with # are skipped.
         name: Name of the file, for messages.
 
     Returns:
-        As `read_trace`.
+        The same as `read_trace`.
 
     Raises:
-        BadInputError: As `read_trace`.
+        BadInputError: In the cases of `read_trace`.
     """
     table = Table(lines, f"trace {name}")
     delay_column = _check_columns(table.columns, name)
@@ -144,8 +148,8 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
 def write_trace(trace: Trace) -> str:
     """Format a trace as the CSV that `read_trace` reads.
 
-    If all delays are below 1 ms, the column is `delay_us`, since the reader would reject such
-    milliseconds as seconds.
+    If all delays are below 1 ms, the column is `delay_us`: the reader would take milliseconds below
+    1 for seconds and reject them.
     """
     short = 0.0 < max(trace.delays) < 1e-3
     unit, scale = ("us", 1e6) if short else ("ms", 1e3)
@@ -165,9 +169,9 @@ class Row(NamedTuple):
     """One row of a CSV file.
 
     Attributes:
-        where: Its file and line, for messages.
+        where: File and line of the row, for messages.
         cells: Column -> text, stripped.
-        problem: Why it cannot be used; "" if it can.
+        problem: Why the row cannot be used; "" without a problem.
     """
 
     where: str
@@ -179,11 +183,11 @@ class Table:
     """A CSV file with a header, separated by commas, semicolons or tabs.
 
     Attributes:
-        columns: Names of the columns, in lower case; "RTT (ms)" is rtt_ms.
+        columns: Names of the columns in lower case; "RTT (ms)" becomes rtt_ms.
     """
 
     def __init__(self, lines: Iterable[str], name: str) -> None:
-        """Read the header; raise a BadInputError for a file of numbers alone.
+        """Read the header; raise a BadInputError if the file has only numbers.
 
         Args:
             lines: Lines of the file; blank lines and comments are skipped.
@@ -200,11 +204,11 @@ class Table:
             self._refuse_bare_numbers()
 
     def rows(self) -> Iterator[Row]:
-        """Yield the rows; one whose number of cells is not that of the header has a problem.
+        """Yield the rows; a row with fewer cells than the header gets a `problem`.
 
         Raises:
-            BadInputError: If a row has more cells than the header: commas inside its numbers would
-                give it another meaning.
+            BadInputError: If a row has more cells than the header: decimal commas may have split
+                its numbers.
         """
         columns = self.columns
         for number, line in self._lines:
@@ -221,7 +225,10 @@ class Table:
             yield Row(where, dict(zip(columns, map(str.strip, cells), strict=True)))
 
     def number(self, text: str) -> float | None:
-        """Parse a number; None if it is none. Beside semicolons and tabs, a comma is a point."""
+        """Parse a number; None if the text is not a number.
+
+        If semicolons or tabs separate the cells, a comma is a decimal point.
+        """
         if self._separator != ",":
             text = text.replace(",", ".")
         try:
@@ -240,7 +247,7 @@ class Table:
             raise BadInputError(f"{where}: {error}; give a CSV file") from None
 
     def _refuse_bare_numbers(self) -> None:
-        """Name a file of one number a line: a rate trace of mahimahi, or delays without times."""
+        """Refuse one number per line: a rate trace of mahimahi, or delays without times."""
         texts = [self._first[1], *(line for _, line in self._lines)]
         values = [float(text) for text in texts if _is_number(text)]
         rising = all(before <= after for before, after in pairwise(values))
@@ -257,11 +264,11 @@ class Table:
 
 
 def looks_lost(values: Iterable[float], decimals: int) -> bool:
-    """Tell whether zeros among delays mark lost packets: the others are far from 0.
+    """Return whether zeros among delays mark lost packets: all other delays are far from 0.
 
     Args:
         values: Delays in the file's unit.
-        decimals: Largest number of decimals in the file: zeros may be rounded.
+        decimals: Largest number of decimals in the file, because a zero may be a rounded delay.
     """
     values = list(values)
     shortest = min((value for value in values if value > 0.0), default=0.0)
@@ -304,12 +311,12 @@ def _number(table: Table, row: Row, column: str, maximum: float = inf) -> float:
 
 
 def shown(text: str) -> str:
-    """Show the text of a cell in a message, at most 40 characters."""
+    """Quote the text of a cell for a message: at most 40 characters; "nothing" if it is empty."""
     return repr(text[:40]) if text else "nothing"
 
 
 def _from_start(times: list[float], name: str) -> tuple[float, ...]:
-    """Let times begin at the first row if they are Unix times; refuse other late beginnings."""
+    """Shift Unix times so that the first row is at 0; refuse other times that begin too late."""
     start = times[0]
     if start > START_MAX * 1e9:
         raise BadInputError(f"trace {name}: time_s begins at {start:.15g}, which is not in seconds")
@@ -324,7 +331,7 @@ def _from_start(times: list[float], name: str) -> tuple[float, ...]:
 
 
 def _refuse_seconds(longest_ms: float, name: str) -> None:
-    """Reject delays that are in seconds, the most common mistake: the link would seem ideal."""
+    """Reject delays that seem to be in seconds, a common mistake: the link would seem ideal."""
     if 0.0 < longest_ms < 1.0:
         raise BadInputError(
             f"trace {name}: delay_ms is at most {longest_ms:g}, which looks like seconds; "
@@ -333,7 +340,7 @@ def _refuse_seconds(longest_ms: float, name: str) -> None:
 
 
 def _refuse_marks(delays: list[float], column: str, name: str) -> None:
-    """Reject delays of 0 that mark lost packets: the packets would be the fastest."""
+    """Reject delays of 0 that seem to mark lost packets; otherwise these would be the fastest."""
     decimals = max(decimals_of(f"{delay:g}") for delay in delays)
     if len(delays) >= _ROWS_TO_JUDGE and looks_lost(delays, decimals):
         raise BadInputError(
@@ -343,7 +350,7 @@ def _refuse_marks(delays: list[float], column: str, name: str) -> None:
 
 
 def _check_columns(columns: list[str], name: str) -> str:
-    """Check a header; reject missing, unknown and repeated columns; return the delay's column."""
+    """Check a header; reject missing, unknown or repeated columns; return the delay column."""
     found = ",".join(columns)[:200] or "nothing"
     for wanted in ((_TIME,), tuple(_SCALES)):
         if not any(column in columns for column in wanted):

@@ -1,8 +1,9 @@
 """Record flights in MCAP files and read them back as arrays.
 
-`topics` defines what is recorded, `hash` identifies a run, `recorder` and `writer` write files,
-`reader` and `columns` read them, `recover` repairs them, `merge` puts both ends on one clock. Only
-`ros`, `writer`, `reader` and `recover` import the packages that `cloudrc[record]` installs.
+`topics` defines the topics, `hash` identifies a run, `recorder` and `writer` write files, `reader`
+and `columns` read files, `recover` repairs files, `merge` puts the recordings of both ends on one
+clock. Only `ros`, `writer`, `reader` and `recover` import the packages that `cloudrc[record]`
+installs.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from cloudrc.errors import MissingPrerequisiteError
 
 
 def missing(error: ImportError) -> MissingPrerequisiteError:
-    """Name a missing package and the command that installs it.
+    """Make an error that names a missing package and the command that installs the package.
 
     Args:
         error: Error of the import.

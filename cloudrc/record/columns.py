@@ -5,9 +5,9 @@
 
 A topic without records is a table without rows.
 
-The log time of a row is its stamp, or the log time of the row before if that is later. So log times
-never fall within an end, and both ends can be merged by log time. Files and memory are merged by
-the same rule and give the same tables.
+The log time of a row is its stamp. If the log time of the previous row is later, the row gets that
+log time. So log times never decrease within one end, and both ends can be merged by log time. Files
+and records in memory are merged by the same rule and give the same tables.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def logged(records: Iterable[Record], offset_ns: int = 0) -> Iterator[tuple[int,
         offset_ns: Added to every row's stamp [ns].
 
     Yields:
-        The log time [ns] and the row; the log times never fall.
+        The log time [ns] and the row; the log times never decrease.
     """
     latest = FIRST_NS
     for record in records:
@@ -57,16 +57,16 @@ def merged(
 ) -> Iterator[tuple[int, Row]]:
     """Merge the records of both ends into one sequence of rows on world's clock.
 
-    Only the rows' stamps are converted; other stamps in a row stay on the clock that their
+    Only the stamp of each row is converted; other times in a row stay on the clock that their
     description names.
 
     Args:
-        world_records: Oldest first, on world's clock.
-        cloud_records: Oldest first, on cloud's clock.
-        offset_ns: World's clock minus cloud's [ns].
+        world_records: World's records, oldest first, on world's clock.
+        cloud_records: Cloud's records, oldest first, on cloud's clock.
+        offset_ns: World's clock minus cloud's clock [ns].
 
     Yields:
-        The log time [ns] and the row; at the same instant world's rows come first.
+        The log time [ns] and the row; of rows with equal log times, world's rows come first.
     """
     world, cloud = logged(world_records), logged(cloud_records, offset_ns)
     return heapq.merge(world, cloud, key=itemgetter(0))
@@ -88,8 +88,9 @@ _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
 class Table:
     """The columns of one topic; its length is the number of rows n.
 
-    Integers are int64, floats and vectors float64, truth values bool, strings objects. Vectors
-    have shape (n, 3), quaternions (n, 4), all others (n,).
+    The types of the arrays are int64 for integers, float64 for floats and vectors, bool for truth
+    values, object for strings. Vectors have shape (n, 3), quaternions (n, 4), all other columns
+    (n,).
     """
 
     def __init__(self, topic: Topic, rows: list[tuple[int, Values]]) -> None:
@@ -127,9 +128,9 @@ class Recording:
 
     Attributes:
         metadata: The file's metadata, such as its clock; empty if made from records.
-        attachments: Attached files, by name.
+        attachments: Name -> attached file.
         note: What is missing, in words; "" if nothing is missing.
-        lacking: The part of `note` that no killed process explains; "" without.
+        lacking: The part of `note` that a killed process cannot explain; "" if there is none.
         remarks: What was ignored or sorted, as in `Contents`.
     """
 
@@ -137,8 +138,8 @@ class Recording:
         """Store rows by topic; most callers use `read` or `from_records`.
 
         Args:
-            rows: Stamp [ns] and values of each row, in order, by topic.
-            contents: Contents of the file that the rows come from; None without a file.
+            rows: Topic -> stamp [ns] and values of each row, in order.
+            contents: Contents of the file from which the rows come; None without a file.
         """
         self._rows = rows
         self._tables: dict[str, Table] = {}
@@ -160,12 +161,12 @@ class Recording:
         cloud_records: Iterable[Record] = (),
         offset_ns: int = 0,
     ) -> Self:
-        """Make a recording in memory, equal to that read from a merged file.
+        """Make a recording in memory; it equals a recording read from a merged file.
 
         Args:
-            world_records: Oldest first, on world's clock.
-            cloud_records: Oldest first, on cloud's clock.
-            offset_ns: World's clock minus cloud's [ns].
+            world_records: World's records, oldest first, on world's clock.
+            cloud_records: Cloud's records, oldest first, on cloud's clock.
+            offset_ns: World's clock minus cloud's clock [ns].
         """
         rows: _Rows = {name: [] for name in TOPICS}
         for _, (topic, stamp_ns, values) in merged(world_records, cloud_records, offset_ns):
@@ -174,13 +175,13 @@ class Recording:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read an MCAP file as far as it is readable.
+        """Read an MCAP file up to its end or its first damaged part.
 
         Args:
             path: The file, complete or torn.
 
         Raises:
-            BadInputError: If nothing in it is readable.
+            BadInputError: If nothing in the file is readable.
             MissingPrerequisiteError: If `cloudrc[record]` is not installed.
         """
         from cloudrc.record.reader import read_contents

@@ -1,9 +1,14 @@
 """Identify a run by one SHA-256 over all its records.
 
-A record's bytes are little-endian and the same in every process. They are, in this order: the
-length and name of its type; its numbers (integers as 64 bits, floats as IEEE 754 doubles, truth
-values as one byte); its vectors; its strings as UTF-8, each after its 32-bit length. Within each
-group the order is that of the fields; a nested record takes the place of its field.
+The bytes of a record are little-endian and the same in every process. They consist of four groups,
+in this order:
+
+1. Length and name of the record's type.
+2. Numbers: integers with 64 bits, floats as IEEE 754 doubles, truth values with one byte.
+3. Vectors.
+4. Strings as UTF-8, each after its 32-bit length.
+
+Within a group the order is that of the fields; the fields of a nested record replace its field.
 """
 
 from __future__ import annotations
@@ -23,7 +28,7 @@ _flatten = chain.from_iterable
 
 
 class RecordHash:
-    """SHA-256 over records in their order, whatever their batches."""
+    """SHA-256 over records in their order; the division into batches does not matter."""
 
     def __init__(self) -> None:
         self._sha256 = hashlib.sha256()
@@ -43,7 +48,7 @@ class RecordHash:
 
 
 def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
-    """Hash the messages of a file from a real-time run, which has no records in memory.
+    """Hash the messages of a file, for real-time runs, which have no records in memory.
 
     Args:
         messages: Topic, log time [ns] and CDR bytes of each message, in the file's order.
@@ -58,17 +63,17 @@ def add_message(sha256: hashlib._Hash, topic: str, log_time_ns: int, data: bytes
     """Add a message to a hash as `messages_sha256` does.
 
     Args:
-        sha256: The hash of the messages before.
-        topic: Its topic.
-        log_time_ns: When it was recorded [ns].
-        data: Its CDR bytes.
+        sha256: The hash of all earlier messages.
+        topic: Topic of the message.
+        log_time_ns: Log time of the message [ns].
+        data: CDR bytes of the message.
     """
     sha256.update(b"%s %d %d " % (topic.encode(), log_time_ns, len(data)))
     sha256.update(data)
 
 
 class _Packers(dict[type, _Pack]):
-    """Packers by class, each made for the first record of its class."""
+    """Record class -> packer; a packer is made for the first record of its class."""
 
     def __missing__(self, cls: type) -> _Pack:
         packer = self[cls] = _packer(cls)

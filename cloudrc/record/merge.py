@@ -1,16 +1,17 @@
 """Merge the recordings of both ends into one mission on world's clock.
 
-Only the stamp of a cloud message is converted; other stamps in it stay on the clock that their
-description names.
+Only the stamp of a cloud message is converted; other times in the message stay on the clock that
+their description names.
 
-The clock offset follows from the packets, since none arrives before it was sent. Each telemetry
-shows that world's clock is ahead of cloud's by at least (sent - arrived), each command by at most
-(arrived - sent). The fastest packets of both directions give the narrowest interval, as wide as the
-smallest round trip without any hold. After a stall, world's clock also lags that of its machine.
+The clock offset follows from the packets, since no packet arrives before it was sent. Each
+telemetry datagram shows that world's clock is ahead of cloud's by at least (sent - arrived). Each
+command datagram shows that world's clock is ahead by at most (arrived - sent). The fastest packets
+of both directions give the narrowest interval; its width is the sum of both delays. After a stall,
+world's clock also lags the clock of world's machine.
 
-`cut_to_last_mission` takes one mission from a pod's recording, which holds several. A pod's file is
-still open when it is copied, so its end may be missing; the mission is complete if its own end is
-in the file.
+`cut_to_last_mission` takes one mission from a pod's recording, which may hold several. A pod's file
+is still open when it is copied, so the end of the file may be missing. The mission is complete if
+the end of the mission is in the file.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from cloudrc.records import UNDER_WAY
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """The offset of world's clock from cloud's.
+    """The offset between world's clock and cloud's clock.
 
     Attributes:
-        offset_ns: World's clock minus cloud's, to add to cloud's stamps [ns].
-        uncertainty_ns: Largest error of the offset [ns]; None if it is unknown.
+        offset_ns: World's clock minus cloud's clock [ns]; the value to add to cloud's stamps.
+        uncertainty_ns: Largest possible error of the offset [ns]; None if unknown.
         method: "same clock"; "packets" if estimated from both directions; "first records" if the
             clocks are unrelated and both recordings are assumed to begin together.
     """
@@ -51,7 +52,7 @@ class ClockOffset:
     method: Literal["same clock", "packets", "first records"]
 
     def metadata(self) -> dict[str, str]:
-        """Format the offset for a file's metadata, without an unknown uncertainty."""
+        """Format the offset for a file's metadata; leave the uncertainty out if it is unknown."""
         noted = {"clock_offset_ns": str(self.offset_ns), "clock_offset_method": self.method}
         if self.uncertainty_ns is not None:
             noted["clock_offset_uncertainty_ns"] = str(self.uncertainty_ns)
@@ -64,18 +65,18 @@ SAME_CLOCK = ClockOffset(0, 0, "same clock")
 def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
     """Estimate the offset that puts cloud's stamps on world's clock.
 
-    Source: the clock filter of RFC 5905 (NTP), section 10: the sample of the smallest round trip,
-        half of which bounds the error.
-    Deviation: each direction has its own minimum, that of its fastest packet; clock drift is not
-        modelled (50 ppm are 3 ms in a minute).
+    Source: the clock filter of RFC 5905 (NTP), section 10: it uses the sample with the smallest
+        round trip, and half of this round trip bounds the error.
+    Deviation: each direction uses its own fastest packet. Clock drift is not modelled (50 ppm are
+        3 ms per minute).
 
     Args:
         world: World's recording, on its clock.
         cloud: Cloud's recording, on its clock.
 
     Returns:
-        An offset of 0 if both files name the same clock; else the middle of the interval that the
-        packets allow.
+        Offset 0 if both files name the same clock; else the centre of the interval that the packets
+        allow; without packets in both directions, the difference of the first stamps.
     """
     clock_id = world.metadata.get("clock_id")
     if clock_id and clock_id == cloud.metadata.get("clock_id"):
@@ -90,7 +91,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest arrival minus departure [ns], each on its own clock."""
+    """Return the smallest (arrival - departure) [ns]; each time is on the clock of its end."""
     departures = dict(zip(_packet_ids(sent), sent["stamp_ns"].tolist(), strict=True))
     differences = [
         stamp_ns - departures[packet]
@@ -110,13 +111,13 @@ def _first_ns(recording: Recording) -> int:
 
 
 class WorldTime:
-    """Converts instants on world's machine clock to world's clock, which may lag."""
+    """Converts instants from the clock of world's machine to world's clock, which may lag."""
 
     def __init__(self, telemetry: Table) -> None:
         """Read the lag from telemetry.
 
         Args:
-            telemetry: World's table, with stamps on world's clock.
+            telemetry: World's table of telemetry, with stamps on world's clock.
         """
         self._slip_ns = telemetry["slip_ns"]
         self._machine_ns = telemetry["stamp_ns"] + self._slip_ns
@@ -128,7 +129,7 @@ class WorldTime:
             machine_ns: Instants on the machine's clock [ns], shape (n,).
 
         Returns:
-            The instants on world's clock [ns], shape (n,); rising if the argument rises.
+            The instants on world's clock [ns], shape (n,); in rising order if `machine_ns` is.
         """
         if not self._slip_ns.any():
             return machine_ns
@@ -162,8 +163,8 @@ class Mission:
         """Write the mission to an MCAP file.
 
         Args:
-            target: Replaced atomically if it exists.
-            attachments: Files to attach, by name, in addition to those of both ends.
+            target: Path of the file; an existing file is replaced atomically.
+            attachments: Name -> file to attach, in addition to the attachments of both ends.
 
         Raises:
             OSError: If the file cannot be written.
@@ -190,8 +191,8 @@ def merge(world: Path, cloud: Path) -> Mission:
         cloud: Cloud's recording.
 
     Returns:
-        The mission. If one file cannot be read, the mission is the other file on its own clock,
-        and its note says so.
+        The mission. If one file cannot be read, the mission contains only the other file, on that
+        file's own clock, and the note of the mission says so.
 
     Raises:
         BadInputError: If neither file can be read.
@@ -237,8 +238,8 @@ def _join(world: Contents, cloud: Contents) -> Mission:
 
 
 BEFORE_NS = 1_000_000_000
-"""Time before a mission's start that is kept [ns]; the session and the guard's first change are in
-it."""
+"""Time before a mission's start that is kept [ns]. The beginning of the session and the guard's
+first change are in this time."""
 AFTER_NS = 2_000_000_000
 """Time after a mission's end that is kept [ns]."""
 CUT_SHORT = "cut short"
@@ -252,7 +253,7 @@ def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
         mission: The merged recordings of both ends.
 
     Returns:
-        The last mission that was started in it, and whether the mission's end is in it.
+        The last mission that was started, and whether the recording contains the mission's end.
     """
     contents = mission.contents
     began, ended = _last_mission(contents)
@@ -271,7 +272,7 @@ def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
 
 
 def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
-    """Find the stamps [ns] of the last mission's start and end; None for a missing one."""
+    """Find the stamps [ns] of the last mission's start and end; None for a missing stamp."""
     events = [message for message in contents.messages if message[0] == "/mission"]
     table = Recording.from_contents(Contents(events))["/mission"]
     began = ended = None

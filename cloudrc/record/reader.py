@@ -1,9 +1,9 @@
 """Read an MCAP file from its start to its end, or to its first damaged part.
 
-A killed process leaves a file without an end: it is read up to its last complete chunk. `Records`
-yields the records of any MCAP file; `read_contents` collects what cloudrc records. The package
-`mcap` parses the format; this module bounds what a file may unpack to and says in words what is
-missing.
+A killed process leaves a file without an end; such a file is read up to its last complete chunk.
+`Records` yields the records of any MCAP file. `read_contents` collects the topics that cloudrc
+records. The package `mcap` parses the format. This module limits the unpacked size of a file, and
+says in words what is missing.
 """
 
 from __future__ import annotations
@@ -49,48 +49,48 @@ except ImportError as error:
 
 UNPACKED_MAX = 64
 """Largest size of a recording in memory, as a multiple of its size in the file [1]. A file below
-1 MiB counts as 1 MiB. Recordings of flights need 10, those of an idle robot 30."""
+1 MiB counts as 1 MiB. Recordings of flights need a factor of 10, recordings of an idle robot 30."""
 MESSAGE_COST = 128
-"""Memory of a message's objects beside its bytes [bytes]."""
+"""Memory of a message's Python objects, in addition to the message's bytes [bytes]."""
 LISTED_MAX = 3
-"""Largest number of topics that a message lists."""
+"""Largest number of topics that an error message lists."""
 HEAD_SIZE = 16
-"""Number of bytes that show of which kind a file is."""
+"""Number of first bytes that identify the type of a file [bytes]."""
 KINDS = (
     (b"#ROSBAG V", "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert"),
     (b"SQLite format 3", "is an SQLite file, not MCAP; convert it with: ros2 bag convert"),
 )
-"""First bytes of other recordings, and what to say about them."""
+"""First bytes of other types of recordings, and the text of the error about them."""
 
 
 class NothingReadableError(BadInputError):
-    """A file of which not one message can be read, as a kill at the start leaves it."""
+    """Report a file without any readable message, such as after a kill at the start."""
 
 
 class _TooMuchError(Exception):
-    """A file unpacks to more than any recording."""
+    """Report that a file unpacks to more data than any recording may."""
 
 
 class Records:
-    """The records of one MCAP file, including those in chunks, without the chunks themselves.
+    """The records of one MCAP file: chunks are unpacked, so no chunk is among the records.
 
     Attributes:
         path: The file, for messages.
         size: Size of the file [bytes].
-        position: Number of bytes of the file up to the last intact record [bytes].
+        position: Position behind the last intact record [bytes].
         chunks: Number of intact chunks.
-        data_ended: Whether the end of the data was reached; behind it is only the index.
-        ended: Whether the end of the file was reached.
+        data_ended: Whether reading has reached the end of the data; only the index follows.
+        ended: Whether reading has reached the end of the file.
         fault: Why reading stopped or what is wrong, in words; "" if nothing is wrong.
-        cut: Whether the fault is at the end of the file, as a killed process leaves it.
-        stated: Number of messages that the index states; None if it was not reached.
+        cut: Whether the fault is at the end of the file, as after a kill of the process.
+        stated: Number of messages according to the index; None if the index was not reached.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a file; close it by `with`.
+        """Open a file; use `with` to close it.
 
         Raises:
-            BadInputError: If it cannot be opened or is not an MCAP file.
+            BadInputError: If the file cannot be opened or is not an MCAP file.
         """
         self.path = path
         try:
@@ -118,7 +118,7 @@ class Records:
         """Yield the records up to the file's end or its first damaged part.
 
         Raises:
-            BadInputError: If the file is not MCAP or is compressed in an unknown way.
+            BadInputError: If the file is not MCAP or has an unknown compression.
         """
         self._stream.seek(0)
         head = self._stream.read(HEAD_SIZE)
@@ -163,7 +163,7 @@ class Records:
 
     @property
     def unread(self) -> int:
-        """Return the size of the part that was not read [bytes], without a torn index."""
+        """Return the size of the part that was not read [bytes]; a torn index does not count."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
     def _take_room(self, size: int) -> None:
@@ -212,7 +212,7 @@ class Records:
                 raise ValueError("a record is not as long as it states")
 
     def _foreign(self, head: bytes) -> BadInputError:
-        """Name what the file is by its first bytes, since it is not MCAP."""
+        """Say by the first bytes what the file is instead of MCAP."""
         if not head.strip(b"\0"):
             return NothingReadableError(f"{self.path}: is empty; name a recording (.mcap)")
         kinds = (text for magic, text in KINDS if head.startswith(magic))
@@ -225,14 +225,14 @@ class Contents:
     """The contents of a file.
 
     Attributes:
-        messages: Topic, log time [ns] and CDR bytes of each, in the order of their log times.
-        metadata: All metadata of the file; later values of a key replace earlier ones.
-        attachments: The attached files by name.
+        messages: Topic, log time [ns] and CDR bytes of each message, in the order of log times.
+        metadata: All metadata of the file; later values of a key replace earlier values.
+        attachments: Name -> attached file.
         note: What is missing, in words; "" if nothing is missing.
-        lacking: Of what is missing the part that no killed process explains: damaged, filtered or
-            foreign parts; "" without.
-        remarks: What was ignored or sorted, each as a sentence about the recording without its
-            subject; nothing is missing for it.
+        lacking: The part of `note` that a killed process cannot explain: damaged, filtered or
+            foreign parts; "" if there is none.
+        remarks: What was ignored or sorted, although nothing is missing: sentences without their
+            subject, which is the recording.
     """
 
     messages: list[tuple[str, int, bytes]] = field(default_factory=list)
@@ -244,13 +244,13 @@ class Contents:
 
 
 def read_contents(path: Path) -> Contents:
-    """Read what cloudrc has recorded, up to the end of a file or its first damaged part.
+    """Read the topics that cloudrc records, up to the end of a file or its first damaged part.
 
     Args:
         path: An MCAP file, possibly torn.
 
     Raises:
-        BadInputError: If nothing in it is readable.
+        BadInputError: If nothing in the file is readable.
     """
     with Records(path) as records:
         collector = _Collector(records)
@@ -260,7 +260,7 @@ def read_contents(path: Path) -> Contents:
 
 
 class _Collector:
-    """Collects what cloudrc has recorded from the records of a file."""
+    """Collects the messages of cloudrc's topics, all metadata and all attachments of a file."""
 
     def __init__(self, records: Records) -> None:
         self._records = records
@@ -290,7 +290,7 @@ class _Collector:
             contents.attachments[record.name] = record.data
 
     def finish(self) -> Contents:
-        """Sort the messages; say what is missing."""
+        """Sort the messages, note what is missing, and return the contents."""
         contents, records = self._contents, self._records
         messages = contents.messages
         if not records.data_ended and not messages:
@@ -315,7 +315,7 @@ class _Collector:
         return contents
 
     def _fault(self) -> str:
-        """Say what is wrong with the file, and how far it was read."""
+        """Describe the fault of the file, and how far the file was read."""
         messages, fault = self._contents.messages, self._records.fault
         if self._records.data_ended:
             return fault
@@ -323,7 +323,7 @@ class _Collector:
         return f"{fault}: {len(messages)} messages were read, the last at {until:.2f} s"
 
     def _lacking(self, read: Counter[str]) -> Iterator[str]:
-        """Say what other programs have removed or added.
+        """Describe the data that other programs have removed or added.
 
         Args:
             read: Number of messages by topic.
@@ -358,13 +358,13 @@ class _Collector:
 
 
 def _list(topics: list[str]) -> str:
-    """List the first topics and the number of the others."""
+    """List the first topics, and give the number of the others."""
     more = len(topics) - LISTED_MAX
     return ", ".join(topics[:LISTED_MAX]) + f" and {more} more topics" * (more > 0)
 
 
 def _parse_counts(text: str) -> dict[str, int]:
-    """Parse the writer's own number of messages by topic; empty if there is none.
+    """Parse the number of messages by topic that the writer has stored; empty if there is none.
 
     Args:
         text: Value of `COUNTS` in the metadata.

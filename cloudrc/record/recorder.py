@@ -1,7 +1,8 @@
 """Record a real-time process into a file without blocking its loop.
 
-The loop puts records into a bounded queue; a thread (`cloudrc/drivers/recording.py`) writes them. A
-full queue drops its oldest record and counts it. An error of the file never stops the flight.
+The loop puts records into a bounded queue; a thread (`cloudrc/drivers/recording.py`) writes the
+records. If the queue is full, the oldest record is dropped and counted. An error of the file never
+stops the flight.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ TROUBLE = {
     errno.EROFS: "disk is read-only",
 }
 CAPACITY = 20_000
-"""Number of records that the queue holds; world or cloud makes that many in about 30 s."""
+"""Number of records that the queue holds; world or cloud needs about 30 s to make as many."""
 
 
 class Recorder:
-    """A queue between a thread that puts and one that drains; a third thread may `sync`.
+    """A queue between two threads: one puts records, one drains them. A third may call `sync`.
 
     Attributes:
-        error: Why something was not recorded, in words; "" without an error.
+        error: Why records are missing from the file, in words; "" without an error.
     """
 
     def __init__(
@@ -41,11 +42,11 @@ class Recorder:
         capacity: int = CAPACITY,
         size_max: int | None = None,
     ) -> None:
-        """Create the queue; the first drain opens the file.
+        """Create the queue; the first `drain` opens the file.
 
         Args:
             path: The file.
-            open_sink: Opens it: `lambda path: McapWriter(path, clock="world")`.
+            open_sink: Opens the file: `lambda path: McapWriter(path, clock="world")`.
             capacity: Number of records that the queue holds.
             size_max: Size at which the file is ended [bytes]; None for no limit.
         """
@@ -67,7 +68,7 @@ class Recorder:
         return self._overflowed + self._unwritten
 
     def put(self, records: Iterable[Record]) -> None:
-        """Queue records; never waits and never raises.
+        """Queue records; never wait and never raise.
 
         Args:
             records: Records of the process, oldest first.
@@ -81,10 +82,10 @@ class Recorder:
                 self._overflowed += 1
 
     def drain(self, max_records: int = 64) -> int:
-        """Write records from the queue; never raises.
+        """Write records from the queue; never raise.
 
         Args:
-            max_records: Limit of records, so that the caller does not block the loop.
+            max_records: Limit of records per call, so that the caller does not block the loop.
 
         Returns:
             Number of records taken from the queue.
@@ -99,10 +100,10 @@ class Recorder:
         return taken
 
     def flush(self, *, sync: bool = True) -> None:
-        """Hand the written data to the operating system; never raises.
+        """Hand the written data to the operating system; never raise.
 
         Args:
-            sync: Whether to sync it to the disk, too, however long that takes.
+            sync: Whether to sync the data to the disk, too, however long that takes.
         """
         if self._sink and not self._ended:
             try:
@@ -117,10 +118,10 @@ class Recorder:
                 self._stop(error)
 
     def sync(self) -> bool:
-        """Sync the flushed data to the disk, however long that takes; never raises.
+        """Sync the flushed data to the disk, however long that takes; never raise.
 
         Returns:
-            False if that failed or nothing is recorded into a file.
+            False if the sync failed, or if no file is open.
         """
         sink = self._sink
         if sink is not None and not self._ended:
@@ -134,7 +135,7 @@ class Recorder:
         return False
 
     def close(self) -> None:
-        """Write the remaining records and close the file; never raises."""
+        """Write the remaining records and close the file; never raise."""
         while self.drain():
             pass
         if self._sink and not self._ended:
@@ -167,7 +168,7 @@ class Recorder:
             self.error = f"{self._path}: a record of type {kind} cannot be written: {error}"
 
     def _stop(self, error: OSError) -> None:
-        """End the file after an error: it stays readable; later records are only counted."""
+        """End the file after an error, so that it stays readable; only count later records."""
         self._ended = True
         reason = f"recording stopped: {TROUBLE.get(error.errno or 0, error.strerror or error)}"
         self.error = (

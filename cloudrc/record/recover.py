@@ -1,8 +1,8 @@
-"""Copy a torn recording, up to its first damaged part, into a new file that is whole.
+"""Copy a torn recording, up to its first damaged part, into a new, complete file.
 
-The copy keeps messages with their stamps, schemas, channels, attachments and metadata. It has an
-index, checksums and, if anything is missing, a note about it. MCAP itself has no such tool for
-Python.
+The copy keeps messages with their stamps, schemas, channels, attachments and metadata. The copy has
+an index and checksums. If anything is missing, it also has a note about the loss. The Python
+package `mcap` has no such tool.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ except ImportError as error:
     raise missing(error) from error
 
 CHANNELS_MAX = 65_535
-"""Limit of channels and of schemas in a file, since MCAP numbers them with 16 bits."""
+"""Limit of the number of channels plus schemas in a file; MCAP numbers both with 16 bits."""
 LOSSY_SHARE_MAX = 0.999
-"""Largest share that is stated if anything is missing [1]."""
+"""Largest value of `Recovery.share` if anything is missing [1]."""
 
 
 @dataclass(slots=True)
@@ -37,8 +37,8 @@ class Recovery:
     Attributes:
         size: Size of the damaged file [bytes].
         kept: Number of objects in the new file, by kind.
-        dropped: Number of messages that are known to be lost; empty if it is not known.
-        bytes_lost: Bytes after the last intact record [bytes].
+        dropped: Number of objects that are known to be lost, by kind (only "messages").
+        bytes_lost: Size of the part behind the last intact record [bytes].
         notes: What is missing or doubtful, in words.
         index_is_new: Whether the old file had no readable index.
     """
@@ -57,9 +57,9 @@ class Recovery:
 
     @property
     def share(self) -> float:
-        """Return the kept share in [0, 1]: of the messages if their number is known, else bytes.
+        """Return the kept share of messages, in [0, 1]; of bytes if that number is unknown.
 
-        It is below 1 if anything is missing.
+        The share is below 1 if anything is missing.
         """
         if self.complete:
             return 1.0
@@ -69,11 +69,11 @@ class Recovery:
 
 
 def recover(source: Path, target: Path) -> Recovery:
-    """Write a whole copy of a recording.
+    """Write a complete copy of a recording.
 
     Args:
         source: An MCAP file, possibly torn or damaged.
-        target: The new file; written atomically.
+        target: The new file; it is written atomically.
 
     Raises:
         BadInputError: If the file holds no readable message.
@@ -87,7 +87,7 @@ def recover(source: Path, target: Path) -> Recovery:
 
 
 class _Copy:
-    """Copies records to a new file and numbers channels and schemas anew."""
+    """Copies records to a new file, with new numbers for channels and schemas."""
 
     def __init__(self, new: IO[bytes], records: Records) -> None:
         self._records = records
@@ -128,7 +128,7 @@ class _Copy:
                 self._told = record.metadata.get(MISSING, self._told)
 
     def finish(self) -> Recovery:
-        """Complete the new file; return what it holds and what is lost."""
+        """Complete the new file; return what the file holds and what is lost."""
         records, kept = self._records, self._kept
         if not kept["messages"] and not kept["attachments"]:
             reason = records.fault or "none is in it"
@@ -158,7 +158,7 @@ class _Copy:
         self._writer.start(profile=profile, library=f"cloudrc {__version__} recover")
 
     def _define(self, record: Any, known: dict[int, Any]) -> None:
-        """Register a schema or channel, once for each definition of its number."""
+        """Register a schema or channel; register each definition of its number only once."""
         if record.id in known and known[record.id][0] == record:
             return
         self._defined += 1

@@ -1,11 +1,12 @@
 """Convert rows of topics to ROS 2 messages in CDR and back.
 
-Only here do quaternions change from `wxyz` to `xyzw`, and an odometry's velocity from the world
-frame to the body frame. Every message begins with a `std_msgs/Header` that has the row's stamp; the
-frames are `world` and `base_link`.
+Only this module converts quaternions from `wxyz` to `xyzw`, and an odometry's velocity from the
+world frame to the body frame. Every message begins with a `std_msgs/Header` that has the row's
+stamp; the frames are `world` and `base_link`.
 
 The message types in `cloudrc_msgs` are generated from `cloudrc/record/topics.py`, with a comment
-and a unit for each field; the others are ROS's own. rosbags parses, encodes and hashes all of them.
+and a unit for each field; the other types are standard ROS types. rosbags parses, encodes and
+hashes all types.
 """
 
 from __future__ import annotations
@@ -50,9 +51,9 @@ def _own_definition(ros_type: str) -> str:
 _OWN = {t.ros_type: _own_definition(t.ros_type) for t in TOPICS.values() if _OURS in t.ros_type}
 
 TEXT_MAX = 1 << 16
-"""Longest definition that is parsed [characters]; ours and ROS's own have a few thousand."""
+"""Longest definition that is parsed [characters]; those of cloudrc and ROS have a few thousand."""
 STORE = get_typestore(Stores.ROS2_JAZZY)
-"""The message types of rosbags, including ours."""
+"""The message types of rosbags, including those of cloudrc."""
 for _name, _text in _OWN.items():
     STORE.register(get_types_from_msg(_text, _name))
 
@@ -79,8 +80,8 @@ def definition(ros_type: str) -> str:
         ros_type: Type of a topic.
 
     Returns:
-        Its definition and those of the types it uses; ours have a comment and a unit for each
-        field.
+        The definition of the type and of the types that it uses. Types of cloudrc have a comment
+        and a unit for each field.
     """
     return _DEFINITIONS[ros_type]
 
@@ -100,7 +101,7 @@ def is_known(ros_type: str, text: str) -> bool:
 
     Args:
         ros_type: Name of the message type.
-        text: Its definition in the encoding `ros2msg`; comments are ignored.
+        text: Definition of the type in the encoding `ros2msg`; comments are ignored.
     """
     if text == definition(ros_type):
         return True
@@ -116,7 +117,8 @@ def is_known(ros_type: str, text: str) -> bool:
 
 _SECOND_NS = 1_000_000_000
 _ENCAPSULATION = 4
-"""Size of the header before the message [bytes]; its second byte is 1 for little-endian."""
+"""Size of the encapsulation header before the message [bytes]; its second byte is 1 if the message
+is little-endian."""
 
 _type: dict[str, Any] = dict(STORE.types)
 _Time, _Header = _type["builtin_interfaces/msg/Time"], _type["std_msgs/msg/Header"]
@@ -141,7 +143,7 @@ def encode(topic: Topic, stamp_ns: int, values: Values) -> bytes:
         values: Values in the order of the topic's fields.
 
     Returns:
-        Little-endian CDR with its encapsulation header.
+        Little-endian CDR bytes with their encapsulation header.
     """
     sec, nanosec = divmod(stamp_ns, _SECOND_NS)
     build = _CODECS[topic.name][0]
@@ -154,7 +156,7 @@ def decode(topic: Topic, data: bytes) -> tuple[int, Values]:
 
     Args:
         topic: Topic of the message.
-        data: CDR with its encapsulation header.
+        data: CDR bytes with their encapsulation header.
 
     Returns:
         The stamp [ns] and the values in the order of the topic's fields.
@@ -165,10 +167,10 @@ def decode(topic: Topic, data: bytes) -> tuple[int, Values]:
 
 
 def shifted(data: bytes, offset_ns: int) -> bytes:
-    """Shift a message's stamp without decoding the rest of it.
+    """Shift a message's stamp without decoding the rest of the message.
 
     Args:
-        data: CDR of one of our messages, which all begin with the stamp of their header.
+        data: CDR bytes of a message of cloudrc; all these begin with the stamp of their header.
         offset_ns: Added to the stamp [ns].
     """
     if offset_ns == 0:
@@ -180,7 +182,7 @@ def shifted(data: bytes, offset_ns: int) -> bytes:
 
 
 def _rotate(orientation_wxyz: Quaternion, vector: Vector) -> Vector:
-    """Rotate a vector from the body frame to the world frame: v + 2 u x (u x v + w v).
+    """Rotate a vector from the body frame to the world frame: v + 2 · u x (u x v + w · v).
 
     This is Rodrigues' formula for the unit quaternion (w, u).
     """

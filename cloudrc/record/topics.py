@@ -1,8 +1,8 @@
 """Define the topics of a recording and convert records to their rows.
 
 A record gives a row in one or more topics. A topic is a table with the column `stamp_ns` and the
-fields below, which are named as in `cloudrc/records.py`. Here quaternions are `wxyz` and velocities
-in the world frame; `cloudrc/record/ros.py` converts them for ROS.
+fields below, which are named as in `cloudrc/records.py`. In these tables quaternions are `wxyz` and
+velocities are in the world frame; `cloudrc/record/ros.py` converts both for ROS.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from cloudrc.records import Record
 Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
 Values: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = tuple[str, int, Values]
-"""Topic, stamp [ns] on the clock of the recording end, values in the order of the fields."""
+"""Topic, stamp [ns] on the clock of the end that records, values in the order of the fields."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,10 @@ class Field:
     Attributes:
         name: Name of the column and of the ROS field.
         kind: Type of a value; vectors have shape (3,), quaternions shape (4,).
-        unit: Unit of the values; "" without one.
+        unit: Unit of the values; "" without a unit.
         text: Meaning of the values.
-        path: Dotted path of the value in the record; "" if it is the topic's part and the name.
+        path: Dotted path of the value in the record. "" means the record's field `name`; if the
+            record has no such field, `part` of the topic followed by `name`.
     """
 
     name: str
@@ -47,13 +48,14 @@ class Topic:
 
     Attributes:
         name: Name in the MCAP file, with its slash.
-        ros_type: Message type; those in `cloudrc_msgs` are defined by `fields`.
+        ros_type: Message type; `fields` defines the types in `cloudrc_msgs`.
         source: Record class of the rows.
-        end: End that records it: "world", "cloud" or "either".
+        end: End that records the topic: "world", "cloud" or "either".
         text: Meaning of a row.
         fields: The columns after `stamp_ns`.
         stamp_path: Dotted path of the row's stamp in the record.
-        part: Dotted path, with its last dot, to fields that the record itself does not have.
+        part: Dotted path, with its last dot, to the nested record with the fields that the record
+            itself does not have; "" without a nested record.
     """
 
     name: str
@@ -119,7 +121,7 @@ LINK_TOPICS = (
         ),
     ),
 )
-"""Topics of the link, whose records the drivers make."""
+"""Topics of the link; the drivers make the records of these topics."""
 
 
 _POSE_AND_TWIST = (
@@ -387,7 +389,7 @@ _TABLE = (
 )
 
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
-"""Every topic of a recording by its name."""
+"""Name -> topic, for every topic of a recording."""
 
 _WHEN_SENT = "departure of the telemetry, which is the instant of the measurement"
 _WHEN_TRUE = "instant of the physics step"
@@ -421,7 +423,7 @@ SAMPLING: dict[str, tuple[str, str]] = {
     "/link_check": ("end of the interval that is judged", "every 5 s per quantity"),
     "/lateness": ("when the deadline was handled", "100 Hz per end"),
 }
-"""Topic -> what the stamp of a row marks, and how often a row is written; for docs/topics.md."""
+"""Topic -> meaning of a row's stamp, and how often a row is written; for docs/topics.md."""
 _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Values]]
 
 

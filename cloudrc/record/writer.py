@@ -1,9 +1,9 @@
 """Write records to an MCAP file that ROS 2 tools can read.
 
-The profile is `ros2`, schemas are `ros2msg`, messages `cdr`, chunks compressed by zstd. A chunk
-goes to the operating system after at most half a second of recording, so that a killed process
-loses no more. Chunks, the data section and the index have checksums, so that a reader detects
-every wrong byte. A complete file also holds the number and the hash of its messages.
+The MCAP profile is `ros2`, schemas are `ros2msg`, messages are `cdr`, and zstd compresses the
+chunks. A chunk goes to the operating system after at most half a second of recording, so a killed
+process loses at most half a second. Chunks, the data section and the index have checksums, so a
+reader detects every wrong byte. A complete file also holds the number and the hash of its messages.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ CHUNK_NS = 500_000_000
 METADATA = "cloudrc"
 """Name of the file's metadata record."""
 CLOCK = "clock"
-"""Key in the metadata with the end whose clock the stamps are on."""
+"""Metadata key: the end ("world" or "cloud") whose clock the stamps use."""
 MISSING = "missing"
-"""Key in the metadata with what is missing from the file, in words."""
+"""Metadata key: what is missing from the file, in words."""
 COUNTS, SHA256 = "counts", "messages_sha256"
-"""Keys in the metadata of a complete file: number of messages by topic as JSON, and their hash by
-`record.hash`. They show whether another program has changed the recording. The number is "" until
-the file is complete."""
+"""Metadata keys of a complete file: number of messages by topic as JSON, and hash of the messages
+by `record.hash`. The values show whether another program has changed the recording. The value of
+`COUNTS` is "" until the file is complete."""
 
 
 class McapWriter:
@@ -59,9 +59,9 @@ class McapWriter:
 
         Args:
             target: A path, overwritten if it exists, or a binary stream that the caller closes.
-            clock: End whose clock the stamps are on: "world" or "cloud".
-            clock_id: Identity of the machine's clock, such as the kernel's boot id; files with the
-                same one need no clock offset; "" if it is unknown.
+            clock: End whose clock the stamps use: "world" or "cloud".
+            clock_id: Identity of the machine's clock, such as the kernel's boot id; "" if unknown.
+                Files with the same identity need no clock offset.
 
         Raises:
             OSError: If the file cannot be written.
@@ -114,8 +114,9 @@ class McapWriter:
 
         Args:
             topic: A name in `TOPICS`.
-            log_time_ns: When it was recorded [ns]; raised to that of the last message, or zero.
-            data: Its CDR bytes.
+            log_time_ns: Log time of the message [ns]. A negative time becomes zero. A time before
+                the previous message's log time becomes that log time.
+            data: CDR bytes of the message.
         """
         now_ns = self._latest_ns = max(self._latest_ns, log_time_ns)
         if self._chunk_start_ns is None:
@@ -131,10 +132,10 @@ class McapWriter:
         add_message(self._sha256, topic, now_ns, data)
 
     def note(self, metadata: Mapping[str, str]) -> None:
-        """Add to the file's metadata; a later value of a key replaces an earlier one.
+        """Add values to the file's metadata; a later value of a key replaces an earlier value.
 
         Args:
-            metadata: Values by key.
+            metadata: Key -> value.
         """
         self._noted |= metadata
         self._mcap.add_metadata(METADATA, dict(self._noted))
@@ -144,13 +145,13 @@ class McapWriter:
 
         Args:
             name: Name of the file, such as config.yaml or report.json.
-            data: Its bytes.
-            media_type: Its media type, such as application/json.
+            data: Bytes of the file.
+            media_type: Media type of the file, such as application/json.
         """
         self._mcap.add_attachment(0, self._latest_ns, name, media_type, data)
 
     def flush(self) -> None:
-        """Close the chunk and hand it to the operating system."""
+        """Close the present chunk and hand it to the operating system."""
         self._chunk_start_ns = None
         self._mcap.flush()
         self._whole = self._stream.tell()
@@ -166,13 +167,13 @@ class McapWriter:
                     raise
 
     def abandon(self, reason: str) -> int:
-        """End the file after an error: cut its torn end off and add a note, if there is space.
+        """End the file after an error: cut off the torn end, and add a note if there is disk space.
 
         Args:
             reason: Why the recording stopped, for the readers of the file.
 
         Returns:
-            Number of written records that are lost.
+            Number of records that were written but are lost.
         """
         note: Any = RecordBuilder()  # without type annotations
         end: Any = RecordBuilder()
@@ -228,8 +229,8 @@ class McapWriter:
 class _ChunkIndexes:
     """The writer's list of the chunks so far, compressed.
 
-    mcap's own list takes 12 MB for an hour of recording, this one a third of a megabyte: it stores
-    differences, which compress best.
+    The list of mcap takes 12 MB for an hour of recording. This list takes a third of a megabyte: it
+    stores differences, which compress best.
     """
 
     def __init__(self) -> None:
@@ -238,7 +239,7 @@ class _ChunkIndexes:
         self._before = (0, 0, 0)  # times and position of the last chunk
 
     def append(self, index: ChunkIndex) -> None:
-        """Add a chunk."""
+        """Add the index of a chunk."""
         now = (index.message_start_time, index.message_end_time, index.chunk_start_offset)
         channels = list(index.message_index_offsets)
         places = [now[2] + index.chunk_length, *index.message_index_offsets.values()]

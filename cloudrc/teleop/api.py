@@ -1,8 +1,8 @@
 """Serve teleop's API over HTTP: carry requests to the mission service, and answer in JSON.
 
-The handlers ask the service through the bridge. A refusal is one line of `detail`; it names the
-mission that is in the way, or each value that cannot be used. Events are sent as they happen, as
-server-sent events; each has a number, so that a client can resume.
+The handlers call the service through the bridge. A refusal has one line of `detail`. The refusal
+names the mission in conflict, or each value that cannot be used. Events are sent as they happen, as
+server-sent events; each event has a number, so that a client can resume.
 """
 
 from __future__ import annotations
@@ -46,25 +46,27 @@ from cloudrc.teleop.store import ConflictError, UnavailableError, UnknownMission
 LOOK_PERIOD = 0.1
 """Time between two checks for new events [s]."""
 ALIVE_PERIOD = 10.0
-"""Time without an event after which a stream gets a comment, so that no proxy closes it [s]."""
+"""Time without an event after which the stream sends a comment [s], so that no proxy closes the
+connection."""
 ANSWER_LIMIT = 2.0
 """Time limit for the mission service to answer [s]."""
 ALARM_PERIOD, ALARM_REPEATS = 0.02, 100
-"""Time between two attempts to tell a blocked cloud of an emergency stop [s], and their number."""
+"""Time between two attempts to send an emergency stop to a blocked cloud [s], and the number of
+attempts."""
 HEAD_MAX = 4_096
 """Longest head of a request [bytes]."""
 KEEP_ALIVE = 5
 """Time after which a connection without a request is closed [s]."""
 BACKLOG = 1_024
-"""Limit of the connections that wait to be accepted."""
+"""Limit of the connections that the server has not accepted yet."""
 STOP_LIMIT = 1
-"""Time for requests to end when the server stops [s]."""
+"""Time limit for open requests when the server stops [s]."""
 STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
-"""Error -> status of the answer."""
+"""Error -> HTTP status of the answer."""
 
 
 def _handle_errors(app: FastAPI, complain: Callable[[str], None]) -> None:
-    """Make an application answer with `Refusal` whatever cannot be done."""
+    """Make an application answer every error with a `Refusal`."""
 
     @app.exception_handler(CloudrcError)
     async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
@@ -99,12 +101,12 @@ def _handle_errors(app: FastAPI, complain: Callable[[str], None]) -> None:
 def create_app(
     bridge: Bridge, surroundings: Surroundings, complain: Callable[[str], None]
 ) -> FastAPI:
-    """Make the ASGI application, which belongs behind a `Gate`.
+    """Make the ASGI application; it must run behind a `Gate`.
 
     Args:
-        bridge: Leads to the mission service.
-        surroundings: The experiment.
-        complain: Gets one line about each internal error.
+        bridge: Bridge to the mission service.
+        surroundings: Facts about the experiment.
+        complain: Receives one line about each internal error.
     """
     app = FastAPI(
         title="cloudrc teleop",
@@ -129,17 +131,20 @@ async def _ask(bridge: Bridge, call: Call) -> Any:
 
 
 async def _move(bridge: Bridge, call: Call) -> Any:
-    """Ask for something that lets the robot move."""
+    """Make a call that may set the robot in motion, unless a stop or a hold overtakes it."""
     return await _ask(bridge, bridge.unless_overtaken(call))
 
 
 async def _urgent_answer(asked: Future[Any]) -> Any:
-    """Wait for an urgent call, which is made however late, and for which others may wait, too."""
+    """Wait for the answer to an urgent call, at most `ANSWER_LIMIT`.
+
+    After the limit the call stays queued; other requests may wait for the same call.
+    """
     return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(asked)), ANSWER_LIMIT)
 
 
 async def _body(request: Request) -> bytes:
-    """Read a body; one that is too long or too slow is not read to its end."""
+    """Read the body of a request; stop reading if the body is too long or arrives too slowly."""
     too_long = HTTPException(413, models.REFUSALS[413]["description"])
     if (
         int(request.headers.get("content-length", "0")) > models.BODY_MAX
@@ -158,7 +163,7 @@ async def _body(request: Request) -> bytes:
 
 
 def _takes(model: type[BaseModel], example: dict[str, Any]) -> dict[str, Any]:
-    """Describe a body that `_body` reads."""
+    """Describe a request body that `_body` reads, for the OpenAPI document."""
     content = {"application/json": {"schema": models.inlined(model), "example": example}}
     return {"requestBody": {"required": True, "content": content}}
 
@@ -308,7 +313,7 @@ def _add_views(router: APIRouter, bridge: Bridge) -> None:
 
 
 async def _stream(request: Request, bridge: Bridge, after: int) -> AsyncIterator[str]:
-    """Write events, until the client leaves, its token is withdrawn, or teleop ends."""
+    """Yield events until the client disconnects, its token becomes invalid, or teleop ends."""
     looks = 0
     yield ": cloudrc\n\n"
     while not (bridge.closed or await request.is_disconnected()):
@@ -337,7 +342,7 @@ Address: TypeAlias = tuple[str, int] | Path
 
 
 class ApiServer:
-    """Serve the API on a thread of its own, from `start` to `stop`.
+    """Serve the API in a separate thread, from `start` to `stop`.
 
     Attributes:
         url: "http://HOST:PORT", or "unix:PATH" for a Unix socket.
@@ -348,7 +353,8 @@ class ApiServer:
         """Bind the address; port 0 lets the kernel choose.
 
         Raises:
-            BadInputError: If the address cannot be bound, or anybody there could command.
+            BadInputError: If the address cannot be bound, or if there are no tokens and the address
+                is not a socket file: then everybody could command.
         """
         if gate.tokens is None and not isinstance(address, Path):
             raise BadInputError(
@@ -381,12 +387,12 @@ class ApiServer:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of requests by outcome, and of lost lines of the audit log."""
+        """Number of requests by outcome, and number of lost lines of the audit log."""
         audit = self.gate.audit
         return {**self.gate.counts, "audit_dropped": audit.dropped if audit else 0}
 
     def start(self) -> None:
-        """Begin to serve; clients can connect from now on."""
+        """Start serving; clients can connect from now on."""
         self._socket.listen(BACKLOG)
         self._thread.start()
 
@@ -401,7 +407,7 @@ class ApiServer:
 
 
 def _bind(address: Address) -> tuple[socket.socket, str]:
-    """Return a socket that is bound to an address, and its URL."""
+    """Bind a socket to an address; return socket and URL."""
     if isinstance(address, Path):
         return _bind_file(address), f"unix:{address}"
     host, port = address[0].strip("[]"), address[1]
@@ -422,7 +428,7 @@ def _bind(address: Address) -> tuple[socket.socket, str]:
 
 
 def _bind_file(path: Path) -> socket.socket:
-    """Return a Unix socket that only its owner can connect to, from the start."""
+    """Bind a Unix socket to which, from the start, only its owner can connect."""
     unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
     try:

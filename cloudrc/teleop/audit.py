@@ -1,6 +1,6 @@
-"""Log who commanded what, and what has come of it, as lines of JSON.
+"""Log commands as lines of JSON: who has sent them, and with which result.
 
-A thread writes the lines, so that no request waits for the disk.
+A separate thread writes the lines, so that no request waits for the disk.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 SIZE_MAX = 8 << 20
-"""Size of the log at which it replaces the one before it [bytes]."""
+"""Size at which the log file is closed and a new one begins [bytes]; the closed file replaces the
+previous closed file."""
 
 
 class Audit(RotatingFileHandler):
@@ -30,7 +31,7 @@ class Audit(RotatingFileHandler):
     """
 
     def __init__(self, path: Path, complain: Callable[[str], None]) -> None:
-        """Start the thread; `complain` gets one line if the file cannot be written."""
+        """Start the thread; `complain` receives one line if the file cannot be written."""
         super().__init__(path, maxBytes=SIZE_MAX, backupCount=1, encoding="utf-8", delay=True)
         self.dropped, self._complain = 0, complain
         waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -40,11 +41,11 @@ class Audit(RotatingFileHandler):
     def note(
         self, role: str, token: str, scope: Mapping[str, Any], answer: Mapping[str, Any]
     ) -> None:
-        """Have a line about a command written.
+        """Queue a line about a command for the writing thread.
 
         Args:
             role: Role of the caller.
-            token: Name of the caller's token, which does not reveal it.
+            token: Name of the caller's token; the name does not reveal the token.
             scope: The request, as ASGI describes it.
             answer: Status and body of the answer.
         """
@@ -66,13 +67,13 @@ class Audit(RotatingFileHandler):
         self._queue.handle(logging.makeLogRecord({"msg": text}))
 
     def stop(self) -> None:
-        """Write what waits, and close the file."""
+        """Write the queued lines, and close the file."""
         self._listener.stop()
         with suppress(OSError):
             self.close()
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
-        """Count a line that is lost."""
+        """Count a lost line."""
         if not self.dropped:
             reason = sys.exception()
             self._complain(f"the audit log {self.baseFilename} cannot be written: {reason}")

@@ -1,7 +1,8 @@
 """Admit callers to the API by bearer token, and count their requests.
 
-An operator's token may do everything, a reader's may only read. Only digests of tokens are kept in
-memory. An operator's emergency stop and hold are never refused as too many.
+A caller with an operator's token may do everything; a caller with a reader's token may only read.
+Memory holds only digests of tokens. The limit on simultaneous requests never refuses an operator's
+emergency stop or hold.
 """
 
 from __future__ import annotations
@@ -27,42 +28,42 @@ from cloudrc.teleop.audit import Audit
 from cloudrc.teleop.bridge import WAITING_MAX
 
 OPERATOR, READER = "operator", "reader"
-"""Roles; a token file has the name of its role."""
+"""Roles; the name of a token file is its role."""
 BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a reader's for GET")
 READ_PERIOD = 1.0
 """Time after which the token files are read again [s]."""
 TOKEN_SIZE_MAX = 4096
-"""Largest token file [bytes], with white space around the token."""
+"""Largest token file [bytes], including white space around the token."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 
 READS = ("GET", "HEAD")
 URGENT = ("/v1/estop", "/v1/hold")
-"""Commands that are never refused as too many."""
+"""Commands that the limit on simultaneous requests never refuses."""
 ORDERS = ("/v1/missions", "/v1/goto")
-"""Commands whose refusals are counted: orders to fly a mission, or to a point."""
+"""Commands whose refusals are counted: orders to fly a mission or to fly to a point."""
 COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
-"""Status of a refused order -> name of its count."""
+"""HTTP status of a refused order -> name under which it is counted."""
 IN_FLIGHT_MAX = WAITING_MAX // 2
-"""Limit of the requests of one role that are answered at the same time, streams included: readers
-cannot take the operators' room on the bridge."""
+"""Limit of the requests of one role that are answered at the same time, including streams. So
+readers cannot use up the operators' room on the bridge."""
 
 
 class Caller(NamedTuple):
-    """A known caller: the role, and a name that does not reveal the token."""
+    """A known caller: role, and name of the token; the name does not reveal the token."""
 
     role: str
     name: str
 
 
 LOCAL = Caller(OPERATOR, "local")
-"""The caller over a socket file, which only its owner can open."""
+"""The caller through a socket file, which only its owner can open."""
 
 
 class Tokens:
-    """Know the tokens in a folder: the file `operator` and, if that role is used, `reader`."""
+    """The tokens in a folder: the file `operator` and, if there are readers, the file `reader`."""
 
     def __init__(self, folder: Path, warn: Callable[[str], None] = lambda text: None) -> None:
-        """Read the tokens; `warn` gets one line for each file that others can read.
+        """Read the tokens; `warn` receives one line for each file that other users can read.
 
         Raises:
             BadInputError: If a file cannot be used; the text does not contain the token.
@@ -74,7 +75,7 @@ class Tokens:
                 warn(f"warning: {path} can be read by others: chmod 600 {path}")
 
     def caller(self, token: str) -> Caller | None:
-        """Return who has this token; nobody does while a file cannot be used."""
+        """Return the caller with this token; None for unknown tokens or if a file is unusable."""
         if time.monotonic() - self._read_at >= READ_PERIOD:
             self._read_at, self._known = time.monotonic(), {}
             with suppress(BadInputError):
@@ -113,12 +114,12 @@ def _read_token(path: Path) -> bytes:
 
 
 class Gate:
-    """Admit callers to an application, whatever path they ask for.
+    """Admit callers to an application; the check covers every path.
 
     Attributes:
         tokens: The known tokens; None if everybody who can connect may command.
-        audit: Logs operators' commands; None if nothing does.
-        counts: Number of requests by outcome; "served" for those that reached the application.
+        audit: Logs operators' commands; None without a log.
+        counts: Number of requests by outcome; "served" means that the application has answered.
     """
 
     def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
@@ -128,7 +129,7 @@ class Gate:
         self.counts: Counter[str] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request; a slash at the end of its path means nothing."""
+        """Answer one request; ignore a slash at the end of its path."""
         scope["path"] = path = scope["path"].rstrip("/") or "/"
         caller, is_command = await self.caller(scope), scope["method"] not in READS
         if caller is None:
@@ -150,7 +151,7 @@ class Gate:
                 self._in_flight[caller.role] -= 1
 
     async def caller(self, scope: Scope) -> Caller | None:
-        """Return who has sent a request; None for a stranger."""
+        """Return the caller of a request; None if the caller is unknown."""
         if self.tokens is None:
             return LOCAL
         sent = await BEARER(Request(scope))
@@ -162,7 +163,7 @@ class Gate:
         return JSONResponse({"detail": detail}, status, headers)
 
     async def _serve(self, caller: Caller, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, count it, and log what has come of a command."""
+        """Pass a request on, count it, and log the result if it is a command."""
         answer: Message = {"status": 500}
 
         async def keep(message: Message) -> None:

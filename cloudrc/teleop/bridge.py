@@ -1,8 +1,8 @@
 """Carry calls from the API's thread to teleop's loop, and their results back.
 
-The mission service belongs to the loop's thread. The API leaves a call here, and the loop makes the
-call between two deadlines. The number of waiting calls is bounded. An emergency stop and a hold do
-not wait behind other calls, and they always have room.
+Only the loop's thread may use the mission service. The API queues a call, and the loop makes the
+call between two deadlines. The number of queued calls is bounded. An emergency stop and a hold do
+not wait behind other calls, and the queue always has room for them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ STARTING = "teleop is starting"
 WAITING_MAX = 64
 """Limit of the calls that wait at the same time."""
 Call: TypeAlias = Callable[[MissionService, int], Any]
-"""Function of the service and the current time [ns] that returns the answer."""
+"""Function that takes the service and the current time [ns] and returns the answer."""
 Waiting: TypeAlias = tuple[Call, Future[Any]]
 Urgent: TypeAlias = Literal["stop", "hold"]
 
@@ -45,26 +45,26 @@ class Bridge:
         self._service: MissionService | None = None
 
     def open(self, service: MissionService) -> None:
-        """Accept calls for `service`; send the alarm of a stop that already waits."""
+        """Accept calls for `service`; if a stop already waits, send the alarm."""
         self._service, self.closed = service, ""
         if "stop" in self._urgent:
             self.alarm()
 
     def close(self, why: str) -> None:
-        """Refuse calls from now on, and also the stop that waits for the start."""
+        """Refuse calls from now on; also refuse a waiting stop or hold."""
         with self._lock:
             self.closed = why
             while self._urgent:
                 self._urgent.popitem()[1][1].set_exception(UnavailableError(why))
 
     def submit(self, call: Call, urgent: Urgent | None = None) -> Future[Any]:
-        """Queue a call, from any thread.
+        """Queue a call; any thread may do this.
 
-        A stop or hold that waits already is not queued a second time: both requests get its result.
-        While teleop starts, only a stop is accepted; it is the first call to be made.
+        If a stop is already queued, a second stop gets the result of the first; the same holds for
+        a hold. While teleop starts, the bridge accepts only a stop; the loop makes it first.
 
         Raises:
-            UnavailableError: If no call is accepted, or too many wait.
+            UnavailableError: If no call is accepted, or if too many calls wait.
         """
         future: Future[Any] = Future()
         with self._lock:
@@ -81,7 +81,7 @@ class Bridge:
         return future
 
     def unless_overtaken(self, call: Call) -> Call:
-        """Make a call that is refused if a stop or a hold overtakes it: the robot must not move."""
+        """Wrap a call so that it fails if a stop or a hold overtakes it: no robot may move then."""
         known = self.overtakings
 
         def checked(service: MissionService, now_ns: int) -> Any:
@@ -92,7 +92,7 @@ class Bridge:
         return checked
 
     def take(self) -> list[Callable[[int], None]]:
-        """Return all calls for the loop to make: first a stop, then a hold, then the others."""
+        """Return all queued calls for the loop: first a stop, then a hold, then the others."""
         with self._lock:
             taken = [self._urgent.pop(each) for each in ("stop", "hold") if each in self._urgent]
             taken += self._waiting
@@ -100,7 +100,7 @@ class Bridge:
         return [self._bound(*waiting) for waiting in taken]
 
     def take_urgent(self) -> list[Callable[[int], None]]:
-        """Return the stop alone, for the loop to make before it looks at new telemetry."""
+        """Return only a queued stop; the loop makes it before it processes new telemetry."""
         with self._lock:
             stop = self._urgent.pop("stop", None)
         return [] if stop is None else [self._bound(*stop)]

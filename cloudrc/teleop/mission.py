@@ -10,8 +10,8 @@
 A `Setpoint` is valid until the next one, within its session. An `OperatorRequest` is repeated at
 10 Hz until telemetry shows that the robot has acted on it. Each `MissionEvent` is sent once.
 
-An emergency stop is the request `ALARM`, without a number: cloud numbers and repeats it. Teleop
-tells cloud so, also at 10 Hz and before everything else, until telemetry shows the stop.
+An emergency stop is the request `ALARM` without a number; cloud numbers the request and repeats it.
+Teleop sends `ALARM` to cloud at 10 Hz, before all other messages, until telemetry shows the stop.
 
               start                    start seen             every waypoint reached
         IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
@@ -21,14 +21,14 @@ tells cloud so, also at 10 Hz and before everything else, until telemetry shows 
 
 Cancel leads from STARTING, FLYING and HELD to CANCELLED. A time limit, a restart of world, a guard
 in LAND or an emergency stop lead to FAILED. At every end teleop asks the robot to hold and leaves
-the setpoint at the robot's position. The robot stores the number of waypoints reached and that a
-mission is over, for a teleop that restarts. Times are the caller's clock [ns].
+the setpoint at the robot's position. For a teleop that restarts, the robot stores the number of
+reached waypoints and whether the mission is over. Times are on the caller's clock [ns].
 
-A robot flies to the last setpoint as soon as it is armed, no matter by whom. So teleop sends the
-first waypoint before it has seen the start only if the robot cannot fly to a wrong place.
+As soon as anybody arms the robot, it flies to the last setpoint. So teleop sends the first waypoint
+before telemetry shows the start only if the robot cannot fly to a wrong place.
 
-The time of a leg counts only while the robot flies on cloud's commands, not while the link is
-silent, the guard holds, or the robot stands on the ground.
+The time of a leg counts only while the robot flies on cloud's commands. It does not count while the
+link is silent, while the guard holds, or while the robot stands on the ground.
 """
 
 from __future__ import annotations
@@ -54,18 +54,18 @@ from cloudrc.teleop.wire import (
 )
 
 WORST_GUARD = GuardState.HOLD
-"""Last state of the guard, in the order of `GuardState`, in which a mission goes on."""
+"""Last state of the guard, in the order of `GuardState`, in which a mission continues."""
 ANY_WORLD = ""
-"""Value for the world of a mission that has not started: it may start in any world."""
+"""World of a mission that has not started yet: the mission may start in any world."""
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
-"""Lowest height of a hold setpoint [m]: below it the robot would scrape along the floor.
+"""Lowest height of a hold setpoint [m]; at lower heights the robot would scrape along the floor.
 Source: docs/safety.md, "The guard"."""
 NO_WAYPOINT = -1
 """Waypoint index of a setpoint or event without a waypoint."""
 UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
 """States of a mission that has begun and not ended."""
 ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
-"""Code of an outcome -> state of the mission after it; all other codes are failures."""
+"""Code of an outcome -> state of the mission at its end; all other codes lead to FAILED."""
 END_LOST = "end_lost", "the robot reports that the mission is over, but its outcome is lost;"
 INACTIVE = tuple(state for state in State if state not in UNDER_WAY)
 
@@ -79,7 +79,7 @@ _RULES: dict[str, tuple[tuple[State, ...], str]] = {
     "acknowledge": (INACTIVE, "the robot flies a mission"),
     "pause": (UNDER_WAY, "no mission is under way"),
 }
-"""For each verb the states that allow it, and the reason for a refusal in the others; an emergency
+"""Verb -> states that allow the verb, and the reason for the refusal in other states. An emergency
 stop is always allowed."""
 
 
@@ -93,14 +93,14 @@ class SetpointSelector:
 
     Attributes:
         setpoint: The last setpoint; None before the first.
-        is_pending: Whether the mission's first setpoint has still to be sent.
+        is_pending: Whether the mission's first setpoint has not been sent yet.
     """
 
     def __init__(self, requests: RequestSender, send: Callable[[Setpoint], None]) -> None:
         """Begin without a mission.
 
         Args:
-            requests: The requests to the robot; they tell whether it waits.
+            requests: The requests to the robot; their `waits` tells whether the robot waits.
             send: Sends a setpoint.
         """
         self.setpoint: Setpoint | None = None
@@ -117,18 +117,18 @@ class SetpointSelector:
         """Note the newest telemetry.
 
         Returns:
-            Whether it is the first of its session.
+            Whether this telemetry is the first of its session.
         """
         before, self._seen = self._seen, seen
         return before is None or (before.epoch, before.world) != (seen.epoch, seen.world)
 
     def begin(self, plan: Plan, mission_id: int, before: Continue | None = None) -> None:
-        """Begin a mission; a continued mission that is held gets no setpoint before its resume.
+        """Begin a mission; if it is continued and held, send no setpoint before it is resumed.
 
         Args:
             plan: Plan of the mission.
             mission_id: Number of the mission on board; 0 if it has none.
-            before: State before the restart of teleop, if the mission is continued.
+            before: State before the restart of teleop; None for a new mission.
         """
         self._plan = plan
         self._mission_id = mission_id
@@ -136,13 +136,14 @@ class SetpointSelector:
         self.is_pending = before is None or not before.held
 
     def select_early(self, leg: int) -> None:
-        """Select the waypoint before the start is seen, so that the first command is right.
+        """Select the waypoint before telemetry shows the start, so that the first command is right.
 
-        This waits while the robot may still fly a mission whose end was lost: the robot would fly
-        to the waypoint at once, although this mission begins at the spawn.
+        The method does nothing yet if the mission begins at the spawn and the robot may still fly
+        an earlier mission whose end request was lost: the robot would fly to the waypoint at once.
 
         Args:
-            leg: Index of the waypoint, as far as teleop knows; the robot may have reached more.
+            leg: Index of the current waypoint as known to teleop; the robot may have reached later
+                waypoints.
         """
         seen, from_spawn = self._seen, self._from_spawn
         if not self.is_pending or seen is None or (from_spawn and not self._requests.waits):
@@ -154,10 +155,13 @@ class SetpointSelector:
             self.select_leg(leg)
 
     def repeat(self, *, starting: bool) -> None:
-        """Send the setpoint again, because cloud forgets it with its session.
+        """Send the setpoint again in a new session, because cloud forgets it with the old session.
+
+        A mission that begins at the spawn and has not started yet gets the robot's position as
+        setpoint, unless the robot waits.
 
         Args:
-            starting: Whether the mission's start has not been seen yet.
+            starting: Whether teleop still waits for the start of the mission.
         """
         if starting and self._from_spawn and not self._requests.waits:
             self.is_pending = True
@@ -166,19 +170,19 @@ class SetpointSelector:
             self._select(self.setpoint)
 
     def confirm_start(self, leg: int) -> None:
-        """Select the waypoint of this index after the start, unless it has been sent already."""
+        """Select the waypoint with this index after the start, unless it has been sent already."""
         if self.is_pending:
             self.is_pending = False
             self.select_leg(leg)
 
     def select_leg(self, leg: int) -> None:
-        """Select the waypoint of this index, unless the robot has to stay."""
+        """Select the waypoint with this index, unless the robot has to stay."""
         to = self._plan.legs[leg]
         if not self._stays:
             self._select(Setpoint(to.position, to.yaw, leg))
 
     def select_point(self, position: Vector, yaw: float) -> None:
-        """Select a point: position [m], world frame, shape (3,); yaw [rad]."""
+        """Select a point: `position` [m], world frame, shape (3,); `yaw` [rad]."""
         self._select(Setpoint(position, yaw, NO_WAYPOINT))
 
     def select_here(self) -> None:
@@ -205,10 +209,10 @@ class SetpointSelector:
 
 
 GAP_MAX_NS = 500_000_000
-"""Largest part of the time between two telemetries that counts as time of flight [ns]."""
+"""Limit of the time of flight that counts between two telemetry messages [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
-"""Longest time between two telemetries for which the robot still counts as near the waypoint
-[ns]."""
+"""Longest gap between two telemetry messages [ns] after which the time near the waypoint still
+continues; after a longer gap this time starts at zero."""
 GROUND, HOLD = GuardState.GROUND, GuardState.HOLD  # looked up with every telemetry
 
 
@@ -224,16 +228,16 @@ class LegWatch:
         self.pause()
 
     def pause(self) -> None:
-        """Interrupt the leg: keep the time flown, but restart the time near the waypoint."""
+        """Interrupt the leg: keep the time of flight, but reset the time near the waypoint."""
         self._seen_ns = self._near_since_ns = NEVER_NS
 
     @property
     def flown(self) -> float:
-        """Time for which the leg has been flown [s]."""
+        """Time of flight of this leg [s]."""
         return self._flown_ns * 1e-9
 
     def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
-        """Whether the robot has been near the waypoint for the dwell of the leg.
+        """Return whether the robot has been near the waypoint for the leg's dwell time.
 
         Args:
             leg: The current leg.
@@ -267,14 +271,14 @@ class Teleop:
     Attributes:
         state: State of the mission.
         leg: Index of the current waypoint; the number of waypoints once all are reached.
-        outcome: How the mission ended; None while there is none or it is under way.
+        outcome: How the mission ended; None before the first mission and during a mission.
         requests: Requests to the robot.
         stopping: Whether an emergency stop is pending: telemetry does not show it yet.
         outputs: Messages since the last `take_outputs`.
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission; `ended` tells whether the mission of a number is over."""
+        """Begin without a mission; `ended` returns whether the mission with a number is over."""
         self.state = State.IDLE
         self.outcome: Outcome | None = None
         self.requests = RequestSender()
@@ -322,8 +326,8 @@ class Teleop:
             now_ns: Own clock [ns].
             plan: Plan of the mission.
             mission_id: Number under which the robot stores the progress; 0 to store none.
-            again: Whether an earlier teleop may have flown it; if it is over, it is not flown
-                again.
+            again: Whether an earlier teleop may have flown the mission. If it is over, teleop does
+                not fly it again.
         """
         self._check("start")
         self._order(plan, mission_id, now_ns)
@@ -342,7 +346,7 @@ class Teleop:
         self._setpoints.select_early(0)
 
     def continue_mission(self, now_ns: int, before: Continue) -> None:
-        """Continue a mission of an earlier teleop from here, with its current waypoint."""
+        """Take over a mission of an earlier teleop at its current waypoint; do not reset world."""
         self._check("continue")
         self._order(before.plan, before.mission_id, now_ns - round(before.elapsed * 1e9))
         self.leg, self._continued, self._world = before.leg, before, before.world
@@ -354,7 +358,10 @@ class Teleop:
             self.see(self._seen, now_ns)  # the mission may be over, or the world another one
 
     def go_to(self, now_ns: int, position: Vector, yaw: float = 0.0, mission_id: int = 0) -> None:
-        """Fly to a point: as a mission of one waypoint from here, or as another place to hold.
+        """Fly to a point.
+
+        If a mission is held, the point is the new place to hold. Otherwise the point is a mission
+        with one waypoint that starts at the robot's position.
 
         Args:
             now_ns: Own clock [ns].
@@ -371,7 +378,7 @@ class Teleop:
             self.start(now_ns, Plan((leg,), Start.HERE, leg.time_limit), mission_id)
 
     def hold(self, now_ns: int) -> None:
-        """Stop the robot where it is and wait, at `now_ns` [ns]."""
+        """Hold the robot at its position and interrupt the mission, at `now_ns` [ns]."""
         self._check("hold")
         self._hold(now_ns)
 
@@ -389,10 +396,10 @@ class Teleop:
         self._end("cancelled", "mission cancelled", now_ns)
 
     def stop(self, now_ns: int) -> None:
-        """Stop the rotors at once; what was asked of the robot before does not count any more.
+        """Stop the rotors at once, and drop all earlier requests to the robot.
 
-        A robot that is stopped already may be about to act on an acknowledgement. Then its state
-        alone is not enough, and telemetry has to show a new request.
+        If the robot is already stopped, it may be about to act on an acknowledgement. So its state
+        ESTOP alone is no proof of the new stop: telemetry has to show a new request, too.
 
         Args:
             now_ns: Own clock [ns].
@@ -406,12 +413,12 @@ class Teleop:
         self.stopping, self._stop_ns = True, 0
 
     def acknowledge(self, now_ns: int) -> None:
-        """Let a robot fly again that has landed or was stopped, at `now_ns` [ns]."""
+        """Allow the robot to fly again after a landing or a stop, at `now_ns` [ns]."""
         self._check("acknowledge")
         self.requests.ask(Request.ACKNOWLEDGE, after=True)
 
     def pause(self, now_ns: int) -> None:
-        """Let the robot hold, at `now_ns` [ns], until the next teleop continues the mission."""
+        """Ask the robot to hold, at `now_ns` [ns], until the next teleop continues the mission."""
         self._check("pause")
         self._report("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
         self.requests.ask(Request.END)
@@ -466,7 +473,7 @@ class Teleop:
             self.outputs.append(request)
 
     def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
-        """Return code and text of a failure that telemetry shows and that ends the mission."""
+        """Find a failure in telemetry that ends the mission; return its code and its text."""
         if self._world not in (ANY_WORLD, seen.world):
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
@@ -478,7 +485,7 @@ class Teleop:
         return None
 
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
-        """Return code and text of an exceeded time limit, if any."""
+        """Find an exceeded time limit; return its code and its text, or None."""
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
         if self.elapsed(now_ns) >= limit and self.state is STARTING:
             return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
@@ -489,7 +496,11 @@ class Teleop:
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
-        """Hold a robot that flies without a mission here, and keep a standing one on the ground."""
+        """Keep the robot from flying a mission that this teleop does not fly.
+
+        The setpoint becomes the robot's position. If the robot stands on the ground, or if its
+        mission has ended, teleop also asks the robot to end the mission.
+        """
         mission_id = seen.mission_id
         may_take_off = seen.guard is GROUND and mission_id != 0
         over = self._is_ended(mission_id) or may_take_off
@@ -498,13 +509,13 @@ class Teleop:
         self._setpoints.select_here()
 
     def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
-        """Note a mission that begins: its plan, its number, and since when its time counts."""
+        """Store a new mission: its plan, its number, and the start of its time."""
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
         self._continued, self._may_be_flown = None, False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
-        """Begin the mission after telemetry shows its start: start its clock and the leg's."""
+        """Begin the mission after telemetry shows its start; start the times of mission and leg."""
         plan, before = self._plan, self._continued
         self.state = FLYING
         self._expected = (self._mission_id,)
@@ -524,7 +535,7 @@ class Teleop:
         self._report("started", 0, text, now_ns)
 
     def _advance(self, how: str, now_ns: int, *, select: bool = True) -> None:
-        """Go on to the next waypoint or end the mission; `select` tells whether to select it."""
+        """Go on to the next waypoint or end the mission; with `select`, select the waypoint."""
         text = f"{self._leg_name()} {how} at {self.elapsed(now_ns):.2f} s"
         self._report("reached", self.leg, text, now_ns)
         self.leg += 1
@@ -542,7 +553,7 @@ class Teleop:
         self._report("held", self.leg, f"held {self._where()}", now_ns)
 
     def _end(self, code: str, text: str, now_ns: int) -> None:
-        """End the mission, and ask the robot to hold where it is."""
+        """End the mission, and ask the robot to hold its position."""
         waypoint = min(self.leg, len(self._plan.legs) - 1)
         self.state = ENDS.get(code, State.FAILED)
         self.outcome = Outcome(code, text, waypoint, reached=self.leg)
@@ -558,7 +569,7 @@ class Teleop:
 
     @property
     def _over(self) -> int:
-        """Number of waypoints stored on board that means that the mission is over."""
+        """Smallest number of waypoints stored on board that means: the mission is over."""
         may_be_flown = self._may_be_flown and self.state is STARTING
         return len(self._plan.legs) if may_be_flown else MISSION_OVER
 

@@ -1,7 +1,7 @@
-"""Define what the API takes and gives, and check the orders that it takes.
+"""Define requests and answers of the API, and check the orders in requests.
 
-The OpenAPI document comes from these models. Orders are sections like those of a configuration
-file: the same code checks them and words the problems.
+The OpenAPI document comes from these models. Orders have the form of sections of a configuration
+file: the same code checks them and describes their problems.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ BODY_MAX = 256 * 1024
 BODY_LIMIT = 5.0
 """Time limit for a body to arrive [s]."""
 PROBLEMS_MAX = 50
-"""Limit of the problems of one request that are put into words."""
+"""Limit of the problems of one request that the answer describes."""
 
 
 def _printable(text: str) -> str:
-    """Refuse control characters: they would steer the terminals of those who read the text."""
+    """Refuse control characters, because they would control the terminals of readers."""
     if not text.isprintable():
         raise PydanticCustomError("unprintable", "must be one line of printable characters")
     return text
@@ -109,7 +109,7 @@ class Failure(_Answer):
 
 
 class Verdict(_Answer):
-    """What became of a mission that has ended."""
+    """Result of a mission that has ended."""
 
     outcome: Literal["success", "failure", "invalid", "interrupted"] = Field(
         description="As in report.json"
@@ -119,7 +119,7 @@ class Verdict(_Answer):
 
 
 class Event(_Answer):
-    """Something that happened to a mission."""
+    """An event of a mission."""
 
     id: int = Field(description="Rises with every event of all missions")
     mission: str = Field(description="Whose")
@@ -150,14 +150,14 @@ class MissionSummary(_Answer):
 
 
 class MissionView(MissionSummary):
-    """A mission with everything that has happened to it."""
+    """A mission with its events."""
 
     events: list[Event] = Field(max_length=SHOWN, description="The newest of them, oldest first")
     events_left_out: int = Field(description="How many there were before those")
 
 
 class MissionList(_Answer):
-    """All missions that are known."""
+    """All known missions."""
 
     missions: list[MissionSummary] = Field(description="Oldest first")
 
@@ -186,7 +186,7 @@ class Seen(_Answer):
 
 
 class StateView(_Answer):
-    """How things are now."""
+    """The present state of missions and robot."""
 
     mission: MissionSummary | None = Field(description="The one under way")
     queue: list[str] = Field(description="Ids of those that wait")
@@ -198,14 +198,14 @@ class StateView(_Answer):
 
 
 class Stopped(_Answer):
-    """An emergency stop on its way."""
+    """Answer to an emergency stop, which is under way to the robot."""
 
     id: str | None = Field(description="The mission that was under way and has failed")
     state: Literal["stopping"] = Field(description="Until the guard on board is in ESTOP")
 
 
 class Acknowledged(_Answer):
-    """An acknowledgement on its way."""
+    """Answer to an acknowledgement, which is under way to the robot."""
 
     state: Literal["acknowledged"] = Field(
         description="The next mission may fly; a landing low over the ground ends first, and "
@@ -224,7 +224,7 @@ class Problem(_Answer):
 
 
 class Refusal(_Answer):
-    """Why something is not done."""
+    """Reason why a request is refused."""
 
     detail: str = Field(description="In words")
     id: str | None = Field(None, description="The mission that is in the way")
@@ -259,7 +259,7 @@ other requests are refused as too many.
 
 
 def inlined(model: type[BaseModel]) -> dict[str, Any]:
-    """Return a model's JSON schema without references, as the body of a request needs it."""
+    """Return a model's JSON schema without references, as needed for a request body."""
     schema = model.model_json_schema()
     parts = schema.pop("$defs", {})
 
@@ -277,12 +277,13 @@ def inlined(model: type[BaseModel]) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What an order needs to know of the experiment.
+    """Facts about the experiment that the check of an order needs.
 
     Attributes:
-        scene: The scene that waypoints are checked against.
-        time_limit: Time limit of missions that do not give one [s].
-        contact: Whether missions that do not say, and lead to the board, have to touch it.
+        scene: The scene for the check of waypoints.
+        time_limit: Time limit of missions without their own limit [s].
+        contact: Whether a mission that leads to the board has to touch the board, if the mission
+            itself does not specify this.
         plan: Makes a plan from a checked mission and its time limit [s].
     """
 
@@ -307,7 +308,7 @@ def read_mission(body: bytes, scene: Scene) -> tuple[MissionRequest, Mission]:
     """Read a mission and check it against the scene.
 
     Raises:
-        RefusedError: With all problems.
+        RefusedError: If the mission has problems; contains all of them.
     """
     _refuse_too_many(body)
     request = _parse(body, MissionRequest)
@@ -322,7 +323,7 @@ def read_order(body: bytes, surroundings: Surroundings) -> Order:
     """Read a mission, check it, and plan it.
 
     Raises:
-        RefusedError: With all problems.
+        RefusedError: If the mission has problems; contains all of them.
     """
     request, mission = read_mission(body, surroundings.scene)
     limit = surroundings.time_limit if request.time_limit_s is None else request.time_limit_s
@@ -337,7 +338,7 @@ def read_goto(body: bytes, scene: Scene) -> GoToRequest:
     """Read a point and check it against the scene.
 
     Raises:
-        RefusedError: With all problems.
+        RefusedError: If the point has problems; contains all of them.
     """
     request = _parse(body, GoToRequest)
     waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
@@ -349,15 +350,16 @@ def read_goto(body: bytes, scene: Scene) -> GoToRequest:
 
 
 def check_way(service: MissionService, target: Vector | None, scene: Scene) -> None:
-    """Refuse to fly straight from where the robot is seen through the wall of a pipe.
+    """Refuse a flight if the straight way from the robot's position crosses the wall of a pipe.
 
     Args:
-        service: In its own thread.
-        target: Where to [m], world frame, shape (3,); None: to the next waypoint of what is held.
-        scene: With the pipes.
+        service: The service; call this function in its thread.
+        target: End of the way [m], world frame, shape (3,); None: the next waypoint of the held
+            mission.
+        scene: Scene with the pipes.
 
     Raises:
-        ConflictError: If a wall is in the way; says which.
+        ConflictError: If a wall is in the way; the text names the pipe.
     """
     seen, waiting = service.sight.seen, service.book.open()
     mission = waiting[0] if waiting else None
@@ -377,14 +379,14 @@ def check_way(service: MissionService, target: Vector | None, scene: Scene) -> N
 
 
 def check_first_way(service: MissionService, order: Order, scene: Scene) -> None:
-    """Check the way to the first waypoint of a new mission that begins at once, from here."""
+    """Check the way to the first waypoint of a mission that begins at once, where the robot is."""
     begins = not service.book.open() and service.book.with_key(order.key) is None
     if begins and order.plan.start is Start.HERE:
         check_way(service, order.plan.legs[0].position, scene)
 
 
 def leads_to_board(mission: Mission, scene: Scene) -> bool:
-    """Check whether the arm's tip is at the board or behind its face at some waypoint."""
+    """Return whether the arm's tip is at the board, or behind its face, at any waypoint."""
     board = scene.board
     if board is None:
         return False
@@ -408,7 +410,7 @@ def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:
 
 
 def _refuse_too_many(body: bytes) -> None:
-    """Refuse too many waypoints before they are checked: to word the problems of all takes long."""
+    """Refuse too many waypoints before their check: to describe all problems would take long."""
     try:
         points = from_json(body)["waypoints"]
     except (ValueError, TypeError, KeyError):

@@ -8,34 +8,35 @@ from cloudrc.teleop.wire import RobotStatus
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
 UNNUMBERED = 0
-"""Number of a request that has not got one yet."""
+"""Number of a request before it gets its final number."""
 NOT_ENDED = (-1, 0)
 """Epoch and number that mean: the robot has acted on no request that ends a mission."""
 IDLE_NS = 3_000_000_000
-"""Time for which a started robot may hold or stand although its telemetry arrives [ns].
+"""Longest time for which a started robot may hold or stand while its telemetry arrives [ns].
 
-After that time another sender must have given the robot another request, and teleop sends the start
-again.
+After a longer time, teleop assumes that another sender has given the robot another request, and
+sends the start again.
 """
 PREDECESSORS = 1_000
-"""Count of numbers reserved for an earlier teleop process. The last requests of that process may
-not show in telemetry yet, and must not be confused with ours. Every process chooses its first
-number in the same way; therefore the first number also rises with the machine's clock."""
+"""How many numbers are reserved for an earlier teleop process. The last requests of that process
+may not show in telemetry yet, and must not be confused with requests of this process. Every process
+chooses its first number in the same way; therefore the first number also rises with the machine's
+clock."""
 CLOCK_MAX = 65_536
-"""Largest part of the first number that comes from the clock, so that the numbers of a session
-suffice for many processes."""
+"""Limit of the part of the first number that comes from the clock. The limit leaves enough numbers
+in a session for many processes."""
 
 
 class RequestSender:
     """Repeat the newest request at 10 Hz until telemetry shows that the robot has acted on it.
 
-    A new request replaces the one before, acknowledged or not: its number is higher, and the robot
-    acts on rising numbers only. The numbers continue well above the one in telemetry, because an
-    earlier teleop may have sent higher ones; before the first telemetry nothing is sent. Every copy
-    has the epoch of the newest telemetry. The emergency stop is none of these requests: cloud
-    repeats it.
+    A new request replaces the previous request, acknowledged or not. The number of the new request
+    is higher, and the robot acts only on rising numbers. The first number is far above the number
+    in telemetry, because an earlier teleop may have sent higher numbers. Before the first telemetry
+    nothing is sent. Every copy has the epoch of the newest telemetry. The emergency stop is not
+    among these requests: cloud repeats it.
 
-    Without a request, this sends the progress of the mission until the robot has stored it.
+    Without a request, the class sends the progress of the mission until the robot has stored it.
     """
 
     def __init__(self) -> None:
@@ -57,7 +58,10 @@ class RequestSender:
 
     @property
     def waits(self) -> bool:
-        """Whether the robot is seen to fly on no command: on the ground, or after an end."""
+        """Whether telemetry shows that commands do not move the robot.
+
+        Commands do not move a robot on the ground, or after a request that ends a mission.
+        """
         seen = self._seen
         if seen is None or self._next is not None:
             return False
@@ -81,7 +85,7 @@ class RequestSender:
             self._next = asked
 
     def forget(self) -> None:
-        """Drop all requests, because another sender has the robot, or it is stopped."""
+        """Drop all requests, because another sender controls the robot or the robot is stopped."""
         self._is_started = False
         self._pending = self._next = None
 
@@ -90,7 +94,7 @@ class RequestSender:
 
         Args:
             mission_id: Number of the mission; 0 if there is none.
-            reached: Number of its waypoints that the robot has reached.
+            reached: Number of waypoints of the mission that the robot has reached.
         """
         self._progress = self._progress._replace(mission_id=mission_id, reached=reached)
         if self._pending is None:
@@ -100,7 +104,7 @@ class RequestSender:
         """Process new telemetry at `now_ns` [ns].
 
         Returns:
-            The pending request, once the robot has acted on it.
+            The pending request if this telemetry shows that the robot has acted on it, else None.
         """
         self._seen, pending = seen, self._pending
         if pending is None:
@@ -118,7 +122,7 @@ class RequestSender:
         return pending.request
 
     def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
-        """Send the start again if an earlier teleop or another cloud has overridden it."""
+        """Send the start again if a request of an earlier teleop or another cloud replaced it."""
         ours = self._is_started and seen.mission_id == self._progress.mission_id
         if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
             self._flies_ns = now_ns
@@ -127,7 +131,7 @@ class RequestSender:
                 self.ask(Request.START, Start.HERE)
 
     def due(self, now_ns: int) -> OperatorRequest | None:
-        """Return the request if a copy of it has to leave at `now_ns` [ns]."""
+        """Return the request to send at `now_ns` [ns], or None."""
         pending, seen = self._pending, self._seen
         if seen is None:
             return None
@@ -146,7 +150,7 @@ class RequestSender:
         return pending._replace(epoch=seen.epoch)
 
     def _progress_due(self, seen: RobotStatus, now_ns: int) -> OperatorRequest | None:
-        """Return the mission's progress if the robot flies this mission and has not stored it."""
+        """Return the progress of the mission if the robot flies it and lacks this progress."""
         progress = self._progress
         same = seen.mission_id == progress.mission_id != 0
         if not same or seen.reached >= progress.reached or now_ns < self._due_ns:

@@ -1,13 +1,13 @@
 """Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
 
-Like the state machine `Teleop` that it drives, the service is pure; it stores all events in a
-store. Each mission has an id and, if its sender gives one, a key: a second order with the same key
-gets the mission of the first one. After a restart a mission that was under way continues at the
-same waypoint, if world has not restarted.
+The service drives the state machine `Teleop`. Both are pure; the service writes all events to a
+store. Each mission has an id. A mission also has a key if the sender gives one: a second order with
+the same key returns the existing mission. After a restart of teleop, a mission under way continues
+at the same waypoint, if world has not restarted.
 
 An emergency stop also survives a restart of teleop. The store contains the stop and, once the robot
-has acted on it, its acknowledgement. A new teleop that finds only the stop sends it again, unless
-the robot has flown another mission since or is another one.
+has acted on an acknowledgement, this acknowledgement. A new teleop that finds only the stop sends
+it again, unless the robot has flown another mission since then or is a different robot.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED = (LAND, ESTOP)
 """States of the guard that end only when the operator acknowledges them."""
 SILENCE = 1.0
-"""Age after which telemetry, or the last message of cloud, is too old to be valid [s]."""
+"""Age above which telemetry or the last message of cloud counts as too old [s]."""
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
 BY_ITSELF = "without commands the robot holds its position, then lands, by itself"
 NOT_HEARD = f"cloud has no telemetry from the robot: check the link and world; {BY_ITSELF}"
@@ -42,7 +42,7 @@ ALONE = {
     LAND: "the robot lands; find the cause, then: cloudrc mission acknowledge",
     ESTOP: "the rotors are stopped; find the cause, then: cloudrc mission acknowledge",
 }
-"""The next step while no mission is under way, by the guard's state."""
+"""State of the guard -> next step while no mission is under way."""
 IN_MISSION = {
     **ALONE,
     GROUND: f"the robot takes off with the mission's first commands, {REST}; if no command comes "
@@ -51,12 +51,12 @@ IN_MISSION = {
     HOLD: "the robot gets no fresh commands: it continues by itself when they arrive, and lands if "
     "none arrive within guard.hold_max_s",
 }
-"""The next step while a mission is under way, by the guard's state."""
+"""State of the guard -> next step while a mission is under way."""
 HELD = "the operator holds the mission; to continue: cloudrc mission resume"
 
 
 class RobotView:
-    """The robot as its newest telemetry shows it.
+    """The robot as shown by its newest telemetry.
 
     Attributes:
         seen: The newest telemetry; None before the first.
@@ -74,7 +74,7 @@ class RobotView:
 
     @property
     def latched(self) -> str:
-        """Why the guard needs an acknowledgement before the robot can fly; "" if it does not."""
+        """Why the guard needs an acknowledgement before the robot can fly; "" if none is needed."""
         guard = self.guard
         if self.seen is None or guard not in LATCHED:
             return ""
@@ -85,7 +85,7 @@ class RobotView:
         self._heard_ns = now_ns
 
     def cloud_age(self, now_ns: int) -> float | None:
-        """Return the time since the last message from cloud [s]; None before the first.
+        """Return the time since the last message from cloud [s]; None before the first message.
 
         Args:
             now_ns: Own clock [ns].
@@ -96,7 +96,7 @@ class RobotView:
         """Note new telemetry at `now_ns` [ns].
 
         Returns:
-            Whether it is the first telemetry of a new session with the same robot.
+            Whether this telemetry is the first of a new session with the same robot.
         """
         before, self.seen, self._seen_ns = self.seen, seen, now_ns
         self.hear(now_ns)
@@ -151,12 +151,12 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 
 
 def _known(value: float) -> float | None:
-    """Replace NaN and infinity, which JSON does not have, by None."""
+    """Replace NaN and infinity by None, because JSON does not have them."""
     return value if isfinite(value) else None
 
 
 def describe_session(mission: Mission) -> str:
-    """Describe that the controller has another session with the same robot."""
+    """Describe the event that the controller has a new session with the same robot."""
     where = f"waypoint {mission.waypoint + 1} of {len(mission.order.plan.legs)}"
     is_held = mission.state == store.HELD
     goes_on = f"is held on the way to {where}" if is_held else f"goes on to {where}"
@@ -168,7 +168,8 @@ def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
 
 
 SETPOINT_PERIOD_NS = 100_000_000
-"""Time between two copies of the setpoint [ns]; copies let either process restart."""
+"""Time between two copies of the setpoint [ns]. Because of the copies, cloud or teleop may restart
+at any time."""
 
 
 class MissionService:
@@ -201,19 +202,20 @@ class MissionService:
 
     @property
     def over(self) -> bool:
-        """Whether there were missions, all have ended, and no request is pending."""
+        """Whether at least one mission is known, all have ended, and no request is pending."""
         return bool(self.book.missions) and not self.book.open() and self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission from an order; it starts at once or waits in the queue.
+        """Create a mission from an order; the mission starts at once or waits in the queue.
 
         Returns:
-            The mission, and whether it is new: the same key gives the same mission.
+            The mission, and whether it is new. An order with a known key returns the known mission.
 
         Raises:
-            ConflictError: If the key belongs to another order, another mission is under way and
-                the order may not wait, the queue is full, or the operator has to acknowledge first.
-            UnavailableError: If the mission cannot be stored, or this process ends.
+            ConflictError: If the key belongs to another order, if another mission is under way and
+                the order may not wait, if the queue is full, or if the operator has to acknowledge
+                first.
+            UnavailableError: If the mission cannot be stored, or if this process is ending.
         """
         known = self.book.with_key(order.key)
         if known is not None:
@@ -237,8 +239,8 @@ class MissionService:
 
         Raises:
             UnknownMissionError: If no mission has this id.
-            ConflictError: If it has ended.
-            UnavailableError: If it is in the queue and the end cannot be stored.
+            ConflictError: If the mission has ended.
+            UnavailableError: If the mission is in the queue and its end cannot be stored.
         """
         mission = self.book.find(mission_id)
         if not mission.ended and mission is self._start_next(now_ns):
@@ -249,21 +251,24 @@ class MissionService:
         return mission
 
     def hold(self, now_ns: int) -> Mission:
-        """Stop the robot where it is; raises ConflictError unless it flies a mission."""
+        """Hold the robot at its position; raise ConflictError unless it flies a mission."""
         return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
         """Continue the held mission.
 
         Raises:
-            ConflictError: If no mission is held, or the operator has to acknowledge first.
-            UnavailableError: If this process ends.
+            ConflictError: If no mission is held, or if the operator has to acknowledge first.
+            UnavailableError: If this process is ending.
         """
         self._check_can_fly()
         return self._operate(self._teleop.resume, now_ns)
 
     def go_to(self, position: Vector, yaw: float, now_ns: int) -> Mission:
-        """Fly to a point: as a new mission, or as another place to hold the current one.
+        """Fly to a point.
+
+        If a mission is held, the point is the new place to hold. Otherwise the point is a new
+        mission.
 
         Args:
             position: The point [m], world frame, shape (3,).
@@ -271,9 +276,9 @@ class MissionService:
             now_ns: Own clock [ns].
 
         Raises:
-            ConflictError: If a mission is under way that is not held, or the operator has to
+            ConflictError: If a mission is under way and not held, or if the operator has to
                 acknowledge first.
-            UnavailableError: If the mission cannot be stored, or this process ends.
+            UnavailableError: If the mission cannot be stored, or if this process is ending.
         """
         self._check_can_fly()
         waiting = self.book.open()
@@ -289,7 +294,7 @@ class MissionService:
         return mission
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
-        """Stop the rotors at once in any state, and return the mission that failed, if any."""
+        """Stop the rotors at once in any state; return the mission that this ends, if any."""
         mission = self._start_next(now_ns)
         self._inherits_stop = self._acknowledges = False
         self._teleop.stop(now_ns)
@@ -297,7 +302,11 @@ class MissionService:
         return mission
 
     def acknowledge(self, now_ns: int) -> None:
-        """Let a robot fly again that has landed or was stopped; ConflictError in a mission."""
+        """Allow the robot to fly again after a landing or a stop.
+
+        Raises:
+            ConflictError: If a mission is under way.
+        """
         if self._current is not None:
             raise busy(self._current, "there is nothing to acknowledge")
         self._teleop.acknowledge(now_ns)
@@ -305,7 +314,7 @@ class MissionService:
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
-        """Hold the mission under way before this process ends; the next process continues it."""
+        """Pause the mission under way before this process ends; the next process continues it."""
         self._ends = True
         if self._start_next(now_ns) is not None:
             self._operate(self._teleop.pause, now_ns)
@@ -338,9 +347,10 @@ class MissionService:
         self._collect(now_ns)
 
     def _repeat_stop(self, seen: RobotStatus, now_ns: int) -> None:
-        """Repeat the stop of an earlier teleop, unless the first telemetry is of another mission.
+        """Repeat the stop of an earlier teleop if the first telemetry shows the stopped mission.
 
-        It is not, if the robot has flown since, or is another one.
+        Telemetry shows another mission if the robot has flown since the stop, or if it is a
+        different robot.
         """
         self._inherits_stop = False
         stopped = self.book.stopped()
@@ -350,7 +360,7 @@ class MissionService:
                 self._teleop.acknowledge(now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Start a waiting mission, check time limits, and repeat what is due at `now_ns` [ns]."""
+        """Start a waiting mission, check time limits, and repeat messages due at `now_ns` [ns]."""
         self.book.catch_up(now_ns)
         if not self._ends:
             in_sight = self.sight.seen is not None
@@ -362,7 +372,7 @@ class MissionService:
             self._outputs.append(self._setpoint)
 
     def take_outputs(self) -> list[Output | Fault]:
-        """Return the messages since the last call, oldest first; faults are for the own log."""
+        """Return the messages since the last call, oldest first; faults are for teleop's log."""
         outputs, self._outputs = self._outputs, []
         return outputs
 
@@ -378,7 +388,7 @@ class MissionService:
 
     @property
     def _blocked(self) -> str:
-        """Why nothing can fly before the operator acknowledges it; "" if it can."""
+        """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
         if self._teleop.stopping or self._inherits_stop:
             return "an emergency stop is on its way to the robot"
         return self.sight.latched
@@ -403,7 +413,10 @@ class MissionService:
         return mission
 
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
-        """Continue a begun mission or, if `queued`, start a waiting one; return the current one."""
+        """Make the first open mission the current one; return the current mission, if any.
+
+        If the mission has begun, it continues. If it waits, it starts only with `queued`.
+        """
         waiting = self.book.open()
         if self._current is None and waiting:
             if queued and waiting[0].state == store.QUEUED:

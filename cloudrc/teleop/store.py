@@ -1,12 +1,13 @@
-"""Store missions and their progress in an SQLite file, and give them back after a restart.
+"""Store missions and their progress in an SQLite file; read them after a restart.
 
 A mission is one row: its order, written once, and its status, written with each event. A waypoint
-is reached once, because mission and index are the key of a row. A transaction is on the disk when
-it returns (`synchronous=FULL`), so a process that is killed at any instant loses at most the event
-under way. The number of missions, and of events of each mission, is bounded.
+cannot be stored twice as reached, because mission and index are the key of a row. A transaction is
+on the disk when it returns (`synchronous=FULL`), so a process that is killed at any instant loses
+at most the event that it is writing. The number of missions and the number of events per mission
+are bounded.
 
-A disk that is full or fails refuses new missions, but stops no flight: what happens meanwhile stays
-in memory, and is written before anything else once the disk takes it.
+If the disk is full or fails, the store refuses new missions, but flights continue. Their events
+stay in memory. Once the disk works again, the store writes these events before anything else.
 
 An old and a new teleop can overlap when a pod is replaced. The file is locked for one of them.
 """
@@ -37,8 +38,8 @@ QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
 DONE, FAILED, CANCELLED = "done", "failed", "cancelled"
 ENDED = (DONE, FAILED, CANCELLED)
 SHOWN = 100
-"""Limit of the events that are kept of one mission, the newest. A mission has about ten, but a held
-one can be sent to other places without end."""
+"""Limit of the events that are kept per mission; the newest are kept. A mission has about ten
+events, but a held mission gets one more each time it is sent to another place."""
 NEVER_BEGAN = "mission cancelled before it began"
 STATES = {
     "queued": QUEUED,
@@ -66,9 +67,10 @@ class Order:
     Attributes:
         plan: Checked plan.
         name: Name for people.
-        key: Key of the request; the same key never makes a second mission. "" for none.
+        key: Key of the request; a second order with the same key makes no second mission. "" if
+            the order has no key.
         contact: Whether the arm has to touch the board.
-        queue: Whether to wait for the mission under way, instead of being refused.
+        queue: Whether the order may wait for the mission under way. Otherwise it is refused.
     """
 
     plan: Plan
@@ -87,11 +89,11 @@ class Mission:
         order: The order.
         number: Number of the mission on board; below 2^63.
         state: One of the values of `STATES`.
-        world: World in which it was started; "" before that.
-        elapsed: Duration at its last event [s].
-        reached: Index and time [s] of each waypoint reached.
+        world: World in which the mission was started; "" before the start.
+        elapsed: Duration of the mission at its last event [s].
+        reached: Index and time [s] of each reached waypoint.
         events: The newest events, as the API shows them.
-        happened: Count of each event, with those that are no longer kept.
+        happened: Count of each kind of event, including events that are no longer kept.
         witness: What the robot has touched.
         verdict: The verdict, as the API shows it; None until the mission has ended.
     """
@@ -115,19 +117,19 @@ class Mission:
 
     @property
     def waypoint(self) -> int:
-        """Index of the current waypoint, or of the last one at the end."""
+        """Index of the current waypoint; at the end, index of the last waypoint."""
         return min(len(self.reached), len(self.order.plan.legs) - 1)
 
     def apply(
         self, number: int, event: str, text: str, *, waypoint: int | None = None, **changed: Any
     ) -> None:
-        """Change the mission by an event.
+        """Update the mission with an event.
 
         Args:
             number: Number of the event.
-            event: One word.
-            text: The same in words.
-            waypoint: Index of the waypoint that the event is about; None for the current one.
+            event: Kind of the event, one word.
+            text: Description of the event.
+            waypoint: Index of the event's waypoint; None for the current waypoint.
             changed: New values of attributes: elapsed, world, witness, verdict.
         """
         waypoint = self.waypoint if waypoint is None else waypoint
@@ -141,19 +143,19 @@ class Mission:
             self.reached.append({"waypoint": waypoint, "time_s": self.elapsed})
 
     def before(self) -> Continue | None:
-        """Return what a new teleop continues; None if the mission has not begun to fly."""
+        """Return the state from which a new teleop continues; None if the mission did not start."""
         if not self.world:
             return None
         held, plan = self.state == HELD, self.order.plan
         return Continue(plan, self.waypoint, self.elapsed, self.world, held, self.number)
 
     def copy(self) -> Mission:
-        """Copy the mission, so that an event changes only the copy."""
+        """Copy the mission; an event of the copy does not change the original."""
         reached, events, happened = [*self.reached], self.events.copy(), self.happened.copy()
         return replace(self, reached=reached, events=events, happened=happened)
 
     def summary(self) -> dict[str, Any]:
-        """Return what a list of missions shows."""
+        """Return the fields that a list of missions shows."""
         return {
             "id": self.id,
             "name": self.order.name,
@@ -166,7 +168,7 @@ class Mission:
         }
 
     def as_json(self) -> dict[str, Any]:
-        """Return everything that the API shows."""
+        """Return all fields that the API shows."""
         left_out = self.happened.total() - len(self.events)
         return {**self.summary(), "events": list(self.events), "events_left_out": left_out}
 
@@ -175,7 +177,7 @@ def number_of(mission_id: str, salt: bytes) -> int:
     """Compute the number of a mission on board, from 1 to 2^63 - 1.
 
     Args:
-        mission_id: Its identifier; these begin again with a new file.
+        mission_id: Identifier of the mission; identifiers begin again with a new file.
         salt: Random bytes that no other process has.
     """
     digest = hashlib.sha256(salt + mission_id.encode()).digest()
@@ -183,19 +185,25 @@ def number_of(mission_id: str, salt: bytes) -> int:
 
 
 class UnknownMissionError(CloudrcError):
-    """There is no mission of this id."""
+    """Report that no mission has this id."""
 
 
 class UnavailableError(CloudrcError):
-    """Not now: the journal cannot be written, another teleop holds it, or this one ends."""
+    """Report that the service is not available at present.
+
+    Causes: the journal cannot be written, another teleop has locked it, or this teleop is ending.
+    """
 
 
 class StoreLockedError(CloudrcError):
-    """Another process has the file open."""
+    """Report that another process has locked the file."""
 
 
 class ConflictError(CloudrcError):
-    """The state does not allow it; `mission` is the id of the mission in the way, "" if none."""
+    """Report that the present state does not allow a request.
+
+    `mission` is the id of the mission that is in conflict, "" if none.
+    """
 
     exit_code = 5
 
@@ -205,12 +213,13 @@ class ConflictError(CloudrcError):
 
 
 def busy(mission: Mission, advice: str) -> ConflictError:
-    """Make the error for a mission that is in the way."""
+    """Make the error for a mission that is in conflict."""
     return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)
 
 
 APPLICATION, VERSION = 0x43524A32, 1
-"""Numbers in the head of the file: that it is ours, and the version of its tables."""
+"""Numbers in the head of the file: the identifier of cloudrc's files, and the version of the
+tables."""
 SCHEMA = f"""
 CREATE TABLE mission (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL);
 CREATE TABLE reached (mission INTEGER REFERENCES mission ON DELETE CASCADE, waypoint INTEGER,
@@ -222,16 +231,16 @@ PRAGMA application_id = {APPLICATION};
 PRAGMA user_version = {VERSION};
 """
 SQLITE, OLD_JOURNAL = b"SQLite format 3\0", b"\x93CRJ"
-"""First bytes of a file of SQLite, and of a journal of cloudrc up to version 0.1."""
+"""First bytes of an SQLite file, and first bytes of a journal of cloudrc up to version 0.1."""
 NUMBERS = ("application_id", "user_version")
 SIDE_FILES = ("", "-wal", "-shm", "-journal")
-"""Endings of the files that belong to one file of SQLite."""
+"""Suffixes of the files that belong to one SQLite database."""
 
 
 def open_store(path: Path, salt: bytes, factory: Any = sqlite3.Connection) -> MissionStore:
-    """Open the file of missions and lock it; make it if there is none.
+    """Open the file of missions and lock it; make a new file if there is none.
 
-    A damaged file, and a journal of an earlier version, is set aside: see `MissionStore.notice`.
+    A damaged file or a journal of an earlier version is renamed, and `MissionStore.notice` says so.
 
     Args:
         path: Path of the file.
@@ -239,8 +248,9 @@ def open_store(path: Path, salt: bytes, factory: Any = sqlite3.Connection) -> Mi
         factory: Class of the connection.
 
     Raises:
-        StoreLockedError: If another process has it open.
-        BadInputError: If it is something else, of another version, or cannot be made.
+        StoreLockedError: If another process has locked the file.
+        BadInputError: If the file is not a file of missions, has another version, or cannot be
+            made.
     """
     head = _head(path)
     if head.startswith(OLD_JOURNAL):
@@ -259,7 +269,7 @@ def open_store(path: Path, salt: bytes, factory: Any = sqlite3.Connection) -> Mi
 
 
 def _head(path: Path) -> bytes:
-    """Read the first bytes of the file; make it, for its owner alone, if there is none."""
+    """Read the first bytes of the file; if there is none, make one that only the owner can use."""
     if path.exists() and not path.is_file():
         raise BadInputError(f"--journal {path}: is not a file; name another one")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -268,7 +278,7 @@ def _head(path: Path) -> bytes:
 
 
 def _set_aside(path: Path, why: str) -> Path:
-    """Rename a file and those that belong to it; return its new path."""
+    """Rename a file and the files of `SIDE_FILES`; return the new path of the file."""
     aside = path.with_name(f"{path.name}.{why}")
     for ending in SIDE_FILES:
         with suppress(FileNotFoundError):
@@ -277,16 +287,16 @@ def _set_aside(path: Path, why: str) -> Path:
 
 
 def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqlite3.Connection:
-    """Connect to a file of missions, lock and check it.
+    """Connect to a file of missions, lock it, and check it.
 
     Args:
         path: Path of the file; None for memory.
         factory: Class of the connection.
 
     Raises:
-        StoreLockedError: If another process has it open.
-        BadInputError: If it is of another version, or cannot be made.
-        sqlite3.DatabaseError: If it is damaged.
+        StoreLockedError: If another process has locked the file.
+        BadInputError: If the file has another version, or cannot be made.
+        sqlite3.DatabaseError: If the file is damaged.
     """
     # The thread that serves missions may be another one than that which opens the file.
     db: sqlite3.Connection = sqlite3.connect(
@@ -325,11 +335,11 @@ def _not_opened(path: Path | None, error: sqlite3.OperationalError) -> CloudrcEr
 QUEUE_MAX = 16
 """Limit of the missions that wait for the one under way."""
 KEPT = 100
-"""Limit of the missions that have ended and are still known."""
+"""Limit of the ended missions that the store keeps."""
 KEEP_PERIOD_NS = 1_000_000_000
-"""Time between two attempts to write what the disk has refused [ns]."""
+"""Time between two attempts to write events that the disk has refused [ns]."""
 LOGGED = 5_000
-"""Limit of the events, of all missions together, that a reader can ask for."""
+"""Limit of the events of all missions together that a reader can request."""
 
 
 class MissionStore:
@@ -337,10 +347,10 @@ class MissionStore:
 
     Attributes:
         missions: Missions by id.
-        trouble: Why the disk has refused the last event; "" if it has not.
-        dropped: Count of the events that a reader has asked for after they were forgotten.
-        notice: What was wrong with the file and where it is now; "" if nothing.
-        damaged: Whether a damaged file has been set aside.
+        trouble: Why the disk has refused the last event; "" if the disk has accepted it.
+        dropped: Number of events that a reader has requested too late, after their removal.
+        notice: What was wrong with an earlier file and where it is now; "" if nothing was wrong.
+        damaged: Whether a damaged file was renamed.
     """
 
     def __init__(
@@ -354,10 +364,10 @@ class MissionStore:
         """Read the missions of a file.
 
         Args:
-            connection: Connection by `connect`; it is closed on an error.
+            connection: Connection from `connect`; an error closes the connection.
             salt: Random bytes for the numbers of missions.
-            notice: See above.
-            damaged: See above.
+            notice: See the attribute.
+            damaged: See the attribute.
 
         Raises:
             sqlite3.DatabaseError: If a row cannot be read.
@@ -377,7 +387,7 @@ class MissionStore:
 
     @property
     def kept(self) -> bool:
-        """Whether everything is on the disk."""
+        """Whether all events are on the disk."""
         return not self._unsaved
 
     def open(self) -> list[Mission]:
@@ -385,7 +395,7 @@ class MissionStore:
         return [mission for mission in self.missions.values() if not mission.ended]
 
     def stopped(self) -> Mission | None:
-        """Return the mission that the operator has stopped and not acknowledged since, if any."""
+        """Return the mission whose emergency stop the operator has not acknowledged yet, if any."""
         for mission in reversed(self.missions.values()):
             events = mission.happened
             if "started" in events or "emergency_stopped" in events:
@@ -394,10 +404,11 @@ class MissionStore:
         return None
 
     def waits_for(self, order: Order) -> list[Mission]:
-        """Return the missions that a new one has to wait for.
+        """Return the missions for which a new mission has to wait.
 
         Raises:
-            ConflictError: If there are any and the order does not want to wait, or too many do.
+            ConflictError: If a mission is under way and the order may not wait, or if too many
+                missions wait.
         """
         before = self.open()
         if before and not order.queue:
@@ -410,7 +421,7 @@ class MissionStore:
         """Return a mission.
 
         Raises:
-            UnknownMissionError: If there is none of this id.
+            UnknownMissionError: If no mission has this id.
         """
         mission = self.missions.get(mission_id)
         if mission is None:
@@ -418,18 +429,18 @@ class MissionStore:
         return mission
 
     def has_ended(self, number: int) -> bool:
-        """Whether a mission, by its number on board, is over."""
+        """Return whether the mission with this number on board is over."""
         return any(mission.number == number and mission.ended for mission in self.missions.values())
 
     def with_key(self, key: str) -> Mission | None:
-        """Return the mission that was ordered with a key, if any."""
+        """Return the mission whose order has this key, if any."""
         return next((m for m in self.missions.values() if key and m.order.key == key), None)
 
     def add(self, order: Order) -> Mission:
-        """Store a new mission, and forget the oldest if too many have ended.
+        """Store a new mission; delete the oldest ended missions if there are more than `KEPT`.
 
         Raises:
-            UnavailableError: If it cannot be stored; it then does not exist.
+            UnavailableError: If the mission cannot be stored; then it does not exist.
         """
         mission_id = f"m{self._numbered + 1}"
         number = number_of(mission_id, self._salt)
@@ -444,7 +455,7 @@ class MissionStore:
         return mission
 
     def begin(self, mission: Mission, now_ns: int) -> None:
-        """Store that a waiting mission is asked to start, at `now_ns` [ns]; else it waits on."""
+        """Store at `now_ns` [ns] that a waiting mission starts; if that fails, it keeps waiting."""
         if now_ns < self._keep_ns:
             return
         try:
@@ -456,19 +467,20 @@ class MissionStore:
         """Store that a waiting mission will not begin.
 
         Raises:
-            UnavailableError: If it cannot be stored: a teleop after this one would fly it.
+            UnavailableError: If this cannot be stored, because the next teleop would fly the
+                mission.
         """
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
         waits = f"{mission.id} waits on"
         self._save(waits, mission, "cancelled", NEVER_BEGAN, verdict=verdict)
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Store what happens to a mission, now or as soon as the disk can be written again.
+        """Store an event of a mission, at once or as soon as the disk works again.
 
         Args:
             mission: The mission.
-            event: One word.
-            text: The same in words.
+            event: Kind of the event, one word.
+            text: Description of the event.
             changed: See `Mission.apply`.
         """
         if event == "reached" and changed["waypoint"] < len(mission.reached):
@@ -478,18 +490,18 @@ class MissionStore:
         self._try_to_save()
 
     def catch_up(self, now_ns: int) -> None:
-        """Write what the disk has refused, if it is time [ns] for that."""
+        """Try again to write events that the disk has refused, if due at `now_ns` [ns]."""
         if self._unsaved and now_ns >= self._keep_ns:
             self._try_to_save()
             self._keep_ns = now_ns + (KEEP_PERIOD_NS if self.trouble else 0)
 
     def news(self) -> str:
-        """Return the trouble once; "" if there is none, or it has been told."""
+        """Return `trouble` once; "" if there is none, or if an earlier call has returned it."""
         told, self._told = self._told, self.trouble
         return "" if told == self.trouble else self.trouble
 
     def events_after(self, number: int) -> list[Event]:
-        """Return the events of all missions after the one of this number."""
+        """Return the events of all missions after the event with this number."""
         if number > self._events:  # of a file that is gone
             number = 0
         if number and self._log:  # without a number nobody has missed anything
@@ -509,7 +521,7 @@ class MissionStore:
         self._log.append(mission.events[-1])
 
     def _save(self, refused: str, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Store an event of a mission, or let it not happen."""
+        """Store an event of a mission; if that fails, leave the mission unchanged."""
         after = mission.copy()
         after.apply(self._events + 1, event, text, **changed)
         self._commit(refused, after)
@@ -522,12 +534,12 @@ class MissionStore:
     def _commit(
         self, refused: str, changed: Mission | None = None, old: Iterable[str] | None = None
     ) -> None:
-        """Write what is not on the disk yet and then a mission, or nothing.
+        """Write the events that are not on the disk yet, and then a mission, in one transaction.
 
         Args:
-            refused: What follows if the disk refuses, in words.
-            changed: A mission with one event that is new, or a new mission.
-            old: Missions to forget; given with a new mission.
+            refused: Consequence of a failure, in words, for the error.
+            changed: A mission with one new event, or a new mission; None for neither.
+            old: Missions to delete; None unless `changed` is a new mission.
 
         Raises:
             UnavailableError: If the disk refuses.
@@ -602,10 +614,10 @@ def from_json(
     """Read a mission without its events and waypoints.
 
     Args:
-        mission_id: Its identifier.
-        order: See `to_json`.
-        happened: Count of each event.
-        witness: Attributes of its observations.
+        mission_id: Identifier of the mission.
+        order: Text from `to_json`.
+        happened: Count of each kind of event.
+        witness: Attributes of the mission's observations.
         status: Other attributes of the mission.
     """
     read = json.loads(order)

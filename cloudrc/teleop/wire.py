@@ -1,7 +1,7 @@
-"""Define teleop's messages and encode those between the processes of cloud and teleop.
+"""Define teleop's messages; encode the messages between the processes of cloud and teleop.
 
-Teleop gets `Seen` from cloud and verbs from the operator. It sends `Setpoint` to the controller,
-`OperatorRequest` to the robot and `MissionEvent` to the recorder.
+Teleop gets `RobotStatus` from cloud and verbs from the operator. It sends `Setpoint` to the
+controller, `OperatorRequest` to the robot and `MissionEvent` to the recorder.
 
 Each datagram between the processes is a JSON list: the name of the message's type and its fields in
 order. Teleop and cloud check every datagram, because other programs could write to the socket.
@@ -39,10 +39,10 @@ class Leg:
     Attributes:
         position: Waypoint [m], world frame, shape (3,).
         yaw: Heading to hold [rad].
-        tolerance: Largest distance that counts as at the waypoint [m]. If it is infinite, the leg
-            always lasts `dwell`; steps at fixed instants are flown in this way.
+        tolerance: Largest distance from the waypoint that counts as reached [m]. If the tolerance
+            is infinite, the leg always lasts `dwell`; steps at fixed instants use this.
         dwell: Time to stay within the tolerance without interruption [s].
-        time_limit: Longest duration of the leg without the time it is held [s].
+        time_limit: Longest duration of the leg, without the time in which it is held [s].
     """
 
     position: Vector
@@ -73,8 +73,8 @@ class Plan:
 
     Attributes:
         legs: Legs to fly, in order; at least one.
-        start: Place of the start: the spawn, in a reset world, or the robot's position.
-        time_limit: Longest duration of the mission, including the time it is held [s].
+        start: Place of the start: the spawn (world is reset), or the robot's position.
+        time_limit: Longest duration of the mission, including the time in which it is held [s].
     """
 
     legs: tuple[Leg, ...]
@@ -85,7 +85,7 @@ class Plan:
         """Check the values.
 
         Raises:
-            BadInputError: If there is no leg or the limit is out of range.
+            BadInputError: If there is no leg, or if the limit is out of range.
         """
         if not self.legs:
             raise BadInputError("a mission needs at least one waypoint")
@@ -104,19 +104,21 @@ class RobotStatus(NamedTuple):
         epoch: Epoch of the session.
         position: Measured position of the base [m], world frame, shape (3,).
         guard: State of the guard.
-        mission: Number of the last operator request that world has acted on; 0 if none. The
-            mission's own number is `mission_id`.
+        mission: Number of the last operator request that world has acted on; 0 if none. (The
+            number of the mission is `mission_id`.)
         world: Text that identifies world's process; it changes when world restarts. A restart of
             cloud changes only the epoch.
         pipe_contacts: Number of contacts with pipes so far.
         touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before that.
         slip_ns: Lag of world's clock behind its machine's clock [ns].
         horizon: Prediction horizon of cloud [s]; NaN before its first command.
-        rtt: Last round trip, without the time that world held the command's stamp before it sent
-            the echo [s]; NaN before the first.
-        loop_delay: Last `now - echo_stamp`, with that time [s]; NaN before the first.
-        mission_id: Number of the mission that world was last told to start; 0 if none.
-        reached: Number of its waypoints stored as reached by world, or `MISSION_OVER`.
+        rtt: Last round trip [s], without the hold time, for which world held the command's stamp
+            before it sent the echo; NaN before the first round trip.
+        loop_delay: Last `now - echo_stamp` [s], including the hold time; NaN before the first
+            round trip.
+        mission_id: Number of the mission of the last start request; 0 if none.
+        reached: Number of waypoints of this mission that world has stored as reached, or
+            `MISSION_OVER`.
         cause: Cause of the guard's state.
     """
 
@@ -144,8 +146,8 @@ class Continue:
         plan: Plan of the mission.
         leg: Index of the current waypoint.
         elapsed: Duration of the mission so far [s].
-        world: World in which it was flown; in another world it fails.
-        held: Whether the operator held it.
+        world: World in which the mission was flown; in another world it fails.
+        held: Whether the operator held the mission.
         mission_id: Number of the mission.
     """
 
@@ -167,7 +169,7 @@ class State(IntEnum):
     IDLE = 0
     """No mission has been started yet."""
     STARTING = 1
-    """Teleop asks the robot to start, and telemetry does not show the start yet."""
+    """Teleop has requested the start; telemetry does not show the start yet."""
     FLYING = 2
     """The robot flies to a waypoint."""
     HELD = 3
@@ -187,9 +189,9 @@ class Outcome:
     Attributes:
         code: "done", "cancelled", "leg_timed_out", "timed_out", "world_restarted",
             "guard_stopped", "emergency_stopped", "taken_over" or "end_lost".
-        text: The same in words.
+        text: Description of the outcome.
         waypoint: Index of the current waypoint at the end.
-        reached: Number of waypoints reached.
+        reached: Number of reached waypoints.
     """
 
     code: str
@@ -204,10 +206,10 @@ class Outcome:
 
 
 Message: TypeAlias = RobotStatus | Output
-"""Messages between the processes: `Seen` to teleop, the others to cloud."""
+"""Messages between the processes: `RobotStatus` to teleop, the others to cloud."""
 
 ALARM = OperatorRequest(0, Request.ESTOP)
-"""Emergency stop that does not wait for teleop's state machine; cloud gives it a number."""
+"""Emergency stop; it does not wait for teleop's state machine, and cloud gives it a number."""
 
 _INT_MIN, _INT_MAX = -(2**63), 2**63 - 1
 _KINDS: dict[str, TypeAdapter[Any]] = {
@@ -225,7 +227,8 @@ def decode(data: bytes) -> Message:
     """Decode a message from its datagram.
 
     Raises:
-        ValueError: If it is not a message, or a value does not fit into a recording or datagram.
+        ValueError: If the data are not a message, or if a value does not fit into a recording or a
+            datagram.
     """
     try:
         name, fields = json.loads(data)
@@ -237,9 +240,10 @@ def decode(data: bytes) -> Message:
 
 
 def _check_ranges(message: Message) -> None:
-    """Check that integers fit into a recording, and those of a request also into the tunnel.
+    """Check that integers fit into a recording, and integers of a request also into the tunnel.
 
-    The number of a request may be too high for the tunnel: cloud counts and drops such a request.
+    Exception: the number of a request may be too high for the tunnel. Cloud counts and drops such a
+    request.
 
     Raises:
         ValueError: If a value does not fit.

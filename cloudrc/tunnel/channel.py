@@ -1,12 +1,13 @@
 """Classify the datagrams of one stream by their counters: used, late or repeated.
 
-By default the newest datagram wins; the published code uses the last to arrive.
+By default a datagram is used only if it is newer than all earlier ones. The published code uses the
+last to arrive.
 """
 
 from __future__ import annotations
 
 WINDOW = 1024
-"""Number of counters before the newest that a channel remembers [datagrams]."""
+"""Number of counters below the newest that a channel remembers [datagrams]."""
 _MASK = (1 << WINDOW) - 1
 
 
@@ -23,9 +24,9 @@ class Channel:
         """Start empty.
 
         Args:
-            newest_wins: True: a datagram older than the newest is late. False: the last to arrive
-                is used, even if it is older (the published code's policy). Repeats are dropped
-                either way.
+            newest_wins: True: a datagram older than the newest is late. False: the last datagram to
+                arrive is used, even if it is older (the published code's policy). Repeats are
+                dropped in both cases.
         """
         self._newest_wins = newest_wins
         self.reset()
@@ -38,9 +39,9 @@ class Channel:
 
     @property
     def is_flooded(self) -> bool:
-        """Whether repeats outnumber the datagrams sent.
+        """Whether there are more repeats than sent datagrams.
 
-        No link does that, so the caller need not record each repeat.
+        No link repeats so many datagrams, so the caller need not record each repeat.
         """
         return self._repeats > self._newest + 1
 

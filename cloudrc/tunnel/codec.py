@@ -1,13 +1,14 @@
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
-A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body whose length
-follows from its kind, and a 16-byte tag. This module defines the layout only; `session` seals and
+A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body with a fixed
+length for each kind, and a 16-byte tag. This module defines only the layout; `session` seals and
 opens datagrams. `check` and the decoders raise no exception except DecodeError.
 
 The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
-nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
+nonce of the cipher. The nonce is unique, because no two datagrams of one direction and epoch have
+the same kind and counter.
 
-Deviation: the paper's tunnel sends pickled ROS messages, which can execute code and have 1 kB.
+Deviation: the paper's tunnel sends pickled ROS messages. They have 1 kB and can execute code.
 """
 
 from __future__ import annotations
@@ -29,20 +30,21 @@ from cloudrc.messages import (
 )
 
 VERSION = 6
-"""Version of the wire format. A build speaks one version and refuses all others.
+"""Version of the wire format. Each release of cloudrc uses one version and refuses all others.
 
-Version 1 had no tags; 2 had no basis stamp in requests; 3 had no cause of the guard's state; in 4 a
-challenge was shorter than its answer; 5 had a choice of ciphers and several keys in an epoch.
+Version 1 had no tags; version 2 had no basis stamp in requests; version 3 had no cause of the
+guard's state; in version 4 a challenge was shorter than its answer; version 5 had a choice of
+ciphers and several keys in an epoch.
 """
 DATAGRAM_MAX = 512
-"""Size of the receive buffer [bytes], above every valid datagram; longer ones are refused."""
+"""Size of the receive buffer [bytes]: every valid datagram is shorter, longer ones are refused."""
 
 
 class Kind(IntEnum):
-    """What a datagram carries; every kind has its own counter in each direction.
+    """Kind of a datagram's content; every kind has its own counter in each direction.
 
     Kinds up to LAST_GREETING open a session and are authenticated with the pre-shared key. The
-    other kinds belong to a session and are sealed with its keys.
+    other kinds belong to a session and are sealed with the session's keys.
     """
 
     HELLO = 1
@@ -63,7 +65,7 @@ class Direction(IntEnum):
 
 
 class DecodeError(ValueError):
-    """A datagram is not valid; the error's text is the outcome under which it is counted."""
+    """Report an invalid datagram; the text is the outcome under which the datagram is counted."""
 
 
 Header: TypeAlias = tuple[int, int, int, int, int]
@@ -79,7 +81,7 @@ class Hello(NamedTuple):
         nonce: 16 bytes that identify the requested session.
         clock: 16 bytes that identify cloud's monotonic clock.
         cookie: Cookie from world's challenge, 13 bytes; zeros before the first challenge.
-        epoch: Newest epoch that cloud has had; world continues from it.
+        epoch: Newest epoch that cloud has had; world continues from this epoch.
     """
 
     nonce: bytes
@@ -92,7 +94,7 @@ class Accept(NamedTuple):
     """World's acceptance; the header holds the epoch of the session.
 
     Attributes:
-        nonce: Nonce of the hello that this answers.
+        nonce: Nonce of the answered hello.
         world_nonce: 16 bytes that identify world's process.
         clock: 16 bytes that identify world's monotonic clock.
     """
@@ -148,7 +150,7 @@ def check(data: bytes) -> Header:
     The header is not authenticated yet.
 
     Raises:
-        DecodeError: "version" for another version, "malformed" for any other error.
+        DecodeError: "version" for a wrong version, "malformed" for any other error.
     """
     size = len(data)
     if size < HEADER_SIZE:
@@ -277,7 +279,7 @@ def decode_challenge(body: bytes) -> bytes:
 
 
 def encode_busy(nonce: bytes) -> bytes:
-    """Encode the body of a BUSY datagram: the nonce of the hello that it answers."""
+    """Encode the body of a BUSY datagram: the nonce of the answered hello."""
     return _BUSY.pack(nonce)
 
 

@@ -7,19 +7,23 @@
                                         <--    ACCEPT (nonce, world's nonce, clock), a new epoch
                                             or BUSY (nonce)
 
-Every greeting has a tag by a pre-shared key; world does not answer a sender without one, and
-answers with the key of the hello. The cookie is a MAC over a time slot of two seconds, so world
-stores nothing for a hello without a cookie, and a captured hello is useless after four seconds. No
-answer is longer than its hello. World sends at most ten challenges per second. A repeated captured
-hello can use up only these, and the honest cloud can use them, too, because they name nobody. A
-hello with a cookie is answered once per counter.
+Every greeting (hello or answer) has a tag by a pre-shared key. World does not answer a hello
+without a valid tag, and authenticates its answer with the key of the hello. A hello with a cookie
+is answered once per counter. No answer is longer than its hello.
 
-The cloud with the session keeps it while world hears it: at least one new sealed datagram per
-`command_age_max`. After that another cloud can get a session under the next epoch. Epochs rise,
-also through a restart of world, because each hello names the newest epoch of its cloud.
+The cookie is a MAC over a time slot of two seconds. So world stores nothing for a hello without a
+cookie, and a captured hello is useless after four seconds.
 
-Deviation: WireGuard also derives session keys by Diffie-Hellman. Here the pre-shared key is enough,
-because one owner has both ends, and anybody with that key can command the robot anyway.
+World sends at most ten challenges per second. An attacker who repeats a captured hello can use up
+only these challenges. The true cloud can use the same challenges, because a challenge names no
+receiver.
+
+The cloud with the session keeps it while world hears this cloud: at least one new sealed datagram
+per `command_age_max`. Otherwise another cloud can get a session under the next epoch. Epochs rise
+even if world restarts, because each hello contains the newest epoch of its cloud.
+
+Deviation: WireGuard also derives session keys by Diffie-Hellman. In this tunnel the pre-shared key
+is enough: one owner has both ends, and anybody with the key can command the robot anyway.
 """
 
 from __future__ import annotations
@@ -48,15 +52,15 @@ from cloudrc.tunnel.codec import (
 from cloudrc.tunnel.session import NO_EPOCH, Session
 
 EPOCH_MAX = 2**32 - 1
-"""Last epoch that the header can hold; 1 follows it."""
+"""Last epoch that the header can hold; the next epoch is 1."""
 CHALLENGE_NS = 100_000_000
-"""Least time between two challenges [ns]."""
+"""Shortest time between two challenges [ns]."""
 COOKIE_NS = 2_000_000_000
-"""Length of a cookie's time slot [ns]; a cookie is valid in its slot and in the next one."""
+"""Length of a cookie's time slot [ns]; a cookie is valid in its slot and in the next slot."""
 GRACE_NS = 1_000_000_000
-"""Time for which a cloud keeps a new session before it is heard for the first time [ns]."""
+"""Time for which a cloud keeps a new session although world has not heard it yet [ns]."""
 REPEATS_MAX = 3
-"""Number of times that world repeats its acceptance to a cloud that it does not hear."""
+"""How often world repeats its acceptance to a cloud that it does not hear."""
 CLOUDS_MAX = 64
 """Number of nonces of which world remembers the newest counter."""
 NO_COOKIE = bytes(COOKIE_SIZE)
@@ -64,13 +68,13 @@ NO_COOKIE = bytes(COOKIE_SIZE)
 REPLIES_MAX = 3
 """Largest number of challenges that cloud answers between two periodic hellos."""
 COOKIES_MAX = 4096
-"""Number of cookies that cloud remembers, one per time slot; together they cover over two hours."""
+"""Number of cookies that cloud remembers, one per time slot, for more than two hours in total."""
 WORLDS_MAX = 64
 """Number of earlier world processes that cloud remembers."""
 
 
 def is_newer(epoch: int, than: int) -> bool:
-    """Check whether an epoch is ahead of another one by less than half of all epochs."""
+    """Return whether `epoch` is ahead of `than` by less than half of all epochs."""
     return 0 < (epoch - than) % (EPOCH_MAX + 1) <= EPOCH_MAX // 2
 
 
@@ -79,8 +83,8 @@ class HelloAnswer(NamedTuple):
 
     Attributes:
         outcome: Name under which the hello is counted.
-        datagrams: Datagrams to send, none or one.
-        opened: Whether a new session has been opened.
+        datagrams: Datagrams to send: none or one.
+        opened: Whether the hello has opened a new session.
     """
 
     outcome: str
@@ -89,16 +93,16 @@ class HelloAnswer(NamedTuple):
 
 
 class ServerHandshake:
-    """World's side: decide which cloud has authority, and under which epoch."""
+    """World's side of the handshake: decide which cloud has authority, and under which epoch."""
 
     def __init__(self, session: Session, nonce: bytes, clock: bytes, age_max_ns: int) -> None:
         """Begin without a session.
 
         Args:
-            session: World's session; this class begins its epochs.
+            session: World's session; this class begins the epochs of the session.
             nonce: 16 bytes that identify this process, new at every start.
-            clock: 16 bytes that identify its monotonic clock.
-            age_max_ns: Silence after which a cloud loses the session to another one [ns].
+            clock: 16 bytes that identify the monotonic clock of this process.
+            age_max_ns: Silence after which another cloud can take the session [ns].
         """
         self._session = session
         self._nonce, self._clock, self._epoch = nonce, clock, NO_EPOCH
@@ -122,7 +126,7 @@ class ServerHandshake:
         """Accept an ALIVE or OPERATOR datagram of the session once, at `now_ns` [ns].
 
         Raises:
-            DecodeError: "malformed" if it has another kind, "repeated".
+            DecodeError: "malformed" for other kinds; "repeated" if the counter is not new.
         """
         window = self._windows.get(kind)
         if window is None:
@@ -132,11 +136,11 @@ class ServerHandshake:
         self.hear(now_ns)
 
     def receive_hello(self, hello: Hello, counter: int, now_ns: int) -> HelloAnswer:
-        """Answer the hello that the session has just opened.
+        """Answer the hello that `Session.open` has just verified.
 
         Args:
             hello: Body of the hello.
-            counter: Counter in its header.
+            counter: Counter in the header of the hello.
             now_ns: Monotonic clock [ns].
         """
         session, key = self._session, self._session.greeting_key
@@ -162,16 +166,20 @@ class ServerHandshake:
         return HelloAnswer("hello", [self._accept()], opened=True)
 
     def begin_next_epoch(self, now_ns: int) -> bytes:
-        """Begin the next epoch of the session at `now_ns` [ns]; make the datagram for cloud."""
+        """Begin the next epoch of the session at `now_ns` [ns]; return the datagram for cloud."""
         self._begin(now_ns)
         self._session.begin(self._epoch)
         return self._accept()
 
     def _keeps_epoch(self, now_ns: int) -> bool:
-        """Decide whether the cloud that has the session gets its epoch again, or the next one.
+        """Decide whether the cloud with the session keeps its epoch or gets the next epoch.
 
-        It gets the next one if it has the newest key and the epoch does not, or if it asks again
-        and again, unheard or with another key than that of the epoch.
+        The cloud gets the next epoch in these cases:
+
+        - The session has no epoch any more.
+        - The hello has the newest key, and the epoch has an older key.
+        - The cloud has asked more than `REPEATS_MAX` times, and either world does not hear it or
+          the hello has another key than the epoch.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -210,14 +218,14 @@ class ServerHandshake:
 
 
 class ClientHandshake:
-    """Cloud's side: make hellos and decide which answers are valid."""
+    """Cloud's side of the handshake: make hellos and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes) -> None:
         """Begin without a session.
 
         Args:
             nonce: 16 bytes that identify this process, new at every start.
-            clock: 16 bytes that identify its monotonic clock.
+            clock: 16 bytes that identify the monotonic clock of this process.
         """
         self._seed, self._clock = nonce, clock
         self._nonce, self._nonces = nonce, 0
@@ -234,9 +242,9 @@ class ClientHandshake:
         return self._hello()
 
     def answer_challenge(self, cookie: bytes) -> bytes | None:
-        """Make the body of the hello that answers a challenge, or None if it is not needed.
+        """Make the body of the hello that answers a challenge; None if no answer is needed.
 
-        A repeated cookie is ignored, because an older one must not replace the newest.
+        A repeated cookie is ignored, because an older cookie must not replace the newest.
         """
         if self._replies == 0 or cookie in self._cookies:
             return None
@@ -248,20 +256,21 @@ class ClientHandshake:
         return self._hello()
 
     def is_refused(self, nonce: bytes) -> bool:
-        """Check whether a refusal with this nonce answers our hello."""
+        """Return whether a refusal with this nonce answers a hello of this process."""
         return nonce == self._nonce
 
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
         """Handle an acceptance; return cloud's and world's nonce for the new epoch, or None.
 
-        Cloud accepts another world process only while it asks for a session, because a late
-        datagram of a dead process may arrive. If cloud has accepted a dead process nevertheless,
-        the living one counts as old; when it answers again, cloud asks under a new nonce.
+        Cloud accepts another world process only while cloud asks for a session, because a late
+        datagram of a dead world process may arrive. If cloud has accepted a dead process
+        nevertheless, the living process counts as old. When the living process answers again, cloud
+        asks under a new nonce.
 
         Args:
             epoch: Epoch in the header.
             accept: Body of the datagram.
-            asks: Whether cloud wants a session: it has none, or does not hear world.
+            asks: Whether cloud asks for a session, because it has none or does not hear world.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):
@@ -291,14 +300,14 @@ SILENCE_TEXT = (
 
 
 class HandshakeLog:
-    """Log each reason why there is no session once, until the next session begins."""
+    """Log why there is no session: each reason once, until the next session begins."""
 
     def __init__(self) -> None:
         """Begin with nothing logged."""
         self._logged: set[str] = set()
 
     def forget(self) -> None:
-        """Start again, because there is a session."""
+        """Forget the logged reasons, because a session has begun."""
         self._logged.clear()
 
     def about(self, outcome: str, data: bytes, now_ns: int) -> list[Fault]:
@@ -319,8 +328,8 @@ class HandshakeLog:
     def say(self, code: str, text: str, now_ns: int) -> list[Fault]:
         """Log a fault at `now_ns` [ns] unless the same text has been logged.
 
-        The text decides, not the code: a datagram with any version, which anybody can send, does
-        not hide the version of the peer.
+        The comparison uses the text, not the code. Otherwise a forged datagram with a wrong version
+        could hide that the true peer has a wrong version.
         """
         if text in self._logged:
             return []

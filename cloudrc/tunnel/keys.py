@@ -1,7 +1,8 @@
 """Pre-shared keys, and the text of a key file.
 
-A key never prints itself and cannot be pickled. The tunnel uses keys derived from it by HKDF-SHA256
-(RFC 5869); each is bound to the wire version and to one use.
+The text form of a `Key` object hides the secret, and a `Key` cannot be pickled. The tunnel uses
+keys that HKDF-SHA256 (RFC 5869) derives from the pre-shared key; each derived key is bound to the
+wire version and to one use.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from cloudrc.tunnel.codec import TAG_SIZE, VERSION
 
 KEY_SIZE = 32
-"""Size of a pre-shared key and of the keys derived from it [bytes]."""
+"""Size of a pre-shared key and of derived keys [bytes]."""
 _LABEL = b"cloudrc %d " % VERSION
 
 
@@ -25,7 +26,7 @@ class Key:
     """A secret pre-shared key of 32 bytes.
 
     Attributes:
-        name: Short public name that tells two keys apart.
+        name: Short public name that distinguishes two keys.
     """
 
     __slots__ = ("_secret", "_tag_key", "name")
@@ -34,7 +35,8 @@ class Key:
         """Make a key from its bytes.
 
         Raises:
-            ValueError: If it is not 32 bytes long or all zeros; the message does not contain it.
+            ValueError: If the secret is not 32 bytes long, or if all bytes are zero; the message
+                does not contain the secret.
         """
         if len(secret) != KEY_SIZE:
             raise ValueError(f"a key has {KEY_SIZE} bytes, not {len(secret)}")
@@ -78,7 +80,7 @@ class KeySet(NamedTuple):
 
     Attributes:
         current: The key to use.
-        previous: The key before it, which is accepted too; None if there is none.
+        previous: The previous key, which is still accepted; None if there is none.
     """
 
     current: Key
@@ -86,13 +88,13 @@ class KeySet(NamedTuple):
 
     @property
     def accepted(self) -> tuple[Key, ...]:
-        """The keys that an end accepts, the current key first."""
+        """The keys that an end accepts; the first is the current key."""
         return (self.current,) if self.previous is None else (self.current, self.previous)
 
 
 @dataclass
 class KeyRing:
-    """The keys of one end; the driver replaces `keys` in flight."""
+    """The keys of one end; the driver replaces the attribute `keys` in flight."""
 
     keys: KeySet
 
@@ -103,7 +105,7 @@ def parse(data: bytes) -> KeySet:
     The lines `overlap_s` and `previous_until_s` of older files are ignored.
 
     Raises:
-        ValueError: If the file is invalid; the message contains nothing of the file.
+        ValueError: If the file is invalid; the message contains no part of the file.
     """
     if len(data) == KEY_SIZE:
         return KeySet(Key(data))
@@ -121,7 +123,7 @@ def parse(data: bytes) -> KeySet:
 
 
 def write(keys: KeySet) -> str:
-    """Write the text of a key file."""
+    """Return the text of a key file."""
     lines = ["# A key of cloudrc's tunnel: keep it secret. Made by 'cloudrc key new'."]
     lines.append(f"current {keys.current.text()}")
     if keys.previous is not None:

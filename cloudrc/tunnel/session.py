@@ -1,16 +1,19 @@
 """Seal outgoing datagrams and open incoming ones under the keys of one end's session.
 
 Each direction of an epoch has one key, derived by HKDF from a pre-shared key, both ends' nonces and
-the epoch. If one of these changes, captured datagrams become worthless. One key is enough for an
-epoch: 2^32 datagrams take over a year. A datagram changes no state before its tag is verified.
+the epoch. If one of these inputs changes, captured datagrams become worthless. One key is enough
+for an epoch: 2^32 datagrams take over a year. A datagram changes no state before its tag is
+verified.
 
-Each kind has its own counter, so that greetings and probes never shift the counters of telemetry
-and commands. Counters restart with every epoch, except those of greetings without an epoch: the
-link draws its impairments from the counter, and a repeated one would always get the same draw.
+Each kind of datagram has its own counter, so that greetings and probes do not change the counters
+of telemetry and commands. Counters restart with every epoch, except the counters of greetings
+without an epoch. These continue, because the link draws impairments by the counter: a repeated
+counter would always get the same draw.
 
-Two ends in one process may use an unsealed session, because virtual time has no wire to protect and
-sealing would take a twentieth of the flight's time. Drivers with a socket refuse such a session
-(`Endpoint.sealed`), so a missing key is an error at the start and never plaintext on a wire.
+Two ends in one process may use an unsealed session: virtual time has no wire to protect, and
+sealing would take a twentieth of the flight's time. Drivers with a socket refuse an unsealed
+session (`Endpoint.sealed`). So a missing key is an error at the start, and never leads to plaintext
+on a wire.
 """
 
 from __future__ import annotations
@@ -39,10 +42,10 @@ _NO_TAG = bytes(TAG_SIZE)
 
 
 class NoCipher:
-    """Take the place of the cipher between two ends in one process."""
+    """Replace the cipher between two ends in one process."""
 
     def encrypt(self, nonce: bytes, body: bytes, header: bytes) -> bytes:
-        """Append zeros in place of a tag."""
+        """Append zeros instead of a tag."""
         return body + _NO_TAG
 
     def decrypt(self, nonce: bytes, data: bytes, header: bytes) -> bytes:
@@ -56,7 +59,7 @@ class Session:
     Attributes:
         epoch: Current epoch; `NO_EPOCH` without a session.
         ring: The pre-shared keys; `follow_keys` adopts changes.
-        greeting_key: Key of the last greeting opened.
+        greeting_key: Pre-shared key of the last opened greeting.
         epoch_key: Pre-shared key of the epoch.
         is_outdated: Whether the key file has a newer key than the epoch.
     """
@@ -67,7 +70,8 @@ class Session:
         """Start without a session.
 
         Args:
-            sends: Direction in which this end sends; it opens datagrams of the other one only.
+            sends: Direction in which this end sends; it opens only datagrams of the other
+                direction.
             ring: The pre-shared keys.
         """
         self.epoch = NO_EPOCH
@@ -83,8 +87,8 @@ class Session:
 
         Args:
             epoch: Number of the epoch.
-            nonces: Cloud's nonce, then world's; empty to keep those of the previous epoch.
-            key: Pre-shared key of the handshake; None to keep that of the previous epoch.
+            nonces: Cloud's nonce, then world's nonce; empty to keep the previous epoch's nonces.
+            key: Pre-shared key of the handshake; None to keep the previous epoch's key.
         """
         self.epoch = epoch
         self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)
@@ -102,7 +106,7 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def greet(self, kind: int, body: bytes, key: Key | None = None) -> bytes:
-        """Make a greeting authenticated with a pre-shared key, by default that of the epoch."""
+        """Make a greeting with a tag by a pre-shared key, by default the key of the epoch."""
         counter = self._counters[kind]
         self._counters[kind] = counter + 1
         epoch = NO_EPOCH if kind in TIMELESS else self.epoch
@@ -110,11 +114,11 @@ class Session:
         return data + (key or self.epoch_key).tag(data)
 
     def open(self, data: bytes) -> Datagram:
-        """Verify and decode a datagram; nothing changes unless its tag is right.
+        """Verify and decode a datagram; change no state if its tag is wrong.
 
         Raises:
-            DecodeError: "malformed", "version", "direction" (our own direction), "old_epoch"
-                (another epoch) or "tag".
+            DecodeError: "malformed", "version", "direction" (the direction in which this end
+                sends), "old_epoch" (an epoch other than the current one) or "tag".
         """
         _, direction, epoch, kind, counter = check(data)
         if direction != self._opens:
@@ -137,7 +141,7 @@ class Session:
         return self._counters[kind]
 
     def follow_keys(self) -> None:
-        """Adopt a new key file; end the session if the file does not have its key."""
+        """Adopt a new key file; end the session if the file does not contain the session's key."""
         if (keys := self.ring.keys) is self._keys:
             return
         self._keys = keys
@@ -173,7 +177,7 @@ class UnsealedSession(Session):
 
 
 def make_session(sends: Direction, ring: KeyRing | None) -> Session:
-    """Make an end's session: sealed if it has keys, else unsealed and only for one process."""
+    """Make the session of an end: sealed with keys; without keys, unsealed and for one process."""
     return UnsealedSession(sends) if ring is None else Session(sends, ring)
 
 
