@@ -69,7 +69,7 @@ def find(choice: str) -> Metric:
         choice: Name of a shipped or installed metric, or path of a Python file, which is executed.
 
     Raises:
-            BadInputError: If `choice` does not exist, or is not a metric.
+        BadInputError: If `choice` does not exist, or is not a metric.
     """
     if choice in SHIPPED:
         return SHIPPED[choice]
