@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 MS_TO_NS = 1_000_000
 CRUISE_SPEED = 1.0
-"""Expected speed of a leg, if the guard allows it [m/s]."""
+"""Expected speed on a leg, if the guard allows this speed [m/s]."""
 SETTLE_TIME = 4.0
 """Expected extra time for the beginning and the end of a leg [s]."""
 LEG_PATIENCE = 3.0

@@ -44,8 +44,8 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If it is not a regular file, for example a pipe.
-        TooLongError: If it is larger than `size_max`.
+        ValueError: If `path` is not a regular file but, for example, a pipe.
+        TooLongError: If the file is larger than `size_max`.
     """
     with BufferedReader(open_file(path)) as file:
         status = os.fstat(file.fileno())
@@ -62,7 +62,7 @@ def open_file(path: Path) -> FileIO:
 
     Raises:
         OSError: If the file cannot be opened.
-        ValueError: If it is not a regular file, for example a pipe.
+        ValueError: If `path` is not a regular file but, for example, a pipe.
     """
     file = FileIO(path, opener=_at_once)
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):

@@ -128,7 +128,7 @@ class Telemetry(NamedTuple):
         mission_id: Mission that was started last, as in `OperatorRequest`; 0 if none.
         reached: Number of waypoints reached in that mission, as far as world knows, or
             `MISSION_OVER`.
-        cause: Why the guard is in its state; after touch-down in LAND, why it landed.
+        cause: Why the guard is in its state; after touch-down in LAND, why the robot landed.
     """
 
     stamp_ns: int

@@ -20,12 +20,13 @@ class LinkChanged(NamedTuple):
     record holds the requested values at the start of the time line.
 
     Attributes:
-        stamp_ns: When this end recorded it [ns], own clock.
+        stamp_ns: When this end recorded the conditions [ns], own clock.
         uplink: True for the uplink, False for the downlink.
         shaper: "relay" or "netem".
         cause: Why the link changed, in words; "" at the start.
         age: How long these conditions have been in force [s].
-        time_line: Time since the time line began [s]; NaN if the change did not restart it.
+        time_line: Time since the time line began [s]; NaN if the change did not restart the time
+            line.
         delay: Requested one-way delay [s].
         jitter: Requested jitter, as in the profile [s].
         loss: Requested long-run loss, in [0, 1].
@@ -47,7 +48,7 @@ class LinkChanged(NamedTuple):
 
 
 class LinkChecked(NamedTuple):
-    """Driver, in real time only: one measured quantity of the link, judged. Topic /link_check.
+    """Driver, in real time only: one judged quantity of the link. Topic /link_check.
 
     Cloud judges the uplink, world the downlink. Both use the tunnel's own datagrams of the last
     60 s at most.

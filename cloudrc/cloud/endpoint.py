@@ -2,7 +2,7 @@
 
 Cloud asks for a session with hellos and uses the epoch that world assigns. While cloud has nothing
 to command, it sends ALIVE datagrams: world gives the session to another cloud if it receives
-nothing.
+nothing for a while.
 
 Cloud and teleop exchange messages only: teleop gets the robot's status and returns setpoints and
 operator requests.
@@ -230,7 +230,7 @@ class CloudEndpoint:
             self._records += self._loop.take_faults()
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Handle one datagram; an invalid one is counted and dropped."""
+        """Handle one datagram. Count and drop an invalid datagram."""
         try:
             kind, _, epoch, counter, body = self._session.open(data)
             if kind == TELEMETRY:
@@ -279,7 +279,7 @@ class CloudEndpoint:
         self._counts["sent"] += 1
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
-        """Begin the epoch that world assigns to this process, if it is new."""
+        """Begin the epoch that world assigns to this process, if the epoch is new."""
         asks = self._wants_session(now_ns)
         nonces = self._handshake.receive_accept(epoch, accept, asks=asks)
         if nonces is None:

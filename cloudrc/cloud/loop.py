@@ -281,7 +281,7 @@ class ControlLoop:
         return now_ns - self._echoed_ns > horizon * 1e9 + FREEZE_NS
 
     def _note(self, kind: str, error: BaseException, now_ns: int, instead: str = "") -> None:
-        """Count a failure of a plug-in and report the first one.
+        """Count a failure of a plug-in, and report the first failure of its kind.
 
         A plug-in may raise any exception; only a user's Ctrl-C is raised again. A failure whose
         `now_ns` is NEVER_NS gets the stamp of the next telemetry.

@@ -31,7 +31,7 @@ class Release:
     """One release of the chart: one robot and its cloud.
 
     Attributes:
-        context: Context of the kubeconfig; None for the current one.
+        context: Context of the kubeconfig; None for the current context.
         namespace: Namespace of the release.
         name: Name of the Helm release.
     """

@@ -97,7 +97,7 @@ class JobSettings:
 
 
 def labels(release: Release) -> dict[str, str]:
-    """Return the labels of a mission's objects; the NetworkPolicies select by them."""
+    """Return the labels of a mission's objects; the NetworkPolicies select by these labels."""
     return {
         "app.kubernetes.io/name": "cloudrc",
         "app.kubernetes.io/instance": release.name,
@@ -259,7 +259,7 @@ def run_job(
     Args:
         release: Release that flies the mission.
         mission: Mission in the API's format: name, start, time_limit_s, waypoints.
-        name: Name of the Job; default: an unused one.
+        name: Name of the Job; default: an unused name.
         limit: Time limit of the mission [s].
         queue: Whether to wait while another mission flies; else the mission is refused.
 
@@ -543,7 +543,7 @@ def _check_can_start(release: Release, status: JobStatus) -> None:
 
 
 def cancel(release: Release, name: str, token: str | None = None) -> str:
-    """Cancel the mission of a Job, or delete the Job if it has not posted its mission yet.
+    """Cancel the mission of a Job; delete a Job that has not posted its mission yet.
 
     Args:
         release: Release that flies the mission.

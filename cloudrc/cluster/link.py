@@ -195,7 +195,7 @@ def send(
         place: The release.
         link: The present link of the release.
         profile: New profile, as in `cloudrc.config.profile_edit.edit_profile`.
-        settings: Values to set, likewise.
+        settings: Values to set, also as in `edit_profile`.
         note: Returns the text of a file beside the profile: who changed the profile, and why.
 
     Raises:
@@ -253,7 +253,7 @@ def keep(place: ReleasePlace, link: LinkParts, sent: Sent) -> None:
 
 
 def needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
-    """Select the profile and the files that it names from a ConfigMap's files.
+    """Select from a ConfigMap's files the profile and the files that the profile names.
 
     Args:
         values: Values of the profile.

@@ -271,7 +271,7 @@ def api_url(context: str | None, namespace: str | None, release: str) -> Iterato
     """Forward a port to a release's API while the block runs.
 
     Args:
-        context: Context of the kubeconfig; None for the current one.
+        context: Context of the kubeconfig; None for the current context.
         namespace: Namespace of the release; None for the namespace of the context.
         release: Name of the Helm release.
 

@@ -153,7 +153,7 @@ def check_profile(document: Document, name: str) -> Profile:
 def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
     """Load a mission by name or path (relative to `folder`); raises BadInputError.
 
-    `config.mission_check.check_mission` checks it against a scene.
+    `config.mission_check.check_mission` checks a mission against a scene.
     """
     document = shipped.read("mission", str(name), folder or Path())
     return _validate(document, Mission, str(name), [])

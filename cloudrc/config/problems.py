@@ -75,7 +75,7 @@ def expectation(model: type[BaseModel], path: KeyPath) -> str:
 
 
 def nearest_key(model: type[BaseModel], path: KeyPath) -> str:
-    """Suggest a known key in place of an unknown one."""
+    """Suggest a known key in place of an unknown key."""
     *above, key = path
     siblings = _keys_at(model, tuple(above))
     near = _near(key, siblings)
@@ -91,7 +91,7 @@ def nearest_key(model: type[BaseModel], path: KeyPath) -> str:
 
 
 def nearest_choice(detail: ErrorDetails) -> str:
-    """List the allowed words, and suggest the one nearest to a wrong word."""
+    """List the allowed words, and suggest the allowed word nearest to a wrong word."""
     expected = detail["ctx"]["expected"]
     near = _near(str(detail["input"]), re.findall(r"'([^']*)'", expected))
     return f"must be {expected}" + (f"; did you mean {near}?" if near else "")

@@ -51,7 +51,8 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
 
     Args:
         before: The present profile.
-        profile: Name or path of a profile that replaces it; None edits the present one.
+        profile: Name or path of a profile that replaces the present profile; None to edit the
+            present profile.
         settings: Values to set, such as "downlink.delay_ms=120".
 
     Raises:

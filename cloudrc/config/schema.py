@@ -329,7 +329,7 @@ class Sensors(Section):
 
 
 class World(Section):
-    """The robot and the scene in which it flies."""
+    """The robot and its scene."""
 
     robot: str = Field(
         "pelican",

@@ -58,7 +58,7 @@ Pages = Mapping[str, Callable[[], Answer]]
 
 
 class ProbeServer(socketserver.ThreadingTCPServer):
-    """Serves pages until it is closed.
+    """Serves pages until `close` is called.
 
     The server does not use `http.server.HTTPServer`, which may wait for a name server.
 

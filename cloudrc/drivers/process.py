@@ -1,4 +1,4 @@
-"""Run one end as a process: record it, feed its supervisor, and stop on signals.
+"""Run one end as a process: record its data, feed its supervisor, and stop on signals.
 
 The process ends on SIGTERM or SIGINT, or when its parent process is gone.
 

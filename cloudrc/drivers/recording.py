@@ -58,7 +58,7 @@ def told(step: float, stamp_ns: int) -> Fault:
 
     Args:
         step: Size of the step [s].
-        stamp_ns: When it was detected [ns], own clock of the end.
+        stamp_ns: When the step was detected [ns], own clock of the end.
     """
     text = (
         f"wall clock stepped by {step:+.1f} s: the flight is not affected;"
@@ -142,7 +142,7 @@ class SyncAge:
     """
 
     def __init__(self) -> None:
-        """Begin without a completed sync."""
+        """Create the measurement; no sync has completed yet."""
         self._safe: float | None = None
 
     def done(self, began: float) -> None:
@@ -158,7 +158,7 @@ class RecordingThread:
     """Runs a recorder in the background from `start` to `stop`."""
 
     def __init__(self, recorder: Recorder) -> None:
-        """Create the thread; it does not run yet.
+        """Create the thread; `start` starts it.
 
         Args:
             recorder: The recorder. The loop adds records; only this thread drains them.

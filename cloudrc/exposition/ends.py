@@ -340,7 +340,7 @@ class PredictionJudge:
     """
 
     def __init__(self) -> None:
-        """Begin with no prediction and no error."""
+        """Create the judge; there is no prediction and no error yet."""
         self.error: Vector = (nan, nan, nan)
         self.square = 0.0
         self.judged = 0
@@ -387,7 +387,7 @@ class DelayJudge:
     """
 
     def __init__(self) -> None:
-        """Begin with no command and no error."""
+        """Create the judge; there is no command and no error yet."""
         self.error = nan
         self.reset()
 

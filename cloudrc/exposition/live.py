@@ -75,7 +75,7 @@ class Link:
     """
 
     def __init__(self) -> None:
-        """Begin with no shaper and no counts."""
+        """Create the metrics; nothing is shaped or counted yet."""
         self.tell: Callable[[], str] = lambda: "{}\n"
         self._shapers: dict[str, Labels] = {}
         self._delays: dict[str, float] = {}

@@ -422,8 +422,8 @@ class Observations:
         """Return the evidence of a mission that has ended.
 
         Args:
-            ending: How it ended.
-            elapsed: Duration [s].
+            ending: How the mission ended.
+            elapsed: Duration of the mission [s].
             known: Other attributes of the evidence.
         """
         end = Moment(elapsed)

@@ -31,7 +31,7 @@ from cloudrc.report.document import Run
 from cloudrc.report.write import DIFFERS, RECORDING_NOTE
 
 REPORT_BYTES_MAX = 16 << 20
-"""Largest report.json that is read [bytes]; it may have many notes."""
+"""Largest report.json that is read [bytes]; a report may have many notes."""
 JUDGEMENT = ("criteria", "description", "name", "report")
 """Keys of an experiment that change the report, but not the flight."""
 FOLLOWS = (("/command_applied", "/guard"), ("/pid", "/mission"))

@@ -62,7 +62,7 @@ def assess(
     Args:
         recording: Recording of both ends, on world's clock.
         experiment: The experiment. Metric files named in the experiment are not executed, because
-            it may come from somebody else.
+            the experiment may come from somebody else.
         run: Facts about the run that are not in its recording.
         own: The user's own metrics, names or paths; files are executed.
     """

@@ -86,7 +86,7 @@ class Orders:
     def __init__(
         self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
     ) -> None:
-        """Begin with no request carried out.
+        """Set the guard and the limits; no request was carried out yet.
 
         Args:
             guard: The guard that carries the requests out.
@@ -235,7 +235,7 @@ class WorldEndpoint:
         command_age_max_ns: int,
         start_ns: int = 0,
     ) -> None:
-        """Begin with the robot on the ground at its spawn.
+        """Connect the parts and put the robot on the ground at its spawn.
 
         Args:
             robot: The robot, its guard in GROUND.
@@ -306,7 +306,7 @@ class WorldEndpoint:
         return records
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Handle one datagram; an invalid one is counted and dropped."""
+        """Handle one datagram. Count and drop an invalid datagram."""
         world_ns = self._follow(now_ns)
         try:
             kind, _, epoch, counter, body = self._session.open(data)
@@ -444,7 +444,7 @@ class WorldEndpoint:
     def _receive_command(
         self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
     ) -> None:
-        """Record a command of this epoch, and give it to the guard if it is the newest."""
+        """Record a command of this epoch; if it is the newest command, give it to the guard."""
         command, guard = codec.decode_command(body), self.robot.guard
         outcome = self._channel.take(counter)
         if outcome != REPEATED:
@@ -462,7 +462,7 @@ class WorldEndpoint:
         self._counts[outcome] += 1
 
     def _offer(self, command: Command) -> str | None:
-        """Give the guard a command. Return why it is rejected; None for an accepted command."""
+        """Give the guard a command; return the reason of a rejection, None if accepted."""
         tick_ns = self._clock.tick_ns
         rejection = self.robot.guard.offer(command, tick_ns)
         for observer in self.robot.observers:

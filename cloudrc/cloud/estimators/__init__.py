@@ -1,8 +1,8 @@
 """Delay estimators compute the horizon of the prediction from echoes; one file each.
 
-The horizon is how far the predictor predicts. World echoes the stamp of each command that it
-applies. A plug-in file defines `build(**parameters)`, which returns an `Estimator`. All parameters
-are annotated.
+The horizon is the time by which the predictor predicts. Telemetry echoes the stamp of the newest
+command that world has applied. A plug-in file defines `build(**parameters)`, which returns an
+`Estimator`. All parameters are annotated.
 """
 
 from __future__ import annotations

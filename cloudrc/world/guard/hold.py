@@ -195,7 +195,7 @@ class Descent:
 
 
 class TakeOff:
-    """Detects when the robot has left the ground, and whether it may take off.
+    """Detects when the robot has left the ground, and whether the robot may take off.
 
     Before take-off a robot in HOLD would scrape along the floor, so the rotors stop instead.
 

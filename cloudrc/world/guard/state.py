@@ -66,7 +66,7 @@ class Guard:
 
     Attributes:
         state: Current state.
-        cause: Why the guard is in this state; after touch-down in LAND, why it landed.
+        cause: Why the guard is in this state; after touch-down in LAND, why the robot landed.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Last velocity reference for the low-level controller [m/s], shape (3,).
         yaw_rate: Capped yaw rate [rad/s]; the published low-level controller ignores it.
