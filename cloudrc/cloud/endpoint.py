@@ -1,8 +1,8 @@
 """Run cloud's end of the tunnel: receive telemetry and send a command every 10 ms.
 
 Cloud asks for a session with hellos and uses the epoch that world assigns. While cloud has nothing
-to command, it sends ALIVE datagrams: world gives the session to another cloud if it receives
-nothing for a while.
+to command, it sends ALIVE datagrams: if world receives nothing from this cloud, it gives the
+session to another cloud.
 
 Cloud and teleop exchange messages only: teleop gets the robot's status and returns setpoints and
 operator requests.
@@ -55,7 +55,7 @@ all periods may be missed."""
 
 
 class MissedPeriods:
-    """Reports that cloud misses many periods: once, and again after all of them were forgiven."""
+    """Reports once that cloud misses many periods, and again only after all were forgiven."""
 
     def __init__(self) -> None:
         self._missed, self._reported = 0, False
@@ -171,7 +171,7 @@ class CloudEndpoint:
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended and the robot holds, or has not answered for GIVE_UP_NS."""
+        """Whether the mission has ended, and the robot holds or does not answer for GIVE_UP_NS."""
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 

@@ -24,7 +24,7 @@ class Operator(Protocol):
 
     @property
     def outcome(self) -> Outcome | None:
-        """How the mission ended; None while cloud has to go on."""
+        """How the mission ended; None while cloud has to continue."""
 
     @property
     def settled(self) -> bool:
@@ -87,7 +87,7 @@ def make_robot_status(
 
 
 class EmergencyStopRepeater:
-    """Repeat an emergency stop until telemetry shows that the robot has acted on it.
+    """Repeats an emergency stop until telemetry shows that the robot has acted on the stop.
 
     Only this class numbers the stop and repeats it towards the robot. Teleop's loop, or teleop's
     API without the loop, may ask for the stop any number of times. Without a session the stop waits

@@ -162,7 +162,7 @@ def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
 def dump(experiment: ResolvedExperiment) -> str:
     """Write an experiment as YAML that loads as an equal experiment without other files.
 
-    Exceptions are files outside the package: for traces and plug-ins the text has absolute paths.
+    The text does not contain traces and plug-ins outside the package, only their absolute paths.
     """
     return write_yaml(experiment.model_dump(mode="json"))
 

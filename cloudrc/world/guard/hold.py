@@ -43,7 +43,7 @@ INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
 """Position hold: integral gain [1/s^2], largest integral term per axis [m/s], and largest distance
 from the hold point at which it integrates [m]. The arm makes the robot lopsided, and the low-level
 controller's own integral is too small. Without the integral of the position hold, the robot would
-hold its position 30 mm off the hold point."""
+stand 30 mm off the hold point."""
 TAKE_OFF_MARGIN = 0.5
 """Smallest distance from the fence's walls at which a stopped robot may take off [m]. A tilted
 robot scrapes along the floor before it rises, by at most 0.35 m:
@@ -231,7 +231,7 @@ class TakeOff:
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
-        """Reset to before take-off, because the robot stands or falls to the ground.
+        """Reset to the state before take-off, because the robot stands or falls to the ground.
 
         Args:
             stopped: Whether the rotors may have been stopped in the air or on an obstacle.

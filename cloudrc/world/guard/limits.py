@@ -3,7 +3,7 @@
 World alone sets the limits. Each limit is finite and above 0: no value switches a limit off.
 
 The functions are pure. For any input, NaN and infinity included, each returns a finite result
-within its bound. For this, every comparison is written so that it is false for NaN.
+within its bound. For this purpose, every comparison is false for NaN.
 `tests/world/guard/test_proof.py` proves the bounds of the scalar functions for all 64-bit floats.
 """
 
@@ -35,8 +35,8 @@ FAR = 1e6
 """Distance beyond which a face of the fence limits nothing [m]."""
 RECHECK_DISTANCE, RECHECK_NS = 0.25, 10_000_000
 """If the fence limits nothing within RECHECK_DISTANCE [m] of the robot, the guard checks the fence
-only once per RECHECK_NS [ns]. In this time the robot moves by less than RECHECK_DISTANCE, since it
-is never faster than 25 m/s."""
+only once per RECHECK_NS [ns]. In this time the robot moves by less than RECHECK_DISTANCE, since the
+robot is never faster than 25 m/s."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
 """Return from beyond the margin to the inside of the fence: velocity per distance [1/s], largest
 speed [m/s]."""

@@ -1,7 +1,8 @@
 """The guard: the state machine that decides which commands the robot flies.
 
 The guard stands between the tunnel and the low-level controller. Every 2 ms it gives a velocity
-reference. It uses only its own clock and the onboard sensors. It assumes that the cloud is hostile.
+reference. The guard uses only its own clock and the onboard sensors, and assumes that the cloud is
+hostile.
 
                  fresh command of a         command too old, mission over,
                   started mission                   new session
@@ -16,8 +17,8 @@ reference. It uses only its own clock and the onboard sensors. It assumes that t
 The *basis* of a command is the odometry from which the command was computed. A command is fresh
 while its basis is at most `command_age_max` old.
 
-- ESTOP begins from every state, by the operator's request or when the robot has turned over: the
-  rotors would push it in any direction. An acknowledgement leads to GROUND.
+- ESTOP begins from every state: by the operator's request, or when the robot has turned over,
+  because the rotors would push it in any direction. An acknowledgement leads to GROUND.
 - LAND: an acknowledgement in the air leads to HOLD. An acknowledgement low above the ground or on
   an obstacle leads to GROUND at touch-down.
 - LAND and ESTOP end the mission: only a new start arms the robot again.
@@ -216,7 +217,7 @@ class Guard:
         return self._take_off.allowed and apart_ns >= SETTLE_NS
 
     def _note_invalid(self, now_ns: int) -> None:
-        """Count an impossible command, which no honest cloud sends. Begin LAND after several."""
+        """Count an impossible command, which no honest cloud sends; land after several of them."""
         self._invalid_ns.append(now_ns)
         if len(self._invalid_ns) < INVALID_COMMANDS or now_ns - self._invalid_ns[0] > INVALID_NS:
             return
