@@ -1,7 +1,7 @@
 """Build world, cloud and link from an experiment, and convert its values to SI units.
 
-Drivers know the contract of an endpoint only, and world and cloud do not import each other. This
-module puts them together.
+World and cloud do not import each other, and drivers know only the contract of an endpoint. This
+module connects world, cloud and link.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 
 MS_TO_NS = 1_000_000
 CRUISE_SPEED = 1.0
-"""Expected speed of a leg, if the guard allows it [m/s]."""
+"""Expected speed on a leg, if the guard allows this speed [m/s]."""
 SETTLE_TIME = 4.0
 """Expected extra time for the beginning and the end of a leg [s]."""
 LEG_PATIENCE = 3.0
-"""Time limit of a leg as a multiple of its expected time [1].
+"""Time limit of a leg, divided by the leg's expected time [1].
 Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
 """Mission number of a cloud that flies only one mission."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)
-"""Longest straight way inside the fence [m]."""
+"""Length of the longest straight way inside the fence [m]."""
 
 
 def build_world(
@@ -50,12 +50,13 @@ def build_world(
     identity: WorldIdentity,
     clock: Callable[[], int] = lambda: 0,
 ) -> WorldEndpoint:
-    """Build world's end: the robot in its scene and its end of the tunnel; needs MuJoCo.
+    """Build world's end: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 
     Args:
         experiment: The experiment.
         identity: The identity of this end.
-        clock: Its monotonic clock [ns]; read last, because a scene takes a while to compile.
+        clock: Monotonic clock of this end [ns]. It is read last, because compiling a scene takes
+            a while.
     """
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.guard.limits import Limits
@@ -98,14 +99,15 @@ def build_cloud(
     *,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
 ) -> CloudEndpoint:
-    """Build cloud's end: plug-ins, teleoperation and its end of the tunnel.
+    """Build cloud's end: plug-ins, teleoperation, and cloud's end of the tunnel.
 
     Args:
         experiment: The experiment.
         identity: The identity of this end.
-        clock: Its monotonic clock [ns].
-        teleop: The source of setpoints; None for an internal one, which starts the mission at once.
-        make_loop: Makes the control loop of the same arguments as `ControlLoop`.
+        clock: Monotonic clock of this end [ns].
+        teleop: The source of setpoints. None for an internal source, which starts the mission at
+            once.
+        make_loop: Makes the control loop. It takes the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud
     loop = make_loop(
@@ -122,7 +124,7 @@ def build_cloud(
 
 
 def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:
-    """Build both directions of the emulated network: uplink, downlink."""
+    """Build the uplink and the downlink of the emulated network."""
     return (
         LinkDirection(link_profile(experiment.uplink), experiment.seed, uplink=True),
         LinkDirection(link_profile(experiment.downlink), experiment.seed, uplink=False),
@@ -160,7 +162,7 @@ def mission_plan(
 
 
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
-    """Convert one direction of a link profile to SI units; read its trace and table.
+    """Convert one direction of a link profile to SI units, and read its trace and its table.
 
     Args:
         direction: One direction, as in the profile's file.
@@ -209,7 +211,7 @@ def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: fl
 
 
 def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:
-    """Make random setpoints, each for one period, wherever the robot is."""
+    """Make random setpoints. Each lasts for one period, whether the robot arrives or not."""
     rng = np.random.Generator(np.random.PCG64([seed, _stream("steps")]))
     offsets = rng.uniform(-1.0, 1.0, (steps.count, 3)) * steps.range_m + steps.centre_m
     limit = 10 * steps.period_s
@@ -246,5 +248,5 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def _stream(name: str) -> int:
-    """Return the number of a random stream, so that no stream shifts another."""
+    """Return the number of a random stream; draws of one stream do not change the others."""
     return int.from_bytes(name.encode(), "little")

@@ -1,7 +1,7 @@
 """The contract of both ends of the tunnel: state machines without I/O.
 
-An endpoint has no socket, no clock and no thread. A driver calls it; only the driver knows whether
-time is virtual or real:
+An endpoint has no socket, no clock and no thread. A driver calls the endpoint, and only the driver
+knows whether time is virtual or real:
 
     for data in arrived:
         endpoint.receive_datagram(data, now_ns)
@@ -10,8 +10,11 @@ time is virtual or real:
     send(endpoint.take_datagrams())
     keep(endpoint.take_records())
 
-Rules for drivers: `now_ns` never falls. All datagrams that are read in one wake get the same
-`now_ns`, so that an endpoint knows which ones waited in the socket while its process was stalled.
+Rules for drivers:
+
+- `now_ns` never falls.
+- All datagrams that a driver reads in one wake get the same `now_ns`. From this an endpoint knows
+  which datagrams waited in the socket while its process was stalled.
 """
 
 from __future__ import annotations
@@ -22,23 +25,23 @@ from cloudrc.records import Record
 
 
 class Endpoint(Protocol):
-    """One end of the tunnel. Times are integer nanoseconds on its own clock."""
+    """One end of the tunnel. All times are integer nanoseconds on the clock of this end."""
 
     @property
     def sealed(self) -> bool:
-        """Whether its datagrams are authenticated; if not, they must never reach a socket."""
+        """Whether the endpoint's datagrams are authenticated; only these may reach a socket."""
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Handle one datagram; an invalid one is counted and dropped and raises nothing."""
+        """Handle one datagram. Count and drop an invalid datagram, without an exception."""
 
     def next_deadline_ns(self) -> int:
-        """Return when to call `handle_deadline` next [ns]."""
+        """Return the time of the next call of `handle_deadline` [ns]."""
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Do what is due at `now_ns` [ns]; a late call is allowed."""
+        """Do the work that is due at `now_ns` [ns]; the call may be late."""
 
     def take_datagrams(self) -> list[bytes]:
-        """Return the datagrams to send since the last call, oldest first."""
+        """Return the datagrams to send, made since the last call, oldest first."""
 
     def take_records(self) -> list[Record]:
-        """Return the records since the last call, oldest first."""
+        """Return the records made since the last call, oldest first."""

@@ -1,7 +1,7 @@
 """Errors that a user can fix: one line that says what is wrong, where, and what to do next.
 
-Foreign code and files may contain texts of any length and characters; two functions here turn them
-into one printable line.
+Texts from foreign code and files may be long and may contain any characters. Two functions of this
+module turn such a text into one printable line.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class MissingPrerequisiteError(CloudrcError):
 
 
 class InvalidRunError(CloudrcError):
-    """The run is invalid: it was not in real time, or a process died."""
+    """The run is invalid: it did not keep real time, or a process died."""
 
     exit_code = 6
 
@@ -41,13 +41,13 @@ class TimedOutError(CloudrcError):
 
 
 class InterruptedRunError(CloudrcError):
-    """The user interrupted the run before there was anything to report."""
+    """The user interrupted the run before the run had any result to report."""
 
     exit_code = 130
 
 
 def to_one_line(text: str) -> str:
-    """Turn a foreign text into one line that can be printed; lone surrogates are escaped."""
+    """Turn a foreign text into one printable line, with lone surrogates escaped."""
     line = " ".join(text[:TEXT_MAX].split())
     return line.encode("utf-8", "backslashreplace").decode("utf-8")
 

@@ -1,4 +1,7 @@
-"""Read and write files that other processes write, too: without waiting, and in one step."""
+"""Read and write files that other processes also write.
+
+Reading never waits. Writing replaces a file in one step.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ class TooLongError(ValueError):
 
 
 def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | None:
-    """Identify the version of a file with one system call; None if it does not exist.
+    """Identify the version of a file with one system call; return None if the file does not exist.
 
     Args:
         path: The file.
@@ -41,8 +44,8 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If it is not a regular file, for example a pipe.
-        TooLongError: If it is larger than `size_max`.
+        ValueError: If `path` is not a regular file but, for example, a pipe.
+        TooLongError: If the file is larger than `size_max`.
     """
     with BufferedReader(open_file(path)) as file:
         status = os.fstat(file.fileno())
@@ -59,7 +62,7 @@ def open_file(path: Path) -> FileIO:
 
     Raises:
         OSError: If the file cannot be opened.
-        ValueError: If it is not a regular file, for example a pipe.
+        ValueError: If `path` is not a regular file but, for example, a pipe.
     """
     file = FileIO(path, opener=_at_once)
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -69,10 +72,11 @@ def open_file(path: Path) -> FileIO:
 
 
 def readable_by_others(path: Path) -> bool:
-    """Check whether other users can read one's own file; a missing file is not readable.
+    """Check whether other users can read a file of this user; a missing file is not readable.
 
-    Kubernetes gives a Secret's files to root, and lets the pod's group read them: only a file that
-    belongs to this user must also be closed to the group.
+    A file that belongs to this user must be closed to the group, too. A file of another owner may
+    be open to the group, because Kubernetes gives a Secret's files to root and lets the pod's group
+    read them.
     """
     try:
         status = path.stat()
@@ -84,17 +88,17 @@ def readable_by_others(path: Path) -> bool:
 
 @contextmanager
 def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
-    """Write a file under a temporary name and rename it to `path` once it is complete.
+    """Write a file under a temporary name, and rename the complete file to `path`.
 
-    Others may write to the folder, too. Therefore a symbolic link at `path` is replaced and not
-    followed, and the temporary name cannot be guessed.
+    Other users may write to the folder. Therefore a symbolic link at `path` is replaced and not
+    followed, and nobody can guess the temporary name.
 
     Args:
-        path: The file; an existing one is replaced.
+        path: The file; an existing file is replaced.
         mode: Permissions of the new file from its creation, minus the umask.
 
     Raises:
-        OSError: If the file cannot be written; an existing one then stays unchanged.
+        OSError: If the file cannot be written; an existing file then stays unchanged.
     """
     new = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
     alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW

@@ -1,10 +1,13 @@
 """The messages between world, cloud and teleoperation.
 
-They are named tuples in SI units: immutable, and four times as fast to make as a frozen dataclass,
-which matters for a dozen of them in every 10 ms. Every stamp is an integer number of nanoseconds on
-the monotonic clock of the named end; only stamps of the same clock may be subtracted.
-Frames: REP-103 (x forward, y left, z up). A vector is in the world frame unless its name ends in
-``_body``. Quaternions are ``wxyz``, as in MuJoCo.
+Messages are immutable named tuples in SI units. Making a named tuple takes a quarter of the time of
+a frozen dataclass, and the loops make a dozen messages every 10 ms.
+
+- Stamps: integer nanoseconds on the monotonic clock of the named end. Only stamps of the same clock
+  may be subtracted.
+- Frames: REP-103 (x forward, y left, z up). A vector is in the world frame unless its name ends in
+  ``_body``.
+- Quaternions: ``wxyz``, as in MuJoCo.
 """
 
 from __future__ import annotations
@@ -26,24 +29,24 @@ class GuardState(IntEnum):
     """State of the guard."""
 
     GROUND = 0
-    """Rotors stopped; only an operator's start of a mission leads out."""
+    """The rotors are stopped. Only the operator's start of a mission ends this state."""
     TRACK = 1
-    """Fresh commands from the cloud are flown."""
+    """The robot flies fresh commands from the cloud."""
     HOLD = 2
-    """No fresh command: brake, then hold the position with onboard sensing alone."""
+    """No command is fresh: the robot brakes, then holds its position with onboard sensors alone."""
     LAND = 3
-    """Slow descent; the rotors stop at touch-down; latched until acknowledged."""
+    """The robot descends slowly and stops its rotors at touch-down. Latched until acknowledged."""
     ESTOP = 4
-    """Rotors stopped at once; latched until acknowledged."""
+    """The rotors were stopped at once. Latched until acknowledged."""
 
 
 class Cause(IntEnum):
-    """Why the guard is in its state: a number on the wire, and `words` for people."""
+    """Why the guard is in its state: a number in messages, and `words` for people."""
 
     words: str
 
     def __new__(cls, number: int, words: str) -> Cause:
-        """Make a member from its number and its words."""
+        """Make a member of the enum from its number and its words."""
         cause = int.__new__(cls, number)
         cause._value_, cause.words = number, words
         return cause
@@ -78,15 +81,15 @@ class Request(IntEnum):
     """A request of the operator to the robot."""
 
     START = 0
-    """Begin the mission: arm."""
+    """Arm the robot and begin the mission."""
     END = 1
-    """The mission is over: hold locally until the next one starts."""
+    """End the mission: the robot holds its position by itself until the next mission starts."""
     ESTOP = 2
     """Stop the rotors at once, in any state; latched until acknowledged."""
     ACKNOWLEDGE = 3
-    """Release a landing or stop whose cause the operator has seen; arms nothing."""
+    """Release a landing or stop whose cause the operator has seen, without arming the robot."""
     PROGRESS = 4
-    """Keep the mission's progress on board, for a cloud that restarts; has no number."""
+    """Store the mission's progress on board, for a cloud that restarts. Its number is 0."""
 
 
 class Odometry(NamedTuple):
@@ -114,17 +117,18 @@ class Telemetry(NamedTuple):
         stamp_ns: Stamp of the odometry [ns], world's clock.
         odometry: Measured pose and twist, with sensor noise if configured.
         tip_force: Force on the touch sensor at the arm's tip [N].
-        echo_stamp_ns: Stamp of the newest applied command [ns], cloud's clock; NEVER_NS if none.
+        echo_stamp_ns: Stamp of the newest applied command [ns], cloud's clock; `NEVER_NS` if none.
         echo_hold_ns: How long world has held that command [ns].
         slip_ns: Lag of world's clock behind its machine's monotonic clock [ns].
         mission: Number of the last operator request that world carried out; 0 if none.
         guard: State of the guard.
         pipe_contacts: Number of contacts with pipes in this mission.
         touch_speed: Speed of the tip at its first contact with the board in this mission [m/s]; NaN
-            before that.
+            before the first contact.
         mission_id: Mission that was started last, as in `OperatorRequest`; 0 if none.
-        reached: Number of its waypoints reached, as far as world knows, or `MISSION_OVER`.
-        cause: Why the guard is in its state; after touch-down in LAND, why it landed.
+        reached: Number of waypoints reached in that mission, as far as world knows, or
+            `MISSION_OVER`.
+        cause: Why the guard is in its state; after touch-down in LAND, why the robot landed.
     """
 
     stamp_ns: int
@@ -147,7 +151,8 @@ class Command(NamedTuple):
 
     Attributes:
         stamp_ns: Time of the computation [ns], cloud's clock.
-        basis_stamp_ns: Stamp of the odometry it was computed from [ns], world's clock.
+        basis_stamp_ns: Stamp of the odometry from which the command was computed [ns], world's
+            clock.
         basis_hold_ns: How long cloud had held that odometry [ns].
         velocity: Wanted velocity [m/s], world frame, shape (3,).
         yaw_rate: Wanted yaw rate [rad/s].
@@ -168,15 +173,17 @@ class OperatorRequest(NamedTuple):
     """A request of the operator to the robot, repeated until telemetry shows its number.
 
     Attributes:
-        number: Number of the request; it rises, and is above what the robot has carried out.
+        number: Number of the request, above the number of every request that the robot has carried
+            out.
         request: Kind of the request.
         start: Where the mission starts from; used with `Request.START` only.
         mission_id: Number of the mission, below 2^63.
-        reached: Number of its waypoints reached; `MISSION_OVER` if it ended early.
-        basis_stamp_ns: Stamp of cloud's newest odometry when it forwarded the request [ns], world's
-            clock; `NEVER_NS` before the first.
-        epoch: Session that teleop saw when it made the request; 0 for none. Cloud uses it and does
-            not send it to the robot.
+        reached: Number of waypoints reached in the mission; `MISSION_OVER` if the mission ended
+            early.
+        basis_stamp_ns: Stamp of cloud's newest odometry when cloud forwarded the request [ns],
+            world's clock; `NEVER_NS` before the first odometry.
+        epoch: Session that teleop saw when it made the request; 0 for none. Only cloud uses the
+            epoch; the robot does not get it.
     """
 
     number: int
@@ -194,8 +201,8 @@ class Setpoint(NamedTuple):
     Attributes:
         position: Wanted position [m], world frame, shape (3,).
         yaw: Wanted heading [rad].
-        waypoint: Index of its waypoint in the mission; -1 for none.
-        epoch: Session that it is meant for, as teleop saw it; 0 for none.
+        waypoint: Index of the waypoint in the mission; -1 for none.
+        epoch: Session for which teleop made the setpoint; 0 for none.
     """
 
     position: Vector

@@ -1,9 +1,9 @@
 """Find plug-ins by kind and configuration name, and build them.
 
-A plug-in is one file with a function `build(**parameters)`. Its file name is its configuration
-name. A metric has no `build`; see `cloudrc.metrics`. Three places are searched:
+A plug-in is one file with a function `build(**parameters)`. The file name is the plug-in's
+configuration name. A metric has no `build`; see `cloudrc.metrics`. Three places are searched:
 
-1. the package of the kind in cloudrc, except for files that start with an underscore;
+1. the package of the kind in cloudrc, without files whose name begins with an underscore;
 2. installed packages with an entry point in the group `cloudrc.<kind>`;
 3. a file, if the name is a path or ends in `.py`.
 """
@@ -30,16 +30,17 @@ PACKAGES = {
     "controllers": "cloudrc.cloud.controllers",
     "metrics": "",
 }
-"""Kind of plug-in -> package of the shipped ones. Shipped metrics are rows of tables instead."""
+"""Kind of plug-in -> package of the shipped plug-ins. Shipped metrics are rows of tables, without a
+package."""
 
 
 def names(kind: str) -> list[str]:
-    """List the configuration names of a kind, sorted; no plug-in is imported."""
+    """List the configuration names of a kind, sorted, without importing a plug-in."""
     return sorted({*_shipped(kind), *_installed(kind)})
 
 
 def describe(kind: str, name: str) -> str:
-    """Return the first line of a plug-in's docstring, or why it cannot be loaded."""
+    """Return the first line of a plug-in's docstring, or why the plug-in cannot be loaded."""
     try:
         target = find(kind, name)
     except CloudrcError as error:
@@ -84,7 +85,7 @@ def find(kind: str, name: str) -> Any:
         name: Configuration name, or the path of a file.
 
     Returns:
-        Its module, or the object of its entry point.
+        The plug-in's module, or the object of its entry point.
     """
     try:
         if is_path(name):
@@ -109,13 +110,13 @@ def is_path(name: str) -> bool:
 
 
 def unknown_name_text(what: str, name: str, available: list[str]) -> str:
-    """Return the error text for an unknown name, with the known and the nearest names."""
+    """Return the error text for an unknown name, with all known names and the nearest name."""
     there = ", ".join(available) or "none"
     return f"no {what} named {name!r}; available: {there}{suggest_name(name, available)}"
 
 
 def suggest_name(name: str, available: list[str]) -> str:
-    """Return the end of an error text that suggests the nearest name; "" if none is near."""
+    """Return the suggestion that ends an error text: the nearest name. "" if no name is near."""
     near = difflib.get_close_matches(name, available, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 

@@ -1,7 +1,7 @@
 """The records of a run, which world, cloud and the drivers make during a flight.
 
-A record is a named tuple whose first field is `stamp_ns`, on the clock of the end that made it.
-Its docstring begins with who makes it: an end, or the driver that runs the end.
+A record is a named tuple. Its first field is `stamp_ns`, on the clock of the end that made the
+record. The docstring of each record begins with its maker: an end, or the driver that runs the end.
 `record/` turns records into MCAP topics, columns and a hash; `metrics/` turns them into numbers.
 """
 
@@ -16,16 +16,17 @@ class LinkChanged(NamedTuple):
     """Driver, in real time only: the conditions of the link towards this end. Topic /link.
 
     World records the uplink, cloud the downlink: at the start, after every change, and again when
-    a session or a mission begins. A profile may change its values over time, by its time line. The
-    requested values are those at the start of the time line.
+    a session or a mission begins. The time line of a profile may change values over time; the
+    record holds the requested values at the start of the time line.
 
     Attributes:
-        stamp_ns: When this end recorded it [ns], own clock.
+        stamp_ns: When this end recorded the conditions [ns], own clock.
         uplink: True for the uplink, False for the downlink.
         shaper: "relay" or "netem".
         cause: Why the link changed, in words; "" at the start.
-        age: Time for which these conditions have been in force [s].
-        time_line: Time since the time line began [s]; NaN if the change did not restart it.
+        age: How long these conditions have been in force [s].
+        time_line: Time since the time line began [s]; NaN if the change did not restart the time
+            line.
         delay: Requested one-way delay [s].
         jitter: Requested jitter, as in the profile [s].
         loss: Requested long-run loss, in [0, 1].
@@ -47,23 +48,24 @@ class LinkChanged(NamedTuple):
 
 
 class LinkChecked(NamedTuple):
-    """Driver, in real time only: one measured quantity of the link, judged. Topic /link_check.
+    """Driver, in real time only: one judged quantity of the link. Topic /link_check.
 
-    Cloud judges the uplink, world the downlink, from the tunnel's own datagrams of up to 60 s.
+    Cloud judges the uplink, world the downlink. Both use the tunnel's own datagrams of the last
+    60 s at most.
 
     Attributes:
         stamp_ns: Time of the check [ns], own clock.
         uplink: True for the uplink, False for the downlink.
-        quantity: "mean", "deviation", "round_trip", "loss", "reordered" or
-            "duplicated". These are for information only: "datagrams" (needed, received);
-            "time_line" (it is not judged in flight); "rate" (single datagrams cannot measure it);
-            "correlation" (requested of netem, which has none).
+        quantity: Judged: "mean", "deviation", "round_trip", "loss", "reordered", "duplicated".
+            For information only: "datagrams" (needed, received); "time_line" (not judged in
+            flight); "rate" (single datagrams cannot measure a rate); "correlation" (requested of
+            netem, which has none).
         asked: Expected value: delays [s], shares in [0, 1].
         measured: Measured value, likewise.
         low: Lowest accepted value, likewise.
         high: Highest accepted value, likewise.
-        verdict: "ok" or "off"; "open" if there were too few datagrams, if what is off is still
-            looked at once more, or if the ends woke too late to judge the link; "told" for
+        verdict: "ok", "off", "open" or "told". "open": the datagrams were too few, a deviation is
+            being checked a second time, or the ends woke too late to judge the link. "told": for
             information only.
         datagrams: Number of datagrams behind the measurement.
     """
@@ -90,7 +92,7 @@ class TelemetrySent(NamedTuple):
     Attributes:
         stamp_ns: Time of sending [ns], world's clock.
         epoch: Session of the datagram.
-        counter: Counter in its header.
+        counter: Counter in the datagram's header.
         telemetry: The message, as sent.
     """
 
@@ -119,16 +121,17 @@ class GroundTruth(NamedTuple):
 class Arrival(NamedTuple):
     """Either end: a telemetry or command datagram arrived, late ones included.
 
-    Repeated datagrams are recorded until they are as many as the sent ones, then only counted.
-    Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
+    A repeated datagram is recorded while there are fewer repeated than sent datagrams; after that
+    it is only counted. Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
 
     Attributes:
         stamp_ns: Time of arrival [ns], receiver's clock.
         uplink: True for telemetry at cloud, False for commands at world.
-        epoch: Epoch in its header.
-        counter: Counter in its header.
+        epoch: Epoch in the datagram's header.
+        counter: Counter in the datagram's header.
         delay: One-way delay [s]; NaN if the two ends cannot prove that they share a clock.
-        used: True if it became the newest; False if it was late, stale, repeated or rejected.
+        used: True if the datagram became the newest; False if it was late, stale, repeated or
+            rejected.
     """
 
     stamp_ns: int
@@ -143,10 +146,12 @@ class CommandApplied(NamedTuple):
     """World: a command was applied for the first time. Topic /command_applied.
 
     Attributes:
-        stamp_ns: When the low-level controller first saw it [ns], world's clock.
-        epoch: Epoch in its header.
-        counter: Counter in its header; epoch and counter identify its `Control` record.
-        basis_stamp_ns: Stamp of the odometry that it was computed from [ns], world's clock.
+        stamp_ns: When the low-level controller first saw the command [ns], world's clock.
+        epoch: Epoch in the command's header.
+        counter: Counter in the command's header; epoch and counter identify the `Control` record
+            of the command.
+        basis_stamp_ns: Stamp of the odometry from which the command was computed [ns], world's
+            clock.
         velocity: Commanded velocity, before the caps [m/s], shape (3,).
     """
 
@@ -163,7 +168,7 @@ class GuardChange(NamedTuple):
     Attributes:
         stamp_ns: Time of the change [ns], world's clock.
         state: The new state.
-        cause: Why, in words: "mission started", "command age 0.252 s above 0.250 s".
+        cause: Why the state changed: "mission started", "command age 0.252 s above 0.250 s".
     """
 
     stamp_ns: int
@@ -176,11 +181,11 @@ class Contact(NamedTuple):
 
     Attributes:
         stamp_ns: Time of the contact [ns], world's clock.
-        body: Name of the scene's body: pipe_1, board, floor.
+        body: Name of the touched body of the scene: pipe_1, board, floor.
         position: Position of the base just before [m], world frame, shape (3,).
         velocity: Velocity of the base just before [m/s], world frame, shape (3,).
         tip_velocity: Velocity of the arm's tip just before [m/s], world frame, shape (3,).
-        tip: True if the arm's tip touched, False for any other part.
+        tip: True if the arm's tip touched the body, False if another part of the robot did.
     """
 
     stamp_ns: int
@@ -198,7 +203,7 @@ class SessionOpened(NamedTuple):
         stamp_ns: Time of the start [ns], own clock.
         end: "world" or "cloud".
         epoch: The new epoch.
-        cause: Why, in words: "cloud said hello", "mission starts from spawn".
+        cause: Why the session began: "cloud said hello", "mission starts from spawn".
     """
 
     stamp_ns: int
@@ -218,9 +223,9 @@ class Control(NamedTuple):
         counter: Counter in the command's header.
         basis_stamp_ns: Stamp of the odometry used [ns], world's clock.
         horizon: Prediction horizon [s]: the delay estimate, clamped.
-        rtt: Last round trip without the hold [s]; NaN before the first echo.
-        loop_delay: Last `now - echo_stamp` with the hold, the paper's tau_n [s]; NaN before the
-            first echo.
+        rtt: Last round trip, without the hold time on world [s]; NaN before the first echo.
+        loop_delay: Last `now - echo_stamp`, the paper's tau_n, with the hold time [s]; NaN before
+            the first echo.
         measured: Position in the odometry used [m], shape (3,).
         position: Predicted position for `basis_stamp_ns + horizon` [m], shape (3,).
         orientation_wxyz: Predicted orientation, unit quaternion, shape (4,).
@@ -255,8 +260,8 @@ class Control(NamedTuple):
 
 
 UNDER_WAY = ("started", "reached", "held", "resumed", "goto", "paused")
-"""Events after which a mission continues; every other event ends it. "paused": its process ends,
-and the next one continues it."""
+"""Events after which a mission continues; every other event ends the mission. "paused": the process
+that flies the mission ends, and the next process continues the mission."""
 
 
 class MissionEvent(NamedTuple):
@@ -264,11 +269,11 @@ class MissionEvent(NamedTuple):
 
     Attributes:
         stamp_ns: Time of the event [ns], cloud's clock.
-        event: One of `UNDER_WAY`; at the end its outcome: "done", "cancelled", "timed_out",
+        event: One of `UNDER_WAY`, or the outcome of the mission: "done", "cancelled", "timed_out",
             "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped", "taken_over",
             "end_lost".
-        waypoint: Index of the waypoint concerned; -1 if none.
-        text: The same in words.
+        waypoint: Index of the waypoint of the event; -1 if none.
+        text: The event in words.
     """
 
     stamp_ns: int
@@ -283,7 +288,7 @@ class Fault(NamedTuple):
     Attributes:
         stamp_ns: Time of the problem [ns], own clock.
         code: One word: "estimator_failed", "predictor_failed", "controller_failed", "recorder",
-            "link_check", "wall_clock", or "late" (cloud missed its periods, or world is slower than
+            "link_check", "wall_clock", or "late" (cloud missed periods, or world is slower than
             real time).
         text: What is wrong, where, and what to do.
     """
@@ -299,8 +304,8 @@ class Counted(NamedTuple):
     Attributes:
         stamp_ns: Time of the reading [ns], own clock.
         end: "world", "cloud" or "link".
-        name: "received", "sent", "malformed", "late", "stale", "repeated", "old_epoch",
-            "range", "recorder_dropped"...
+        name: Name of the counter, such as "received", "sent", "malformed", "late", "stale",
+            "repeated", "old_epoch", "range", "recorder_dropped".
         total: Value since the start.
     """
 

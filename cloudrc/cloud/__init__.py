@@ -1,6 +1,6 @@
-"""The remote controller in the cloud: turn the robot's telemetry into velocity commands.
+"""The remote controller in the cloud: it turns the robot's telemetry into velocity commands.
 
-The signal passes through three plug-ins; the operator gives the setpoint:
+The signal passes through three plug-ins. The operator gives the setpoint:
 
     telemetry > estimators (how long is the loop delay?)
               > predictors (where will the robot be by then?)
@@ -8,6 +8,6 @@ The signal passes through three plug-ins; the operator gives the setpoint:
                                                 ^
               operator > teleop (missions) ---- setpoint
 
-A file in `estimators`, `predictors` or `controllers` is a plug-in under its own name. A name that
-begins with an underscore is a helper of the others.
+A file in `estimators`, `predictors` or `controllers` is a plug-in; the file name is the plug-in's
+name. A file whose name begins with an underscore is a helper of the plug-ins.
 """

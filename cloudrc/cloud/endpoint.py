@@ -1,9 +1,11 @@
 """Run cloud's end of the tunnel: receive telemetry and send a command every 10 ms.
 
-Cloud asks for a session with hellos and uses the epoch that world assigns. While it has nothing to
-command it sends ALIVE datagrams, because world gives the session to another cloud if it hears
-nothing. Cloud and teleop exchange messages only: teleop gets the robot's status and returns
-setpoints and operator requests.
+Cloud asks for a session with hellos and uses the epoch that world assigns. While cloud has nothing
+to command, it sends ALIVE datagrams: if world receives nothing from this cloud, it gives the
+session to another cloud.
+
+Cloud and teleop exchange messages only: teleop gets the robot's status and returns setpoints and
+operator requests.
 """
 
 from __future__ import annotations
@@ -45,14 +47,15 @@ class CloudIdentity:
 
 
 MISSED_MAX = 50
-"""Number of missed periods, not yet forgiven, at which cloud reports a fault [periods]; any machine
-misses a few."""
+"""Number of missed periods, not yet forgiven, from which on cloud reports a fault [periods]. Every
+machine misses a few periods."""
 FORGIVEN_NS = 200_000_000
-"""Time after which one missed period no longer counts [ns]: 5 % of all periods may be missed."""
+"""Time after which one missed period is forgiven: it no longer counts [ns]. With this value, 5 % of
+all periods may be missed."""
 
 
 class MissedPeriods:
-    """Report when cloud misses many periods, and again after all of them are forgiven."""
+    """Reports once that cloud misses many periods, and again only after all were forgiven."""
 
     def __init__(self) -> None:
         self._missed, self._reported = 0, False
@@ -86,12 +89,12 @@ class MissedPeriods:
 PERIOD_NS = 10_000_000
 """Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""
 HELLO_PERIOD_NS = 100_000_000
-"""Least time between two periodic hellos [ns]."""
+"""Shortest time between two periodic hellos [ns]."""
 KEY_PERIOD_NS = 5_000_000_000
-"""Time between two hellos with a new key while the session has the old one [ns]. World, which may
-not have the new key yet, counts them as forged: 12 a minute raise no alert."""
+"""Time between two hellos with a new key while the session uses the old key [ns]. World may not
+have the new key yet, and then counts these hellos as forged. 12 hellos a minute raise no alert."""
 GIVE_UP_NS = 5_000_000_000
-"""Longest time for which cloud tries to tell the robot that its mission is over [ns]."""
+"""Longest time for which cloud tries to tell the robot that the mission is over [ns]."""
 SILENCE_NS = 500_000_000
 """Time without telemetry after which cloud says hello again [ns]; world may have restarted."""
 ALIVE_PERIOD_NS = 100_000_000
@@ -121,7 +124,7 @@ class CloudEndpoint:
         newest_wins: bool,
         start_ns: int = 0,
     ) -> None:
-        """Begin without a session.
+        """Connect the parts; there is no session yet.
 
         Args:
             loop: Estimator, predictor and controller.
@@ -158,7 +161,7 @@ class CloudEndpoint:
 
     @property
     def counts(self) -> Counter[str]:
-        """How often each thing has happened, as of now; a copy."""
+        """A copy of the counters: how often each event has happened so far."""
         return Counter(self._counts | self._loop.counts)
 
     @property
@@ -168,13 +171,13 @@ class CloudEndpoint:
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended and the robot holds, or does not answer."""
+        """Whether the mission has ended, and the robot holds or does not answer for GIVE_UP_NS."""
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 
     @property
     def sealed(self) -> bool:
-        """See `Endpoint`."""
+        """Whether the datagrams are authenticated."""
         return self._session.sealed
 
     def next_deadline_ns(self) -> int:
@@ -182,17 +185,17 @@ class CloudEndpoint:
         return self._tick_ns
 
     def take_datagrams(self) -> list[bytes]:
-        """Hand over the datagrams to send."""
+        """Return the datagrams to send."""
         datagrams, self._datagrams = self._datagrams, []
         return datagrams
 
     def take_records(self) -> list[Record]:
-        """Hand over the records since the last call."""
+        """Return the records since the last call."""
         records, self._records = self._records, []
         return records
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Send what is due at `now_ns` [ns]; missed periods are skipped."""
+        """Send the datagrams that are due at `now_ns` [ns]; skip missed periods."""
         if now_ns < self._tick_ns:
             return
         missed = (now_ns - self._tick_ns) // PERIOD_NS
@@ -227,7 +230,7 @@ class CloudEndpoint:
             self._records += self._loop.take_faults()
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Handle one datagram; an invalid one is counted and dropped."""
+        """Handle one datagram. Count and drop an invalid datagram."""
         try:
             kind, _, epoch, counter, body = self._session.open(data)
             if kind == TELEMETRY:
@@ -258,7 +261,7 @@ class CloudEndpoint:
             self._records += self._complaints.about(outcome, data, now_ns)
 
     def _say_hello_if_due(self, now_ns: int, period_ns: int = HELLO_PERIOD_NS) -> None:
-        """Say hello once a period; while two keys are accepted, with each of them in turn."""
+        """Send a hello once a period. While two keys are valid, use them in turn."""
         if now_ns < self._hello_ns + period_ns:
             return
         self._hello_ns = now_ns
@@ -268,7 +271,7 @@ class CloudEndpoint:
         self._greet(self._handshake.make_hello(), key)
 
     def _wants_session(self, now_ns: int) -> bool:
-        """Whether cloud asks for a session: it has none, or does not hear world."""
+        """Whether cloud asks for a session: it has none, or receives nothing from world."""
         return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
 
     def _greet(self, hello: bytes, key: Key) -> None:
@@ -276,7 +279,7 @@ class CloudEndpoint:
         self._counts["sent"] += 1
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
-        """Begin the epoch that world assigns to this process, if it is new."""
+        """Begin the epoch that world assigns to this process, if the epoch is new."""
         asks = self._wants_session(now_ns)
         nonces = self._handshake.receive_accept(epoch, accept, asks=asks)
         if nonces is None:
@@ -296,7 +299,7 @@ class CloudEndpoint:
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
     def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
-        """Record telemetry of this epoch; pass it to loop and teleop if it is to be used."""
+        """Record telemetry of this epoch; pass usable telemetry to loop and teleop."""
         outcome = self._channel.take(counter)
         if outcome != REPEATED:  # anybody can send repeats
             self._heard_ns = now_ns
@@ -334,8 +337,8 @@ class CloudEndpoint:
     def _relay(self, request: OperatorRequest) -> None:
         """Relay a request to world, or drop it; teleop repeats a dropped request.
 
-        An emergency stop without a number is repeated by cloud itself. Cloud relays nothing without
-        a session, and no start before telemetry has arrived or while it repeats a stop.
+        Cloud itself repeats an emergency stop without a number. Without a session, cloud relays
+        nothing. Cloud relays no start before telemetry arrives, and none while it repeats a stop.
         """
         if request.number > codec.NUMBER_MAX:  # somebody with the keys has used up the numbers
             self._counts["words_dropped"] += 1

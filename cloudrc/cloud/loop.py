@@ -1,12 +1,13 @@
 """Compute each command from the newest telemetry with estimator, predictor and controller.
 
-A plug-in may raise, or return values that are not finite or not numbers. The loop then uses a safe
-value (the last good horizon, the last sample, zero velocity), counts the failure and reports the
-first one. It never stops.
+A plug-in may raise an exception, or return values that are not finite or not numbers. The loop then
+uses a safe value (the last good horizon, the last sample, zero velocity). It counts every failure
+and reports the first failure of each plug-in. The loop never stops.
 
 While no echo shows that the robot flies the commands, the loop freezes: it commands zero velocity
-and does not call the controller. So no integral winds up, and no predictor assumes motion that the
-robot did not fly. The loop goes on sending commands, because only a new echo ends the silence.
+and does not call the controller. Therefore no integral winds up, and no predictor assumes motion
+that the robot did not fly. A frozen loop continues to send commands, because only the echo of a new
+command ends the freeze.
 
 The loop measures all ages on cloud's own clock and compares world's stamps only with each other,
 so it needs no clock synchronisation.
@@ -30,11 +31,11 @@ HORIZON_MAX = 1.0
 
 
 class DelayMeter:
-    """Feed a delay estimator with echoes and get the horizon from it.
+    """Feeds a delay estimator with echoes and gets the horizon from the estimator.
 
     Attributes:
-        rtt: Last round trip without the hold [s]; NaN before the first.
-        loop_delay: Last `now - echo_stamp`, which includes the hold [s]; NaN before the first.
+        rtt: Last round trip, without the hold time on world [s]; NaN before the first.
+        loop_delay: Last `now - echo_stamp`, with the hold time [s]; NaN before the first.
         newest_echo_ns: Stamp of the newest command that an echo shows as flown [ns], cloud's clock.
     """
 
@@ -49,8 +50,8 @@ class DelayMeter:
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process new telemetry at its arrival.
 
-        A repeated echo is no sample. While the downlink is silent, world echoes the same command
-        again and again, and its growing age would corrupt the estimate.
+        A repeated echo is no sample. While the downlink is silent, world repeats the echo of the
+        same command; the growing age of that command would corrupt the estimate.
 
         Args:
             telemetry: The newest telemetry.
@@ -68,7 +69,7 @@ class DelayMeter:
         self._estimator.update(DelaySample(self.loop_delay, self.rtt, applied_minus_stamp))
 
     def horizon(self, now_ns: int) -> float:
-        """Return how far to predict from the newest odometry for a command that leaves now.
+        """Return the horizon for a command that leaves now, from the newest odometry.
 
         Args:
             now_ns: Cloud's clock [ns].
@@ -96,7 +97,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class ControlLoop:
-    """Run estimator, predictor and controller of one session.
+    """Runs estimator, predictor and controller of one session.
 
     Attributes:
         faults: Faults since the last `take_faults`.
@@ -111,7 +112,7 @@ class ControlLoop:
     ) -> None:
         """Connect three plug-ins; every session gets a new estimator.
 
-        Exceptions of the plug-ins are not caught here, because nothing flies yet.
+        The constructor does not catch exceptions of the plug-ins, because nothing flies yet.
         """
         self._build_estimator = build_estimator
         self._predictor = predictor
@@ -272,7 +273,7 @@ class ControlLoop:
             return STAND_STILL
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether no new echo has come for too long; the first one has as much time."""
+        """Whether no new echo has come for too long; the first echo has the same time limit."""
         if self._echoed_ns < self._delays.newest_echo_ns:
             self._echoed_ns = self._delays.newest_echo_ns
         elif self._echoed_ns == NEVER_NS:
@@ -280,10 +281,10 @@ class ControlLoop:
         return now_ns - self._echoed_ns > horizon * 1e9 + FREEZE_NS
 
     def _note(self, kind: str, error: BaseException, now_ns: int, instead: str = "") -> None:
-        """Count a failure of a plug-in and report the first one.
+        """Count a failure of a plug-in, and report the first failure of its kind.
 
-        A plug-in may raise anything; only a user's Ctrl-C is raised again. A failure at NEVER_NS
-        gets its stamp from the next telemetry.
+        A plug-in may raise any exception; only a user's Ctrl-C is raised again. A failure whose
+        `now_ns` is NEVER_NS gets the stamp of the next telemetry.
         """
         if isinstance(error, KeyboardInterrupt):
             raise error
@@ -299,7 +300,7 @@ _INSTEAD = {
     "predictor": "cloud uses the last sample without a prediction",
     "controller": "cloud commands zero velocity",
 }
-"""Kind of plug-in -> what cloud does instead when the plug-in fails."""
+"""Kind of plug-in -> what cloud does when the plug-in fails."""
 
 
 def _explain(kind: str, error: BaseException, instead: str) -> str:
@@ -308,6 +309,6 @@ def _explain(kind: str, error: BaseException, instead: str) -> str:
 
 
 def _triple(numbers: Vector) -> Vector:
-    """Convert what a plug-in returned to three floats."""
+    """Convert a vector that a plug-in returned to three floats."""
     x, y, z = numbers
     return float(x), float(y), float(z)

@@ -1,4 +1,4 @@
-"""Connect cloud's end to teleop by messages, and repeat an emergency stop until it is seen."""
+"""Connect cloud's end to teleop by messages, and repeat an emergency stop until the robot stops."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class Operator(Protocol):
 
     @property
     def outcome(self) -> Outcome | None:
-        """How the mission ended; None while cloud has to go on."""
+        """How the mission ended; None while cloud has to continue."""
 
     @property
     def settled(self) -> bool:
         """Whether telemetry shows that the robot has acted on the last request."""
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Pass on the newest telemetry at `now_ns` [ns]."""
+        """Pass the newest telemetry, received at `now_ns` [ns], to teleop."""
 
     def handle_deadline(self, now_ns: int) -> None:
         """Do what is due at `now_ns` [ns]."""
@@ -43,8 +43,8 @@ class Operator(Protocol):
 def is_for_session(epoch: int, output: Output | Fault) -> bool:
     """Whether a message from teleop is valid in a session.
 
-    A setpoint and a start are valid only in the session for which teleop made them, because another
-    cloud may have moved the robot since; teleop repeats them for the new session. All other
+    A setpoint and a start are valid only in the session for which teleop made them: another cloud
+    may have moved the robot in the meantime. Teleop repeats both for the new session. All other
     messages are always valid, because they cannot make the robot fly.
 
     Args:
@@ -65,7 +65,7 @@ def make_robot_status(
 
     Args:
         telemetry: The newest telemetry.
-        epoch: Epoch of its session.
+        epoch: Epoch of the telemetry's session.
         world: Text that identifies world's process.
         delays: Horizon, round trip and loop delay of the last command [s]; NaN before the first.
     """
@@ -87,11 +87,11 @@ def make_robot_status(
 
 
 class EmergencyStopRepeater:
-    """Repeat an emergency stop until telemetry shows that the robot has acted on it.
+    """Repeats an emergency stop until telemetry shows that the robot has acted on the stop.
 
-    This is the only place that numbers and repeats the stop towards the robot. Teleop, or its API
-    past teleop's loop, asks for it as often as it likes. Without a session the stop waits, and it
-    continues in the next one.
+    Only this class numbers the stop and repeats it towards the robot. Teleop's loop, or teleop's
+    API without the loop, may ask for the stop any number of times. Without a session the stop waits
+    for the next session.
 
     Attributes:
         sounds: Whether the stop is being repeated.
@@ -102,7 +102,7 @@ class EmergencyStopRepeater:
         self._number = self._acted_on = self._due_ns = 0
 
     def sound(self) -> None:
-        """Start to repeat the stop, unless that is under way."""
+        """Start to repeat the stop, unless it is being repeated already."""
         if not self.sounds:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
@@ -117,16 +117,16 @@ class EmergencyStopRepeater:
             self.sounds = False
 
     def acknowledge(self) -> None:
-        """End the stop of a robot that is stopped: teleop has seen that, and then acknowledges."""
+        """End the repetition if the robot is stopped: teleop has seen and acknowledges the stop."""
         self.sounds = self.sounds and not self._stopped
 
     def due(self, asked: int, now_ns: int) -> OperatorRequest | None:
-        """Return the request if a copy of it is due.
+        """Return a copy of the emergency stop if one is due, else None.
 
         World acts on rising numbers only, so the stop needs a number above all others.
 
         Args:
-            asked: Highest number of a request so far.
+            asked: Highest number of all requests so far.
             now_ns: Cloud's monotonic clock [ns].
         """
         if not self.sounds or now_ns < self._due_ns:

@@ -1,4 +1,4 @@
-"""Check parameters of plug-ins from the experiment file.
+"""Check the parameters that an experiment file gives to plug-ins.
 
 Every error names the parameter, the value and the reason in one line.
 """
@@ -15,7 +15,7 @@ def not_negative(name: str, value: object) -> float:
     """Return `value` if it is a finite number >= 0, in any unit.
 
     Raises:
-        ValueError: If it is not.
+        ValueError: If `value` is no finite number or is negative.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{name}: {value!r} is not a number")
@@ -28,7 +28,7 @@ def positive(name: str, value: object) -> float:
     """Return `value` if it is a finite number > 0, in any unit.
 
     Raises:
-        ValueError: If it is not.
+        ValueError: If `value` is no finite number or is not above 0.
     """
     number = not_negative(name, value)
     if number == 0:
@@ -40,7 +40,7 @@ def gain(name: str, value: object) -> float:
     """Return `value` if it is a valid gain of an average [1]: above 0, at most 1.
 
     Raises:
-        ValueError: If it cannot.
+        ValueError: If `value` is not a number above 0 and at most 1.
     """
     number = positive(name, value)
     if number > 1:
@@ -49,10 +49,10 @@ def gain(name: str, value: object) -> float:
 
 
 def vector(name: str, value: object) -> Vector:
-    """Return `value` as a tuple if it is three finite numbers >= 0, one per axis.
+    """Return `value` as a tuple if it consists of three finite numbers >= 0, one per axis.
 
     Raises:
-        ValueError: If it is not.
+        ValueError: If `value` is not three finite numbers >= 0.
     """
     if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 3:
         raise ValueError(f"{name}: {value!r} must be three numbers, for x, y and z")

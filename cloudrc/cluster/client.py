@@ -31,7 +31,7 @@ class Release:
     """One release of the chart: one robot and its cloud.
 
     Attributes:
-        context: Context of the kubeconfig; None for the current one.
+        context: Context of the kubeconfig; None for the current context.
         namespace: Namespace of the release.
         name: Name of the Helm release.
     """
@@ -112,7 +112,7 @@ class Release:
 
 @contextmanager
 def _login_errors(where: str) -> Iterator[None]:
-    """Raise an error that the client only logs: a failure of the kubeconfig's login program.
+    """Raise an error if the kubeconfig's login program fails, which the client only logs.
 
     Raises:
         MissingPrerequisiteError: With the client's message, which names the program.
@@ -143,11 +143,11 @@ def _login_errors(where: str) -> Iterator[None]:
 def connect(
     context: str | None = None, namespace: str | None = None, release: str = DEFAULT_RELEASE
 ) -> Release:
-    """Select a release by the kubeconfig; sends nothing to the cluster.
+    """Select a release by the kubeconfig, without a request to the cluster.
 
     Args:
         context: Value of `--context`; None for the current context.
-        namespace: Value of `-n`; None for that of the context, or "default".
+        namespace: Value of `-n`; None for the namespace of the context, or "default".
         release: Name of the Helm release.
 
     Raises:
@@ -183,7 +183,7 @@ def server_version(release: Release) -> tuple[int, int]:
         Major and minor version.
 
     Raises:
-        ClusterError: If the API server does not answer, or refuses.
+        ClusterError: If the API server does not answer, or refuses the request.
     """
     with explain_errors("get the version", release.where):
         code = release.version.get_code(_request_timeout=ANSWER_LIMIT)

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 
 FLUSH = 1.0
-"""Time after which a recorder has surely flushed its buffer [s]; the buffer holds at most half a
+"""Time after which a recorder has certainly flushed its buffer [s]; the buffer holds at most half a
 second of records."""
 FETCHES = 4
-"""Maximum number of attempts to fetch recordings that contain the mission's end."""
+"""Largest number of attempts to fetch recordings that contain the mission's end."""
 FLOWN = (0, 1, 6, 130)
 """Exit codes of a Job whose mission has flown: success, failure, invalid, interrupted."""
 COMPONENTS = ("world", "cloud")
@@ -40,10 +40,10 @@ def fly_in_cluster(
     """Fly one experiment on a release and fill its run folder.
 
     Args:
-        experiment: Complete and checked.
-        folder: Empty until the mission has flown; then it gets configuration, recordings,
-            metrics, logs and report.
-        release: Where to fly; installed if missing, and kept afterwards.
+        experiment: A complete and checked experiment.
+        folder: Folder of the run. It is empty until the mission has flown; then it gets
+            configuration, recordings, metrics, logs and report.
+        release: The release that flies; installed if missing, and kept afterwards.
         timeout: Time for the release to become ready [s].
         tell: Called with progress, a line at a time.
 
@@ -51,7 +51,7 @@ def fly_in_cluster(
         The content of report.json.
 
     Raises:
-        CloudrcError: If the mission could not be flown, or another one is flying there.
+        CloudrcError: If the mission could not be flown, or if the release flies another mission.
     """
     from cloudrc.cluster.release import current_values, install
     from cloudrc.cluster.tools import chart_folder
@@ -75,11 +75,11 @@ def fly_in_cluster(
 
 
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Give the chart's values for an experiment; other values of the release stay.
+    """Return the chart's values for an experiment; all other values of the release stay the same.
 
     Args:
-        experiment: Complete; it becomes the chart's `experiment`, with its link.
-        before: Values that the release was installed with.
+        experiment: A complete experiment; it becomes the chart's `experiment`, with its link.
+        before: Values with which the release was installed.
     """
     link = {**before.get("link", {}), "profile": ""}
     # The chart's own Job would fly its mission at the same time.
@@ -89,7 +89,7 @@ def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> d
 
 
 def _refuse_busy(release: Release) -> None:
-    """Refuse to interrupt a flight: installing an experiment replaces both pods."""
+    """Refuse to install an experiment, which replaces both pods, while a mission flies."""
     from cloudrc.cluster.jobs import current_mission
     from cloudrc.cluster.tools import ClusterError
 
@@ -103,7 +103,7 @@ def _refuse_busy(release: Release) -> None:
 
 
 def mission_document(experiment: ResolvedExperiment) -> dict[str, Any]:
-    """Give the mission of an experiment as the API expects it."""
+    """Return the mission of an experiment in the API's format."""
     mission = experiment.mission.model_dump(mode="json")
     return {
         "name": experiment.name,
@@ -117,7 +117,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
     """Refuse an experiment that names local files, which the images do not contain.
 
     Raises:
-        BadInputError: Names the key of the file.
+        BadInputError: If the experiment names a local file; the message names the key.
     """
     from cloudrc.config.load import FILE_READERS
 
@@ -145,7 +145,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
-    """Fly by a Job; cancel the mission if interrupted."""
+    """Fly the mission by a Job; cancel the mission if the user interrupts."""
     from cloudrc.cluster.jobs import follow, follow_limit, run_job
     from cloudrc.cluster.tools import ClusterError
 
@@ -174,13 +174,14 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
     """Fetch recordings, metrics and logs, and merge the recordings.
 
     Args:
-        release: Where the mission flew.
+        release: The release that flew the mission.
         folder: The folder of the run.
         tell: Called with a line for each file that cannot be fetched.
         want_end: Whether to fetch again until the recordings contain the mission's end.
 
     Raises:
-        CloudrcError: If the recordings cannot be fetched; the report needs no other file.
+        CloudrcError: If the recordings cannot be fetched. The other files are not needed for the
+            report, so they cause no exception.
     """
     from cloudrc.cluster.pods import fetch_logs, fetch_metrics
     from cloudrc.record.merge import cut_to_last_mission, merge
@@ -236,7 +237,7 @@ def _fetch_before(release: Release, folder: Path, tell: Tell) -> None:
 
 
 def _shaper(folder: Path) -> str:
-    """Read the link's emulator, such as netem, from its container's metrics."""
+    """Read from the link container's metrics what emulates the link, such as netem."""
     texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
     found = {name for text in texts for name in _SHAPER_LABEL.findall(text)}
     return "+".join(sorted(found)) or "unknown"

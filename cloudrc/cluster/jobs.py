@@ -1,7 +1,8 @@
 """Fly missions as Kubernetes Jobs: create, list, follow, cancel and delete them.
 
-The container of a Job posts the mission to the release's API, follows it and ends with its verdict.
-`charts/cloudrc/examples/mission-job.yaml` shows the same objects, written by hand.
+The container of a Job posts the mission to the release's API, follows the mission, and ends with
+the exit code of the mission's verdict. `charts/cloudrc/examples/mission-job.yaml` shows the same
+objects, written by hand.
 """
 
 from __future__ import annotations
@@ -40,21 +41,21 @@ COMPONENT = "mission"
 FOLDER = "/etc/cloudrc-mission"
 """Folder of the mission's file in the container."""
 FILE = "mission.yaml"
-"""Key of the mission in the ConfigMap, and name of its file."""
+"""Key of the mission in the ConfigMap, and name of the mission's file."""
 TOKENS = "/etc/cloudrc-tokens"
 """Folder of the API's tokens in the container."""
 KEY = "MISSION_KEY"
-"""Environment variable with the key under which the mission is posted."""
+"""Environment variable with the mission's key in the API."""
 UID_LABEL = "batch.kubernetes.io/controller-uid"
 """Label with the Job's UID, which Kubernetes sets on the Job's pod."""
 START_ALLOWANCE = 120
-"""Time to start the pod and to see the robot, added to the mission's time limit [s]."""
+"""Time to start the pod and to receive the robot's state, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
 """Time for earlier missions to end, added to the deadline of a Job that may queue [s]."""
 DEADLINE_MAX = 2**31 - 1
 """Largest deadline that Kubernetes accepts [s]."""
 KEEP_FINISHED = 3600
-"""Time for which Kubernetes keeps a finished Job [s]."""
+"""How long Kubernetes keeps a finished Job [s]."""
 USER = 10001
 """User and group id in the container."""
 API_CONTAINER = "teleop"
@@ -96,7 +97,7 @@ class JobSettings:
 
 
 def labels(release: Release) -> dict[str, str]:
-    """Return the labels of a mission's objects; the NetworkPolicies select by them."""
+    """Return the labels of a mission's objects; the NetworkPolicies select by these labels."""
     return {
         "app.kubernetes.io/name": "cloudrc",
         "app.kubernetes.io/instance": release.name,
@@ -110,7 +111,7 @@ def config_map(release: Release, name: str, mission: Mapping[str, Any]) -> dict[
     """Build the ConfigMap with the mission.
 
     Args:
-        release: Release that flies it.
+        release: Release that flies the mission.
         name: Name of Job and ConfigMap.
         mission: Mission in the API's format.
     """
@@ -135,10 +136,10 @@ def deadline(limit: float, queue: bool) -> int:
 def job(
     release: Release, name: str, follower: JobSettings, *, limit: float, queue: bool
 ) -> dict[str, Any]:
-    """Build the Job that posts the mission, follows it and ends with its verdict.
+    """Build the Job that posts the mission, follows the mission and ends with its verdict.
 
     Args:
-        release: Release that flies it.
+        release: Release that flies the mission.
         name: Name of Job and ConfigMap.
         follower: Settings of the pod.
         limit: Time limit of the mission [s].
@@ -233,8 +234,8 @@ class JobStatus:
         uid: UID of the Job, and key of the mission in the API.
         state: "pending", "flying", "complete" or "failed".
         created: Time of creation on the cluster's clock (RFC 3339).
-        exit_code: Exit code of the container; None until it has ended.
-        message: Verdict in words; "" until there is one.
+        exit_code: Exit code of the container; None until the container has ended.
+        message: Verdict in words; "" until the verdict is known.
     """
 
     name: str
@@ -256,9 +257,9 @@ def run_job(
     """Create the Job of a mission; the Job runs to its end even if no client watches it.
 
     Args:
-        release: Release that flies it.
+        release: Release that flies the mission.
         mission: Mission in the API's format: name, start, time_limit_s, waypoints.
-        name: Name of the Job; default: an unused one.
+        name: Name of the Job; default: an unused name.
         limit: Time limit of the mission [s].
         queue: Whether to wait while another mission flies; else the mission is refused.
 
@@ -266,7 +267,7 @@ def run_job(
         The new Job.
 
     Raises:
-        ClusterError: If the cluster refuses, or there is no such release.
+        ClusterError: If the cluster refuses the Job, or if the release does not exist.
     """
     # A Job's pod has a longer name than the Job; the limit is 63 characters.
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
@@ -284,7 +285,7 @@ def run_job(
 
 
 def _create_plan(release: Release, plan: Mapping[str, Any]) -> None:
-    """Create the ConfigMap; if that fails, delete the Job, which would wait for it forever."""
+    """Create the ConfigMap. If this fails, delete the Job, which would wait forever."""
     try:
         with explain_errors("create configmaps", release.where):
             release.core.create_namespaced_config_map(
@@ -343,7 +344,7 @@ def _reference(deployment: Any) -> dict[str, Any] | None:
 
 
 def _placement(release: Release, deployment: Any) -> dict[str, Any]:
-    """Copy the keys that select nodes from a Deployment's pod."""
+    """Return the keys of a Deployment's pod that select nodes."""
     if deployment is None:
         return {}
     spec = release.apps.api_client.sanitize_for_serialization(deployment.spec.template.spec) or {}
@@ -394,7 +395,7 @@ def read_job(release: Release, name: str) -> JobStatus:
 
 
 def delete_job(release: Release, name: str) -> None:
-    """Delete a Job with its pod and ConfigMap; a mission that it has posted continues."""
+    """Delete a Job with its pod and ConfigMap; a mission that was already posted continues."""
     with explain_errors("delete jobs", release.where):
         release.batch.delete_namespaced_job(
             name,
@@ -441,7 +442,7 @@ def _status(job: Any, pod: Any) -> JobStatus:
 
 
 def _verdict(pod: Any) -> tuple[int | None, str]:
-    """Return exit code and termination message of the Job's container."""
+    """Find the exit code and the termination message of the Job's container."""
     for status in (pod.status.container_statuses or []) if pod is not None else []:
         ended = status.state.terminated
         if ended is not None:
@@ -450,14 +451,14 @@ def _verdict(pod: Any) -> tuple[int | None, str]:
 
 
 def _failure(condition: Any) -> str:
-    """Say why Kubernetes ended a Job."""
+    """Describe why Kubernetes ended a Job."""
     if condition.reason == "DeadlineExceeded":
         return "the Job took longer than its activeDeadlineSeconds"
     return f"{condition.reason}: {condition.message}"
 
 
 def follow_limit(limit: float, queue: bool) -> float:
-    """Compute the time within which Kubernetes has ended a Job [s].
+    """Compute the time after which Kubernetes has ended a Job in any case [s].
 
     Args:
         limit: Time limit of the mission, as in `run_job` [s].
@@ -481,8 +482,8 @@ def follow(
         The final state of the Job.
 
     Raises:
-        ClusterError: If the Job's pod cannot run; with the cause.
-        WaitedTooLongError: If the Job has not ended in time.
+        ClusterError: If the Job's pod cannot run; the message has the cause.
+        ExpiredError: If the Job has not ended in time.
     """
     until, written = time.monotonic() + timeout, 0
     while True:
@@ -542,12 +543,12 @@ def _check_can_start(release: Release, status: JobStatus) -> None:
 
 
 def cancel(release: Release, name: str, token: str | None = None) -> str:
-    """Cancel the mission of a Job, or delete the Job if it has not posted its mission yet.
+    """Cancel the mission of a Job; delete a Job that has not posted its mission yet.
 
     Args:
-        release: Release that flies it.
+        release: Release that flies the mission.
         name: Name of the Job.
-        token: Token of an operator; None to read the release's own.
+        token: Token of an operator; None to read the token from the release's Secret.
 
     Returns:
         The result in words.
@@ -579,13 +580,14 @@ def cancel(release: Release, name: str, token: str | None = None) -> str:
 
 
 def current_mission(release: Release) -> tuple[str, str]:
-    """Find the mission that flies on a release, or is about to.
+    """Find the mission that flies, or will fly next, on a release.
 
     Args:
         release: The release; it need not exist.
 
     Returns:
-        The mission in words, "" if none is known; and the name of its Job, "" if it is unknown.
+        The mission in words, "" if no mission is known; and the name of the mission's Job, "" if
+        the Job is unknown.
 
     Raises:
         ClusterError: If the cluster does not list the Jobs.
@@ -608,7 +610,7 @@ def current_mission(release: Release) -> tuple[str, str]:
 
 
 def _running_cloud(release: Release) -> str:
-    """Return the name of the newest running cloud pod; "" if there is none."""
+    """Return the name of the newest running cloud pod; "" if no cloud pod runs."""
     pods = list_pods(release, "cloud")
     return next((str(pod.metadata.name) for pod in pods if pod.status.phase == "Running"), "")
 

@@ -1,12 +1,12 @@
 """Change the link of a release in flight: `cloudrc link set` in a cluster.
 
-The new profile goes into both running link containers, so that it is in force within a second, and
-then into the ConfigMap, so that a restart keeps it. A change that a container refuses does not go
-into the ConfigMap, and one that fails says what has it and what has not. Traces are files beside
-the profile.
+The new profile is first sent to both running link containers, so that it is in force within a
+second. Then it is written into the ConfigMap, so that restarted containers use it, too. If a
+container refuses a change, the ConfigMap stays unchanged. If a change fails, the message lists what
+has the change and what has not. Traces are files beside the profile.
 
-For speed, this module uses kubectl, which starts in 0.1 s, not the Python client, which takes
-0.5 s; and a few lines of `sh` in the containers, not Python.
+For speed, this module uses kubectl, which starts in 0.1 s; the Python client takes 0.5 s. In the
+containers it uses a few lines of `sh` instead of Python.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ from cloudrc.link.state import CHANGE_FILE, STATE_FILE, LinkState, from_text, re
 PROFILE = "profile.yaml"
 """Key of the profile in the ConfigMap."""
 COMPONENTS = ("world", "cloud")
-"""Components whose link containers shape the uplink and the downlink, in this order."""
+"""Components with a link container: world's shapes the uplink, cloud's shapes the downlink."""
 READ_LIMIT = 15.0
 """Time limit for the API server to answer [s]."""
 FOLDER = "/run/cloudrc"
-"""Folder in a link container with its route, its state and the change that it gets."""
+"""Folder in a link container with its route, its state and the change that was sent to it."""
 APPLY_LIMIT = 5.0
-"""Time limit for the sidecar to apply a change [s]; it takes 0.2 s."""
+"""Time limit for the sidecar to apply a change [s]; this usually takes 0.2 s."""
 SEND_LIMIT = 25.0
 """Time limit to send a change to a container and to read the answer [s]."""
 SIZE_MAX = 1_000_000
-"""Largest size of a ConfigMap's files, a little less than its limit of 1 MiB [bytes]."""
+"""Largest size of a ConfigMap's files [bytes]; a little less than Kubernetes' limit of 1 MiB."""
 _COMPONENT = "app.kubernetes.io/component"
 _LOOK_PERIOD = 0.02
 """Time between two looks at the sidecar's state [s]."""
 _KEY = re.compile(r"[^-._a-zA-Z0-9]")
-"""Pattern of a character that no key of a ConfigMap may have."""
+"""Pattern of a character that is not allowed in a key of a ConfigMap."""
 
 
 @dataclass(frozen=True)
 class ReleasePlace:
-    """Context, namespace and name of a release; None is kubectl's default.
+    """Context, namespace and name of a release; None stands for kubectl's default.
 
     Attributes:
         context: Context of the kubeconfig.
@@ -76,7 +76,7 @@ class LinkParts:
 
     Attributes:
         name: Name of the ConfigMap that the link containers follow.
-        files: Its files: the profile, its traces, the record of the last change.
+        files: Files in that ConfigMap: the profile, its traces, the record of the last change.
         pods: Component -> name of its newest running pod.
     """
 
@@ -86,10 +86,10 @@ class LinkParts:
 
 
 def read_link(place: ReleasePlace) -> LinkParts | None:
-    """Read a release's link with one kubectl command; None if a part of it is missing.
+    """Read a release's link with one kubectl command; None if the ConfigMap or a pod is missing.
 
     Raises:
-        ClusterError: If kubectl fails; with its message.
+        ClusterError: If kubectl fails; the message is kubectl's.
     """
     selector = f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={place.name}"
     words = [*place.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
@@ -105,7 +105,7 @@ def read_link(place: ReleasePlace) -> LinkParts | None:
 
 
 def write_files(place: ReleasePlace, name: str, files: Mapping[str, str]) -> None:
-    """Write files into the ConfigMap; its other files stay.
+    """Write files into the ConfigMap; the other files stay unchanged.
 
     Raises:
         ClusterError: If the cluster refuses.
@@ -140,13 +140,14 @@ for _ in $(seq {round(APPLY_LIMIT / _LOOK_PERIOD)}); do
 done
 cat {STATE_FILE}
 """
-"""Script for `sh` in a link container. Its arguments are folder, number of the change and length of
-the document on its standard input. It puts the document where the sidecar reads it, in one step,
-waits until the sidecar has accepted or refused it, and prints the sidecar's state."""
+"""Script for `sh` in a link container. Arguments: the folder, the number of the change, and the
+length of the document on standard input. In one step, the script puts the document where the
+sidecar reads it. Then it waits until the sidecar has accepted or refused the change, and prints the
+sidecar's state."""
 
 
 def send_change(place: ReleasePlace, pod: str, handed: Handed) -> str:
-    """Send a change to a pod's link container, and wait until it has accepted or refused it.
+    """Send a change to a pod's link container; wait until the container accepts or refuses it.
 
     Args:
         place: The release.
@@ -154,7 +155,7 @@ def send_change(place: ReleasePlace, pod: str, handed: Handed) -> str:
         handed: The change.
 
     Returns:
-        The state of the link after that, as JSON.
+        The state of the link after the change, as JSON.
 
     Raises:
         ClusterError: If kubectl or the container refuses.
@@ -166,13 +167,13 @@ def send_change(place: ReleasePlace, pod: str, handed: Handed) -> str:
 
 
 class Sent(NamedTuple):
-    """A change that was sent to both link containers, none of which refused it.
+    """A change that was sent to both link containers, and that neither refused.
 
     Attributes:
         edit: The edited profile.
         files: Files for the ConfigMap.
-        states: States of the directions that report one, after the change.
-        failed: Errors of the others.
+        states: State after the change of each direction that reports its state.
+        failed: Errors of the directions that report no state.
     """
 
     edit: Edit
@@ -188,14 +189,14 @@ def send(
     settings: Sequence[str],
     note: Callable[[Edit], str],
 ) -> Sent:
-    """Change the profile in both link containers, and wait until they have applied it.
+    """Change the profile in both link containers, and wait until both have applied the change.
 
     Args:
         place: The release.
-        link: Its present link.
+        link: The present link of the release.
         profile: New profile, as in `cloudrc.config.profile_edit.edit_profile`.
-        settings: Values to set, likewise.
-        note: Returns the text of the file beside the profile: who changed it, and why.
+        settings: Values to set, also as in `edit_profile`.
+        note: Returns the text of a file beside the profile: who changed the profile, and why.
 
     Raises:
         BadInputError: If the request is not valid, or a container refuses the change.
@@ -233,7 +234,7 @@ def send(
 
 
 def keep(place: ReleasePlace, link: LinkParts, sent: Sent) -> None:
-    """Write a change into the ConfigMap, and report everything that has failed.
+    """Write a change into the ConfigMap, and report all failures.
 
     Raises:
         CloudrcError: If a container or the ConfigMap does not have the change.
@@ -252,7 +253,7 @@ def keep(place: ReleasePlace, link: LinkParts, sent: Sent) -> None:
 
 
 def needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
-    """Select the profile and the files that it names from a ConfigMap's files.
+    """Select from a ConfigMap's files the profile and the files that the profile names.
 
     Args:
         values: Values of the profile.
@@ -266,7 +267,7 @@ def needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[st
 def with_files(
     files: Mapping[str, str], profile: str | None, settings: Sequence[str]
 ) -> tuple[Edit, dict[str, str]]:
-    """Edit the profile among these files.
+    """Edit the profile that is one of `files`.
 
     Returns:
         The edited profile, and the new files: the profile and its new traces.
@@ -295,7 +296,7 @@ def with_files(
 
 
 def _add_file(path: Path, folder: Path, way: str, new: dict[str, str]) -> str:
-    """Return a trace's name beside the profile; add its text to `new` if it is not there yet."""
+    """Return the name of a trace's file beside the profile; add a file that is new to `new`."""
     if path.parent == folder:
         return path.name
     key = f"{way}-{_KEY.sub('_', path.name)}"

@@ -1,7 +1,7 @@
 """Access the pods of a release: find them, explain failures, forward ports, read tokens and files.
 
-A recording is copied while it grows. The copy may be cut off at its end, as after a kill; it can be
-read up to there.
+A recording is copied while it grows. The end of the copy may be cut off, as after a kill; the rest
+is readable.
 """
 
 from __future__ import annotations
@@ -41,18 +41,19 @@ FATAL = {
     "CrashLoopBackOff": "crash",
     "Error": "crash",
 }
-"""Kubernetes' reason for which a container will never run -> kind of failure."""
+"""Reason, in Kubernetes' words, why a container will never run -> kind of failure."""
 SECRETS = {
     "secret": ("key", "head -c 32 /dev/urandom"),
     "tokens": ("operator", "openssl rand -hex 32"),
 }
-"""Volume of the chart's pods -> key that its Secret must have, and a command that makes it."""
+"""Volume of the chart's pods -> key that the volume's Secret must have, and a command that makes
+the key's content."""
 RESTARTS_MAX = 2
-"""Largest number of restarts of a container that may still start."""
+"""Largest number of restarts up to which a container may still start [1]."""
 
 
 def list_pods(release: Release, component: str) -> list[Any]:
-    """List the pods of a component that are not being deleted, the newest first."""
+    """List the pods of a component, the newest first, without pods that are being deleted."""
     with explain_errors("list pods", release.where):
         found = release.core.list_namespaced_pod(
             release.namespace,
@@ -67,7 +68,7 @@ def find_pod(release: Release, component: str) -> Any:
     """Find the newest running pod of a component.
 
     Raises:
-        ClusterError: If there is none; says whether the release exists.
+        ClusterError: If no such pod runs; the message says whether the release exists.
     """
     pods = list_pods(release, component)
     for pod in pods:
@@ -83,10 +84,10 @@ def find_pod(release: Release, component: str) -> Any:
 
 
 def require_release(release: Release) -> None:
-    """Check that a release exists, whether or not its pods run.
+    """Check that a release exists; its pods need not run.
 
     Raises:
-        ClusterError: If it does not exist; says how to install it.
+        ClusterError: If the release does not exist; the message says how to install it.
     """
     with explain_errors("list deployments", release.where):
         found = release.apps.list_namespaced_deployment(
@@ -113,7 +114,7 @@ def is_ready(pod: Any) -> bool:
 
 
 def pod_failure(pod: Any) -> str | None:
-    """Say in one sentence why a pod will never run; None if it may."""
+    """Describe in one sentence why a pod will never run; return None if the pod may run."""
     for status in _containers(pod):
         why = _container_trouble(status)
         if why:
@@ -127,13 +128,13 @@ def pod_failure(pod: Any) -> str | None:
 
 
 def refusal(release: Release, kind: str, name: str) -> str | None:
-    """Say why the cluster refuses an object's pod: Pod Security, a quota; None if it does not."""
+    """Describe why the cluster refuses an object's pod, such as a quota; None if it does not."""
     refused = _events(release, kind, name, "FailedCreate")
     return refused[-1] if refused else None
 
 
 def missing_secret(release: Release, pod: Any) -> str | None:
-    """Say which missing Secret a pod waits for, and how to make it; None if it waits for none."""
+    """Name the missing Secret for which a pod waits, and how to make it; None without one."""
     if any(status.state.running or status.state.terminated for status in _containers(pod)):
         return None
     messages: list[str] = []
@@ -152,7 +153,7 @@ def missing_secret(release: Release, pod: Any) -> str | None:
 
 
 def _has_secret(release: Release, name: str) -> bool:
-    """Whether a Secret exists now: an event may be up to two minutes older than that."""
+    """Whether a Secret exists now; an event about a missing Secret may be two minutes old."""
     with suppress(ClusterError), explain_errors("get secrets", release.where):
         release.core.read_namespaced_secret(
             name, release.namespace, _request_timeout=REQUEST_TIMEOUT
@@ -162,7 +163,7 @@ def _has_secret(release: Release, name: str) -> bool:
 
 
 def _events(release: Release, kind: str, name: str, reason: str) -> list[str]:
-    """List the messages of an object's events with this reason."""
+    """List the messages of those events of an object that have this reason."""
     with explain_errors("list events", release.where):
         events = release.core.list_namespaced_event(
             release.namespace,
@@ -173,7 +174,7 @@ def _events(release: Release, kind: str, name: str, reason: str) -> list[str]:
 
 
 def _waits_for_volume(condition: Any) -> bool:
-    """Whether a pod only waits for a volume that is made on first use."""
+    """Whether a pod waits only for a volume that Kubernetes makes on first use."""
     return "volume" in (condition.message or "") and "unbound" in (condition.message or "")
 
 
@@ -201,7 +202,7 @@ def _container_trouble(status: Any) -> str | None:
 
 
 def _last_end(status: Any) -> str:
-    """Return exit code and message of the container's last end in words; "" if unknown."""
+    """Describe exit code and message of the container's last end; "" if unknown."""
     ended = getattr(status.last_state, "terminated", None)
     if ended is None:
         return ""
@@ -212,14 +213,14 @@ def _last_end(status: Any) -> str:
 VOLUME = "tokens"
 """Volume with the API's tokens in the pods of cloud and missions."""
 OPERATOR = "operator"
-"""Key of the operator's token in the Secret, and name of its file."""
+"""Key of the operator's token in the Secret, and name of the token's file."""
 
 
 def secret_name(release: Release) -> str:
     """Find the name of the Secret with the API's tokens.
 
     Raises:
-        ClusterError: If the cloud pod mounts none.
+        ClusterError: If the cloud pod mounts no such Secret.
     """
     for volume in find_pod(release, "cloud").spec.volumes or []:
         if volume.name == VOLUME and volume.secret is not None:
@@ -231,10 +232,10 @@ def secret_name(release: Release) -> str:
 
 
 def operator_token(release: Release) -> str:
-    """Read the operator's token; this needs the right to get Secrets.
+    """Read the operator's token; the user needs the right to get Secrets.
 
     Raises:
-        ClusterError: If it cannot be read; the message never contains a token.
+        ClusterError: If the token cannot be read; the message never contains a token.
     """
     name = secret_name(release)
     with explain_errors("get secrets", release.where):
@@ -255,11 +256,11 @@ def operator_token(release: Release) -> str:
 API_PORT = 8080
 """TCP port of teleop's API in the cloud pod."""
 NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-"""Opens URLs on this machine, without the proxy of the environment."""
+"""Opens URLs on this machine and ignores proxies that environment variables name."""
 START_LIMIT = 20.0
 """Time limit for kubectl to forward the ports [s]."""
 STOP_LIMIT = 2.0
-"""Time for kubectl to end after SIGTERM, before SIGKILL [s]."""
+"""Time from SIGTERM to SIGKILL in which kubectl can end [s]."""
 LOOK_PERIOD = 0.05
 """Time between two looks at kubectl's output [s]."""
 _FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
@@ -270,15 +271,15 @@ def api_url(context: str | None, namespace: str | None, release: str) -> Iterato
     """Forward a port to a release's API while the block runs.
 
     Args:
-        context: Context of the kubeconfig; None for the current one.
-        namespace: Namespace; None for that of the context.
+        context: Context of the kubeconfig; None for the current context.
+        namespace: Namespace of the release; None for the namespace of the context.
         release: Name of the Helm release.
 
     Yields:
         URL of the API, without a slash at the end.
 
     Raises:
-        CloudrcError: If there is no such release, or the port cannot be forwarded.
+        CloudrcError: If the release does not exist, or if the port cannot be forwarded.
     """
     place = connect(context, namespace, release)
     with forwarded(place, find_pod(place, "cloud").metadata.name, [API_PORT]) as ports:
@@ -316,7 +317,7 @@ def forwarded(release: Release, pod: str, ports: Sequence[int]) -> Iterator[dict
 
 
 class _NotOpenError(Exception):
-    """kubectl ended before it forwarded the ports."""
+    """kubectl ended before the ports were forwarded."""
 
 
 def _wait_until_open(
@@ -389,7 +390,7 @@ def fetch_previous_recording(release: Release, component: str, target: Path) -> 
         False if the container has not restarted in its pod.
 
     Raises:
-        ClusterError: If it has restarted and there is no such file.
+        ClusterError: If the container has restarted, but no earlier recording exists.
     """
     pod = find_pod(release, component)
     statuses = pod.status.container_statuses or []

@@ -16,7 +16,7 @@ COMPONENTS = ("world", "cloud")
 LOOK_PERIOD = 1.0
 """Time between two looks at the pods [s]."""
 HELM_LIMIT = 120.0
-"""Time limit for one helm command, which does not wait for pods [s]."""
+"""Time limit for one helm command [s]; helm does not wait for pods."""
 HINTS = {
     "cluster unreachable": "is the cluster up? ask it: kubectl cluster-info",
     "incompatible with Kubernetes": "make a newer one: kind create cluster",
@@ -27,7 +27,7 @@ HINTS = {
 }
 """Words in an error message of helm -> what to do next."""
 FAILURE_TIME = 5.0
-"""Time for which a failure must last to be reported: a Secret may appear after its pod [s]."""
+"""A failure is reported if it lasts longer than this [s]; a Secret may appear after its pod."""
 
 
 def install(
@@ -50,7 +50,8 @@ def install(
         tell: Gets a line about each change of the pods' state.
 
     Raises:
-        CloudrcError: If helm or the cluster refuses, or a pod cannot run; in one sentence.
+        CloudrcError: If helm or the cluster refuses, or if a pod cannot run. The message is one
+            sentence.
     """
     arguments = ["upgrade", "--install", release.name, str(chart), *release.helm_flags]
     arguments += ["--create-namespace", "--values=-", *extra]
@@ -59,7 +60,7 @@ def install(
 
 
 def current_values(release: Release) -> dict[str, Any]:
-    """Read the values that a release was installed with; empty if there is no release.
+    """Read the values with which a release was installed; empty if the release does not exist.
 
     Raises:
         CloudrcError: If helm or the cluster refuses.
@@ -72,7 +73,7 @@ def current_values(release: Release) -> dict[str, Any]:
 
 
 def _helm(arguments: Sequence[str], given: str = "") -> str:
-    """Run helm; add a hint to its error message."""
+    """Run helm, and add a hint to helm's error message."""
     try:
         return run("helm", arguments, timeout=HELM_LIMIT, given=given)
     except ClusterError as error:
@@ -92,8 +93,8 @@ def wait_ready(
         tell: Gets a line about each change of the pods' state.
 
     Raises:
-        ClusterError: If a pod cannot run however long one waits; with the cause.
-        WaitedTooLongError: If the pods are not ready in time; with their states.
+        ClusterError: If a pod will never run; the message has the cause.
+        ExpiredError: If the pods are not ready in time; the message has their states.
     """
     until, failing_since, last = time.monotonic() + timeout, None, ""
     while True:
@@ -124,7 +125,7 @@ def _describe(release: Release) -> str:
 
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
-    """Say why a component is not ready, "" if it is; and whether waiting cannot help."""
+    """Describe why a component is not ready, "" if it is ready; and whether waiting is useless."""
     deployment = _deployment(release, component)
     refused = _refusal(deployment)
     if refused:

@@ -14,7 +14,7 @@ from typing import IO, TypeVar
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 
 OUTAGE_MAX = 30.0
-"""Time for which requests are repeated while the API server does not answer [s]."""
+"""Longest time for which a request is repeated while the API server does not answer [s]."""
 OUTAGE_PERIOD = 1.0
 """Time between two tries [s]."""
 TOO_MANY_REQUESTS = 429
@@ -24,7 +24,7 @@ WHERE_TO_GET = {
     "kubectl": "https://kubernetes.io/docs/tasks/tools/",
     "helm": "https://helm.sh/docs/intro/install/",
 }
-"""Program -> page with its installation."""
+"""Program -> page that explains the installation."""
 PACKAGE = Path(__file__).resolve().parents[1]
 CHART_FILE = "Chart.yaml"
 
@@ -52,12 +52,12 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
     """Convert exceptions of the Kubernetes client to a ClusterError with one sentence.
 
     Args:
-        doing: Verb and kind of object: "list Jobs".
+        doing: Action as verb and kind of object: "list Jobs".
         where: Cluster and namespace, from `Release.where`.
 
     Raises:
-        ClusterError: In place of an exception of the client; other exceptions pass. It is an
-            `AwayError` if a later try may succeed.
+        ClusterError: In place of an exception of the client; an `UnavailableError` if a later try
+            may succeed. All other exceptions stay unchanged.
     """
     from kubernetes.client.exceptions import ApiException
     from kubernetes.config.config_exception import ConfigException
@@ -115,7 +115,7 @@ def _refusal(error: Exception, doing: str) -> str:
 
 
 def _message(error: Exception) -> str:
-    """Return the API server's message about the error, in one line."""
+    """Extract the API server's message from an error, as one line."""
     try:
         message = json.loads(getattr(error, "body", "") or "")["message"]
     except (ValueError, KeyError, TypeError):
@@ -124,7 +124,7 @@ def _message(error: Exception) -> str:
 
 
 def _root(error: BaseException) -> str:
-    """Return the innermost reason; the outer ones only report repeated tries."""
+    """Return the innermost cause; the outer exceptions only report repeated tries."""
     reason = getattr(error, "reason", None)
     if isinstance(reason, BaseException):
         return _root(reason)
@@ -140,7 +140,8 @@ def program(name: str) -> str:
     """Find a program on the PATH.
 
     Raises:
-        MissingPrerequisiteError: If it is not installed; names the page with its installation.
+        MissingPrerequisiteError: If the program is not installed; the message names a page that
+            explains the installation.
     """
     path = shutil.which(name)
     if path is None:
@@ -160,18 +161,18 @@ def run(
 
     Args:
         name: "kubectl" or "helm".
-        arguments: Its arguments.
+        arguments: Arguments of the program.
         timeout: Time limit [s].
-        given: Text for its standard input.
-        stdout: File for its output; None to return the output.
+        given: Text for the program's standard input.
+        stdout: File for the program's output; None to return the output.
 
     Returns:
-        Its output; "" if `stdout` is given.
+        The program's output; "" if `stdout` is given.
 
     Raises:
-        ClusterError: If the program fails; with its error message.
-        WaitedTooLongError: If it takes longer than `timeout`.
-        MissingPrerequisiteError: If it is not installed.
+        ClusterError: If the program fails; the message is that of the program.
+        ExpiredError: If the program takes longer than `timeout`.
+        MissingPrerequisiteError: If the program is not installed.
     """
     command = [program(name), *arguments]
     target = subprocess.PIPE if stdout is None else stdout
@@ -188,7 +189,7 @@ def run(
 
 
 def last_words(stderr: str) -> str:
-    """Extract the error message of a program in one line, without warnings and log lines."""
+    """Extract a program's error message as one line, without warnings and log lines."""
     lines = [" ".join(line.split()) for line in stderr.splitlines() if line.strip()]
     first = next((i for i, line in enumerate(lines) if line.lower().startswith("error")), None)
     text = " ".join(lines[first:] if first is not None else lines[-1:])
@@ -196,7 +197,7 @@ def last_words(stderr: str) -> str:
 
 
 def _short(name: str, arguments: Sequence[str]) -> str:
-    """Shorten a command to program, verb and object."""
+    """Shorten a command to its program, verb and object."""
     words = [word for word in arguments if not word.startswith("-")][:2]
     return " ".join([name, *words])
 

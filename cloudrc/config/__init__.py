@@ -1,1 +1,1 @@
-"""Configuration files: read, complete and check them; the result is one frozen experiment."""
+"""Read, complete and check configuration files; the result is one immutable experiment."""

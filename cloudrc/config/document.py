@@ -20,10 +20,10 @@ from cloudrc.config.schema import MAX_WAYPOINTS
 from cloudrc.errors import BadInputError
 
 KeyPath = tuple[str, ...]
-"""Keys from the top of a document down to a value; list indices are text."""
+"""Keys from the top of a document down to a value; the indices of lists are text, too."""
 
 SIZE_MAX = 8 << 20
-"""Largest file that is read [bytes]: four times a mission with MAX_WAYPOINTS waypoints."""
+"""Largest file that is read [bytes]: four times the size of a mission of MAX_WAYPOINTS points."""
 SET_LABEL = "--set"
 """Label of a value that was set on the command line."""
 
@@ -38,7 +38,8 @@ _SCALARS = (
         "-+.0123456789",
     ),
 )
-"""Tag, pattern and possible first characters of each kind of scalar; "\\0": an empty scalar.
+"""Tag, pattern and possible first characters of each kind of scalar. The first character "\\0"
+stands for an empty scalar.
 Source: YAML 1.2.2, section 10.3.2."""
 
 _MAX_DEPTH = 50
@@ -46,7 +47,7 @@ _MAX_DEPTH = 50
 _MAX_VALUES = 300_000
 """Largest number of values in a document."""
 _MAX_EVENTS = 3 * _MAX_VALUES
-"""Largest number of parser events: a value has up to two, and its key one."""
+"""Largest number of parser events: a value has at most two events, and its key has one."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -57,7 +58,7 @@ class _Dumper(yaml.SafeDumper):
     yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write every value out, without YAML aliases: people read resolved files."""
+        """Write no YAML aliases but every value in full, because people read resolved files."""
         return True
 
 
@@ -79,7 +80,8 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
         name: Its name in messages.
 
     Returns:
-        Dictionaries with text keys, lists and scalars; and the line of each value, from 1.
+        The document as dictionaries with text keys, lists and scalars; and the line of each value,
+        counted from 1.
 
     Raises:
         BadInputError: If the text is not YAML, repeats a key or has an object that is not plain.
@@ -99,14 +101,16 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
 
 
 def parse_value(text: str, name: str) -> Any:
-    """Parse a value of the command line; all of the text belongs to it, also behind ` #` or `: `.
+    """Parse a value of the command line.
+
+    In a scalar without quotes, ` #` starts no comment and `: ` starts no mapping.
 
     Args:
         text: A list or mapping in YAML's brackets, quoted text, several lines of YAML, or a scalar.
         name: Its name in messages.
 
     Raises:
-        BadInputError: If brackets hold no YAML, or something follows them.
+        BadInputError: If brackets hold no YAML, or if text follows the closing bracket.
     """
     stripped = text.strip()
     if "\n" in stripped:
@@ -130,7 +134,7 @@ def parse_value(text: str, name: str) -> Any:
 
 
 def write_yaml(value: Any) -> str:
-    """Write plain values as YAML; `parse` returns equal values."""
+    """Write plain values as YAML; `parse_yaml` of the text returns equal values."""
     return yaml.dump(
         value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None,
         width=100,
@@ -138,7 +142,7 @@ def write_yaml(value: Any) -> str:
 
 
 def _check_bounds(text: str) -> None:
-    """Refuse a document that would exhaust memory or the stack: libyaml's composer recurses."""
+    """Refuse a document that would exhaust memory or, as libyaml's composer recurses, the stack."""
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=_Loader)):
         if count > _MAX_EVENTS:
@@ -210,7 +214,7 @@ class Source:
     folder: Path
 
     def absolute(self, path: str) -> Path:
-        """Resolve a path that is written at this place; never raises, whatever the path."""
+        """Resolve a path that is written at this place; no path raises an exception."""
         return Path(os.path.realpath(self.folder / os.path.expanduser(path)))
 
 

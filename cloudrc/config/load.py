@@ -1,11 +1,16 @@
-"""Load an experiment and resolve it: names and defaults are replaced by values.
+"""Load an experiment and resolve it: replace names and defaults by values.
 
-The steps: read the file; apply `--set`; insert mission and profile under the experiment's own
-values; add the missing parameters of plug-ins; check everything against the schema, the scene and
-the disk. One error lists all problems, each with its line.
+The steps:
 
-A resolved experiment has its mission and both directions of the link inline, all parameters of the
-plug-ins and all limits. Written to a file it is an experiment file that gives the same run.
+1. Read the file.
+2. Apply `--set`.
+3. Insert mission and link profile; the experiment's own values have priority.
+4. Add the missing parameters of plug-ins.
+5. Check everything against the schema, the scene and the disk. One error lists all problems, each
+   with its line.
+
+A resolved experiment contains its mission, both directions of the link, all parameters of the
+plug-ins and all limits. Written to a file, it is an experiment file that gives the same run.
 """
 
 from __future__ import annotations
@@ -40,15 +45,15 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.link.traces import read_table, read_trace
 
 COMMAND_AGE_MAX_MS = 250.0
-"""Default of guard.command_age_max_ms without a value in experiment or profile [ms].
+"""Value of guard.command_age_max_ms if neither experiment nor profile gives one [ms].
 Source: docs/reference/plant.md, "Command age"."""
 
 
 def speed_cap(command_age_max_ms: float) -> float:
     """Compute the largest speed from which the robot stops within 8.7 m [m/s].
 
-    It flies for T = `command_age_max_ms` [ms] and 0.2 s before it brakes at 3 m/s^2:
-    v (T + 0.2) + v^2 / 6 = 8.7 m.
+    The robot flies for T = `command_age_max_ms` [ms] plus 0.2 s before it brakes at 3 m/s^2:
+    v · (T + 0.2 s) + v^2 / 6 = 8.7 m.
     Source: docs/reference/plant.md, "Speed cap".
     """
     delay = command_age_max_ms * 1e-3 + 0.2
@@ -110,17 +115,18 @@ FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table
 
 
 def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment to fly it; imports the plug-ins that it names.
+    """Load an experiment for a flight, and import the plug-ins that it names.
 
     Args:
         name: Name of a shipped experiment, or path of a file.
-        settings: `key=value` texts that override the file, in any order.
+        settings: Texts `key=value` that override the file, in any order.
 
     Returns:
         The complete, checked experiment; its paths are absolute.
 
     Raises:
-        BadInputError: One line, or a summary and one line for each problem.
+        BadInputError: If the experiment has problems. The message is one line, or a summary and one
+            line for each problem.
     """
     return _load_experiment(str(name), settings, overrides.resolve_plugins)
 
@@ -128,8 +134,8 @@ def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedE
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
     """Load an experiment without its plug-ins, for a process that runs no cloud.
 
-    As `load_experiment`, but plug-ins are neither imported nor checked, and have only the
-    parameters that the file gives. The config.yaml of a run gives all of them.
+    This differs from `load_experiment`: plug-ins are neither imported nor checked, and have only
+    the parameters that the file gives. The config.yaml of a run gives all parameters.
     """
     return _load_experiment(str(name), settings, overrides.name_plugins)
 
@@ -147,7 +153,7 @@ def check_profile(document: Document, name: str) -> Profile:
 def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
     """Load a mission by name or path (relative to `folder`); raises BadInputError.
 
-    `config.mission_check.check_mission` checks it against a scene.
+    `config.mission_check.check_mission` checks a mission against a scene.
     """
     document = shipped.read("mission", str(name), folder or Path())
     return _validate(document, Mission, str(name), [])
@@ -156,7 +162,7 @@ def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
 def dump(experiment: ResolvedExperiment) -> str:
     """Write an experiment as YAML that loads as an equal experiment without other files.
 
-    Exceptions are traces and plug-ins outside the package: the text has their absolute paths.
+    The text does not contain traces and plug-ins outside the package, only their absolute paths.
     """
     return write_yaml(experiment.model_dump(mode="json"))
 
@@ -205,7 +211,11 @@ def _load_profile(name: str, folder: Path) -> tuple[Document, Profile]:
 
 
 def _validate(document: Document, model: type[_Model], name: str, found: list[Problem]) -> _Model:
-    """Check a document against its model; raise a BadInputError with `found` and new problems."""
+    """Check a document against its model.
+
+    Raises:
+        BadInputError: If `found` contains problems or the check finds more; lists all of them.
+    """
     result = None
     # Messages describe what a file may contain: in a file, a mission may be a name, too.
     file_model = Experiment if model is ResolvedExperiment else model
@@ -270,7 +280,7 @@ def _inline_profile(document: Document) -> list[Problem]:
 
 
 def _age_max(document: Document) -> float:
-    """Return the guard's age limit [ms], or the default if the value will be refused later."""
+    """Return the guard's age limit [ms], or the default if a later check will refuse the value."""
     age_max = document.get("guard", "command_age_max_ms")
     least, largest = COMMAND_AGE_MS
     usable = type(age_max) in (int, float) and least <= age_max <= largest  # excludes true

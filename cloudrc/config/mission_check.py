@@ -1,8 +1,8 @@
 """Check whether a mission can be flown in a scene.
 
-Each waypoint must be where the guard lets the robot fly, and the whole robot must be clear of the
-pipes' walls there and on the straight ways, the one from the spawn included. The board is not
-checked: the paper's last waypoint is behind it.
+Each waypoint must be where the guard lets the robot fly. At each waypoint and on the straight ways
+between them, the way from the spawn included, the whole robot must be clear of the pipes' walls.
+The board is not checked: the paper's last waypoint is behind the board.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
         scene: The scene to fly in.
 
     Returns:
-        Problems with paths relative to the mission; empty if it can be flown.
+        Problems with paths relative to the mission; empty if the mission can be flown.
     """
     count = len(mission.waypoints)
     if mission.steps is not None:
@@ -96,7 +96,10 @@ def _in_fence(positions: Array) -> NDArray[np.bool_]:
 
 
 def _check_ways(positions: Array, scene: Scene) -> list[Problem]:
-    """List the straight ways from start to waypoints [m], shape (n, 3), that lead into a wall."""
+    """List the straight ways that lead into a wall.
+
+    `positions` are the start and the waypoints [m], world frame, shape (n, 3).
+    """
     through = find_crossed_pipe(scene, positions[:-1], positions[1:])
     problems = []
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:

@@ -1,9 +1,10 @@
 """Apply `--set key=value` to a document, and complete the parameters of plug-ins.
 
-Shorter keys are set first, so the order of `mission=steps` and `mission.steps.count=3` does not
-matter. Where the value is a name, as in `controller: pid`, a longer key turns the name into a
-mapping: `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`. The index after the last
-appends to a list.
+- Shorter keys are set first. Therefore the order of `mission=steps` and `mission.steps.count=3`
+  does not matter.
+- If the value is a name, as in `controller: pid`, a longer key turns the name into a mapping:
+  `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`.
+- An index that is one above the last index appends to a list.
 
 Parameters of a plug-in are checked against the signature of its `build`, which also gives their
 defaults.
@@ -49,16 +50,17 @@ class Override:
 
     @property
     def inside_name(self) -> bool:
-        """Whether the key is inside a part that a file may give by name: mission or profile."""
+        """Whether the key is inside the mission or the profile, which a file may give by name."""
         inside_mission = self.path[0] == "mission" and len(self.path) > 1
         return inside_mission or (self.path[:2] in _DIRECTIONS and len(self.path) > 2)
 
 
 def parse_settings(texts: Iterable[str]) -> list[Override]:
-    """Read `key=value` texts, values as `document.parse_value` does; shorter keys come first.
+    """Parse texts `key=value`, the values by `document.parse_value`; sort shorter keys first.
 
     Raises:
-        BadInputError: If a text has no key or no `=`, a key is set twice, or a value is not YAML.
+        BadInputError: If a text has no key or no `=`, if a key is set twice, or if a value is not
+            YAML.
     """
     result: list[Override] = []
     for text in texts:
@@ -79,7 +81,7 @@ def apply_overrides(document: Document, overrides: Iterable[Override]) -> None:
 
     Args:
         document: An experiment; changed in place.
-        overrides: The values; relative paths in them start at the working folder.
+        overrides: The values to set; relative paths in these values start at the working folder.
 
     Raises:
         BadInputError: If an index is not a number or beyond the end of its list.
@@ -169,9 +171,9 @@ def resolve_plugins(document: Document) -> list[Problem]:
 
 
 def name_plugins(document: Document) -> list[Problem]:
-    """Replace each plug-in by a mapping as `resolve` does, with the given parameters only.
+    """Replace each plug-in by a mapping with its name and the given parameters.
 
-    Nothing is imported: file and plug-ins may come from somebody else.
+    Unlike `resolve_plugins`, this imports nothing: file and plug-ins may come from somebody else.
     """
     for key, name, parameters in _choices(document):
         document.tree["cloud"][key] = {"name": name, **parameters}
@@ -179,7 +181,10 @@ def name_plugins(document: Document) -> list[Problem]:
 
 
 def locate_metrics(document: Document) -> None:
-    """Make the paths of the user's metrics absolute, and a single name a list; import nothing."""
+    """Make the paths of the user's metrics absolute, and turn a single name into a list.
+
+    No metric is imported.
+    """
     names = document.get("report", "metrics")
     names = [names] if isinstance(names, str) else names
     if not isinstance(names, list):
@@ -192,7 +197,7 @@ def locate_metrics(document: Document) -> None:
 
 
 def build_plugin(kind: str, choice: PlugIn) -> Any:
-    """Build a plug-in of a resolved experiment; converts parameters to the types of its `build`.
+    """Build a plug-in of a resolved experiment; convert parameters to the types in its `build`.
 
     Args:
         kind: One of `cloudrc.plugins.PACKAGES`.
@@ -221,7 +226,7 @@ def parameter_model(kind: str, name: str) -> type[BaseModel]:
 
 
 def _choices(document: Document) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield key, name and parameters of each plug-in; a path as name becomes absolute."""
+    """Yield key, name and parameters of each plug-in; make a name that is a path absolute."""
     for key in KINDS:
         path = ("cloud", key)
         choice = document.get(*path)

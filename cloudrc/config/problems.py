@@ -1,6 +1,6 @@
 """Describe the problems of a configuration: one line each, with place, reason and remedy.
 
-The schema gives the words: a key's type, range and unit, and the known key nearest to a typo.
+The texts come from the schema: a key's type, range and unit, and the known key nearest to a typo.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
 
 
 def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:
-    """List all keys without keys below them, with their fields; index 0 stands for any index."""
+    """List all keys without keys below them, and their fields; index 0 stands for any index."""
     for key, info in model.model_fields.items():
         inner = list(_models(info.annotation))
         many = ("0",) if _is_list(info.annotation) else ()
@@ -42,7 +42,7 @@ def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPat
 
 
 def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
-    """Find the field of the last key of `path`; None if there is none."""
+    """Find the field of the last key of `path`; None if the schema has no such field."""
     field = None
     models = [model]
     for key in path:
@@ -75,7 +75,7 @@ def expectation(model: type[BaseModel], path: KeyPath) -> str:
 
 
 def nearest_key(model: type[BaseModel], path: KeyPath) -> str:
-    """Suggest a known key in place of an unknown one."""
+    """Suggest a known key in place of an unknown key."""
     *above, key = path
     siblings = _keys_at(model, tuple(above))
     near = _near(key, siblings)
@@ -91,7 +91,7 @@ def nearest_key(model: type[BaseModel], path: KeyPath) -> str:
 
 
 def nearest_choice(detail: ErrorDetails) -> str:
-    """List the allowed words, and suggest the one nearest to a wrong word."""
+    """List the allowed words, and suggest the allowed word nearest to a wrong word."""
     expected = detail["ctx"]["expected"]
     near = _near(str(detail["input"]), re.findall(r"'([^']*)'", expected))
     return f"must be {expected}" + (f"; did you mean {near}?" if near else "")
@@ -111,7 +111,7 @@ def _keys_at(model: type[BaseModel], path: KeyPath) -> list[str]:
 
 
 def _types(annotation: Any) -> Iterator[Any]:
-    """List the plain types and models in an annotation, inside aliases and unions, too."""
+    """List the plain types and models in an annotation, also those inside aliases and unions."""
     if get_origin(annotation) is Literal:
         return
     arguments = [argument for argument in get_args(annotation) if argument is not Ellipsis]
@@ -177,7 +177,7 @@ class Problem:
 
     Attributes:
         path: Keys down to the value.
-        value: The value in words; empty if there is none.
+        value: The value in words; empty without a value.
         reason: What the value must be, and what to do.
     """
 
@@ -196,8 +196,8 @@ def from_pydantic(
 
     Args:
         error: The error that `model` raised.
-        model: The model with keys, ranges and units.
-        prefix: Keys above those of the model.
+        model: The model, which has keys, ranges and units.
+        prefix: Keys above the keys of the model.
         limit: Largest number of problems; None for all.
     """
     details = error.errors(include_url=False)[:limit]
@@ -205,7 +205,7 @@ def from_pydantic(
 
 
 def raise_problems(document: Document, problems: Iterable[Problem], name: str) -> None:
-    """Raise a BadInputError that lists all problems with their places; do nothing without any."""
+    """Raise a BadInputError that lists all problems with their places; do nothing if none exist."""
     every = _deepest(problems)
     lines = [f"{document.source(problem.path).label}: {problem}" for problem in every[:_LISTED]]
     if len(every) == 1:
@@ -219,7 +219,8 @@ def raise_problems(document: Document, problems: Iterable[Problem], name: str) -
 def _deepest(problems: Iterable[Problem]) -> list[Problem]:
     """Drop the problem of a value if a part of the value has a problem, too.
 
-    For example, a plug-in that lacks a parameter stays a name, which the schema then refuses.
+    For example, a plug-in that lacks a parameter is not replaced by a mapping. Its value is still a
+    name, for which the schema reports a second problem.
     """
     every = list(problems)
     above = {problem.path[:n] for problem in every for n in range(1, len(problem.path))}
@@ -227,7 +228,7 @@ def _deepest(problems: Iterable[Problem]) -> list[Problem]:
 
 
 def in_words(value: Any) -> str:
-    """Describe a value from a file, shortened."""
+    """Describe a value from a file in a short text."""
     if isinstance(value, dict):
         return "a mapping"
     if isinstance(value, list | tuple):

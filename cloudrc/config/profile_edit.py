@@ -1,7 +1,7 @@
 """Edit a link profile for `cloudrc link set`.
 
-A value set by hand stays in force: if the time line (changes, trace) sets the same value, it is
-removed there. The rest of the time line continues.
+A value that the user sets stays in force. If the time line (changes, trace) sets the same value,
+the value is removed from the time line. The rest of the time line continues.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Edit:
     Attributes:
         values: Values as in a profile file, without defaults; paths are absolute.
         cause: The request in words.
-        restart: Whether the time line starts again when the profile takes effect; else it
-            continues.
+        restart: True if the time line starts again when the profile takes effect, False if the
+            time line continues.
         notes: Sentences for the user about side effects.
     """
 
@@ -51,8 +51,9 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
 
     Args:
         before: The present profile.
-        profile: Name or path of a profile that replaces it; None edits the present one.
-        settings: Values to set, as "downlink.delay_ms=120".
+        profile: Name or path of a profile that replaces the present profile; None to edit the
+            present profile.
+        settings: Values to set, such as "downlink.delay_ms=120".
 
     Raises:
         BadInputError: If the request is empty or not valid.
@@ -77,10 +78,10 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
 
 
 def check_edit(profile: str | None, settings: Sequence[str]) -> None:
-    """Refuse a request that is wrong for every present profile.
+    """Refuse a request that is wrong, whatever the present profile is.
 
     Raises:
-        BadInputError: As `edit`.
+        BadInputError: If the request is empty or not valid.
     """
     independent = [
         text
@@ -113,7 +114,7 @@ def _without_prefix(change: Override) -> Override:
 
 
 def _drop_from_time_line(document: Document, change: Override, notes: list[str]) -> None:
-    """Remove from a direction's time line the key that is set by hand."""
+    """Remove the key that the user sets from a direction's time line."""
     way, key = change.path[:2]
     direction = document.get(way)
     if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:

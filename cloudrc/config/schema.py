@@ -1,8 +1,8 @@
 """Define every key of experiments, missions and link profiles, with its unit, range and default.
 
-Keys carry their unit (`delay_ms`); `cloudrc/assembly.py` converts them to SI. Unknown keys are
-refused. The defaults are the paper's scheme with the published gains. `Experiment` is what a file
-may contain; `config.load.ResolvedExperiment` is what is flown.
+The name of a key ends with its unit (`delay_ms`); `cloudrc/assembly.py` converts the values to SI
+units. Unknown keys are refused. The defaults are the paper's scheme with the published gains.
+`Experiment` is what a file may contain; `config.load.ResolvedExperiment` is what a run flies.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 # The guard's limits have bounds on both sides: none of them can be switched off.
 COMMAND_AGE_MS = 1, 10_000
-"""Smallest and largest value of the limit on a command's age [ms]."""
+"""Range of the age limit of commands: smallest and largest value [ms]."""
 CommandAge = Annotated[
     float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1], allow_inf_nan=False)
 ]
@@ -41,7 +41,7 @@ Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class Section(BaseModel):
-    """A section of a configuration file: frozen, without unknown keys, strictly typed."""
+    """A section of a configuration file: immutable, without unknown keys, strictly typed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -91,7 +91,7 @@ class Blackout(Section):
 
 
 class Change(Section):
-    """New conditions from `at_s` on; keys that are not given keep their values."""
+    """New conditions from `at_s` on; every key that is not given keeps its value."""
 
     at_s: NotNegative = Field(description="Start, in time since the link came up [s]")
     delay_ms: NotNegative | None = Field(
@@ -329,7 +329,7 @@ class Sensors(Section):
 
 
 class World(Section):
-    """The robot and the scene in which it flies."""
+    """The robot and its scene."""
 
     robot: str = Field(
         "pelican",
@@ -383,7 +383,7 @@ class Tunnel(Section):
 
 
 class Link(Section):
-    """The emulated network: a profile, and single values that override it."""
+    """The emulated network: a profile, and single values that override the profile's values."""
 
     profile: str = Field("paper-p2", description="Name of a shipped link profile, or a path")
     uplink: Direction = Field(

@@ -37,11 +37,11 @@ def read(kind: str, name: str, folder: Path) -> Document:
 
     Args:
         kind: "experiment", "mission" or "profile".
-        name: Name of a shipped file, or a path: it contains a slash or ends with `.yaml`.
+        name: Name of a shipped file, or a path. A path contains a slash or ends with `.yaml`.
         folder: Folder at which a relative path starts.
 
     Raises:
-        BadInputError: If there is no such file, or it cannot be read.
+        BadInputError: If there is no such file, or the file cannot be read.
     """
     if is_path(name):
         path = folder / os.path.expanduser(name)
@@ -53,7 +53,7 @@ def read(kind: str, name: str, folder: Path) -> Document:
 
 
 def check_name(kind: str, name: str) -> None:
-    """Raise a BadInputError if no file of this kind ships under that name."""
+    """Raise a BadInputError if no shipped file of this kind has that name."""
     available = names(kind)
     if name not in available:
         raise BadInputError(unknown_name_text(kind, name, available))

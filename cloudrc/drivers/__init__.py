@@ -1,4 +1,4 @@
 """Run the endpoints: only drivers own the control loop's clocks, sockets and threads.
 
-They know the endpoints by the contract in `cloudrc/endpoint.py` alone.
+Drivers know only the contract of endpoints in `cloudrc/endpoint.py`.
 """

@@ -3,12 +3,13 @@
     exporter = Exporter("world")
     exporter.serve("127.0.0.1:9100")    /metrics, /healthz and /readyz, on separate threads
     exporter.see(records)               on the loop's thread: less than 1 us per record
-    exporter.ready(True)                only in a process that is no end of the tunnel
+    exporter.ready(True)                only in a process that is not an end of the tunnel
 
-`see` updates plain numbers; a scrape turns them into Prometheus' text, at most four times a second.
+`see` updates plain numbers. A scrape turns these numbers into Prometheus' text, at most four times
+a second.
 
-Slow or hostile clients cannot block a probe: a connection lives at most 5 s, and when too many are
-open the server closes the oldest.
+Slow or hostile clients cannot block a probe: a connection stays open for at most 5 s, and the
+server closes the oldest connection when too many are open.
 """
 
 from __future__ import annotations
@@ -57,11 +58,12 @@ Pages = Mapping[str, Callable[[], Answer]]
 
 
 class ProbeServer(socketserver.ThreadingTCPServer):
-    """Serves pages until it is closed.
+    """Serves pages until `close` is called.
 
-    It does not use `http.server.HTTPServer`, which may wait for a name server.
-    The accept queue is long: if a flood of connections fills it, the kernel drops kubelet's
-    connections, too, and its probes fail although the process is healthy.
+    The server does not use `http.server.HTTPServer`, which may wait for a name server.
+
+    The accept queue is long: if a flood of connections filled the queue, the kernel would drop
+    kubelet's connections, too, and kubelet's probes would fail although the process is healthy.
     """
 
     allow_reuse_address = True
@@ -70,7 +72,7 @@ class ProbeServer(socketserver.ThreadingTCPServer):
     request_queue_size = 1_024
 
     def __init__(self, address: tuple[str, int], pages: Pages) -> None:
-        """Bind and start to answer.
+        """Bind the address and start to answer.
 
         Args:
             address: Host and port; port 0 lets the kernel choose.
@@ -93,19 +95,19 @@ class ProbeServer(socketserver.ThreadingTCPServer):
         self._thread.start()
 
     def server_bind(self) -> None:
-        """Bind; at the host `::` to IPv4, too."""
+        """Bind the address; the host `::` also accepts IPv4."""
         if self.address_family == socket.AF_INET6:
             self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         super().server_bind()
 
     def close(self) -> None:
-        """Stop the server; takes up to 0.25 s."""
+        """Stop the server, which takes up to 0.25 s."""
         self.shutdown()
         self.server_close()
         self._thread.join(1.0)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer on a thread; close the oldest connection if too many are open."""
+        """Answer on a new thread; close the oldest connection if too many are open."""
         with self._guard:
             if len(self._open) >= CONNECTIONS_MAX:
                 oldest = min(self._open, key=self._open.__getitem__)
@@ -129,7 +131,7 @@ class ProbeServer(socketserver.ThreadingTCPServer):
                     _shut_down(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore clients that disconnect early."""
+        """Ignore the errors of clients that disconnect early."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -139,7 +141,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = LIFETIME
 
     def do_GET(self) -> None:
-        """Answer with the page of the path, or 404."""
+        """Answer with the page of the requested path, or with 404."""
         page = self.server.pages.get(self.path.partition("?")[0])
         paths = ", ".join(self.server.pages)
         answer = page() if page else Answer(404, f"there are {paths}\n".encode())
@@ -179,7 +181,7 @@ class Throttling(NamedTuple):
 
     Attributes:
         periods: Number of CFS periods in which a thread was runnable.
-        throttled: Number of them in which threads were throttled.
+        throttled: Number of those periods in which threads were throttled.
         seconds: Throttled time, summed over all CPUs [s].
     """
 
@@ -189,7 +191,7 @@ class Throttling(NamedTuple):
 
 
 def read_throttling(root: Path = ROOT) -> Throttling | None:
-    """Read the counts; None where the kernel has none, for example outside of containers.
+    """Read the counts; None if the kernel has no counts, for example outside a container.
 
     Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
     Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
@@ -208,15 +210,15 @@ def read_throttling(root: Path = ROOT) -> Throttling | None:
 
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
-"""Content type of what `generate_latest` writes."""
+"""Content type of the text that `generate_latest` makes."""
 JSON = "application/json"
 KEPT = 0.25
-"""Time for which a page is reused [s]; making a page takes 1.4 ms and may delay the loop."""
+"""How long a page is reused [s]; making a page takes 1.4 ms and may delay the loop."""
 CONFIG_DIGITS = 12
 """Length of the shortened hash of the process's configuration [hexadecimal digits].
 
-In local mode it is the start of the hash in report.json. In a cluster the hashes may differ, since
-there plug-ins fill in their defaults later.
+In local mode the shortened hash is the beginning of the hash in report.json. In a cluster both may
+differ, since plug-ins fill in their defaults later.
 """
 STILL_MAX = 5.0
 """Time without a record after which a loop counts as standing still [s]; a healthy loop makes a
@@ -227,12 +229,12 @@ class Exporter:
     """The metrics of one process."""
 
     def __init__(self, role: str, *, missions: bool = True) -> None:
-        """Begin without records; nothing is served and the process is not ready.
+        """Set the role. The exporter has no records, serves nothing yet, and is not ready.
 
         Args:
             role: "world", "cloud", "teleop" or "link".
-            missions: Whether this process exports missions; False in a cloud with a separate
-                teleop, which exports them.
+            missions: Whether this process exports metrics of missions; False in a cloud with a
+                separate teleop, which exports them.
         """
         self._role, self._metrics = role, of_role(role)
         self._live = LiveMetrics(role, missions=missions)
@@ -247,12 +249,12 @@ class Exporter:
         ProcessCollector(registry=self._registry)
 
     def see(self, records: Iterable[Record]) -> None:
-        """Update the metrics with records of this process, oldest first; never waits."""
+        """Update the metrics with records of this process, oldest first, without waiting."""
         self._seen_at = time.monotonic()
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether this process is ready; for world and cloud their records show it."""
+        """Set whether this process is ready; not for world and cloud, whose records show this."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -277,15 +279,15 @@ class Exporter:
         self._live.link.asked(direction, delay)
 
     def unresolved(self, count: int) -> None:
-        """Set how many times the peer's name could not be resolved. Any thread may call it."""
+        """Set how many times the peer's name could not be resolved, from any thread."""
         self._live.see([Counted(0, "link", "unresolved", count)])
 
     def recording(self, sync_age: Callable[[], float | None]) -> None:
-        """Set the function that returns the time since the last sync [s], or None before one."""
+        """Set the function that returns the time since the last sync [s]; None before any sync."""
         self._sync_age = sync_age
 
     def tells(self, tell: Callable[[], str]) -> None:
-        """Set the function that writes the JSON of /link.json; only with the role "link"."""
+        """Set the function that makes the JSON of /link.json; only with the role "link"."""
         assert self._live.link is not None, "an end serves its own check"
         self._live.link.tell = tell
 
@@ -298,7 +300,7 @@ class Exporter:
         """Start to answer on HOST:PORT.
 
         Returns:
-            The port; for port 0, the one that the kernel has chosen.
+            The port; for port 0, the port that the kernel has chosen.
 
         Raises:
             MissingPrerequisiteError: If the address cannot be bound.
@@ -348,7 +350,7 @@ class Exporter:
         return generate_latest(self._registry).decode()
 
     def _page(self) -> Answer:
-        """Return the text of at most `KEPT` ago; requests wait while a new one is made."""
+        """Return a text at most `KEPT` old; requests wait while a new text is made."""
         with self._page_lock:
             now = time.monotonic()
             if now - self._made_at >= KEPT:
@@ -360,7 +362,7 @@ class Exporter:
         return Answer(200, b"ready\n") if self.is_ready else Answer(503, b"no peer yet\n")
 
     def _liveness(self) -> Answer:
-        """Answer whether this process's own loop runs, whatever the link and the other end do."""
+        """Answer whether this process's own loop runs, independently of link and other end."""
         still = None if self._seen_at is None else time.monotonic() - self._seen_at
         if still is None or still <= STILL_MAX:
             return Answer(200, b"alive\n")

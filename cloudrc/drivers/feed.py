@@ -1,7 +1,7 @@
 """Send a few records of a process to its supervisor, one line of JSON each.
 
-The process writes the lines to its standard output, which must never block it: if nobody reads
-them, they are lost. Prints of plug-ins go to standard error, the process's log, instead.
+The process writes the lines to its standard output. Writing never blocks the process: lines that
+nobody reads are lost. Prints of plug-ins go to standard error, which is the process's log.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from cloudrc.records import (
 )
 
 READY = "ready"
-"""The line that a process writes once it can receive, and later as a sign of life."""
+"""The line that a process writes when it can receive, and later as a sign of life."""
 ALIVE_PERIOD = 1.0
 """Time between two signs of life [s]."""
 PERIOD_NS = 100_000_000
-"""Time between two records of a type in `SAMPLED` [ns]."""
+"""Shortest time between two sent records of a type in `SAMPLED` [ns]."""
 EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
 """Record types of which every record is sent."""
 SAMPLED = (TelemetrySent, Control)
-"""Record types of which only one record is sent every `PERIOD_NS`."""
+"""Record types of which at most one record is sent per `PERIOD_NS`."""
 
 
 class Feed:
@@ -44,8 +44,8 @@ class Feed:
 
         Args:
             descriptor: File descriptor of the pipe.
-            watched: Whether a supervisor reads it. If not, as in a container, only events are
-                written, as the words of a log.
+            watched: Whether a supervisor reads the pipe. If nobody does, as in a container, only
+                events are written, as lines of a log.
         """
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
@@ -61,11 +61,11 @@ class Feed:
         return feed
 
     def ready(self) -> None:
-        """Report that the process can receive."""
+        """Write that the process can receive."""
         self._write(READY)
 
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Wrap the `stop` that a loop asks in every turn: also give a supervisor signs of life."""
+        """Wrap the `stop` that a loop calls in every turn: also write signs of life."""
         if not self._watched:
             return stop
         due = 0.0
@@ -90,9 +90,10 @@ class Feed:
                 self._write(to_line(record))
 
     def _is_news(self, record: LinkChanged) -> bool:
-        """Check that the link has changed; `LinkNotes` repeats its note when a mission begins.
+        """Tell whether a record of the link shows a change.
 
-        Each direction is compared with its own last note.
+        `LinkNotes` repeats its record when a mission begins. Each direction is compared with its
+        own last record.
         """
         last, self._links[record.uplink] = self._links.get(record.uplink), record.conditions
         return last != record.conditions and bool(record.cause)
@@ -105,7 +106,7 @@ class Feed:
         return True
 
     def _write(self, line: str) -> None:
-        """Write a line or drop it whole; the rest of a partly written line comes first."""
+        """Write a whole line or drop the line; the rest of a partly written line comes first."""
         data = line.encode(errors="backslashreplace") + b"\n"
         try:
             self._rest = self._rest[os.write(self._descriptor, self._rest) :]
@@ -136,7 +137,7 @@ def from_line(line: str) -> Record:
     """Parse a record from its line.
 
     Raises:
-        ValueError: If the line is no record.
+        ValueError: If the line is not a record.
     """
     try:
         name, values = json.loads(line)
@@ -150,7 +151,7 @@ def from_line(line: str) -> Record:
 
 
 def _from_json(kind: Any, value: Any) -> Any:
-    """Convert a JSON value to this type."""
+    """Convert a JSON value to the type `kind`."""
     if hasattr(kind, "_fields"):
         hints = get_type_hints(kind)
         fields = zip(kind._fields, value, strict=True)

@@ -1,8 +1,8 @@
 """Run tc and ip as processes.
 
-A step of a time line must take effect within milliseconds, and starting a process takes longer. So
-one `tc -batch -` keeps running: it reads commands from a pipe. A listing follows each command; its
-line marks the end of the answer.
+A step of a time line must take effect within milliseconds, and starting a process takes longer.
+Therefore one `tc -batch -` keeps running and reads commands from a pipe. After each command this
+module requests a listing of one line, which marks the end of the command's answer.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ TOOL_TIMEOUT = 5.0
 """Time limit of one call of tc or ip [s]."""
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
-"""Command whose answer, one line, ends that of the command before."""
+"""Command whose answer of one line marks the end of the answer before."""
 
 
 class Programs:
-    """Runs tc and ip; changes and listings of qdiscs go through one lasting tc process."""
+    """Runs tc and ip; one lasting tc process makes all changes and listings of qdiscs."""
 
     def __init__(self, tables: str = "", prefix: Sequence[str] = ()) -> None:
         """Store the settings; start no process.
@@ -77,7 +77,7 @@ class Programs:
         return Answer(done.returncode, done.stdout, done.stderr)
 
     def _ask(self, line: str, lists: bool) -> Answer:
-        """Send a line to the lasting tc; raises OSError without an answer."""
+        """Send a line to the lasting tc; raise an OSError if tc does not answer."""
         if self._tc is None:
             self._tc = subprocess.Popen(
                 (*self._prefix, *_BATCH),

@@ -1,6 +1,6 @@
-"""Read an end's key file and follow its changes in flight, since a Secret may be rotated.
+"""Read the key file of an end, and follow its changes in flight, since a Secret may be rotated.
 
-The loop checks the file twice a second, by one system call while nothing changes.
+The loop checks the file twice a second. The check is one system call while nothing changes.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ PERIOD_NS = 500_000_000
 SIZE_MAX = 4096
 """Size limit of a key file [bytes]."""
 MAKE = "make one: cloudrc key new FILE"
-"""Remedy in the message about a missing or bad key file."""
+"""Advice in the message about a missing or bad key file."""
 
 
 class KeyFile:
-    """The keys of one end; `ring` always holds the valid ones."""
+    """The keys of one end; `ring` always holds the valid keys."""
 
     def __init__(self, path: Path, now_ns: int) -> None:
-        """Read the file for the first time, at `now_ns` [ns, monotonic clock].
+        """Read the file; `now_ns` is the present time [ns, monotonic clock].
 
         Raises:
             BadInputError: If the file is missing or holds no key.
@@ -38,7 +38,7 @@ class KeyFile:
         """Check the file for changes, if a check is due at `now_ns` [ns, monotonic clock].
 
         Returns:
-            Records of a new key or of the reason to keep the old ones.
+            Records of a new key or of the reason to keep the old keys.
         """
         if now_ns < self._due_ns:
             return []
@@ -66,11 +66,11 @@ def read_keys(path: Path, named: str = "--key ", remedy: str = MAKE) -> KeySet:
 
     Args:
         path: The key file.
-        named: Option that names it, for messages.
-        remedy: What to do if it holds no key, for messages.
+        named: Option that names the file, for messages.
+        remedy: What to do if the file holds no key, for messages.
 
     Raises:
-        BadInputError: If the file holds no key; never quotes its content.
+        BadInputError: If the file holds no key; the message never quotes the content.
     """
     try:
         data = read(path, SIZE_MAX)

@@ -1,13 +1,13 @@
 """Run relay, world, teleop and cloud as processes on this machine and supervise them.
 
 The supervisor starts the processes in the order of their dependencies and reads their feeds. It
-ends all of them when teleop ends after the mission, when another process dies, or when the user
+ends all processes when teleop ends after the mission, when another process dies, or when the user
 interrupts.
 
-Each flight has a small file that names its folder and its operator's API. The file lies in a folder
-that only this user can write, so other programs may trust it; they cannot trust a run's folder,
-which may come from elsewhere. The file is locked during the flight: an unlocked one was left by a
-killed flight and is removed.
+Each flight has a small file, the flight file, which names the folder of the run and the address of
+the operator's API. The flight file lies in a folder that only this user can write, so other
+programs may trust the file. They cannot trust a run's folder, which may come from elsewhere. The
+flight file is locked during the flight. An unlocked file is from a killed flight, and is removed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PRIVATE = 0o700
 
 
 def places() -> list[Path]:
-    """List the folders for flight files; a login has both, a cron job perhaps only the second.
+    """List the folders for flight files; a login has two, a cron job perhaps only the second.
 
     Source: XDG Base Directory Specification.
     """
@@ -54,13 +54,13 @@ def places() -> list[Path]:
 
 @contextlib.contextmanager
 def announced(run: Path, api: str = "") -> Iterator[bool]:
-    """Announce a flight by a file while the block runs; yield whether the file was written.
+    """Announce a flight by a flight file while the block runs; yield whether the file was written.
 
-    The flight continues without the file.
+    A flight also runs without the file.
 
     Args:
         run: Folder of the run.
-        api: Address of its operator's API; "" without one.
+        api: Address of the operator's API; "" without an API.
     """
     path, lock = None, -1
     for place in places():
@@ -80,7 +80,7 @@ def under_way() -> dict[Path, str]:
     """Find this user's current flights.
 
     Returns:
-        Folder of the run -> address of its API ("" without one), newest first.
+        Folder of the run -> address of the operator's API ("" without an API), newest first.
     """
     found = []
     for place in places():
@@ -95,7 +95,7 @@ def under_way() -> dict[Path, str]:
 
 
 def _write(place: Path, run: Path, api: str) -> tuple[Path, int]:
-    """Create the flight file; it is locked before it gets its final name."""
+    """Create the flight file, and lock it before it gets its final name."""
     place.mkdir(mode=PRIVATE, parents=True, exist_ok=True)
     if not _is_ours(place):
         raise PermissionError(f"other users can access {place}")
@@ -115,7 +115,7 @@ def _write(place: Path, run: Path, api: str) -> tuple[Path, int]:
 
 
 def _read(path: Path) -> tuple[Path, str] | None:
-    """Read a flight's folder and API address; if the flight is over, delete the file: None."""
+    """Read folder and API address from a flight file; delete a file whose flight is over."""
     with path.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -127,7 +127,7 @@ def _read(path: Path) -> tuple[Path, str] | None:
 
 
 def _is_ours(place: Path) -> bool:
-    """Check that this user owns a path and nobody else can read or write it."""
+    """Check that this user owns a path, and that nobody else can read or write it."""
     try:
         state = place.stat()
     except OSError:
@@ -136,25 +136,25 @@ def _is_ours(place: Path) -> bool:
 
 
 START_LIMIT = 60.0
-"""Longest time for a process to become ready [s]; a cold start reads some 100 MB from disk."""
+"""Time limit for a process to become ready [s]; a cold start reads some 100 MB from disk."""
 STOP_LIMIT = 1.5
-"""Longest time for a process to end after it was asked to [s]; then it is killed."""
+"""Time limit for a process to end after SIGTERM [s]; then the process is killed."""
 SILENCE_LIMIT = 5.0
-"""Time without a line of its feed after which a process counts as hung [s]: world and cloud send
-records all the time, relay and teleop a sign of life every second."""
+"""A process counts as hung when no line of its feed arrives for this long [s]. World and cloud send
+records all the time, relay and teleop send a sign of life every second."""
 PAUSE = 1.0
-"""Time without a turn of its loop after which the supervisor itself stood still [s]: it was stopped
-or this machine is overloaded."""
+"""If a turn of the supervisor's loop takes longer than this, the supervisor itself stood still [s]:
+it was stopped, or this machine is overloaded."""
 SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
 """Longest name of a socket of a run, below the folder for temporary files."""
 LOOPBACK = "127.0.0.1"
 API_FILE = "api.json"
-"""File in a run's folder with the address of its API during the flight, for other programs.
+"""File in a run's folder with the address of the run's API during the flight, for other programs.
 
-cloudrc itself reads the address from the flight file, since a run's folder is not trusted.
+cloudrc itself reads the address from the flight file, since it does not trust a run's folder.
 """
 AUDIT_FILE = "audit.jsonl"
-"""File in a run's folder that logs who sent which command over the API; it is kept after the
+"""File in a run's folder that logs who sent which command over the API. The file is kept after the
 flight."""
 UNANNOUNCED = (
     "'cloudrc mission' cannot find this run: no folder for its flight file (XDG_STATE_HOME); give "
@@ -173,13 +173,13 @@ class Child:
     """A process of the run.
 
     Attributes:
-        name: Name of its command.
-        process: Running or ended.
-        log: File with its standard error.
+        name: Name of the process's command.
+        process: The process, running or ended.
+        log: File with the process's standard error.
         unread: Start of a feed line whose end has not arrived yet.
-        heard: When its last feed line arrived [s], monotonic clock; None before the flight.
-        ready: Whether it can receive.
-        garbled: Whether it has written a line that is no record.
+        heard: When the last line of the feed arrived [s], monotonic clock; None before the flight.
+        ready: Whether the process can receive.
+        garbled: Whether the process has written a line that is not a record.
     """
 
     name: str
@@ -191,7 +191,7 @@ class Child:
     garbled: bool = field(default=False)
 
     def last_words(self) -> str:
-        """Return the last line of its log, if any."""
+        """Return the last line of the process's log, or a text that says that the log is empty."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else "it left no message"
 
@@ -200,7 +200,7 @@ class LocalRun:
     """The four processes of one run.
 
     Attributes:
-        notes: What the report has to say of this run.
+        notes: Notes on this run for the report, a sentence each.
     """
 
     def __init__(
@@ -209,10 +209,11 @@ class LocalRun:
         """Prepare the run; no process is started yet.
 
         Args:
-            folder: Folder of the run; has config.yaml, gets world.mcap, cloud.mcap and four logs.
+            folder: Folder of the run. It must contain config.yaml; the run adds world.mcap,
+                cloud.mcap and four logs.
             see: Gets the records of the processes' feeds.
             api: Whether the operator gets an API during the flight; the flight file and api.json
-                hold its address.
+                hold the API's address.
         """
         self._folder, self._see, self._api = folder, see, api
         self._key = folder  # replaced by the key file in `fly`
@@ -221,14 +222,15 @@ class LocalRun:
         self.notes: tuple[str, ...] = ()
 
     def fly(self, limit: float) -> None:
-        """Fly until teleop reports the end of the mission. All processes have ended afterwards.
+        """Fly until teleop reports the end of the mission; then all processes have ended.
 
         Args:
             limit: Longest duration [s].
 
         Raises:
-            ProcessDiedError: If a process ends too early; names it.
-            TimedOutError: If the limit is reached or a process falls silent; names it.
+            ProcessDiedError: If a process ends too early; the message names the process.
+            TimedOutError: If the limit is reached, or if a process falls silent; the message says
+                which.
             BadInputError: If no folder for sockets has a short path.
             KeyboardInterrupt: If the user interrupts.
         """
@@ -274,7 +276,7 @@ class LocalRun:
         self._start(name, *ways, f"--record={record}", *options)
 
     def _url(self, sockets: str) -> str:
-        """Return the address of the operator's API in the folder of the sockets; "" without one."""
+        """Return the address of the run's API in the folder of the sockets; "" without an API."""
         return f"unix:{sockets}/api.sock" if self._api else ""
 
     def _start_teleop(self, sockets: str) -> None:
@@ -332,7 +334,7 @@ class LocalRun:
         self._see(self._listen())
 
     def _note_pause(self, pause: float) -> None:
-        """Mark the run, and begin anew to wait for each process."""
+        """Add a note on the pause, and restart the time limit of each process's silence."""
         text = f"the supervisor of this run stood still for {pause:.1f} s; the flight went on"
         self.notes += (text,)
         self._see([Fault(0, "supervisor", text)])
@@ -340,7 +342,7 @@ class LocalRun:
             child.heard = time.monotonic()
 
     def _listen(self) -> list[Record]:
-        """Return the records of all feeds since the last call; waits at most 50 ms."""
+        """Return the records of all feeds since the last call; wait at most 50 ms."""
         records: list[Record] = []
         for key, _ in self._selector.select(0.05):
             child: Child = key.data
@@ -397,7 +399,7 @@ def socket_folder() -> str:
     """Choose a folder for temporary files with a path that is short enough for Unix sockets.
 
     Raises:
-        BadInputError: If there is none; names TMPDIR.
+        BadInputError: If there is no such folder; the message names TMPDIR.
     """
     given = tempfile.gettempdir()
     for folder in dict.fromkeys((given, os.environ.get("XDG_RUNTIME_DIR", ""), "/tmp")):
@@ -411,7 +413,7 @@ def socket_folder() -> str:
 
 
 def _parse_line(child: Child, line: bytes) -> list[Record]:
-    """Parse a line of a feed; report a bad line once per process, and continue the flight."""
+    """Parse a line of a feed. Report a bad line once per process; the flight continues."""
     try:
         return [from_line(line.decode())]
     except ValueError as error:

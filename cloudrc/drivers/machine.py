@@ -1,6 +1,6 @@
 """Describe this machine: its monotonic clock and its Python interpreter.
 
-`Deadline` is a time limit on that clock for a process that waits for others.
+`Deadline` is a time limit on the monotonic clock, for a process that waits for others.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 def clock_id() -> bytes:
     """Identify the monotonic clock: two processes with the same 16 bytes share it.
 
-    The kernel's boot id identifies it, since each boot restarts the clock. Without a boot id the
-    bytes are random: then the ends do not share a clock, and one-way delays are not reported.
+    The kernel's boot id identifies the clock, since each boot restarts the clock. Without a boot id
+    the bytes are random: then the ends do not share a clock, and one-way delays are not reported.
     """
     text = _boot_id().replace("-", "").strip()
     try:
@@ -42,10 +42,10 @@ def _boot_id() -> str:
 
 
 def interpreter(*words: str) -> list[str]:
-    """Build a command that runs this Python interpreter, such as with `-m cloudrc relay`.
+    """Build a command that runs this Python interpreter, for example with `-m cloudrc relay`.
 
     Python imports from the working folder first, which may be a run from somebody else. The new
-    process does so only if this one does, for example under `python -m`.
+    process imports from there only if this process does, for example under `python -m`.
     """
     here = os.getcwd() in sys.path or "" in sys.path
     return [sys.executable, *(() if here else ("-P",)), *words]
@@ -54,20 +54,20 @@ def interpreter(*words: str) -> list[str]:
 class Deadline:
     """A time limit that does not count the time in which this process itself stood still.
 
-    A process that was stopped, or whose container was paused, cannot tell what others did
-    meanwhile: it has to give them their time anew.
+    A process that was stopped, or whose container was paused, cannot tell what others did in the
+    meantime. It has to give the others this time in addition.
 
     Attributes:
-        pause: How long this process stood still in all [s].
+        pause: Total time for which this process stood still [s].
     """
 
     def __init__(
         self, limit: float, turn_max: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Begin.
+        """Start the time limit.
 
         Args:
-            limit: Time until it passes [s].
+            limit: Time until the limit has passed [s].
             turn_max: Longest time between two calls of `passed` while this process runs [s].
             clock: A monotonic clock [s].
         """

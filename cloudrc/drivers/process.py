@@ -1,11 +1,11 @@
-"""Run one end as a process: record it, feed its supervisor, and stop on signals.
+"""Run one end as a process: record its data, feed its supervisor, and stop on signals.
 
-The process ends on SIGTERM or SIGINT, and when its parent process is gone.
+The process ends on SIGTERM or SIGINT, or when its parent process is gone.
 
-An end also records the state of the link that shapes what it sends. The link's process publishes
-the state in a file (`cloudrc/link/state.py`), which the end checks ten times a second. A second
-file tells how late the relay's datagrams left. The link's process is not trusted: whatever its
-files hold, the loop continues.
+An end also records the state of its outgoing link. The link's process publishes the state in a file
+(`cloudrc/link/state.py`), which the end checks ten times a second. A second file tells how late the
+relay's datagrams left. The end does not trust the link's process: whatever these files contain, the
+loop continues.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ if TYPE_CHECKING:
 PERIOD_NS = 100_000_000
 """Time between two checks of the state file [ns]."""
 RELEASED_PERIOD_NS = 2_000_000_000
-"""Time between two records of how late datagrams left [ns]."""
+"""Time between two records of how late the relay's datagrams left [ns]."""
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
-"""Types of records at which a mission may begin. A recording may be cut there, so that it must
-contain the link's state from there on."""
+"""Types of records at which a mission may begin. A recording may be cut at such a record; therefore
+the link's state is recorded again after it."""
 NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 """Errors that an unreadable or malformed file can raise."""
 
@@ -61,7 +61,7 @@ class LinkNotes:
     """
 
     def __init__(self, path: Path, *, uplink: bool) -> None:
-        """Follow the file at `path`, which need not be there yet.
+        """Follow the file at `path`, which need not exist yet.
 
         Args:
             path: State file of the link.
@@ -75,16 +75,16 @@ class LinkNotes:
         self._due_ns = self._released_ns = self._noted_ns = 0
 
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
-        """Return what to record about the link after these records.
+        """Return the records about the link that follow these records.
 
         Args:
-            records: What the end has just recorded.
+            records: Records that the end has just made.
             now_ns: The machine's monotonic clock [ns].
             slip_ns: Lag of the end's own clock [ns].
 
         Returns:
-            A record if the link has changed or a mission may have begun; every
-            `RELEASED_PERIOD_NS` also how late the relay's datagrams left.
+            A record if the link has changed or a mission may have begun. Every `RELEASED_PERIOD_NS`
+            also records of how late the relay's datagrams left.
         """
         if now_ns >= self._released_ns:
             self._released_ns = now_ns + RELEASED_PERIOD_NS
@@ -102,7 +102,7 @@ class LinkNotes:
         return [note._replace(stamp_ns=now_ns - slip_ns, age=age, time_line=time_line)]
 
     def _late(self, stamp_ns: int) -> list[Record]:
-        """Return how late datagrams left since the relay began; nothing without a relay."""
+        """Return records of how late datagrams left since the relay began; none without a relay."""
         try:
             found = json.loads(read(self._released, STATE_MAX))
             counts = {name: int(n) for name, n in found.items() if name in RELEASED}
@@ -112,7 +112,7 @@ class LinkNotes:
         return [Counted(stamp_ns, "link", f"{way}_{name}", n) for name, n in counts.items()]
 
     def _poll(self, now_ns: int) -> bool:
-        """Read the file if it was replaced; return whether the state has changed."""
+        """Read the file if it was replaced, and return whether the state has changed."""
         self._due_ns = now_ns + PERIOD_NS
         seen = version(self._name)
         if seen == self._seen:
@@ -154,9 +154,9 @@ PARENT = "CLOUDRC_PARENT"
 
 
 class StopSignal:
-    """Returns True once the process shall end.
+    """Tells whether the process must end.
 
-    Create it first: the first process of a container ignores SIGTERM until then.
+    Create this object first: until then, the first process of a container ignores SIGTERM.
     """
 
     def __init__(self) -> None:
@@ -177,7 +177,7 @@ class StopSignal:
 
 
 class Takes(Recorder, Protocol):
-    """A recorder that accepts records, such as that of `cloudrc.record.recorder`.
+    """A recorder that accepts records, such as the recorder in `cloudrc.record.recorder`.
 
     Attributes:
         error: Why something was not recorded, in words; "" without an error.
@@ -191,7 +191,7 @@ class Takes(Recorder, Protocol):
         """Return the number of records that did not reach the file."""
 
     def put(self, records: Iterable[Record]) -> None:
-        """Queue records; never waits and never raises."""
+        """Queue records, without waiting and without an exception."""
 
 
 def run_end(
@@ -214,19 +214,19 @@ def run_end(
 
     Args:
         endpoint: World or cloud.
-        peer: Its socket.
-        recorder: Gets its records.
+        peer: Socket of the endpoint.
+        recorder: Gets the endpoint's records.
         end: "world" or "cloud".
-        stop: Whether somebody has asked this end to stop. Create it before anything slow, so that
-            no request is missed.
+        stop: Whether somebody has asked this end to stop. Create `stop` before anything slow, so
+            that no request is missed.
         over: Whether this end has finished by itself.
         slip_ns: Lag of world's clock [ns].
         exporter: Turns the records into metrics; None for no metrics.
         watched: Whether a supervisor reads the feed.
         choose: Selects the records that are recorded.
         link: State file of the link, whose changes are recorded; None without one.
-        check: Compares the link with its profile by what this end receives.
-        keys: Key file that is followed for new keys; None without one.
+        check: Compares the link with its profile by the datagrams that this end receives.
+        keys: Key file, which may get new keys; None without a key file.
 
     Returns:
         True if the end finished by itself, False if it was stopped.
@@ -263,7 +263,7 @@ class _Observers:
         self._check, self._keys, self._slip_ns = check, keys, slip_ns
 
     def after(self, records: list[Record]) -> list[Record]:
-        """Return what to record after these records."""
+        """Return the records to add after these records."""
         now_ns, slip_ns = time.monotonic_ns(), self._slip_ns()
         noted: list[Record] = [told(step, now_ns - slip_ns) for step in self._clock_steps()]
         if self._keys is not None:
@@ -292,7 +292,7 @@ class _RecordSink:
         self._trouble, self._dropped = "", 0
 
     def __call__(self, records: list[Record]) -> None:
-        """Pass records on; never waits."""
+        """Pass records on, without waiting."""
         recorder, exporter = self._recorder, self._exporter
         records = records + self._observers.after(records)
         recorder.put(self._choose(records))

@@ -4,8 +4,8 @@ The loop sleeps until the endpoint's next deadline or the next datagram, whichev
 All datagrams of one wake get the same instant, as the endpoint's contract requires.
 
 In a pod, a route file holds the address of the other end as one line HOST:PORT. The link's process
-writes it when the link is up and whenever the peer moves; the loop checks it twice a second. HOST
-is a numeric address, since a name server would block the loop.
+writes the file when the link is up, and whenever the address changes. The loop checks the file
+twice a second. HOST is a numeric address, since a query to a name server would block the loop.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class Route:
         self._address: Address | None = None
 
     def look(self) -> Address | None:
-        """Return the address to send to; None before the file was first read.
+        """Return the address of the other end; None before the first readable file.
 
-        The last address stays if the file is missing or half written.
+        If the file is missing or half written, the last address stays valid.
         """
         try:
             seen = version(self._path)
@@ -55,7 +55,7 @@ def parse(text: str) -> Address:
     """Parse HOST:PORT, with an IPv6 address in brackets.
 
     Raises:
-        ValueError: If it is not a numeric address and a port.
+        ValueError: If the text is not a numeric address and a port.
     """
     host, _, port = text.strip().rpartition(":")
     bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
@@ -71,22 +71,22 @@ def parse(text: str) -> Address:
 
 
 DRAIN_MAX = 256
-"""Limit of datagrams per wake, so that a flood cannot keep the loop from its deadlines."""
+"""Largest number of datagrams per wake; so a flood cannot delay the loop's deadlines."""
 RECEIVE_BUFFER = 1 << 22
-"""Requested size of the socket's buffer [bytes], room for valid datagrams behind a flood."""
+"""Requested size of the socket's buffer [bytes]; has room for valid datagrams behind a flood."""
 BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
-"""Limit of datagrams after a stall, above what can wait in the socket: Linux doubles the buffer,
-and a datagram takes at least 768 bytes of it."""
+"""Largest number of datagrams in a wake after a stall. This is more than can wait in the socket:
+Linux doubles the buffer, and a datagram takes at least 768 bytes of the buffer."""
 STALL_NS = 50_000_000
-"""Lateness of a wake above which the loop takes all waiting datagrams at once [ns]: they arrived
+"""If a wake is later than this, the loop takes all waiting datagrams at once [ns]: they arrived
 before the wake."""
 STALL_AGAIN_NS = 1_000_000_000
-"""Limit in place of `STALL_NS` for the wake after a stall [ns]. It is longer, so that a flood,
-which takes long to receive, cannot look like a stall again and again."""
+"""The limit for the wake after a stall, in place of `STALL_NS` [ns]. It is longer, because
+receiving a flood takes long and must not look like one stall after another."""
 SINK_PERIOD_NS = 20_000_000
-"""Longest time between two hand-overs of records [ns]."""
+"""Longest time between two calls of the sink [ns]."""
 WAIT_MAX_NS = 100_000_000
-"""Longest wait for a datagram [ns]; then `stop` is checked again."""
+"""Longest wait for a datagram [ns]; then the loop calls `stop` again."""
 ROUTE_PERIOD_NS = 500_000_000
 """Time between two checks of the route file [ns]."""
 
@@ -96,8 +96,8 @@ class Peer:
     """A UDP socket and the address of its peer.
 
     Attributes:
-        socket: Bound, not blocking.
-        address: Address of the other end of the tunnel or of its relay; None while it is unknown.
+        socket: The socket, bound and not blocking.
+        address: Address of the other end of the tunnel or of the relay; None while it is unknown.
         route: Route file that holds the address; None if the address is fixed.
         unsent: Number of datagrams that could not be sent.
     """
@@ -110,7 +110,7 @@ class Peer:
 
     @classmethod
     def bind(cls, listen: tuple[str, int], where: tuple[str, int] | Route) -> Peer:
-        """Bind a socket at `listen`, for a fixed peer address or for that of a route file."""
+        """Bind a socket at `listen`; the peer's address is fixed or comes from a route file."""
         bound = bind(listen)
         if isinstance(where, Route):
             return cls(bound, None, where)
@@ -123,7 +123,10 @@ class Peer:
             self.address = _reachable(self.socket, self.route.look())
 
     def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
-        """Return at most `most` waiting datagrams; an oversized one keeps one byte too many."""
+        """Return at most `most` waiting datagrams.
+
+        A datagram above DATAGRAM_MAX is cut to DATAGRAM_MAX + 1 bytes, so that decoding fails.
+        """
         datagrams: list[bytes] = []
         while len(datagrams) < most:
             try:
@@ -135,7 +138,7 @@ class Peer:
         return datagrams
 
     def send(self, datagrams: list[bytes]) -> None:
-        """Send datagrams; those that the socket refuses are lost and counted."""
+        """Send datagrams; datagrams that the socket refuses are lost and counted."""
         if self.address is None:
             self.unsent += len(datagrams)
             return
@@ -147,14 +150,14 @@ class Peer:
 
 
 def _reachable(bound: socket.socket, address: Address | None) -> Address | None:
-    """Write an IPv4 address as a socket of IPv6 needs it."""
+    """Convert an IPv4 address to the form that an IPv6 socket needs."""
     if address is None or bound.family != socket.AF_INET6 or ":" in address[0]:
         return address
     return f"::ffff:{address[0]}", address[1]
 
 
 def bind(listen: tuple[str, int]) -> socket.socket:
-    """Open a UDP socket that does not block; at the host `::` it receives IPv4, too."""
+    """Open a UDP socket that does not block; with the host `::`, it also receives IPv4."""
     family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
     udp = socket.socket(family, socket.SOCK_DGRAM)
     if listen[0] == "::":
@@ -194,7 +197,7 @@ def serve(
 
     Args:
         endpoint: World or cloud.
-        peer: Its socket.
+        peer: Socket of the endpoint.
         end: "world" or "cloud", for the records.
         sink: Gets the records, at least every 20 ms; must not block.
         stop: Called at every wake, at most 100 ms apart.

@@ -1,12 +1,13 @@
 """Write a process's recording to its file from a background thread.
 
-The thread writes a few records at a time and sleeps in between, so that it delays the loop, which
-shares the interpreter, by less than a millisecond. A second thread waits for the disk: even if a
-sync takes seconds, the operating system gets the data and keeps it if the process is killed.
+The thread writes a few records at a time and sleeps in between. Loop and thread share the
+interpreter; in this way the thread delays the loop by less than a millisecond. A second thread
+waits for the disk. Even if a sync takes seconds, the operating system has the data and keeps it if
+the process is killed.
 
 With each flush the thread also checks whether somebody set the wall clock, which the loop never
-reads. It compares it with the clock since boot, which nobody sets and which, unlike the monotonic
-clock, continues while the machine sleeps.
+reads. The check compares the wall clock with the clock since boot. Nobody can set the clock since
+boot, and unlike the monotonic clock it continues while the machine sleeps.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from cloudrc.records import (
 STEP = 0.1
 """Smallest change between two checks that counts as a step of the wall clock [s]."""
 DRIFT_MAX = 1e-3
-"""Largest relative drift of the two clocks [1]; kernels slew by at most half of it."""
+"""Largest relative drift between both clocks [1]; kernels slew by at most half of this value."""
 _SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the former: Linux
 
 
@@ -44,7 +45,7 @@ class WallClock:
         self._wall, self._boot = _now()
 
     def step(self) -> float:
-        """Return by how much the clock was set since the last call [s]; 0 if it was not."""
+        """Return by how much the clock was set since the last call [s]; 0 if it was not set."""
         wall, boot = _now()
         elapsed = boot - self._boot
         step = wall - self._wall - elapsed
@@ -57,7 +58,7 @@ def told(step: float, stamp_ns: int) -> Fault:
 
     Args:
         step: Size of the step [s].
-        stamp_ns: When it was detected [ns], own clock of the end.
+        stamp_ns: When the step was detected [ns], own clock of the end.
     """
     text = (
         f"wall clock stepped by {step:+.1f} s: the flight is not affected;"
@@ -76,14 +77,14 @@ def _now() -> tuple[float, float]:
 
 
 AFTERWARDS_NS = 90_000_000_000
-"""Time for which all records are still kept after the robot last followed the cloud [ns]; it covers
-the landing after a loss of the link."""
+"""How long all records are still kept after the robot last followed the cloud [ns]. This time
+covers the landing after a loss of the link."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
-"""Record types that are made all the time, with or without a flight."""
+"""Types of records that are made all the time, with or without a flight."""
 BATCH = 16
 """Number of records written at a time."""
 IDLE = 0.1
-"""Sleep after the queue was emptied [s]; a wake costs more than a few records."""
+"""Sleep after the queue was emptied [s]; a wake costs more time than writing a few records."""
 BUSY = 0.001
 """Sleep while more records wait [s]."""
 FLUSH = 0.25
@@ -100,7 +101,7 @@ class Recorder(Protocol):
         """Hand the written data to the operating system."""
 
     def sync(self) -> bool:
-        """Sync the flushed data to the disk, which may take seconds; return whether it worked."""
+        """Sync the flushed data to the disk, which may take seconds; return the success."""
 
     def close(self) -> None:
         """Write the remaining records and end the file."""
@@ -114,7 +115,7 @@ class FlightsOnly:
     """
 
     def __init__(self, flies: Callable[[], bool]) -> None:
-        """Begin with a robot that does not fly.
+        """Set `flies`; at first the robot does not fly.
 
         Args:
             flies: Whether the robot follows the cloud.
@@ -135,17 +136,17 @@ class FlightsOnly:
 
 
 class SyncAge:
-    """Measures how much of a recording a power cut would destroy.
+    """Measures how much of a recording a power cut would destroy [s].
 
-    That is all since the start of the last completed sync.
+    A power cut destroys all records since the start of the last completed sync.
     """
 
     def __init__(self) -> None:
-        """Begin without a completed sync."""
+        """Create the measurement; no sync has completed yet."""
         self._safe: float | None = None
 
     def done(self, began: float) -> None:
-        """Note that the sync that `began` then [s] has completed."""
+        """Note that a sync has completed; it started at `began` [s]."""
         self._safe = began
 
     def read(self, now: float) -> float | None:
@@ -157,10 +158,10 @@ class RecordingThread:
     """Runs a recorder in the background from `start` to `stop`."""
 
     def __init__(self, recorder: Recorder) -> None:
-        """Create the thread; it does not run yet.
+        """Create the thread; `start` starts it.
 
         Args:
-            recorder: The loop adds records to it; only this thread drains it.
+            recorder: The recorder. The loop adds records; only this thread drains them.
         """
         self._recorder = recorder
         self._stopping = threading.Event()
@@ -185,13 +186,13 @@ class RecordingThread:
         return [self._steps.popleft() for _ in range(len(self._steps))]
 
     def stop(self, timeout: float = 1.5) -> bool:
-        """Write the remaining records, end the file and wait for both.
+        """Write the remaining records, complete the file, and wait until both are done.
 
         Args:
             timeout: Longest time to wait [s].
 
         Returns:
-            True if the file was ended in time.
+            True if the file was completed in time.
         """
         self._stopping.set()
         self._thread.join(timeout)

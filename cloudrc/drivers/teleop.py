@@ -2,8 +2,8 @@
 
     cloud process: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  serve_teleop - machine
 
-Nothing here blocks. A datagram that the other's full or missing socket refuses is lost, as on a
-network. Either process may restart: the socket's path is looked up for each datagram, setpoint and
+No call blocks. A datagram is lost, as on a network, if the socket of the other process is full or
+missing. Either process may restart: the socket's path is looked up for each datagram, setpoint and
 requests are repeated, and events wait until cloud is back.
 """
 
@@ -22,10 +22,11 @@ from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 
 DATAGRAM_MAX = 8_192
-"""Size limit of a datagram, above that of all our messages [bytes]."""
+"""Size limit of a datagram [bytes]; all our messages are smaller."""
 DRAIN_MAX = 1024
-"""Limit of datagrams per wake, so that a flood cannot keep a loop from its deadlines. It is above
-the socket's queue (513 under systemd), so that one wake takes all that waits after a stall."""
+"""Largest number of datagrams per wake; with this limit, a flood cannot delay a loop's deadlines.
+The limit is above the socket's queue (513 under systemd), so that one wake after a stall takes all
+waiting datagrams."""
 PATH_MAX = 107
 """Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
 
@@ -84,28 +85,29 @@ class UnixPeer:
 PERIOD_NS = 20_000_000
 """Time between two deadlines of teleop's machine [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
-"""Shortest time between two robot states sent to teleop [ns]; so teleop gets every second
-telemetry."""
+"""Shortest time between two robot states sent to teleop [ns]. With this value teleop gets every
+second telemetry message."""
 ALIVE_NS = 200_000_000
-"""Time between two empty datagrams to teleop while there is no telemetry [ns]; they tell teleop
-that cloud runs."""
+"""Time between two empty datagrams to teleop while there is no telemetry [ns]. Empty datagrams tell
+teleop that cloud runs."""
 STALL_NS = 100_000_000
-"""Lateness of a wake above which the socket holds only old datagrams [ns]: its queue was full from
-the start of the stall. New datagrams arrive within the next wakes."""
+"""If a wake is later than this, the socket holds only old datagrams [ns]: the queue has been full
+since the start of the stall. New datagrams arrive within the next wakes."""
 BLIND_WAKES = 5
-"""Limit of wakes that wait for a new datagram after a stall; then teleop continues without one."""
+"""Largest number of wakes that wait for a new datagram after a stall [1]. Then teleop continues
+without a new datagram."""
 SILENCE_NS = 1_000_000_000
 """Time without a datagram from teleop after which teleop counts as away [ns]; teleop sends at 10
 Hz."""
 EVENTS_KEPT = 256
-"""Limit of the events that wait while cloud is away."""
+"""Largest number of events that wait while cloud is away [1]."""
 LAST_WORD_NS = 800_000_000
-"""Time for which cloud, while it ends, still forwards teleop's last hold request [ns]. It is longer
+"""How long cloud, while it ends, still forwards teleop's last hold request [ns]. This is longer
 than teleop repeats the request, and shorter than the 1.5 s that a process has to end."""
 
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
-"""Function that decodes a message, and raises a ValueError if the bytes are no message."""
+"""Function that decodes a message; it raises a ValueError if the bytes are not a message."""
 Calls = Callable[[], Iterable[Callable[[int], None]]]
 """Function that returns the calls that other threads have queued. Each call takes the current time
 [ns] and must not block."""
@@ -124,15 +126,15 @@ class Machine(Protocol):
         """Do what is due at `now_ns` [ns]."""
 
     def take_outputs(self) -> Sequence[Any]:
-        """Return its outputs since the last call."""
+        """Return the machine's outputs since the last call."""
 
 
 class RemoteTeleop:
     """Represents teleop in cloud's process.
 
     Attributes:
-        outcome: Always None: cloud does not end with a mission.
-        settled: Always true.
+        outcome: Always None, because cloud does not end when a mission ends.
+        settled: Always True.
         outputs: Teleop's outputs since the last call of `take_outputs`.
         malformed: Number of datagrams that were no messages.
     """
@@ -141,7 +143,10 @@ class RemoteTeleop:
     settled = True
 
     def __init__(self, peer: UnixPeer, encode: Encode, decode: Decode, start_ns: int) -> None:
-        """Begin at `start_ns` [ns]; teleop has a second to send its first datagram."""
+        """Connect to teleop at `start_ns` [ns].
+
+        From then on teleop has one second to send its first datagram.
+        """
         self._peer, self._encode, self._decode = peer, encode, decode
         self._heard_ns, self._silent, self._stalled = start_ns, False, False
         self._tell_ns = self._looked_ns = self._alive_ns = start_ns
@@ -160,8 +165,9 @@ class RemoteTeleop:
         Without telemetry an empty datagram tells teleop that cloud runs.
 
         After a stall, starts and waypoints are dropped: teleop may have withdrawn them in a
-        datagram that found the socket full, and it repeats those that still hold. They are not
-        dropped twice in a row, so that a cloud that is always late can fly.
+        datagram that was lost because the socket was full. Teleop repeats the outputs that are
+        still valid. Outputs are not dropped twice in a row, so that a cloud that is always late can
+        fly.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS
@@ -189,7 +195,7 @@ class RemoteTeleop:
 
 
 class LastWord:
-    """Delays cloud's end while the robot flies, so that teleop can still request a hold.
+    """Delays the end of cloud's process while the robot flies, so that teleop can request a hold.
 
     A pod ends all its containers at once, and teleop's requests pass through cloud.
     """
@@ -200,7 +206,7 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Begin without a request to end.
+        """Set the functions; nobody has asked cloud to end yet.
 
         Args:
             asked: Whether somebody has asked cloud to end.
@@ -233,12 +239,12 @@ def serve_teleop(
     """Run teleop's machine in real time until `stop()` is true.
 
     Args:
-        machine: Gets 50 deadlines a second, before each the newest robot state.
+        machine: Gets 50 deadlines a second, and before each deadline the newest robot state.
         peer: The socket to cloud.
         encode: Encodes a message for cloud.
         decode: Decodes a message from cloud.
-        calls: See `turn`.
-        stops: See `turn`.
+        calls: Returns the queued calls.
+        stops: Returns the queued emergency stops, which are made first.
         tell: Gets the events and faults of each wake; must not block.
         stop: Called at every wake.
     """
@@ -268,7 +274,7 @@ def turn(
     late_ns: int,
     now_ns: int,
 ) -> int:
-    """Do one wake of teleop: receive states, make the queued calls, handle the deadline.
+    """Run one wake of teleop: receive states, make the queued calls, handle the deadline.
 
     Args:
         machine: Gets states, calls and its deadline.
@@ -281,8 +287,8 @@ def turn(
         now_ns: Now [ns].
 
     Returns:
-        Number of wakes that teleop still waits for a new datagram; if it is not 0, this wake has
-        done nothing else.
+        Number of further wakes that wait for a new datagram. If the number is above 0, this wake
+        has only received datagrams.
     """
     arrived, was_blind = peer.receive(), blind
     states = [data for data in arrived if data]  # an empty datagram carries no state
@@ -305,9 +311,9 @@ def turn(
 
 
 def blind_for(before: int, late_ns: int, arrived: bool) -> int:
-    """Return for how many more wakes teleop waits for a new datagram after a stall.
+    """Return how many further wakes wait for a new datagram after a stall.
 
-    Lateness does not count while it waits, so that a loop that is always late still continues.
+    Lateness does not count during the wait, so that a loop that is always late still continues.
 
     Args:
         before: Return value of the last wake.
@@ -322,7 +328,7 @@ def blind_for(before: int, late_ns: int, arrived: bool) -> int:
 def send(
     outputs: Sequence[Any], unsent: deque[bytes], peer: UnixPeer, encode: Encode
 ) -> list[MissionEvent | Fault]:
-    """Send outputs to cloud, first the events that wait in `unsent`.
+    """Send outputs to cloud; the events that wait in `unsent` are sent first.
 
     Returns:
         The events and faults among the outputs.

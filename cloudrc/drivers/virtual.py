@@ -1,7 +1,8 @@
 """Run both ends and the link between them in one process, in virtual time.
 
-The run is an event heap in integer nanoseconds. At one instant, arrivals come first, in the order
-of sending, then world's deadline, then cloud's. So the same inputs give the same run, bit by bit.
+The run is an event heap with times in integer nanoseconds. If events have the same time, arrivals
+come first, in the order of sending, then world's deadline, then cloud's deadline. Therefore the
+same inputs give the same run, bit by bit.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class Link(Protocol):
         """Return the datagram as it arrives, damaged or not."""
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> tuple[int, ...]:
-        """Return when the copies of this datagram arrive [ns]: none, one or two instants."""
+        """Return the times at which the copies of this datagram arrive [ns]: none, one or two."""
 
 
 class VirtualRun:
@@ -52,8 +53,8 @@ class VirtualRun:
         """Connect the parts; time begins at 0.
 
         Args:
-            world: Its clock is virtual time.
-            cloud: Its clock is virtual time plus the offset.
+            world: World's end; its clock is virtual time.
+            cloud: Cloud's end; its clock is virtual time plus the offset.
             uplink: Link from world to cloud.
             downlink: Link from cloud to world.
             cloud_clock_offset_ns: Cloud's clock minus world's [ns].

@@ -1,4 +1,4 @@
-"""Write docs/metrics.md from the table of metrics (`make docs`)."""
+"""Make docs/metrics.md from the table of metrics (`make docs`)."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ OPEN = {
     "defaults (on one machine with those of plug-ins, as `config_sha256` in report.json; in a "
     "cluster without those of plug-ins); empty for a process without configuration",
 }
-"""Label with an open set of values -> its description."""
+"""Label with an open set of values -> description of the values."""
 
 
 def page() -> str:
-    """Write docs/metrics.md."""
+    """Return the text of docs/metrics.md."""
     blocks = [HEAD, "## Queries\n"]
     blocks += [f"{title}:\n\n```promql\n{query}\n```\n" for title, query in QUERIES.items()]
     blocks += ["## All metrics\n", _table(METRICS.values())]
@@ -81,7 +81,7 @@ def _table(metrics: Iterable[Metric]) -> str:
 
 
 def _labels(metric: Metric) -> str:
-    """List the labels with their values."""
+    """Describe the labels of a metric and their values."""
     sets = [
         f"`{label}`: {', '.join(values) or OPEN[label]}" for label, values in metric.labels.items()
     ]

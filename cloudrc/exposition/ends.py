@@ -56,19 +56,19 @@ from cloudrc.records import (
 )
 
 _LEFT_OUT = ("stamp_ns", "uplink")
-"""Fields that /link.json leaves out of its rows: the same for all rows, or of no use."""
+"""Fields that the rows of /link.json do not contain: equal in all rows, or of no use."""
 
 
 class LinkVerdict:
     """The newest verdict on an end's incoming direction of the link."""
 
     def __init__(self, direction: str) -> None:
-        """Start without a verdict; the direction is "uplink" or "downlink"."""
+        """Set the direction, "uplink" or "downlink"; the verdict is "open"."""
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 
     def see(self, record: LinkChecked) -> None:
-        """Store the verdict on one quantity; quantities of an older check are dropped."""
+        """Store the verdict on one quantity, and drop the quantities of an older check."""
         newest = self._newest
         if newest and newest[0].stamp_ns != record.stamp_ns:
             newest = ()
@@ -81,7 +81,7 @@ class LinkVerdict:
         return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
 
     def text(self) -> str:
-        """Return the page /link.json: the overall verdict and a row per quantity."""
+        """Make the page /link.json: the overall verdict and a row per quantity."""
         rows = [
             {
                 key: value
@@ -94,7 +94,7 @@ class LinkVerdict:
         return json.dumps(document, indent=2) + "\n"
 
     def read(self) -> Readings:
-        """See `Part`."""
+        """Return the current values; unknown values are absent."""
         if self.verdict == "open":
             return {}
         return {"cloudrc_link_believed": {(self._direction,): float(self.verdict == "ok")}}
@@ -114,7 +114,7 @@ class End:
     """
 
     def __init__(self, incoming: str, outgoing: str) -> None:
-        """Start before the first session; the directions are "uplink" and "downlink"."""
+        """Set the directions, "uplink" and "downlink"; all counts are 0 and there is no session."""
         self._incoming, self._outgoing = incoming, outgoing
         others = ONLY_CLOUD if incoming == DIRECTIONS[1] else ONLY_WORLD
         self._outcomes = tuple(name for name in OUTCOMES[1:] if name not in others)
@@ -133,7 +133,7 @@ class End:
         self._newest_ns, self._newest_delay = NEVER_NS, nan
 
     def handlers(self) -> Handlers:
-        """See `Part`."""
+        """Map each class of records that this part uses to a handler."""
         return {
             Arrival: self._on_arrival,
             Counted: self._on_count,
@@ -145,7 +145,7 @@ class End:
 
     @property
     def has_peer(self) -> bool:
-        """Whether a new datagram of the other end has arrived within 2 s."""
+        """Whether a new datagram of the other end has arrived in the last 2 s."""
         return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
 
     def _on_arrival(self, record: Arrival) -> None:
@@ -188,7 +188,7 @@ class End:
             self._age.observe(delay + (now_ns - self._newest_ns) * 1e-9)
 
     def read(self) -> Readings:
-        """See `Part`."""
+        """Return the current values; unknown values are absent."""
         counts, stream, incoming = self._counts, self._stream, (self._incoming,)
         received = select(self._outcomes, counts)
         datagrams: dict[Labels, float] = {(*incoming, name): n for name, n in received.items()}
@@ -216,16 +216,16 @@ class End:
 STEP_NS = 1_000_000_000
 """Time between two samples of the real-time factor [ns]."""
 STEPS = 10
-"""Number of steps over which the real-time factor is computed [1]; together they last 10 s."""
+"""Number of steps over which the real-time factor is computed [1]; all steps together last 10 s."""
 ADMITTED = "cloud said hello"
-"""Cause of a session that world opens for a newly connected cloud; see `SessionOpened`."""
+"""`SessionOpened.cause` of a session that world opens for a newly connected cloud."""
 
 
 class WorldEnd(End):
-    """Metrics of world: those of both ends, the robot, guard, contacts, real-time factor."""
+    """Metrics of world: metrics of every end, the robot, guard, contacts, real-time factor."""
 
     def __init__(self) -> None:
-        """Start with the robot on the ground."""
+        """Set all counts to 0 and the guard's state to GROUND."""
         uplink, downlink = DIRECTIONS
         super().__init__(incoming=downlink, outgoing=uplink)
         self._truth: GroundTruth | None = None
@@ -239,7 +239,7 @@ class WorldEnd(End):
         self._instant_ns = NEVER_NS
 
     def handlers(self) -> Handlers:
-        """See `Part`."""
+        """Map each class of records that this part uses to a handler."""
         return {
             **super().handlers(),
             GroundTruth: self._on_truth,
@@ -251,10 +251,10 @@ class WorldEnd(End):
 
     @property
     def has_peer(self) -> bool:
-        """Whether cloud is heard.
+        """Whether world receives datagrams from cloud.
 
-        Before its first command in a session, cloud sends nothing that is recorded here. Until
-        then the session itself counts as a peer.
+        Cloud sends nothing that these metrics see before its first command in a session. Until
+        that command, the session itself counts as a peer.
         """
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
 
@@ -291,7 +291,7 @@ class WorldEnd(End):
             self._instants.append((record.stamp_ns, now_ns))
 
     def read(self) -> Readings:
-        """See `Part`."""
+        """Return the current values; unknown values are absent."""
         readings = super().read()
         readings |= {
             "cloudrc_clouds_admitted_total": unlabelled(self._admitted),
@@ -327,11 +327,11 @@ class WorldEnd(End):
 GAP_MAX_NS = 50_000_000
 """Largest gap between two measurements over which positions are interpolated [ns]."""
 WAITING_MAX = 256
-"""Largest number of predictions that wait for their measurement [1]; a horizon of 1 s needs 100."""
+"""Largest number of predictions that wait for a measurement [1]; a horizon of 1 s needs 100."""
 
 
 class PredictionJudge:
-    """Compare each predicted position with the position measured at the same instant.
+    """Compares each predicted position with the position measured at the same instant.
 
     Attributes:
         error: Newest error: predicted minus measured [m], shape (3,); NaN before the first.
@@ -340,7 +340,7 @@ class PredictionJudge:
     """
 
     def __init__(self) -> None:
-        """Start without predictions."""
+        """Create the judge; there is no prediction and no error yet."""
         self.error: Vector = (nan, nan, nan)
         self.square = 0.0
         self.judged = 0
@@ -353,7 +353,7 @@ class PredictionJudge:
         self._measured: Vector = (nan, nan, nan)
 
     def take(self, control: Control) -> None:
-        """Compare waiting predictions with a period's measurement, then store its prediction."""
+        """Compare waiting predictions with a measurement; then store this period's prediction."""
         stamp_ns, waiting = control.basis_stamp_ns, self._waiting
         if stamp_ns > self._measured_ns:
             before_ns, before = self._measured_ns, self._measured
@@ -377,7 +377,7 @@ class PredictionJudge:
 
 
 class DelayJudge:
-    """Compare each delay estimate with the true time until its command was applied.
+    """Compares each delay estimate with the true time until the command was applied.
 
     An echo gives the instant at which world applied the command, on world's clock: the stamp of the
     echoing odometry minus the hold time. The echo's age in cloud identifies the command.
@@ -387,7 +387,7 @@ class DelayJudge:
     """
 
     def __init__(self) -> None:
-        """Start without commands."""
+        """Create the judge; there is no command and no error yet."""
         self.error = nan
         self.reset()
 
@@ -397,7 +397,7 @@ class DelayJudge:
         self._sent_before: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:
-        """Store a command that was sent."""
+        """Store a command that cloud sent."""
         if len(self._sent) >= WAITING_MAX:
             self._sent_before, self._sent = self._sent, {}
         self._sent[control.stamp_ns] = control
@@ -417,10 +417,10 @@ class DelayJudge:
 
 
 class CloudEnd(End):
-    """Metrics of cloud: those of both ends, delays in the loop, prediction, control."""
+    """Metrics of cloud: metrics of every end, delays in the loop, prediction, control."""
 
     def __init__(self) -> None:
-        """Start before the first control period."""
+        """Set all counts to 0; there is no control period yet."""
         uplink, downlink = DIRECTIONS
         super().__init__(incoming=uplink, outgoing=downlink)
         self._rtt, self._loop = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
@@ -430,7 +430,7 @@ class CloudEnd(End):
         self._used_ns, self._used_count = NEVER_NS, 0
 
     def handlers(self) -> Handlers:
-        """See `Part`."""
+        """Map each class of records that this part uses to a handler."""
         return {**super().handlers(), Control: self._on_control}
 
     def _on_session(self, record: SessionOpened) -> None:
@@ -458,7 +458,7 @@ class CloudEnd(End):
         self._delay.sent(record)
 
     def read(self) -> Readings:
-        """See `Part`."""
+        """Return the current values; unknown values are absent."""
         counts, prediction = self._counts, self._prediction
         readings = super().read()
         readings |= {

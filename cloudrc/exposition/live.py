@@ -1,6 +1,6 @@
 """The current metrics of one process, computed from its records: API, link, mission and both ends.
 
-The ends of the tunnel are in `ends`.
+The module `ends` has the metrics of the tunnel's ends.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ class Api:
     """Counts of teleop's API and journal."""
 
     def __init__(self) -> None:
-        """Start with no counts."""
+        """Set all counts to 0."""
         self._counts: dict[str, int] = {}
 
     def handlers(self) -> Handlers:
-        """See `Part`."""
+        """Map each class of records that this part uses to a handler."""
         return {Counted: self._on_count}
 
     def _on_count(self, record: Counted) -> None:
         self._counts[record.name] = record.total
 
     def read(self) -> Readings:
-        """See `Part`."""
+        """Return the current values; unknown values are absent."""
         counts = {name.removeprefix("api_"): count for name, count in self._counts.items()}
         return {
             "cloudrc_api_requests_total": unlabelled(counts.get("served", 0)),
@@ -75,18 +75,18 @@ class Link:
     """
 
     def __init__(self) -> None:
-        """Start before anything is shaped."""
+        """Create the metrics; nothing is shaped or counted yet."""
         self.tell: Callable[[], str] = lambda: "{}\n"
         self._shapers: dict[str, Labels] = {}
         self._delays: dict[str, float] = {}
         self._counts: dict[str, int] = {}
 
     def handlers(self) -> Handlers:
-        """See `Part`."""
+        """Map each class of records that this part uses to a handler."""
         return {Counted: self._on_count}
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set what shapes a direction from now on.
+        """Set the shaper of a direction from now on.
 
         Args:
             shaper: "relay" or "netem".
@@ -107,7 +107,7 @@ class Link:
         self._counts[record.name] = record.total
 
     def read(self) -> Readings:
-        """See `Part`."""
+        """Return the current values; unknown values are absent."""
         return {
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
             "cloudrc_link_delay_seconds": by_label(dict(self._delays)),
@@ -122,7 +122,7 @@ class Link:
         } | self._single_shaper_counts()
 
     def _single_shaper_counts(self) -> Readings:
-        """Read the counts that only the relay or only netem has; absent if never counted."""
+        """Read the counts that only the relay or only netem has; uncounted values are absent."""
         counts = dict(self._counts)  # one atomic copy: the loop's thread may count on
         return {
             name: unlabelled(counts[one])
@@ -131,7 +131,7 @@ class Link:
         }
 
     def _percentiles(self, quantity: str, percentiles: Mapping[str, str]) -> dict[Labels, float]:
-        """Read the percentiles of a lateness [s]; empty if never counted."""
+        """Read the percentiles of a lateness [s]; empty before the first count."""
         counts = dict(self._counts)  # one atomic copy: the loop's thread may count on
         names = {label: f"{quantity}_{name}_ns" for label, name in percentiles.items()}
         return by_label(
@@ -147,18 +147,18 @@ class Mission:
     """Metrics of the mission, computed from its events."""
 
     def __init__(self, *, always: bool) -> None:
-        """Start without a mission.
+        """Set the state to idle: there is no mission yet.
 
         Args:
-            always: Whether to expose these metrics before the first event; False in a process
-                that may have no mission.
+            always: True to expose these metrics before the first event; False in a process that
+                may have no mission.
         """
         self._shown = always
         self._state, self._waypoint, self._reached = "idle", NO_WAYPOINT, 0
         self._ended = dict.fromkeys(MISSION_OUTCOMES, 0)
 
     def handlers(self) -> Handlers:
-        """See `Part`."""
+        """Map each class of records that this part uses to a handler."""
         return {MissionEvent: self._on_event}
 
     def _on_event(self, record: MissionEvent) -> None:
@@ -182,7 +182,7 @@ class Mission:
         self._waypoint = NO_WAYPOINT
 
     def read(self) -> Readings:
-        """See `Part`."""
+        """Return the current values; unknown values are absent."""
         if not self._shown:
             return {}
         return {
@@ -194,7 +194,7 @@ class Mission:
 
 
 class LiveMetrics:
-    """Current values of one role's metrics; one thread feeds it, any other thread may read it.
+    """Current values of one role's metrics; one thread feeds them, any other thread may read them.
 
     Attributes:
         end: Metrics of this end of the tunnel; None in teleop and link.
@@ -202,11 +202,12 @@ class LiveMetrics:
     """
 
     def __init__(self, role: str, *, missions: bool = True) -> None:
-        """Start before the first record.
+        """Set the role; no record has been seen yet.
 
         Args:
             role: "world", "cloud", "teleop" or "link".
-            missions: Whether to expose missions; False in a cloud whose teleop exposes them.
+            missions: Whether to expose metrics of missions; False in a cloud whose teleop exposes
+                them.
         """
         self.end: End | None = {WORLD: WorldEnd, CLOUD: CloudEnd}.get(role, lambda: None)()
         self.link = Link() if role == LINK else None
@@ -219,7 +220,7 @@ class LiveMetrics:
             self._handlers.update(part.handlers())
 
     def see(self, records: Iterable[Record]) -> None:
-        """Process records of this process, oldest first; never block."""
+        """Process records of this process, oldest first, without blocking."""
         handlers = self._handlers
         for record in records:
             handle = handlers.get(type(record))

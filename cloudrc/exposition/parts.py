@@ -1,7 +1,8 @@
 """Building blocks of live metrics: `Part`, a fast histogram, and loss counters of one direction.
 
-A handler of records runs on the loop's thread and has a budget of 1 us. So it only keeps the newest
-record and counts. `read` does all other work, on the thread that serves the scrape.
+A handler of records runs on the loop's thread and has a budget of 1 us. Therefore a handler only
+stores the newest record and counts. `read` does all other work, on the thread that serves the
+scrape.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from cloudrc.messages import Vector
 
 
 class Histogram:
-    """Count values in buckets; one thread observes, any other thread may read.
+    """Counts values in buckets; one thread observes, any other thread may read.
 
     Attributes:
         bounds: Upper bounds of the buckets, inclusive, rising.
@@ -26,7 +27,7 @@ class Histogram:
     __slots__ = ("_counts", "bounds", "total")
 
     def __init__(self, bounds: tuple[float, ...]) -> None:
-        """Start without values."""
+        """Set the bounds; all counts are 0."""
         self.bounds = bounds
         self.total = 0.0
         self._counts = [0] * (len(bounds) + 1)
@@ -47,37 +48,37 @@ class Histogram:
 
 Handlers: TypeAlias = Mapping[type, Callable[[Any], None]]
 Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
-"""Metric name -> its value for each tuple of label values, or a histogram (without labels)."""
+"""Metric name -> value for each tuple of label values, or a histogram (without labels)."""
 
 
 class Part(Protocol):
     """A group of metrics of one process."""
 
     def handlers(self) -> Handlers:
-        """Map each class of records that this part uses to its handler; parts share no class."""
+        """Map each class of records that this part uses to a handler; parts share no class."""
 
     def read(self) -> Readings:
         """Return the current values; unknown values are absent."""
 
 
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Return a reading without labels of `value` [base unit of the metric]."""
+    """Make a reading without labels from `value` [base unit of the metric]."""
     return {(): value}
 
 
 def unless_nan(value: float) -> dict[Labels, float]:
-    """Return a reading without labels of `value` [base unit of the metric]; absent if NaN."""
+    """Make a reading without labels from `value` [base unit of the metric]; absent if NaN."""
     return {} if isnan(value) else {(): value}
 
 
 def per_axis(vector: Vector) -> dict[Labels, float]:
-    """Return a reading per axis of `vector` [base unit of the metric]; NaN axes are absent."""
+    """Make a reading per axis from `vector` [base unit of the metric]; NaN axes are absent."""
     values = zip(AXES, vector, strict=True)
     return {(axis,): value for axis, value in values if not isnan(value)}
 
 
 def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """Return a reading with one label, given its values by label value."""
+    """Make a reading with one label from a mapping of label values to values."""
     return {(name,): count for name, count in counts.items()}
 
 
@@ -87,23 +88,23 @@ def select(names: Iterable[str], counts: Mapping[str, float]) -> dict[str, float
 
 
 WINDOW = 128
-"""Number of newer datagrams after which a missing datagram counts as lost [1]: 1.28 s at 100 Hz."""
+"""Number of newer datagrams after which a missing datagram counts as lost [1]; 1.28 s at 100 Hz."""
 _MASK = (1 << WINDOW) - 1
 _OLDEST = 1 << (WINDOW - 1)
 
 
 class DatagramTally:
-    """Count lost and reordered datagrams of one direction from their counters, epoch by epoch.
+    """Counts lost and reordered datagrams of one direction by their counters, in each epoch.
 
     Attributes:
         lost: Datagrams that had not arrived when they left the window.
-        reordered: Datagrams that arrived after a newer one, without repeated ones.
+        reordered: Datagrams that arrived after a newer datagram, without repeated datagrams.
     """
 
     __slots__ = ("_before", "_epoch", "_first", "_newest", "_seen", "lost", "reordered")
 
     def __init__(self) -> None:
-        """Start before the first datagram."""
+        """Set all counts to 0; no datagram has arrived yet."""
         self.lost = self.reordered = 0
         self._before = 0  # expected in earlier epochs
         self._epoch = self._first = self._newest = -1
@@ -111,13 +112,13 @@ class DatagramTally:
 
     @property
     def expected(self) -> int:
-        """Number of datagrams that have left the window: each is known to be arrived or lost."""
+        """Number of datagrams that have left the window: each has arrived or counts as lost."""
         return self._before + max(0, self._newest - self._first - WINDOW + 1)
 
     def take(self, epoch: int, counter: int) -> bool:
-        """Count the arrival of a datagram; return True if it is certainly new.
+        """Count the arrival of a datagram; return True if the datagram is certainly new.
 
-        Any other may be a replay: sending a captured datagram again needs no key.
+        Any other datagram may be a replay: sending a captured datagram again needs no key.
         """
         if epoch != self._epoch:
             # Datagrams sent before the first arrival do not count: nobody may have listened yet.
@@ -141,7 +142,7 @@ class DatagramTally:
         return True
 
     def _skip(self, ahead: int) -> None:
-        """Move the window by more than one datagram: those skipped are lost or late."""
+        """Move the window by more than one datagram: the skipped datagrams are lost or late."""
         leaving = min(ahead, WINDOW)
         self.lost += leaving - (self._seen >> (WINDOW - leaving)).bit_count()
         self.lost += ahead - leaving

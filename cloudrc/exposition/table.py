@@ -1,7 +1,7 @@
-"""The table of all Prometheus metrics: name, type, meaning, labels, and who exposes it.
+"""The table of all Prometheus metrics: name, type, meaning, labels, and the exposing processes.
 
 Names follow the rules of Prometheus: prefix `cloudrc_`, base units, counters end in `_total`. Each
-label has a closed set of values, which keeps one pod below 200 series.
+label has a closed set of values, so that one pod has fewer than 200 series.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ OUTCOMES = (
     "busy",
     "unanswered",
 )
-"""What can happen to a datagram. The sender counts "sent", the receiver all others."""
+"""What can happen to a datagram. The sender counts "sent", the receiver the other outcomes."""
 ONLY_WORLD = {"stale", "range", "future", "hello", "unanswered"}
 """Outcomes that only world counts."""
 ONLY_CLOUD = {"accept_ignored"}
@@ -62,10 +62,10 @@ MISSION_OUTCOMES = (
     "other",
 )
 API_REFUSALS = ("token", "role", "busy", "slow")
-"""Reasons for which the API rejects a request: no valid token; a reader's token for an operator's
-request; too many requests at the same time; a body that arrives too slowly."""
+"""Reasons for which the API rejects a request: no valid token; a reader's token for a request of an
+operator; too many requests at the same time; a body that arrives too slowly."""
 ORDER_REFUSALS = ("invalid", "conflict")
-"""Reasons for which the API refuses an order: an invalid value; another mission is active."""
+"""Reasons for which the API refuses an order: a value is invalid; another mission is active."""
 BODIES = ("pipe", "board", "floor", "other")
 """Kinds of bodies: `pipe_2` is a "pipe"; a body of any other kind counts as "other"."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
@@ -76,8 +76,8 @@ LINK_MODES = ("auto", "relay", "netem")
 DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
 """Upper bounds for delays and ages [s]."""
 GAP_BUCKETS = (0.05, 0.25)
-"""Upper bounds for gaps between arrivals [s]: a gap longer than jitter explains, and the age at
-which the guard holds. There are only two, to stay below 200 series per pod."""
+"""Upper bounds for gaps between arrivals [s]: a gap that jitter cannot explain, and the age at
+which the guard holds. There are only two bounds, to stay below 200 series per pod."""
 PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
 """Upper bounds for loop periods [s], around the 10 ms of both loops."""
 LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)
@@ -102,11 +102,11 @@ class Metric(NamedTuple):
     """One Prometheus metric.
 
     Attributes:
-        name: As scraped; a histogram adds `_bucket`, `_sum` and `_count`.
-        kind: Its type.
+        name: Name in the scrape; a histogram adds `_bucket`, `_sum` and `_count`.
+        kind: Type of the metric.
         meaning: The HELP text, one or two sentences.
-        roles: Processes that expose it.
-        labels: Label name -> all its possible values.
+        roles: Processes that expose the metric.
+        labels: Label name -> all possible values of the label.
         buckets: Upper bounds of a histogram, rising, in the metric's unit.
     """
 

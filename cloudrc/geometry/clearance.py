@@ -1,7 +1,7 @@
 """Compute the distance between the robot and the walls of the pipes.
 
-A pipe is an ideal hollow cylinder with flat ends. The staves of the physics deviate from it by up
-to 3.2 mm.
+A pipe is an ideal hollow cylinder with flat ends. The physics builds each pipe from flat staves,
+which deviate from the cylinder by up to 3.2 mm.
 
 Source: docs/reference/plant.md, "Staves".
 """
@@ -20,8 +20,8 @@ _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 def distance_to_pipe(pipe: Pipe, points: Array) -> Array:
     """Compute the signed distance of points to a pipe's wall.
 
-    In the plane of s (along the axis) and r (away from it) the wall is a rectangle. The result is
-    the distance to that rectangle.
+    In the plane of s (along the axis) and r (distance from the axis) the wall is a rectangle. The
+    result is the distance to that rectangle.
 
     Args:
         pipe: The hollow cylinder.
@@ -55,7 +55,7 @@ def clearance_per_pipe(
         scene: The scene.
         positions: Positions of the base [m], world frame, shape (n, 3).
         orientations_wxyz: Orientations of the base, unit quaternions, body to world, shape (n, 4).
-        points: The robot's points; default: `key_points()`.
+        points: Points that represent the robot; default: `key_points()`.
 
     Returns:
         Distance of the nearest point [m], negative in a wall, shape (n, number of pipes).

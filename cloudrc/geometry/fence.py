@@ -9,10 +9,10 @@ HIGH: Vector = (9.2, 5.5, 2.5)
 """Opposite corners of the box in which the robot's base stays [m], world frame.
 Source: docs/reference/plant.md, "Fence of the guard"."""
 FLOOR_MARGIN = 0.35
-"""Least height of a hold point above the fence's floor [m]. Below it a tilted robot would touch the
-ground or scrape along it."""
+"""Smallest height of a hold point above the fence's floor [m]. At a smaller height, a tilted robot
+would touch the ground or scrape along the ground."""
 WALL_MARGIN = 0.2
-"""Distance from the other faces of the fence at which the guard stops the robot [m]."""
+"""Distance from the walls and the ceiling of the fence at which the guard stops the robot [m]."""
 INNER_LOW: Vector = (LOW[0] + WALL_MARGIN, LOW[1] + WALL_MARGIN, LOW[2] + FLOOR_MARGIN)
 INNER_HIGH: Vector = (HIGH[0] - WALL_MARGIN, HIGH[1] - WALL_MARGIN, HIGH[2] - WALL_MARGIN)
 """Opposite corners of the box in which the guard lets the robot fly [m], world frame."""

@@ -1,4 +1,4 @@
-"""Check whether the robot can fly to a position: the guard's limits, the pipes, the way there."""
+"""Check whether the robot can fly to a position: the guard's limits, the pipes, and the way."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
 CLEARANCE_MIN = 0.04
-"""Least distance of the whole robot from a wall at a waypoint and on the way there [m]. It is more
-than the steady error of 32 mm with which the published gains hover."""
+"""Smallest distance of the whole robot from a wall, at a waypoint and on the way to it [m]. This is
+more than 32 mm, the steady error of a hover with the published gains."""
 STEP_MIN = 0.02
-"""Shortest step along a way [m]; below it a way near a wall would take forever."""
+"""Shortest step along a way [m]; without it, the check of a way near a wall would never end."""
 _SEARCH = 1.5  # [m] largest distance of a suggested legal point
 _AT_ONCE = 50  # [1] candidates whose ways are looked at together
 _FAR = 1e3  # [m] positions beyond it would overflow
 
 
 def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]:
-    """Tell which positions are farther outside than the guard lets the robot fly.
+    """Tell which positions are outside the box in which the guard lets the robot fly.
 
     Args:
         positions: Positions of the base [m], world frame, shape (n, 3).
-        slack: Distance beyond the guard's limits that still counts as inside [m], shape () or (n,).
+        slack: Positions up to this distance outside the box still count as inside [m], shape () or
+            (n,).
     """
     nearest = np.clip(positions, fence.INNER_LOW, fence.INNER_HIGH)
     near = np.all(np.abs(positions) < _FAR, axis=1)
@@ -44,7 +45,7 @@ def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray
         yaws: Headings of the level robot [rad], shape (n,).
 
     Returns:
-        Index of the nearest pipe that is nearer than `CLEARANCE_MIN`, or -1, shape (n,).
+        Index of the nearest pipe if its distance is below `CLEARANCE_MIN`, else -1, shape (n,).
     """
     result = np.full(len(positions), -1, dtype=np.int64)
     near = np.flatnonzero(np.all(np.abs(positions) < _FAR, axis=1))
@@ -56,10 +57,10 @@ def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray
 
 
 def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
-    """Find the pipe that the robot would touch on a straight way, level and with yaw 0.
+    """Find the pipe that the robot, level and with yaw 0, would touch on a straight way.
 
-    The robot flies each way in steps as long as its distance from the nearest wall. A robot that
-    begins nearer to a wall than `CLEARANCE_MIN` may move away from it.
+    The check moves along each way in steps as long as the robot's distance from the nearest wall.
+    A robot that begins nearer to a wall than `CLEARANCE_MIN` may move away from that wall.
 
     Args:
         scene: The scene; its board does not count.
@@ -96,18 +97,18 @@ def find_nearest_legal(
 ) -> Vector | None:
     """Find a legal point near a position.
 
-    The search goes along the axes, and towards and away from the axes of the pipes. Candidates are
-    whole centimetres, so that the printed point is the checked one.
+    The search goes along x, y and z, and towards and away from the axes of the pipes. All
+    candidates are whole centimetres, so that the checked point is printed without rounding.
 
     Args:
         scene: The scene.
         position: Position of the base [m], world frame, shape (3,).
         yaw: Heading [rad].
-        before: Point from which the robot comes straight [m], shape (3,); None if it is unknown.
+        before: Start of the straight way to the point [m], shape (3,); None if it is unknown.
 
     Returns:
-        A point that the guard lets the robot reach, without an overlap [m], shape (3,); None if
-        there is none within 1.5 m.
+        A point that the guard lets the robot reach and that overlaps no pipe [m], shape (3,);
+        None if there is no such point within 1.5 m.
     """
     start = np.clip(position, fence.INNER_LOW, fence.INNER_HIGH)
     directions = [*np.eye(3), *-np.eye(3)]

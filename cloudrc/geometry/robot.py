@@ -15,7 +15,8 @@ Array = NDArray[np.float64]
 BASE_HALF = (0.05, 0.05, 0.10)
 """Half sizes of the base's box [m], body frame."""
 ARM_LENGTH, ARM_HEIGHT, ARM_RADIUS = 0.40, 0.17, 0.01
-"""The arm along +x: length from the z axis to the tip, height (z), radius [m], body frame."""
+"""The arm, which points along +x: length from the z axis to the tip, height (z), radius [m], body
+frame."""
 ROTOR_ARM, ROTOR_HEIGHT, ROTOR_RADIUS, ROTOR_HALF_THICKNESS = 0.21, 0.05, 0.128, 0.0025
 """The rotors: distance of a centre from the z axis, height (z), radius, half thickness [m], body
 frame."""
@@ -37,14 +38,14 @@ class Spheres:
 
 
 def key_points() -> Spheres:
-    """Return the 225 points for the clearance: rotors, arm, base box, top rod."""
+    """Return the 225 points that determine the clearance: rotors, arm, base box, top rod."""
     return _points([*_rotor_rings(), _box(2, 2, 2), *_rod_rings()], arm=9)
 
 
 def robot_points() -> Spheres:
     """Return points of the whole robot, dense enough to find every overlap with a wall.
 
-    Neighbours are at most 0.034 m apart; a wall is 0.038 m thick.
+    Neighbouring points are at most 0.034 m apart, less than the 0.038 m of a wall's thickness.
     """
     return _points([*_rotor_rings(), *_rod_rings(), _box(4, 4, 7)], arm=21)
 

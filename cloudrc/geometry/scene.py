@@ -1,13 +1,13 @@
 """Read the pipes, the board and the floor of a scene from its MJCF file.
 
-The file describes the bodies for MuJoCo. It repeats their ideal shapes as numbers, for readers
-without a physics engine: `<custom><numeric name="pipe_1" data="..."/>`, in metres, world frame.
+The file describes the bodies for MuJoCo. For programs without a physics engine, the file repeats
+the ideal shapes as numbers: `<custom><numeric name="pipe_1" data="..."/>`, in metres, world frame.
 
 | name | data |
 |---|---|
 | `pipe_*` | centre x y z, axis x y z, length, inner radius, outer radius |
 | `board` | x of the front face, y from, y to, z from, z to |
-| `floor` | z; 0 where it is absent |
+| `floor` | z; 0 if the file has no `floor` |
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Pipe:
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A wall to touch; its front face looks along -x.
+    """A wall that the robot can touch; its front face points along -x.
 
     Attributes:
         x: Position of the front face [m], world frame.
@@ -68,7 +68,7 @@ class Scene:
     Attributes:
         name: File name without .xml.
         pipes: The pipes, in the order of the file.
-        board: The board, if any.
+        board: The board; None if the scene has none.
         floor: Height z of the floor [m].
         spawn: Where the robot starts [m], world frame, shape (3,).
     """
@@ -81,10 +81,11 @@ class Scene:
 
 
 def load_scene(name: str) -> Scene:
-    """Read a shipped scene by its file name without .xml, or one by the path of its .xml file.
+    """Read a scene by the path of its .xml file, or a shipped scene by its file name without .xml.
 
     Raises:
-        BadInputError: If the file does not exist, or its numbers do not fit the table above.
+        BadInputError: If the file does not exist, or its numbers do not fit the table in the
+            docstring of this module.
     """
     return read_scene(Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml")
 
@@ -93,7 +94,7 @@ def read_scene(path: Path) -> Scene:
     """Read the scene in an MJCF file.
 
     Raises:
-        BadInputError: As `load_scene`.
+        BadInputError: If the file does not exist, or its numbers do not fit the table.
     """
     try:
         root = ElementTree.parse(path).getroot()

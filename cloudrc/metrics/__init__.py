@@ -1,9 +1,9 @@
 """Compute metrics of a recorded flight: each is one number with a unit.
 
 A shipped metric is a row of the table METRICS in `flight`, `control`, `link` or `mission`: name,
-unit, meaning, and the function that computes it. Your own metric is one Python file with
+unit, meaning, and the function that computes the number. Your own metric is one Python file with
 
-- a docstring; its first line says in one sentence what the number means: the report prints it;
+- a docstring whose first line says in one sentence what the number means; the report prints it;
 - `UNIT`, an SI unit as text: "s", "m", "m/s", "N", or "1" for counts and shares;
 - `measure(flight: Flight) -> float | None`, which returns None if the number is unknown.
 
@@ -39,7 +39,7 @@ __all__ = [
 
 
 METRIC_NOTE = "metric "
-"""Prefix of a note on a metric."""
+"""Beginning of a note on a metric."""
 SHIPPED = {
     metric.name: metric
     for metric in (*flight.METRICS, *control.METRICS, *link.METRICS, *mission.METRICS)
@@ -54,7 +54,7 @@ class Number:
     Attributes:
         value: Finite value in `unit`.
         unit: SI unit as text; "1" for counts and shares.
-        meaning: What it means, one sentence.
+        meaning: Meaning of the number, one sentence.
     """
 
     value: float
@@ -69,7 +69,7 @@ def find(choice: str) -> Metric:
         choice: Name of a shipped or installed metric, or path of a Python file, which is executed.
 
     Raises:
-        BadInputError: If it does not exist, or is not a metric.
+        BadInputError: If `choice` does not exist, or is not a metric.
     """
     if choice in SHIPPED:
         return SHIPPED[choice]
@@ -89,7 +89,7 @@ def find(choice: str) -> Metric:
 
 
 def name_of(choice: str) -> str:
-    """Return the name of a metric in report.json: for a file, its name without `.py`."""
+    """Return the name of a metric in report.json; for a file, the file name without `.py`."""
     return Path(choice).stem if plugins.is_path(choice) else choice
 
 
@@ -111,7 +111,7 @@ def check(own: Iterable[str]) -> None:
 
 
 def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
-    """Write a note for each metric file that an experiment names but `own` does not."""
+    """Write a note for each metric file that the experiment names and `own` does not contain."""
     names = set(map(name_of, own))
     return [
         f"{METRIC_NOTE}{name_of(choice)} is not measured: name its file with --metric"
@@ -128,8 +128,8 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
         own: The user's own metrics, as for `find`.
 
     Returns:
-        Numbers by name, sorted, without unknown ones; and a note for each metric that failed. An
-        exception in a user's metric costs its own number, never the report.
+        Known numbers by name, sorted; and a note for each metric that failed. After an exception
+        in a user's metric only the number of that metric is missing.
     """
     numbers: dict[str, Number] = {}
     notes: list[str] = []

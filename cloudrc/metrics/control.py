@@ -12,8 +12,8 @@ from cloudrc.metrics.flight import Array, Flight, Metric, mean, percentile, rms
 def round_trips(flight: Flight) -> dict[str, Array]:
     """Select the control periods with a new echo.
 
-    A period without a new echo repeats the previous values. Counting it would give too much weight
-    to a silent downlink, whose last echo is repeated for seconds.
+    A period without a new echo repeats the previous values. Counting such periods would give too
+    much weight to a silent downlink, during which the last echo repeats for seconds.
     """
     control = flight.control
     pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)
@@ -25,8 +25,9 @@ def round_trips(flight: Flight) -> dict[str, Array]:
 def _rtt_mean(flight: Flight) -> float | None:
     """Average over all echoes.
 
-    Only applied commands have an echo. If the newest command wins, these are the fast ones, so the
-    mean lies below the link profile. Use the one-way delays to judge the link itself.
+    Only applied commands have an echo. If the newest command wins, the applied commands are the
+    fast ones, so that the mean is below the round trip of the link profile. Use the one-way delays
+    to judge the link itself.
     """
     return mean(round_trips(flight)["rtt"])
 
@@ -42,7 +43,8 @@ def _loop_delay_mean(flight: Flight) -> float | None:
 def _age_of_information_mean(flight: Flight) -> float | None:
     """Average the age of the odometry over all control periods.
 
-    None unless both ends prove that they share a clock; only then are one-way delays recorded.
+    Return None unless both ends prove that they share a clock; only then are one-way delays
+    recorded.
     """
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
@@ -58,8 +60,8 @@ def _commands_applied(flight: Flight) -> float | None:
 def _prediction_error_rms(flight: Flight) -> float | None:
     """Compare the predicted with the true position at the application of each command.
 
-    The error includes that of the predictor and that of the delay estimate: a command acts when it
-    is applied, even if it was computed for another instant.
+    The error contains the error of the predictor and the error of the delay estimate: a command
+    acts when it is applied, even if it was computed for another instant.
 
     Source: docs/reference/control.md, "Predictors".
     """
@@ -70,7 +72,7 @@ def _prediction_error_rms(flight: Flight) -> float | None:
 def _estimate_error_rms(flight: Flight) -> float | None:
     """Compare the estimated with the true position, over all control periods.
 
-    The error is that of the predictor alone: both positions are at the odometry's stamp plus the
+    This is the error of the predictor alone: both positions are for the odometry's stamp plus the
     horizon, even if the horizon is wrong.
     """
     control = flight.control
@@ -91,8 +93,8 @@ def _delay_estimate_error_rms(flight: Flight) -> float | None:
 def _tracking_rms(flight: Flight, column: str) -> float | None:
     """Compare the setpoint with a position that cloud knows, over all control periods.
 
-    The distance to the next waypoint dominates this number. For the accuracy of the estimate use
-    estimate_error_rms.
+    The distance to the next waypoint dominates this number. The metric estimate_error_rms shows the
+    accuracy of the estimate.
 
     Source: the paper, error figure.
     """
@@ -124,7 +126,7 @@ def _world_slip(flight: Flight) -> float | None:
 def _real_time_factor(flight: Flight) -> float | None:
     """Divide simulated time by simulated time plus slip.
 
-    It must be close to 1. Below 1 the simulated robot was slower than the network.
+    The factor must be close to 1. Below 1 the simulated robot was slower than the network.
     """
     slipped = _world_slip(flight)
     if slipped is None or not flight.end_ns:
@@ -134,7 +136,7 @@ def _real_time_factor(flight: Flight) -> float | None:
 
 
 def _missed_periods(flight: Flight) -> float | None:
-    """Return the last count of cloud; None in virtual time."""
+    """Return cloud's last count of missed periods; None in virtual time."""
     if not len(flight.recording["/lateness"]):
         return None
     count = flight.recording["/count"]

@@ -1,7 +1,8 @@
 """Define `Flight`, a recording cut to its mission, and the metrics of the robot's motion.
 
-All stamps are on world's clock. Time zero is the guard's first change to TRACK: before it the robot
-does not move. The flight ends with the event that ends the mission, else with the recording.
+All stamps are on world's clock. Time zero is the guard's first change to TRACK; the robot does not
+move before. The flight ends with the event that ends the mission or, without such an event, at the
+end of the recording.
 """
 
 from __future__ import annotations
@@ -76,7 +77,10 @@ class Flight:
 
     @cached_property
     def end_ns(self) -> int | None:
-        """Event that ended the mission, else last true state [ns]; None if the robot never flew."""
+        """Stamp of the end [ns], world's clock; None if the robot never flew.
+
+        The end is the event that ended the mission or, without such an event, the last true state.
+        """
         if self.start_ns is None:
             return None
         if self.ending is not None:
@@ -86,7 +90,7 @@ class Flight:
 
     @cached_property
     def ending(self) -> tuple[int, str, str] | None:
-        """Stamp [ns], name and text of the event that ended the mission; None without one."""
+        """Stamp [ns], name and text of the event that ended the mission; None without an end."""
         mission = self.recording["/mission"]
         rows = zip(mission["stamp_ns"], mission["event"], mission["text"], strict=True)
         for stamp, event, text in rows:
@@ -157,7 +161,7 @@ class Flight:
 
     @cached_property
     def pipes_flown(self) -> int:
-        """Number of different pipes that the base was in."""
+        """Number of different pipes in which the base has been."""
         if not len(self.truth["stamp_ns"]):
             return 0
         indices = np.unique(pipe_index(self.scene, self.truth["position"]))
@@ -201,10 +205,10 @@ class Metric:
     """A metric: one row of the tables in this package.
 
     Attributes:
-        name: Its name in report.json.
+        name: Name in report.json.
         unit: An SI unit as text: "s", "m", "m/s", "N"; "1" for counts and shares.
         meaning: One sentence for the report and for `cloudrc list metrics`.
-        measure: Computes the number in `unit`; returns None if it cannot be known.
+        measure: Computes the number in `unit`; returns None if the number is unknown.
     """
 
     name: str
@@ -214,7 +218,7 @@ class Metric:
 
 
 def mean(values: Array) -> float | None:
-    """Average the finite `values`, shape (n,), any unit; None if there are none."""
+    """Average the finite `values`, shape (n,), any unit; None if no value is finite."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if len(finite) else None
 
@@ -224,7 +228,7 @@ def percentile(values: Array, percent: float) -> float | None:
 
     Args:
         values: Shape (n,), any unit; only finite values count.
-        percent: Share of the values below the result [%].
+        percent: Share of the values that are below the result [%].
     """
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, percent)) if len(finite) else None
@@ -259,13 +263,16 @@ def _speed_max(flight: Flight) -> float | None:
 
 
 def _min_clearance(flight: Flight) -> float | None:
-    """Compute the minimum over the samples inside a pipe; negative if a wall was penetrated."""
+    """Return the minimum clearance inside a pipe; negative if a wall was penetrated."""
     inside = flight.clearance[flight.inside]
     return float(inside.min()) if len(inside) else None
 
 
 def _min_clearance_flight(flight: Flight) -> float | None:
-    """Compute the minimum over all samples; the board does not count, as the arm must touch it."""
+    """Return the minimum clearance of all samples.
+
+    The board does not count, because the arm must touch the board.
+    """
     return float(flight.clearance.min()) if len(flight.clearance) else None
 
 

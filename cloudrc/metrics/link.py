@@ -1,6 +1,6 @@
 """Metrics of each direction of the link: delay, loss, late datagrams, and the relay's own counts.
 
-They include late datagrams: the datagrams that the loop uses are only the fast ones.
+The metrics include late datagrams, because the datagrams that the loop uses are only the fast ones.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ import numpy as np
 from cloudrc.metrics.flight import Flight, Metric, mean
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
-"""Direction -> its description in the meaning of a metric."""
+"""Direction -> description of the direction in the meaning of a metric."""
 SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 """Direction -> topic with one row per datagram sent that way."""
 SETTLING_NS = 2_000_000_000
 """Time after which a datagram that has not arrived counts as lost [ns]."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
-"""Name of a percentile -> its description."""
+"""Name of a percentile -> description of the percentile."""
 RELAY_COUNTS = {
     "relay_overflow": "that the relay dropped because its queue was full.",
     # The release errors do not include this time.
     "relay_stalled": "that waited 50 ms or more until the relay read them.",
     "released_early": "that left before they were due; above 0 the relay has a bug.",
 }
-"""Metric of the relay's counts -> end of its meaning."""
+"""Metric of the relay's counts -> end of the text that says what the metric means."""
 
 
 def _delay_mean(flight: Flight, way: str) -> float | None:
@@ -42,8 +42,8 @@ def _late(flight: Flight, way: str) -> float | None:
 def loss(flight: Flight, way: str) -> float | None:
     """Compute the share of the datagrams sent during the flight that never arrived [1].
 
-    Datagrams are joined by epoch and counter. Those of the last seconds of the recording may still
-    arrive and do not count.
+    Epoch and counter identify a datagram. Datagrams sent in the last SETTLING_NS of the recording
+    may still arrive and do not count.
     """
     sent, arrivals = flight.during(SENT[way]), flight.recording[f"/{way}_delay"]
     world = flight.recording["/telemetry"]["stamp_ns"]

@@ -12,15 +12,16 @@ from cloudrc.metrics.flight import Array, Flight, Metric, mean
 BOARD = "board"
 """Name of the scene's body that the arm must touch."""
 PRESSING_NS = 2_000_000_000
-"""Last part of the mission, over which the steady contact force is averaged [ns]."""
+"""Length of the last part of the mission, over which the steady contact force is averaged [ns]."""
 RESTING_NS = 5_000_000_000
-"""Last part of the flight, over which the steady error is averaged [ns]."""
+"""Length of the last part of the flight, over which the steady error is averaged [ns]."""
 SETTLING_NS = 10_000_000_000
-"""Time before `RESTING_NS` for which the setpoint must not have moved [ns]. Source:
-docs/reference/control.md, "Steady state": the slowest variant that settles needs 8 to 15 s to
-stay within 1 cm."""
+"""Time before the last RESTING_NS in which the setpoint must not move [ns]; otherwise there is no
+steady error.
+Source: docs/reference/control.md, "Steady state": the slowest variant that settles needs 8 to 15 s
+to stay within 1 cm."""
 FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizon_clamped")
-"""Names of cloud's counts that count as faults."""
+"""Names of cloud's counters whose values are added to the number of faults."""
 
 
 def _waypoints_reached(flight: Flight) -> float | None:
@@ -31,7 +32,7 @@ def _waypoints_reached(flight: Flight) -> float | None:
 
 
 def first_touch(flight: Flight) -> dict[str, Array] | None:
-    """Find the row of /contact of the arm's first touch of the board; None if there is none."""
+    """Find the row of /contact at which the arm first touched the board; None without a touch."""
     contact = flight.during("/contact")
     touches = np.flatnonzero((contact["body"] == BOARD) & contact["tip"].astype(bool))
     return {name: column[touches[0]] for name, column in contact.items()} if len(touches) else None
@@ -48,9 +49,9 @@ def _tip_speed(flight: Flight) -> float | None:
 
 
 def _peak_contact_force(flight: Flight) -> float | None:
-    """Return the maximum of the touch sensor; None if the arm never touched the board.
+    """Return the largest force on the touch sensor; None if the arm never touched the board.
 
-    It depends on the contact parameters of the simulator: compare only flights in one scene.
+    The peak depends on the simulator's contact parameters: compare only flights in the same scene.
     """
     if first_touch(flight) is None:
         return None
@@ -59,7 +60,7 @@ def _peak_contact_force(flight: Flight) -> float | None:
 
 
 def _steady_contact_force(flight: Flight) -> float | None:
-    """Average the touch sensor over the last part of a completed mission.
+    """Average the force on the touch sensor over the last part of a completed mission.
 
     Unlike the peak at impact, the steady force does not depend on the simulator's contact
     parameters.
@@ -82,15 +83,15 @@ def _pipe_contacts(flight: Flight) -> float | None:
 
 
 def _steady_error(flight: Flight, axis: int) -> float | None:
-    """Average the distance of the true position from the setpoint along one axis.
+    """Average the distance between true position and setpoint along one axis.
 
     Args:
         flight: Any flight.
         axis: 0, 1 or 2 for x, y or z, world frame.
 
     Returns:
-        Mean absolute error [m] over the last 5 s; None if in the last 15 s the setpoint moved or
-        the arm touched something.
+        Mean absolute error over the last 5 s [m]. None if the setpoint moved or the arm touched
+        something in the last 15 s, or if the flight is shorter.
     """
     control = flight.control
     if flight.end_ns is None or flight.start_ns is None:
@@ -138,7 +139,7 @@ def _hold_time(flight: Flight) -> float | None:
 def _fault_count(flight: Flight) -> float | None:
     """Sum the failures that cloud counted and all other recorded faults.
 
-    A repeated failure has one fault record, but its count includes every time.
+    A failure that repeats has only one fault record; its counter contains every repetition.
     """
     if flight.start_ns is None:
         return None
@@ -153,7 +154,7 @@ def _fault_count(flight: Flight) -> float | None:
 
 
 def _recorder_dropped(flight: Flight) -> float | None:
-    """Sum the last counts of both ends; None without counts."""
+    """Sum both ends' last counts of dropped records; None without counts."""
     count = flight.recording["/count"]
     last = {
         str(end): int(value)

@@ -1,15 +1,17 @@
-"""Judge a mission by one set of rules, from what the operator or what the recording has seen.
+"""Judge a mission by one set of rules, from the operator's telemetry or from the recorded truth.
 
 The verdict is the first of these that applies:
 
-- `interrupted`: the run was stopped, the mission was cancelled, or the recording ends before it;
+- `interrupted`: the run was stopped, the mission was cancelled, or the recording ends before the
+  mission;
 - `invalid`: the run did not keep real time although it had to, so its numbers mean nothing;
-- `failure`: a criterion of success is not met; each one is listed with time and place;
-- `success`: all waypoints reached within the time limit, the board touched slowly enough, no pipe
-  touched, the guard only in TRACK or HOLD, world never restarted.
+- `failure`: at least one criterion of success is not met; each is listed with time and place;
+- `success`: all waypoints were reached within the time limit, the board was touched slowly enough,
+  no pipe was touched, the guard was only in TRACK or HOLD, and world never restarted.
 
-The rules judge `Evidence`. The report takes it from the recorded truth (`flight_evidence`), teleop
-from telemetry (`Observations`). Telemetry arrives late and shows less, so the verdicts can differ.
+The rules judge `Evidence`. The report takes the evidence from the recorded truth
+(`flight_evidence`), teleop takes it from telemetry (`Observations`). Telemetry arrives late and
+shows less, so the two verdicts can differ.
 """
 
 from __future__ import annotations
@@ -27,8 +29,9 @@ from cloudrc.metrics.mission import first_touch
 from cloudrc.records import REAL_TIME_FACTOR_MIN
 
 SLIP_MAX = 0.25
-"""Most time that world's clock may lose in a valid flight [s]: the guard's default limit on the age
-of a command. Above it a slow machine, not the network, could decide what the guard does."""
+"""Largest time that world's clock may lose in a valid flight [s]: the guard's default limit on the
+age of a command. With a larger loss, a slow machine instead of the network could decide what the
+guard does."""
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 """Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
 ADVICE = "close other programs or give the run more cores"
@@ -43,7 +46,7 @@ class Failure:
     Attributes:
         code: One word, for programs.
         text: Description for people.
-        time: Time since the start of the mission [s]; None if there is no instant.
+        time: Time since the start of the mission [s]; None if the failure has no instant.
         place: True position of the base at that time [m], shape (3,); None if unknown.
     """
 
@@ -71,7 +74,7 @@ class Verdict:
 
 
 class Moment(NamedTuple):
-    """When and where something happened; see `Failure`.
+    """When and where something happened, as in `Failure`.
 
     Attributes:
         time: Time since the start of the mission [s].
@@ -98,22 +101,21 @@ class Evidence:
     """What is known of a mission that is over.
 
     Attributes:
-        waypoints: Number of its waypoints.
+        waypoints: Number of waypoints of the mission.
         reached: Number of waypoints reached.
         contact: Whether the arm's tip has to touch the board.
         contact_speed_max: Limit of the speed at the touch [m/s].
-        ending: How it ended; None if its last event is unknown.
+        ending: How the mission ended; None if its last event is unknown.
         end: End of the flight.
-        interrupted: Why the run is over, if somebody has stopped it before the mission's end; "" if
-            nobody has.
-        grounded: Why the robot never flew; "" if it did.
-        duration: Duration [s]; 0 if its limit is not judged.
+        interrupted: Why the run ended, if somebody stopped it before the mission's end; else "".
+        grounded: Why the robot never flew; "" if it flew.
+        duration: Duration [s]; 0 if the limit of the duration is not judged.
         time_limit: Limit of the duration [s].
         touch: Speed of the first touch of the board [m/s] and its moment; None without a touch.
         pipes: Name, number of contacts and first moment of each pipe that was touched.
         guard: State, cause and moment of each change of the guard beyond HOLD.
-        restarts: Cause and moment of each session that world has opened in flight.
-        slow: Why the run did not keep real time; "" if it did, or did not have to.
+        restarts: Cause and moment of each session that world opened in flight.
+        slow: Why the run did not keep real time; "" if it kept real time or did not have to.
     """
 
     waypoints: int
@@ -168,7 +170,7 @@ def _violations(evidence: Evidence) -> Iterator[Failure]:
 
 
 def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
-    """Yield the goals of the mission that it did not reach."""
+    """Yield the goals that the mission did not reach."""
     if evidence.grounded:
         yield Failure("not_started", f"the robot never left the ground: {evidence.grounded}")
         return
@@ -196,7 +198,7 @@ def _too_slow(factor: float) -> str:
 def flight_evidence(
     flight: Flight, numbers: Mapping[str, Number], *, real_time: bool, interrupted: bool
 ) -> Evidence:
-    """Take the evidence of a recorded flight, with the recorded truth.
+    """Take the evidence from the recorded truth of a flight.
 
     Args:
         flight: The recorded flight.
@@ -232,7 +234,7 @@ def flight_evidence(
 
 
 def _moment(flight: Flight, stamp_ns: int) -> Moment:
-    """Give time and place of an instant [ns]."""
+    """Return time and place of an instant [ns]."""
     x, y, z = flight.true_position(np.array([stamp_ns]))[0]
     place = (float(x), float(y), float(z)) if np.isfinite((x, y, z)).all() else None
     return Moment(float(flight.seconds(stamp_ns)), place)
@@ -244,7 +246,7 @@ def _touch(flight: Flight, touch: Mapping[str, Any]) -> tuple[float, Moment]:
 
 
 def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[tuple[str, int, Moment]]:
-    """Yield the pipes that were touched until an instant [ns]."""
+    """Yield the pipes that were touched up to an instant [ns]."""
     contact = flight.during("/contact")
     for body in sorted({str(body) for body in contact["body"] if str(body).startswith("pipe")}):
         stamps = contact["stamp_ns"][contact["body"] == body]
@@ -285,7 +287,7 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
 
 
 def _why_grounded(flight: Flight) -> str:
-    """Say why the guard never applied a command in a flight that did not start."""
+    """Describe why the guard never applied a command in a flight that did not start."""
     arrivals, control = flight.recording["/downlink_delay"], flight.recording["/delay_estimate"]
     if not len(control):
         return "its telemetry or cloud's answers were lost, so cloud computed no command"
@@ -313,10 +315,11 @@ def _why_grounded(flight: Flight) -> str:
 
 
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
-    """Judge a recorded mission that has ended as the operator does at its end.
+    """Judge a recorded mission in the way in which the operator judges at the end of the mission.
 
-    The operator knows contacts only from telemetry that had arrived by then, does not know the
-    report's time limit, and of the timing only the real-time factor.
+    The operator knows only the contacts in telemetry that has arrived by the end of the mission.
+    The operator does not know the time limit of the report. Of the timing, the operator knows only
+    the real-time factor.
 
     Args:
         flight: The recorded flight.
@@ -342,7 +345,7 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
 
 
 AWAY = -1
-"""Value that replaces a slip [ns] until this teleop process has received telemetry from world."""
+"""Value that stands for the slip [ns] until this teleop process receives telemetry from world."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,10 +355,10 @@ class Observations:
     Attributes:
         pipe_contacts: Last count of contacts in telemetry.
         pipe_touches: Number of contacts since the mission began.
-        touch_before: Speed of an earlier mission's touch in telemetry [m/s]; None if none.
+        touch_before: Speed of an earlier mission's touch in telemetry [m/s]; None without one.
         touch_speed: Speed of this mission's touch [m/s]; None if the board was not touched.
-        slip_began_ns: World's slip when the mission began [ns], plus the slip while teleop was
-            away, which does not count.
+        slip_began_ns: World's slip when the mission began, plus the slip during a restart of teleop
+            [ns]: slip that does not count.
         slip_ns: World's slip in the last telemetry [ns]; AWAY after a restart of teleop.
     """
 
@@ -371,9 +374,9 @@ class Observations:
         """Begin with the telemetry at the start of the mission.
 
         Args:
-            pipe_contacts: See `see`.
-            touch_speed: See `see` [m/s].
-            slip_ns: See `see` [ns].
+            pipe_contacts: Number of contacts, as in `see`.
+            touch_speed: Speed of the touch, as in `see` [m/s].
+            slip_ns: Slip, as in `see` [ns].
         """
         return cls(pipe_contacts, 0, _known(touch_speed), None, slip_ns, slip_ns)
 
@@ -382,7 +385,8 @@ class Observations:
 
         Args:
             pipe_contacts: Number of contacts with pipes since the robot was reset.
-            touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before that.
+            touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before the
+                touch.
             slip_ns: Lag of world's clock behind its machine's clock [ns].
         """
         touch = _known(touch_speed)
@@ -403,7 +407,7 @@ class Observations:
         )
 
     def after_restart(self) -> Observations:
-        """Continue after a restart of teleop; the slip in between does not count."""
+        """Continue after a restart of teleop; the slip during the restart does not count."""
         return replace(self, slip_began_ns=self.slip_began_ns - self.slip_ns, slip_ns=AWAY)
 
     def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
@@ -418,8 +422,8 @@ class Observations:
         """Return the evidence of a mission that has ended.
 
         Args:
-            ending: How it ended.
-            elapsed: Duration [s].
+            ending: How the mission ended.
+            elapsed: Duration of the mission [s].
             known: Other attributes of the evidence.
         """
         end = Moment(elapsed)
@@ -435,7 +439,7 @@ class Observations:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the attributes, to store them."""
+        """Return the attributes in the form in which they are stored."""
         return asdict(self)
 
 

@@ -38,8 +38,8 @@ class Run:
     Attributes:
         mode: "virtual", "local" or "cluster".
         shaper: What emulated the link: "virtual", "relay" or "netem".
-        records_sha256: Hash of all records in virtual time, of all messages in real time, by
-            `record.hash`; None if the recording is incomplete.
+        records_sha256: Hash by `record.hash`: of all records in virtual time, of all messages in
+            real time. None if the recording is incomplete.
         interrupted: True if the run was stopped.
         notes: Notes for the reader, a sentence each.
     """
@@ -68,11 +68,11 @@ def report_document(
         run: Facts about the run that are not in its recording.
         experiment: The experiment.
         verdict: The verdict on the run.
-        numbers: Measured numbers; unknown ones are absent.
+        numbers: Measured numbers, without unknown numbers.
         notes: Notes for the reader, a sentence each.
         clock_offset: Document by `clock_offset_document`.
         complete: False if the recording is torn.
-        operator: The operator's verdict, if it differs; None if not.
+        operator: The operator's verdict if it differs from `verdict`, else None.
     """
     document = {
         "schemaVersion": SCHEMA_VERSION,
@@ -126,7 +126,7 @@ def environment_document() -> dict[str, Any]:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a document as JSON; raise ValueError if a number is not finite."""
+    """Write a document as JSON; raise a ValueError if a number is not finite."""
     text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
     write_atomically(path, f"{text}\n".encode())
 
@@ -142,7 +142,7 @@ def _failure_document(failure: Failure) -> dict[str, Any]:
 
 
 def _known(entries: dict[str, Any]) -> dict[str, Any]:
-    """Remove unknown entries, which are None: they are absent, never zero or null."""
+    """Remove entries that are None: an unknown value is absent, never zero or null."""
     return {name: value for name, value in entries.items() if value is not None}
 
 
@@ -154,7 +154,7 @@ def _version(name: str) -> str | None:
 
 
 def _processor() -> str:
-    """Read the processor's model from /proc/cpuinfo, else ask Python."""
+    """Read the processor's model from /proc/cpuinfo; if that fails, ask Python."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

@@ -1,8 +1,8 @@
-"""Read the folder of a recorded run, and refuse it if its recording cannot carry a report.
+"""Read the folder of a recorded run, and refuse a recording that is not sufficient for a report.
 
-A report is written again from `mission.mcap`. Other programs may have filtered, cut, renamed or
-replaced that file. Then the report would be wrong, so the command ends with the reason, and the
-earlier report.json stays as it is.
+A new report of an old run is made from `mission.mcap`. Other programs may have filtered, cut,
+renamed or replaced that file. Then the report would be wrong. Therefore the command ends with the
+reason, and the earlier report.json stays unchanged.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from cloudrc.report.document import Run
 from cloudrc.report.write import DIFFERS, RECORDING_NOTE
 
 REPORT_BYTES_MAX = 16 << 20
-"""Largest report.json that is read [bytes]; it may have many notes."""
+"""Largest report.json that is read [bytes]; a report may have many notes."""
 JUDGEMENT = ("criteria", "description", "name", "report")
-"""Keys of an experiment that change its report, but not its flight."""
+"""Keys of an experiment that change the report, but not the flight."""
 FOLLOWS = (("/command_applied", "/guard"), ("/pid", "/mission"))
-"""Topics of which the first has rows only if the second has."""
+"""Pairs of topics: if the first topic has rows, the second topic must have rows, too."""
 
 
 class _EarlierReport(BaseModel):
@@ -52,7 +52,7 @@ class _EarlierReport(BaseModel):
 def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     """Read the folder of a run, complete or torn, as arguments for `write_report`.
 
-    If the run ended before it merged the recordings of both ends, they are merged now.
+    If the run ended before it merged the recordings of both ends, this function merges them.
 
     Raises:
         BadInputError: If the folder has no experiment or no readable recording, or if the
@@ -76,7 +76,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
 
 
 def _read_merged(folder: Path) -> Contents | None:
-    """Read mission.mcap; None if it is absent or torn and the recordings of the ends are there."""
+    """Read mission.mcap. Return None if it is absent or torn and the ends' recordings exist."""
     merged, ends = folder / "mission.mcap", (folder / "world.mcap", folder / "cloud.mcap")
     there = [path.is_file() for path in ends]
     if not merged.exists():
@@ -94,12 +94,12 @@ def _read_merged(folder: Path) -> Contents | None:
 
 
 def _lacking(recording: Recording, config: Path, earlier: _EarlierReport | None) -> Iterator[str]:
-    """Yield what keeps a recording from carrying a report, the plainest reason first.
+    """Yield the reasons why a recording is not sufficient for a report, the plainest reason first.
 
     Args:
         recording: The recording.
         config: Configuration in the folder of the run.
-        earlier: The report that is there.
+        earlier: The earlier report; None without one.
     """
     if not any(len(recording[topic]) for topic in TOPICS):
         yield "; ".join(["holds no message of cloudrc", *recording.remarks])
@@ -125,7 +125,7 @@ def _lacking(recording: Recording, config: Path, earlier: _EarlierReport | None)
 
 
 def _unequal(recording: Recording) -> Iterator[str]:
-    """Yield topics whose rows are fewer than those of other topics show."""
+    """Yield the topics that have fewer rows than related topics show."""
     for topic in TOPICS.values():
         count = len(recording[topic.name])
         siblings = [t.name for t in TOPICS.values() if t.source is topic.source]
@@ -155,11 +155,11 @@ def _read_earlier(path: Path) -> _EarlierReport | None:
 def _describe(recording: Recording, earlier: _EarlierReport | None, sha256: str) -> Run:
     """Describe a run by its earlier report.
 
-    Without one, guess mode and shaper: a run that recorded lateness was in real time.
+    Without an earlier report, guess mode and shaper: a run that recorded lateness was in real time.
 
     Args:
-        recording: Its recording.
-        earlier: Its earlier report.
+        recording: The recording of the run.
+        earlier: The earlier report; None without one.
         sha256: Hash of the recording's messages.
     """
     if earlier is None:
@@ -186,7 +186,7 @@ def _describe(recording: Recording, earlier: _EarlierReport | None, sha256: str)
 
 
 def _records_sha256(recording: Recording) -> str | None:
-    """Return the hash of the records of a run in virtual time, which its recording keeps."""
+    """Return the hash of all records, which the recording of a run in virtual time contains."""
     try:
         kept = _EarlierReport.model_validate_json(recording.attachments["report.json"])
     except (KeyError, ValueError):

@@ -1,4 +1,4 @@
-"""Lay out the table of numbers of the report: rows in groups, in readable units."""
+"""Lay out the report's table of numbers: rows in groups, in readable units."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def table_rows(numbers: Mapping[str, Number]) -> str:
 
 
 def readable(name: str, number: Number) -> tuple[str, str]:
-    """Format a number in a readable unit; return its digits and the unit."""
+    """Format a number in a readable unit; return the digits and the unit."""
     value, unit = number.value, number.unit
     if value == 0:
         return "0", "" if unit == "1" else unit

@@ -1,6 +1,6 @@
-"""Write the page report.html: verdict, a summary in words, numbers and figures in one file.
+"""Make the page report.html: verdict, a summary in words, numbers and figures in one file.
 
-The page embeds its pictures, uses the reader's fonts and makes no request to the network.
+The page embeds its pictures, uses the reader's fonts and sends no request to the network.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def _guard(known: Mapping[str, float]) -> str:
 
 
 _UNIT = re.compile(r"(\d) (s|m|mm|ms|N|m/s)\b")
-"""Pattern of a number and its unit, between which a line must not break."""
+"""Pattern of a number and its unit; no line may break between number and unit."""
 ACCENTS = {
     "success": "#00694b",
     "failure": "#a33a00",
@@ -168,7 +168,7 @@ def render(
 
 
 def _repeat(run: Run) -> tuple[str, str]:
-    """Return a text and the command for repeating the run."""
+    """Return an instruction and a command with which the reader can repeat the run."""
     command = shlex.join(["cloudrc", "run", "config.yaml", "--mode", run.mode])
     if run.mode == "virtual":
         return "Run this in the folder of the report; the records will be identical:", command

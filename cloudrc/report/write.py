@@ -25,7 +25,7 @@ from cloudrc.report.document import (
 DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
 """Beginning of the note on an operator's verdict that differs."""
 RECORDING_NOTE = "The recording "
-"""Begin of the notes about a recording, which each report writes anew."""
+"""Beginning of the notes on a recording; a new report replaces the old notes."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Assessment:
         run: Facts about the run that are not in its recording.
         experiment: The experiment.
         flight: The recorded flight.
-        numbers: Measured numbers; unknown ones are absent.
+        numbers: Measured numbers, without unknown numbers.
         verdict: The verdict on the run.
         notes: Notes for the reader, a sentence each.
         document: Content of report.json.
@@ -61,8 +61,8 @@ def assess(
 
     Args:
         recording: Recording of both ends, on world's clock.
-        experiment: The experiment. Metric files that it names are not executed: the experiment may
-            come from somebody else.
+        experiment: The experiment. Metric files named in the experiment are not executed, because
+            the experiment may come from somebody else.
         run: Facts about the run that are not in its recording.
         own: The user's own metrics, names or paths; files are executed.
     """
@@ -126,7 +126,7 @@ def write_report(
 
     Raises:
         MissingPrerequisiteError: If `page` is True and matplotlib is not installed; report.json is
-            written before.
+            written before the error.
     """
     assessment = assess(recording, experiment, run, own)
     write_json(folder / "report.json", assessment.document)

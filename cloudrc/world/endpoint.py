@@ -1,8 +1,10 @@
 """World's end of the tunnel: it receives commands, flies the robot and sends telemetry.
 
-Time advances in `_advance` only. The ticks before a datagram's arrival run before the datagram has
-any effect, so that the result does not depend on when the driver wakes up. World alone hands out
-epochs: a cloud that takes control gets a new one, and a mission that starts from the spawn, too.
+Time advances in `_advance` only. All ticks before a datagram's arrival run before the datagram has
+any effect. Therefore the result does not depend on when the driver wakes up.
+
+World alone assigns epochs. A new epoch begins when a cloud takes control, and when a mission starts
+from the spawn.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ class MissionContacts:
 
     Attributes:
         pipes: Number of contacts with pipes.
-        speed: Speed of the tip at its first contact with the board [m/s]; NaN before that.
+        speed: Speed of the tip at its first contact with the board [m/s]; NaN before the first
+            contact.
     """
 
     def __init__(self) -> None:
@@ -66,8 +69,8 @@ class MissionContacts:
 
 
 START_AGE_MAX_NS = 1_000_000_000
-"""Largest age of the telemetry on which a start request is based [ns]. If the experiment allows a
-larger age for commands, that age is the limit."""
+"""Largest age of the telemetry on which a start request is based [ns]. If the experiment allows
+older commands, the age limit of commands applies to start requests, too."""
 
 
 class Orders:
@@ -76,18 +79,18 @@ class Orders:
     Attributes:
         number: Number of the newest request that was carried out in this session.
         mission_id: The mission that was started last, in any session.
-        reached: Number of its waypoints known to be reached; it never falls.
+        reached: Number of waypoints of that mission known to be reached; the number never falls.
         touches: What the robot has touched in this mission.
     """
 
     def __init__(
         self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
     ) -> None:
-        """Start without any request.
+        """Set the guard and the limits; no request was carried out yet.
 
         Args:
             guard: The guard that carries the requests out.
-            counts: Counters of the endpoint; "start_refused" is counted here.
+            counts: Counters of the endpoint; `Orders` counts "start_refused".
             command_age_max_ns: Largest age of a command's basis [ns].
         """
         self._guard, self._counts = guard, counts
@@ -102,7 +105,7 @@ class Orders:
         *,
         waited: bool,
     ) -> bool:
-        """Carry out a request; the caller itself begins a mission.
+        """Carry out a request, except that the caller has to begin a mission.
 
         Args:
             request: The operator's request.
@@ -114,7 +117,7 @@ class Orders:
 
         Raises:
             DecodeError: "stale" or "future" for a start that is not recent. Somebody may have
-                delayed it, and the mission may be over.
+                delayed the request, and the mission may be over.
         """
         if request.request is Request.PROGRESS:
             self._keep_progress(request)
@@ -147,26 +150,25 @@ class Orders:
             raise DecodeError("future")
 
     def _begin_mission(self, request: OperatorRequest) -> None:
-        """Forget waypoints and contacts if the mission is new or starts from the spawn."""
+        """Reset waypoints and contacts if the mission is new or starts from the spawn."""
         if request.mission_id != self.mission_id or request.start is Start.SPAWN:
             self.mission_id, self.reached = request.mission_id, 0
             self.touches = MissionContacts()
 
     def _keep_progress(self, request: OperatorRequest) -> None:
-        """Keep the mission's progress on board, for a cloud that restarts."""
+        """Store the mission's progress on board, for a cloud that restarts."""
         if request.mission_id == self.mission_id:
             self.reached = max(self.reached, request.reached)
 
 
 REPORT_AGAIN_NS = 10_000_000_000
-"""Time without a slowdown after which world reports the next slowdown as a new fault [ns]."""
+"""World reports a slowdown as a new fault if none was seen for longer than this [ns]."""
 
 
 class PaceMonitor:
-    """Compares world's clock with the machine's and reports a world slower than real time.
+    """Compares world's clock with the machine's, and reports a world slower than real time.
 
-    The first call after a start has nothing to compare with. Such a run is invalid, because not the
-    network is slow but the robot.
+    A run with such a world is invalid: the robot is slow, not the network.
     """
 
     def __init__(self) -> None:
@@ -175,6 +177,8 @@ class PaceMonitor:
 
     def check(self, now_ns: int, slip_ns: int) -> list[Fault]:
         """Return a fault if world fell behind since the last call, about a second ago.
+
+        The first call only stores the clocks.
 
         Args:
             now_ns: World's clock [ns].
@@ -201,8 +205,8 @@ class WorldIdentity:
 
     Attributes:
         clock_id: 16 bytes that name this machine's monotonic clock.
-        nonce: 16 bytes that name this process; never the same twice.
-        ring: The pre-shared keys; None for an end whose datagrams stay in its process.
+        nonce: 16 bytes that name this process; every start has new ones.
+        ring: The pre-shared keys; None if both ends are in one process.
     """
 
     clock_id: bytes
@@ -231,14 +235,15 @@ class WorldEndpoint:
         command_age_max_ns: int,
         start_ns: int = 0,
     ) -> None:
-        """Start with the robot on the ground at its spawn.
+        """Connect the parts and put the robot on the ground at its spawn.
 
         Args:
             robot: The robot, its guard in GROUND.
             sensors: The sensors that give odometry its noise.
             identity: The identity of this end.
             newest_wins: Whether late commands are dropped.
-            command_age_max_ns: Datagrams that may have waited longer in the socket are stale [ns].
+            command_age_max_ns: Longest wait in the socket [ns]; a datagram that may have waited
+                longer is stale.
             start_ns: The monotonic clock now [ns].
         """
         self.robot, self._sensors, self._identity = robot, sensors, identity
@@ -263,7 +268,7 @@ class WorldEndpoint:
 
     @property
     def counts(self) -> Counter[str]:
-        """How often each thing has happened, as of now; a copy."""
+        """A copy of the counters: how often each event has happened so far."""
         return Counter(self._counts | self.robot.guard.counts)
 
     @property
@@ -278,7 +283,7 @@ class WorldEndpoint:
 
     @property
     def sealed(self) -> bool:
-        """See `Endpoint`."""
+        """Whether the datagrams are authenticated."""
         return self._session.sealed
 
     def next_deadline_ns(self) -> int:
@@ -286,7 +291,7 @@ class WorldEndpoint:
         return self._odometry_ns + self._clock.slip_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Run every tick up to and including `now_ns`; telemetry is sent on the way."""
+        """Run every tick up to and including `now_ns`, and send the telemetry that becomes due."""
         self._session.follow_keys()
         self._advance(self._follow(now_ns) + 1)
 
@@ -301,7 +306,7 @@ class WorldEndpoint:
         return records
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Handle one datagram; an invalid one is counted and dropped."""
+        """Handle one datagram. Count and drop an invalid datagram."""
         world_ns = self._follow(now_ns)
         try:
             kind, _, epoch, counter, body = self._session.open(data)
@@ -321,9 +326,9 @@ class WorldEndpoint:
                 self._records += self._complaints.about(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
-        """Return world's time at a wake, and remember a wake after a stall.
+        """Return world's time at a wake, and note whether the wake follows a stall.
 
-        The datagrams that a wake after a stall finds may have waited in the socket.
+        Datagrams that arrive at a wake after a stall may have waited in the socket.
         """
         world_ns = now_ns - self._clock.slip_ns
         behind_ns = world_ns - self._clock.tick_ns
@@ -345,7 +350,7 @@ class WorldEndpoint:
             tick_ns = clock.tick_ns = self.robot.run(tick_ns, stop_ns)
 
     def _apply(self, now_ns: int) -> None:
-        """Note that the waiting command takes effect with this tick."""
+        """Record that the waiting command takes effect at this tick."""
         assert self._waiting is not None
         epoch, counter, command = self._waiting
         self._waiting = None
@@ -398,7 +403,7 @@ class WorldEndpoint:
         self._odometry_ns += ODOMETRY_PERIOD_NS
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
-        """Answer a hello; one that waited during a stall is stale."""
+        """Answer a hello; a hello that waited during a stall is stale."""
         if now_ns == self._stalled_wake_ns:
             raise DecodeError("stale")
         answer = self._door.receive_hello(hello, counter, now_ns)
@@ -439,7 +444,7 @@ class WorldEndpoint:
     def _receive_command(
         self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
     ) -> None:
-        """Record a command of this epoch; give the newest one to the guard."""
+        """Record a command of this epoch; if it is the newest command, give it to the guard."""
         command, guard = codec.decode_command(body), self.robot.guard
         outcome = self._channel.take(counter)
         if outcome != REPEATED:
@@ -457,7 +462,7 @@ class WorldEndpoint:
         self._counts[outcome] += 1
 
     def _offer(self, command: Command) -> str | None:
-        """Give a command to the guard; return why the guard rejects it, None if it does not."""
+        """Give the guard a command; return the reason of a rejection, None if accepted."""
         tick_ns = self._clock.tick_ns
         rejection = self.robot.guard.accept_command(command, tick_ns)
         for observer in self.robot.observers:

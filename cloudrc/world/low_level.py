@@ -1,11 +1,11 @@
 """The onboard low-level controller, which makes the robot follow a velocity at 500 Hz.
 
 A velocity PID gives the force that the robot needs. Geometric attitude control turns the thrust
-axis towards that force. The allocation splits thrust and torque over four rotors. It uses plain
-floats, because it runs in every physics step.
+axis towards that force. The allocation splits thrust and torque over four rotors. All of this uses
+plain floats, because it runs in every physics step.
 Source: docs/reference/plant.md, "Low-level controller".
-Deviation: the published code assumes dt = 10 ms but runs every 2 ms; here dt is the true step, and
-the gains are converted so that the effect is the same.
+Deviation: the published code assumes dt = 10 ms but runs every 2 ms. This module uses the true
+step, and its gains are converted so that the effect is the same.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import ARM, SPEED_MAX, THRUST_COEFFICIENT, TORQUE_RATIO
 
 MASS = 1.05
-"""Mass that the controller assumes [kg]; the robot has 1.06.
+"""Mass that the controller assumes [kg]; the robot's mass is 1.06 kg.
 Source: docs/reference/plant.md, "Total mass"."""
 GRAVITY = 9.81
-"""Gravity that the controller assumes [m/s^2]; the physics has 9.8066.
+"""Gravity that the controller assumes [m/s^2]; the physics uses 9.8066 m/s^2.
 Source: docs/reference/plant.md, "Gravity"."""
 TILT_GAIN, YAW_GAIN = 1.0, 0.035
 """Attitude gains (k_R): torque per attitude error [N m]. TILT_GAIN is for x and y, YAW_GAIN for z.
@@ -42,12 +42,12 @@ _HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
 _TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
 
 NOSE_COSINE_MIN, YAW_SINE_MAX = 0.5, 0.3
-"""Limits beyond which the published attitude error uses wrong axes: smallest cosine of the error
-about the nose, and largest sine of the yaw error [1]."""
+"""Limits of the published attitude error: smallest cosine of the error about the nose, and largest
+sine of the yaw error [1]. Beyond either limit the published error uses wrong axes."""
 
 
 class LowLevel:
-    """Makes the robot follow a velocity; yaw is held at 0, as in the published controller."""
+    """Makes the robot follow a velocity; holds the yaw at 0, as the published controller does."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class LowLevel:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the integral and the last error."""
+        """Set the integral to zero and forget the last error."""
         self._integral = ZERO
         self._error: Vector | None = None
 
@@ -93,7 +93,7 @@ class LowLevel:
         return allocate(attitude(force, readings))
 
     def brake(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
-        """Compute the rotor speeds as `update` does, with the integral frozen while braking.
+        """Compute the rotor speeds as `update` does, but keep the integral constant.
 
         Deviation: the published controller always integrates. Its integral winds up while the robot
         brakes, and pushes the robot back for a second afterwards.
@@ -110,7 +110,8 @@ class LowLevel:
     def force(self, velocity: Vector, reference: Vector) -> Vector:
         """Compute the force that the robot needs, and advance the integral by `dt`.
 
-        e = v - v_ref;  F = -(Kp e + Ki int(e dt) + Kd de/dt) + (0, 0, m g), int(e dt) clamped.
+        e = v - v_ref;  F = -(Kp · e + Ki · int(e dt) + Kd · de/dt) + (0, 0, m · g).
+        int(e dt) is clamped.
         Source: docs/reference/plant.md, "Low-level controller".
 
         Args:
@@ -150,12 +151,13 @@ def attitude(force: Vector, readings: Readings) -> Effort:
     """Turn the thrust axis towards `force`, nose along +x.
 
     z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
-    e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R e_R + k_w w); thrust = F . (R z).
+    e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R · e_R + k_w · w);
+    thrust = F · (R z).
     The code works in the body frame, where the wanted axes are the rows of Q.
     Source: docs/reference/plant.md, "Low-level controller", with yaw and yaw rate reference 0.
-    Deviation: if a hit has turned the robot by more than 17 degrees, the tilt is corrected about
-    the body's present axes. There e_R would steer aside by half the yaw error, and beyond 90
-    degrees the wrong way.
+    Deviation: if a collision has turned the robot beyond NOSE_COSINE_MIN or YAW_SINE_MAX (yaw error
+    above 17 degrees), the tilt is corrected about the body's present axes. With e_R the correction
+    would be off by half the yaw error, and would point the wrong way beyond 90 degrees.
 
     Args:
         force: Wanted force [N], world frame, shape (3,).
@@ -195,7 +197,7 @@ def allocate(effort: Effort) -> RotorSpeeds:
     """Split thrust and torque over the rotors.
 
     f = T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km) for front, left,
-    back, right; w = sqrt(f/kf), within [0, 1838 rad/s].
+    back, right; w = sqrt(f/kf), limited to [0, 1838 rad/s].
     Source: docs/reference/plant.md, "Low-level controller".
 
     Args:

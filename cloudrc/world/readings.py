@@ -1,7 +1,7 @@
-"""The interface between physics and onboard part: sensor readings and rotor speeds.
+"""The interface between the physics and the onboard part: sensor readings and rotor speeds.
 
-Nothing else passes between `simulator` and `low_level`, `guard` or `sensors`, so that the two sides
-can run in different processes. This module needs no MuJoCo.
+Nothing else passes between the physics (`simulator`) and the onboard part (`low_level`, `guard`,
+`sensors`). Therefore both can run in different processes. This module needs no MuJoCo.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Readings(NamedTuple):
         orientation_wxyz: Orientation, body to world, unit quaternion, shape (4,).
         velocity: Velocity of the base's origin [m/s], world frame, shape (3,).
         angular_velocity_body: Angular velocity [rad/s], body frame, shape (3,).
-        axes: The body's x, y and z axes in the world frame, shape (9,). They repeat the orientation
-            because drag and low-level controller need them in every step.
+        axes: The body's x, y and z axes in the world frame, shape (9,): the orientation again,
+            because drag and low-level controller need the axes in every step.
     """
 
     position: Vector
@@ -70,8 +70,8 @@ class Touch(NamedTuple):
     """The beginning of a contact between robot and scene.
 
     Attributes:
-        body: Name of the scene's body: pipe_1, board, floor.
-        tip: True if the arm's tip touched, False for any other part.
+        body: Name of the touched body of the scene: pipe_1, board, floor.
+        tip: True if the arm's tip touched the body, False if another part of the robot did.
         position: Position of the base just before [m], world frame, shape (3,).
         velocity: Velocity of the base just before [m/s], world frame, shape (3,).
         tip_velocity: Velocity of the arm's tip just before [m/s], world frame, shape (3,).

@@ -4,8 +4,9 @@ In every tick the simulator gives sensor readings to the onboard part (guard and
 controller) and gets four rotor speeds back. Nothing else passes between the two.
 
 World's clock follows the machine's monotonic clock and may fall behind. After a stall the
-simulation catches up by at most 50 ms per wake; the rest is slip, and world's clock lags by it from
-then on. The guard therefore never skips a tick: a stalled machine makes world slow but never jump.
+simulation catches up by at most 50 ms per wake. The rest of the stall is slip: world's clock lags
+by the slip from then on. Therefore the guard never skips a tick. A stalled machine makes world
+slow, but world's clock never jumps.
 """
 
 from __future__ import annotations
@@ -25,19 +26,19 @@ Source: docs/reference/plant.md, "Physics step"."""
 STEP = STEP_NS * 1e-9
 """Duration of a tick [s]."""
 CATCH_UP_NS = 50_000_000
-"""Longest simulated time that world catches up in one wake of its loop [ns]."""
+"""Longest simulated time by which world catches up in one wake of its loop [ns]."""
 
 
 class SimulationClock:
     """World's clock; `tick_ns` is the next tick to run [ns], `slip_ns` its total lag [ns]."""
 
     def __init__(self, start_ns: int) -> None:
-        """Start at `start_ns` of the machine's monotonic clock [ns]."""
+        """Set world's clock to `start_ns` of the machine's monotonic clock [ns]."""
         self.tick_ns = start_ns
         self.slip_ns = 0
 
     def follow(self, now_ns: int) -> int:
-        """Convert a monotonic time to world time; slip if more than 50 ms were missed.
+        """Convert a monotonic time to world time; increase the slip if the wake is over 50 ms late.
 
         Args:
             now_ns: The machine's monotonic clock [ns].
@@ -55,19 +56,19 @@ TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 
 
 class Observer(Protocol):
-    """Sees all that a robot is told and does, and changes nothing. Times are world's clock [ns]."""
+    """Sees what a robot receives and does, and changes nothing. Times are on world's clock [ns]."""
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
-        """See a step of the physics, after it.
+        """See a step of the physics that has ended.
 
         Args:
             now_ns: Beginning of the step.
-            readings: Readings at its beginning, which the guard's tick got.
+            readings: Readings at the beginning of the step, the input of the guard's tick.
             rotor_speeds: Commanded rotor speeds [rad/s], shape (4,).
         """
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """See a command after the guard's answer; `rejection` is None if it was accepted."""
+        """See a command after the guard's answer; `rejection` is None for an accepted command."""
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
         """See an operator request after it was carried out."""
@@ -82,7 +83,7 @@ class Robot:
     Attributes:
         simulator: The physics.
         guard: The guard.
-        observers: Are told of every step, command and request, in this order.
+        observers: See every step, command, request and session; called in the order of the list.
     """
 
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
@@ -98,7 +99,7 @@ class Robot:
         self.guard.put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run all ticks from `tick_ns` to before `until_ns`, world's clock.
+        """Run all ticks from `tick_ns` (included) to `until_ns` (excluded), world's clock.
 
         Returns:
             The next tick to run [ns].

@@ -1,8 +1,8 @@
 """The rotors: they turn commanded speeds into thrusts and a drag wrench.
 
-It uses plain floats, because it runs in every physics step. The order of the rotors is always front
-(+x), left (+y), back, right. Front and back give a positive reaction torque about z, left and right
-a negative one.
+The code uses plain floats, because it runs in every physics step. The order of the rotors is always
+front (+x), left (+y), back, right. The reaction torque about z is positive for front and back, and
+negative for left and right.
 Source: docs/reference/plant.md, "Robot".
 """
 
@@ -36,8 +36,8 @@ _DRAG_ARM = DRAG_COEFFICIENT * ARM
 _ARM_SQUARED = ARM * ARM
 
 Controls: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
-"""Input to MuJoCo: four thrusts [N], and the drag as a wrench at the base's origin. As a free joint
-requires, its force is in the world frame [N] and its torque in the body frame [N m]."""
+"""Input to MuJoCo: four thrusts [N], and the drag as a wrench at the base's origin. MuJoCo's free
+joint requires the wrench's force in the world frame [N] and its torque in the body frame [N m]."""
 
 
 class Rotors:
@@ -48,7 +48,7 @@ class Rotors:
     """
 
     def __init__(self, dt: float) -> None:
-        """Start with stopped rotors, for steps of `dt` [s]."""
+        """Set the duration of a step, `dt` [s]; the rotors are stopped."""
         self._up = 1.0 - exp(-dt / TIME_CONSTANT_UP)
         self._down = 1.0 - exp(-dt / TIME_CONSTANT_DOWN)
         self.speeds = STOPPED
@@ -56,12 +56,13 @@ class Rotors:
     def step(self, commands: RotorSpeeds, readings: Readings) -> Controls:
         """Advance the rotor speeds by `dt` and return their thrusts and drag.
 
-        Lag: w(t + dt) = w + (command - w) (1 - exp(-dt/T)), T = 12.5 ms up, 25 ms down. This is
-        exact for a command that is constant over a step. Thrust: kf w^2.
-        Drag: at each rotor F = -w c v; v is the hub's velocity across the rotor's axis. With body
-        velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h), v is
-        (u + q h - r y, v + r x - p h). Summed over x = (l, 0, -l, 0), y = (0, l, 0, -l):
-        torque = sum of r x F = (-h Fy, h Fx, sum of x Fy - y Fx).
+        Lag: w(t + dt) = w + (command - w) · (1 - exp(-dt/T)). A rotor that speeds up has
+        T = 12.5 ms, a rotor that slows down T = 25 ms. The formula is exact for a command that is
+        constant over a step. Thrust: kf · w^2.
+        Drag: at each rotor F = -w · c · vh, where vh is the hub's velocity across the rotor's axis.
+        With body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h), vh is
+        (u + q · h - r · y, v + r · x - p · h). The hubs have x = (l, 0, -l, 0), y = (0, l, 0, -l).
+        The sum of r x F over the hubs is the torque (-h · Fy, h · Fx, sum of x · Fy - y · Fx).
         Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
 
         Args:

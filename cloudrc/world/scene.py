@@ -1,9 +1,10 @@
 """Compile a robot and a scene into one MuJoCo model.
 
-The robot may be somebody's own. The onboard controller and the rotors have fixed numbers. A robot
-with others would fly badly or not at all, so it is refused by what differs.
+The robot may be a user's own model. The onboard controller and the rotors assume fixed numbers,
+such as the mass. A robot with other numbers would fly badly or not at all. Therefore this module
+refuses such a robot, and the message lists the differences.
 
-No other module of `world` imports the package `mujoco`; they take it from here.
+The other modules of `world` do not import the package `mujoco`; they use this module's import.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ TIMESTEP = 0.002
 """Step of the physics and of the onboard part [s].
 Source: docs/reference/plant.md, "Physics step"."""
 INERTIA = (0.0121, 0.0116, 0.0226)
-"""Inertia about x, y, z for which the attitude gains are made [kg m^2], that of the pelican."""
+"""Inertia about x, y, z for which the attitude gains were tuned [kg m^2]: the pelican's inertia."""
 TIP = (0.40, 0.0, 0.17)
-"""Place of the arm's tip, from which clearance is computed [m], body frame."""
+"""Position of the arm's tip, from which clearance is computed [m], body frame."""
 SHOWN = 6
-"""Most differences that one message lists [1]."""
+"""Largest number of differences that one message lists [1]."""
 FOLDER = Path(__file__).parent
 _NO_GL = {"", "disable", "disabled", "off", "false", "0"}
 
@@ -41,8 +42,8 @@ _NO_GL = {"", "disable", "disabled", "off", "false", "0"}
 def import_mujoco() -> Any:
     """Import MuJoCo without OpenGL, which a flight does not need.
 
-    With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. Therefore the variable is `disable`
-    during the import. It is restored afterwards, for a child process that renders.
+    With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. Therefore MUJOCO_GL is `disable`
+    during the import. Its value is restored afterwards, for a child process that renders.
 
     Raises:
         MissingPrerequisiteError: If the package is not installed.
@@ -92,8 +93,8 @@ def model_path(kind: str, name: str) -> Path:
 def compile_model(robot: str, scene: str) -> Any:
     """Attach the robot to the scene's frame `spawn` and compile both.
 
-    Static bodies are fused, which halves the time of a step. Their names are lost by that, so each
-    geom of the scene gets the name BODY/NUMBER, from which a contact finds its body.
+    Static bodies are fused, which halves the time of a step but loses the names of the bodies.
+    Therefore each geom of the scene gets the name BODY/NUMBER, by which a contact finds its body.
 
     Args:
         robot: Name or path of the robot's file.
@@ -162,9 +163,9 @@ class _Fact(NamedTuple):
     """A number of a model that the onboard controller relies on.
 
     Attributes:
-        name: Its name, with the unit.
-        found: Its value.
-        wanted: What the controller is made for, in words.
+        name: Name of the number, with the unit.
+        found: Value in the model.
+        wanted: Values for which the controller is made, in words.
         fits: Whether the value is near enough.
     """
 
@@ -175,7 +176,7 @@ class _Fact(NamedTuple):
 
 
 def _near(name: str, found: float, wanted: float, tolerance: float) -> _Fact:
-    """Compare a value with the one that the controller assumes."""
+    """Compare a value of the model with the value that the controller assumes."""
     words = f"{wanted:g} +- {tolerance:.2g}"
     return _Fact(name, found, words, abs(found - wanted) <= tolerance)
 
@@ -183,7 +184,8 @@ def _near(name: str, found: float, wanted: float, tolerance: float) -> _Fact:
 def _facts(model: Any) -> Iterator[_Fact]:
     """Compare a model with what the onboard controller and the rotors assume.
 
-    The velocity loop makes up for 1 N of weight, attitude gains for half of the inertia.
+    The tolerances of mass and inertia: the velocity loop compensates for a weight that differs by
+    1 N, and the attitude gains work for an inertia that differs by half.
     """
     base = model.jnt_bodyid[0]
     yield _near("mass [kg]", model.body_mass[base], MASS, 0.1 * MASS)
@@ -208,7 +210,10 @@ def _facts(model: Any) -> Iterator[_Fact]:
 def _rotor_facts(
     model: Any, number: int, place: tuple[float, float, float], sign: int
 ) -> Iterator[_Fact]:
-    """Compare one actuator with the rotor at this place [m], body frame, turning by `sign`."""
+    """Compare one actuator with the rotor at `place` [m], body frame.
+
+    `sign` is the sign of the rotor's reaction torque about z.
+    """
     name = ROTORS[number]
     if model.actuator_trntype[number] != mujoco.mjtTrn.mjTRN_SITE:
         yield _Fact(f"{name} transmission", model.actuator_trntype[number], "a site", False)

@@ -1,6 +1,6 @@
 """Sensors that add seeded noise to odometry, at 100 Hz.
 
-Only the odometry for cloud is noisy; the onboard controller uses the true state.
+Only the odometry for cloud has noise; the onboard controller uses the true state.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ class Sensors:
         Args:
             position_noise: Standard deviation per axis [m]; 0 for no noise.
             velocity_noise: Standard deviation per axis [m/s]; 0 for no noise.
-            rng: The generator of the noise.
+            rng: Random number generator of the noise.
         """
         self._position_noise, self._velocity_noise = position_noise, velocity_noise
         self._rng = rng
         self._exact = position_noise == velocity_noise == 0.0
 
     def measure(self, truth: Odometry) -> Odometry:
-        """Return the odometry for cloud: the true one plus noise."""
+        """Return the odometry for cloud: the true odometry plus noise."""
         if self._exact:
             return truth
         return truth._replace(

@@ -4,8 +4,8 @@ The rotors (lag, thrust, drag) are computed in plain floats; `mj_step` does the 
 reads and writes MuJoCo's arrays through memory views: writing four elements takes a quarter of the
 time of a numpy slice assignment, and reading is a little faster than `tolist`.
 
-`replay` is for the benchmark: it plays the recorded controls of a flight in C. Its speed is that of
-raw `mj_step`, and its end state equals the simulator's bit by bit, so the comparison is fair.
+`replay` is for the benchmark: it replays the recorded controls of a flight in C, at the speed of
+raw `mj_step`. Its end state equals the simulator's bit by bit, so the comparison is fair.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from cloudrc.world.rotors import STOPPED, Controls, Rotors
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
 
 TOUCH_GAP = 0.1
-"""Time without contact after which a contact is a new one [s]."""
+"""Shortest time without contact before a contact counts as a new contact [s]."""
 CONTACT_CHECK_STEPS = 5
-"""Number of steps between two checks of the contacts while their number is constant. A check takes
-as long as a step."""
+"""Number of steps between two checks of the contacts, as long as their number is constant. A check
+takes as long as a step."""
 
 _mj_step = mujoco.mj_step
 _pack_ctrl = Struct("4d").pack_into
@@ -54,12 +54,13 @@ class Simulator:
         model: The compiled `MjModel`.
         dt: Duration of a step [s].
         readings: State of the base after the last step.
-        touches: Contacts that began since the last `take_contacts`.
-        tape: If set to a list, every step since the last reset appends its controls, for `replay`.
+        touches: Contacts that began since the last call of `take_contacts`.
+        tape: None, or a list to which every step since the last reset appends its controls, for
+            `replay`.
     """
 
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
-        """Compile `robot` in `scene` (names or paths) and put it at its spawn.
+        """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
         Raises:
             BadInputError: If a file is missing or does not suit the loop.
@@ -84,7 +85,7 @@ class Simulator:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the robot to its spawn, at rest, with its rotors stopped."""
+        """Reset the robot to its spawn, at rest, with stopped rotors."""
         mujoco.mj_resetData(self.model, self._data)
         mujoco.mj_forward(self.model, self._data)
         self._rotors.speeds = STOPPED
@@ -99,8 +100,8 @@ class Simulator:
     def step(self, rotor_speeds: RotorSpeeds) -> None:
         """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
 
-        Thrust kf w^2 and drag use the rotor speeds at the end of the step. The drag uses the
-        velocity at its beginning.
+        Thrust kf · w^2 and drag use the rotor speeds at the end of the step. The drag uses the
+        velocity at the beginning of the step.
         """
         before, data = self.readings, self._data
         controls = self._rotors.step(rotor_speeds, before)
@@ -124,7 +125,7 @@ class Simulator:
 
     @property
     def touch_age(self) -> float:
-        """Time since something was touched last [s]; infinite if nothing was."""
+        """Time since the robot last touched something [s]; infinite if it has touched nothing."""
         return (self._steps - max(self._last_touch.values(), default=-inf)) * self.dt
 
     @property
@@ -142,14 +143,14 @@ class Simulator:
         return touches
 
     def state(self) -> State:
-        """Copy the state that `replay` starts from and ends in."""
+        """Return a copy of the state, from which `replay` can start and with which it can end."""
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
         mujoco.mj_getState(self.model, self._data, physics, spec)
         return State(physics, self._data.qacc_warmstart.copy())
 
     def _check_contacts(self, contacts: int, before: Readings) -> None:
-        """Note the contacts if their number has changed, else every few steps."""
+        """Note the contacts at once if their number has changed, else only every few steps."""
         if contacts and (contacts != self._contacts or self._steps % CONTACT_CHECK_STEPS == 0):
             self._note_contacts(before)
         self._contacts = contacts
@@ -170,7 +171,7 @@ class Simulator:
 
 
 def _velocity_at(readings: Readings, offset: Vector) -> Vector:
-    """Return the velocity [m/s], world frame, of a point fixed to the base at `offset` [m]."""
+    """Return the velocity of a point fixed to the base at `offset` [m], in [m/s], world frame."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = readings.axes
     p, q, r = readings.angular_velocity_body
     x, y, z = offset

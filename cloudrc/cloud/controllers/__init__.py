@@ -1,6 +1,7 @@
 """Controllers compute a velocity command from the estimate and the setpoint; one file each.
 
-A plug-in file has a `build(**parameters)` with annotated parameters that returns a `Controller`.
+A plug-in file defines `build(**parameters)`, which returns a `Controller`. All parameters are
+annotated.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Controller:
     """Track a setpoint."""
 
     def reset(self) -> None:
-        """Forget everything at the start of a session or mission."""
+        """Reset the controller at the start of a session or mission."""
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
         """Compute one command.

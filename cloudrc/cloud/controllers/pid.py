@@ -18,10 +18,14 @@ UNLIMITED: Vector = (inf, inf, inf)
 class Pid(Controller):
     """PID on the position that commands a velocity.
 
-    Deviation: eq. (4) as printed, estimate minus setpoint, diverges with positive gains; here
-    error = setpoint - estimate. The derivative acts on the measurement, so a new setpoint causes no
-    kick. An axis whose output is limited does not integrate an error that would push it further
-    (conditional anti-windup). The published code has none of the three limits.
+    Deviations from eq. (4) and the published code:
+
+    - Here error = setpoint - estimate. Eq. (4) as printed has estimate - setpoint, which diverges
+      with positive gains.
+    - The derivative acts on the measurement, so that a new setpoint causes no kick.
+    - The integral term, the velocity per axis and the speed are limited; the published code has no
+      limits. While the output of an axis is limited, the axis does not integrate an error that
+      would push the output further (conditional anti-windup).
     """
 
     def __init__(
@@ -34,7 +38,7 @@ class Pid(Controller):
         velocity_max: Vector,
         speed_max: float,
     ) -> None:
-        """Start with an integral of zero; an infinite limit limits nothing.
+        """Set gains and limits; the integral is zero. An infinite limit limits nothing.
 
         Args:
             gain_p: Velocity per position error [1/s], shape (3,).
@@ -61,10 +65,10 @@ class Pid(Controller):
         self._integral = ZERO
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
-        """Compute one command: u = P e + I (integral of e) - D v, then the limits.
+        """Compute one command: u = P · e + I · (integral of e) - D · v, then the limits.
 
-        The three returned terms are not limited, so their sum is the velocity only if no limit
-        acts. The integral contains the errors before this one.
+        The three returned terms are not limited, so that their sum is the velocity only if no limit
+        acts. The integral contains the errors of all earlier updates, not the present error.
 
         Source: the paper, eq. (5).
 
@@ -105,7 +109,7 @@ class Pid(Controller):
         return (x * scale, y * scale, z * scale)
 
     def _integrate(self, error: Vector, wanted: Vector, velocity: Vector, dt: float) -> None:
-        """Add this error [m] over `dt` [s] on each axis that it does not wind up."""
+        """Add `error` [m] over `dt` [s] to the integral on each axis where it causes no windup."""
         x, y, z = (
             max(min(term + gain * e * dt, limit), -limit) if v == u or e * u < 0 else term
             for term, gain, e, u, v, limit in zip(
@@ -121,7 +125,7 @@ class Pid(Controller):
         self._integral = (x, y, z)
 
     def _yaw_rate(self, orientation_wxyz: Quaternion, yaw: float) -> float:
-        """Multiply the yaw error [rad], the short way round, by the gain."""
+        """Return the yaw error [rad], wrapped to at most half a turn, times the gain."""
         w, x, y, z = orientation_wxyz
         measured = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         return self._gain_yaw * remainder(yaw - measured, tau)
@@ -152,11 +156,13 @@ def build(
             controller always holds the yaw at 0.
         integral_limit: Largest integral term per axis [m/s], shape (3,); None: no limit.
         velocity_max: Largest velocity per axis [m/s], shape (3,); None: no limit.
-        speed_max: Largest speed [m/s]; the direction stays. None: no limit. With an integral it
-            should not exceed the guard's cap, which the anti-windup does not know.
+        speed_max: Largest speed [m/s]; the limit keeps the direction. None: no limit. With an
+            integral gain, `speed_max` should not exceed the guard's cap, which the anti-windup
+            does not know.
 
     Raises:
-        ValueError: If a parameter is not finite or negative; the message names it.
+        ValueError: If a parameter is infinite, NaN or negative; the message names the
+            parameter.
     """
     return Pid(
         vector("gain_p", gain_p),

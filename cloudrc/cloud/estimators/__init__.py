@@ -1,6 +1,8 @@
 """Delay estimators compute the horizon of the prediction from echoes; one file each.
 
-A plug-in file has a `build(**parameters)` with annotated parameters that returns an `Estimator`.
+The horizon is the time by which the predictor predicts. Telemetry echoes the stamp of the newest
+command that world has applied. A plug-in file defines `build(**parameters)`, which returns an
+`Estimator`. All parameters are annotated.
 """
 
 from __future__ import annotations
@@ -12,8 +14,9 @@ class DelaySample(NamedTuple):
     """The delays that one newly echoed command shows.
 
     Attributes:
-        loop_delay: Arrival of the echo minus the command's stamp [s]; includes the hold on world.
-        rtt: The same without the hold [s].
+        loop_delay: Arrival of the echo minus the command's stamp [s]. The difference includes the
+            hold time: how long world had the command before it sent the echo.
+        rtt: `loop_delay` minus the hold time [s].
         applied_minus_stamp: Instant of application on world's clock minus the command's stamp on
             cloud's clock [s]: the downlink delay plus the unknown offset world - cloud.
     """
@@ -24,18 +27,18 @@ class DelaySample(NamedTuple):
 
 
 class Estimator:
-    """Estimate the horizon: the time from the measurement to the application of the command."""
+    """Estimates the horizon: the time from the measurement to the application of the command."""
 
     def update(self, sample: DelaySample) -> None:
         """Add one sample; called once per newly echoed command, never for a repeated echo."""
         raise NotImplementedError
 
     def horizon(self, age: float) -> float:
-        """Return how far to predict from the newest odometry for a command that leaves now.
+        """Return the horizon for a command that leaves now, from the newest odometry.
 
         Args:
-            age: Now on cloud's clock minus the odometry's stamp on world's clock [s]: its uplink
-                delay, its time in cloud, and the unknown offset cloud - world.
+            age: Now on cloud's clock minus the odometry's stamp on world's clock [s]. This is the
+                sum of uplink delay, time in cloud, and the unknown clock offset cloud - world.
 
         Returns:
             Horizon [s]; 0 before the first sample.

@@ -1,7 +1,7 @@
 """Delay estimator: the exponentially weighted moving average of the loop delay.
 
-Source: docs/reference/control.md, "Delay estimators": a gain of 0.05 follows a step of the delay
-three times as well as the paper, eq. (1), and is no worse at a constant delay.
+Source: docs/reference/control.md, "Delay estimators": with a gain of 0.05, the average follows a
+step of the delay three times as well as eq. (1) of the paper. At a constant delay it is no worse.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 
 
 class Ewma(Estimator):
-    """Exponentially weighted moving average of the loop delay, starting at the first sample."""
+    """Exponentially weighted moving average of the loop delay; starts with the first sample."""
 
     def __init__(self, gain: float) -> None:
-        """Start empty.
+        """Set the gain; there is no sample yet.
 
         Args:
             gain: Weight of a new sample [1], above 0 and at most 1.
@@ -23,7 +23,7 @@ class Ewma(Estimator):
         self._average: float | None = None
 
     def update(self, sample: DelaySample) -> None:
-        """Add one loop delay [s]: average += gain (sample - average)."""
+        """Add one loop delay [s]: average += gain · (sample - average)."""
         if self._average is None:
             self._average = sample.loop_delay
         else:

@@ -11,7 +11,8 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 class RunningMean(Estimator):
     """Mean of all loop delays since the session began.
 
-    It is slow by design: after 60 s, it takes another 60 s to follow half of a step of the delay.
+    The mean is slow by design: after 60 s it needs another 60 s to follow half of a step of the
+    delay.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,8 @@
 """Delay estimator: a running mean of the loop delay whose gain stays at 1/500 after 500 samples.
 
-Source: the authors' published code. Its comments describe a window of 500 samples, but it computes
-a mean with the gain 1/(k+1) down to 1/500: from then on an exponential average.
+Source: the authors' published code. Its comments describe a window of 500 samples. The code,
+however, computes a mean whose gain 1/(k+1) falls to 1/500; from then on the mean is an exponential
+average.
 """
 
 from __future__ import annotations
@@ -11,13 +12,13 @@ from cloudrc.cloud.parameters import positive
 
 
 class CappedRunningMean(Estimator):
-    """Running mean whose gain falls to 1/count_max and then stays."""
+    """Running mean whose gain falls to 1/count_max and then stays constant."""
 
     def __init__(self, count_max: int) -> None:
-        """Start empty.
+        """Set `count_max`; there is no sample yet.
 
         Args:
-            count_max: Number of samples after which the gain stays.
+            count_max: Number of samples after which the gain stays at 1/count_max.
         """
         self._count_max = count_max
         self._count = 0

@@ -1,12 +1,12 @@
-"""Delay estimator: the age of this odometry plus the average delay of the downlink.
+"""Delay estimator: the age of the newest odometry plus the average delay of the downlink.
 
-Source: docs/reference/control.md, "Delay estimators": the best of those compared, because it
-measures the uplink delay of each packet and estimates only that of the downlink.
+Source: docs/reference/control.md, "Delay estimators": the best of the compared estimators, because
+it measures the uplink delay of each packet and estimates only the downlink delay.
 
-The clocks need no synchronisation. With `offset` = cloud's clock minus world's,
+The clocks need no synchronisation. With `offset` = cloud's clock minus world's clock,
 
-    now - stamp of the odometry          = its age so far + offset    (exact, this packet)
-    application - stamp of the command   = downlink delay - offset    (averaged)
+    now - stamp of the odometry          = age of the odometry + offset   (exact, this packet)
+    application - stamp of the command   = downlink delay - offset        (averaged)
 
 and the sum is the time from the measurement to the application of the command.
 """
@@ -18,10 +18,10 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 
 
 class Split(Estimator):
-    """Exact uplink age of each packet plus an exponential average of applied minus stamp."""
+    """Exact age of the newest odometry, plus an exponential average of `applied_minus_stamp`."""
 
     def __init__(self, gain: float) -> None:
-        """Start empty.
+        """Set the gain; there is no sample yet.
 
         Args:
             gain: Weight of a new sample of the downlink [1], above 0 and at most 1.
@@ -30,7 +30,7 @@ class Split(Estimator):
         self._applied_minus_stamp: float | None = None
 
     def update(self, sample: DelaySample) -> None:
-        """Add one applied-minus-stamp [s] to the average of the downlink."""
+        """Add one `applied_minus_stamp` [s] to the average of the downlink."""
         if self._applied_minus_stamp is None:
             self._applied_minus_stamp = sample.applied_minus_stamp
         else:

@@ -1,9 +1,12 @@
 """Predictors extrapolate odometry by the horizon; one file each.
 
-A plug-in file has a `build(**parameters)` with annotated parameters that returns a `Predictor`.
+A plug-in file defines `build(**parameters)`, which returns a `Predictor`. All parameters are
+annotated.
 
-All predictors extrapolate the orientation by q(t + tau) = q(t) * exp(omega tau / 2), which is exact
-while the body's angular velocity is constant. The paper says only "similarly the orientation".
+All predictors except `last_sample` extrapolate the orientation by
+q(t + tau) = q(t) * exp(omega · tau / 2), where * is the product of quaternions. The formula is
+exact while the body's angular velocity is constant. The paper says only "similarly the
+orientation".
 
 Source: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, eqs. (101), (214).
 """
@@ -16,16 +19,16 @@ from cloudrc.messages import Command, Odometry, Quaternion, Vector
 
 
 class Predictor:
-    """Extrapolate odometry; a plug-in has to define only `predict`."""
+    """Extrapolates odometry; a plug-in has to define only `predict`."""
 
     def observe(self, odometry: Odometry) -> None:
-        """Note a newly arrived odometry sample; called once each, with rising stamps."""
+        """Note a new odometry sample; called once per sample, with rising stamps."""
 
     def commanded(self, command: Command) -> None:
-        """Note a command that has just been sent."""
+        """Note a command that cloud has just sent."""
 
     def reset(self) -> None:
-        """Forget everything at the start of a session."""
+        """Reset the predictor at the start of a session."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Extrapolate `odometry` by `horizon`.
@@ -35,7 +38,7 @@ class Predictor:
             horizon: Time from the sample to the predicted state [s], >= 0.
 
         Returns:
-            A new sample whose `stamp_ns` is later by `horizon`.
+            The predicted sample; its `stamp_ns` is later than that of `odometry` by `horizon`.
         """
         raise NotImplementedError
 

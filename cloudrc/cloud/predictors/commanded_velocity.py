@@ -1,7 +1,7 @@
 """Predictor: extrapolate the position with the last commanded velocity.
 
-Source: the authors' published code. It multiplies the delay by the last commanded velocity, not by
-the measured velocity as in the paper, eq. (3).
+Source: the authors' published code. The code multiplies the delay by the last commanded velocity;
+the paper, eq. (3), multiplies it by the measured velocity.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from cloudrc.messages import ZERO, Command, Odometry
 
 
 class CommandedVelocity(Predictor):
-    """Last commanded velocity times horizon.
+    """Adds the last commanded velocity times the horizon to the position.
 
-    With a proportional controller, u = -K (p + u tau) gives u = -K p / (1 + K tau): this predictor
-    lowers the gain as the delay grows. It damps well but predicts badly.
+    With a proportional controller, u = -K · (p + u · tau) gives u = -K · p / (1 + K · tau). So the
+    longer the delay, the lower the effective gain. The predictor damps well but predicts badly.
     """
 
     def __init__(self) -> None:
@@ -25,13 +25,13 @@ class CommandedVelocity(Predictor):
         self._commanded = command.velocity
 
     def reset(self) -> None:
-        """Forget the last command: zero velocity until the next one."""
+        """Forget the last command; the velocity is zero until the next command."""
         self._commanded = ZERO
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate a sample: p + u tau; the velocity stays as measured.
+        """Extrapolate a sample: p + u · tau; the velocity stays as measured.
 
-        Source: the authors' published code; the orientation turns as in the other predictors.
+        Source: the authors' published code. The orientation turns as in the other predictors.
 
         Args:
             odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.

@@ -17,7 +17,7 @@ class ConstantAcceleration(Predictor):
     """Measured velocity plus the acceleration between the ends of a short window."""
 
     def __init__(self, window: float) -> None:
-        """Start without an acceleration.
+        """Set the window; the acceleration is zero.
 
         Args:
             window: Longest time between the two compared velocities [s].
@@ -27,10 +27,10 @@ class ConstantAcceleration(Predictor):
         self._acceleration = ZERO
 
     def observe(self, odometry: Odometry) -> None:
-        """Compute the acceleration [m/s^2] between this sample and the oldest in the window.
+        """Compute the acceleration [m/s^2] from the oldest sample in the window to this sample.
 
-        A stamp that does not rise is ignored. After a gap longer than the window the acceleration
-        is zero until the next sample.
+        A sample whose stamp is not later than the last stamp is ignored. After a gap longer than
+        the window, the acceleration is zero until the next sample.
         """
         recent, stamp_ns = self._recent, odometry.stamp_ns
         if recent and stamp_ns <= recent[-1].stamp_ns:
@@ -42,12 +42,12 @@ class ConstantAcceleration(Predictor):
         self._acceleration = _mean_acceleration(oldest, odometry) if len(recent) > 1 else ZERO
 
     def reset(self) -> None:
-        """Forget all samples; the acceleration is zero until there are two again."""
+        """Forget all samples; the acceleration is zero until there are two new samples."""
         self._recent.clear()
         self._acceleration = ZERO
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate a sample: p + v tau + a tau^2 / 2, v + a tau.
+        """Extrapolate a sample: p + v · tau + a · tau^2 / 2, v + a · tau.
 
         Source: the paper, eq. (3b), for the velocity.
         Deviation: eq. (3a) as printed has no acceleration in the position.
@@ -88,7 +88,8 @@ def build(window: float = 0.05) -> ConstantAcceleration:
 
     Args:
         window: Longest time between the two compared velocities [s]; at least one period of the
-            odometry. A longer window reduces the noise but lags more, by half its length.
+            odometry. A longer window reduces the noise, but the acceleration lags by half the
+            window.
 
     Raises:
         ValueError: If `window` is not above 0.

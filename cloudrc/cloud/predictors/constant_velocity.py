@@ -10,13 +10,13 @@ from cloudrc.messages import Odometry
 
 
 class ConstantVelocity(Predictor):
-    """Predict with the measured velocity; the orientation keeps turning at the measured rate."""
+    """Predicts with the measured velocity; the orientation keeps turning at the measured rate."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate a sample: p + v tau, v + a tau with a = 0.
+        """Extrapolate a sample: p + v · tau, v + a · tau with a = 0.
 
-        Source: the paper, eq. (3a); eq. (3b) without acceleration, which the robot does not
-        measure.
+        Source: the paper, eq. (3a), and eq. (3b) with a = 0, because the robot does not measure its
+        acceleration.
 
         Args:
             odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.

@@ -1,6 +1,6 @@
 """Predictor: use the last odometry without a prediction.
 
-Source: docs/reference/control.md, "Predictors", (a): the baseline for the others.
+Source: docs/reference/control.md, "Predictors", (a): the baseline for the other predictors.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from cloudrc.messages import Odometry
 
 
 class LastSample(Predictor):
-    """Predict nothing: pose and twist stay as measured."""
+    """Predicts nothing: pose and twist stay as measured."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Return the sample with a stamp that is later by `horizon` [s]."""

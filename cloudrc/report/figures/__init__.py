@@ -1,7 +1,7 @@
 """Draw the figures of a report as PNG and SVG.
 
-Each module draws one figure. It has `draw(subject)`, `caption(subject)`, and the text `ALT` for
-readers who cannot see the figure. No display, GL or pyplot is needed.
+Each module draws one figure. A module has `draw(subject)`, `caption(subject)`, and the text `ALT`
+for readers who cannot see the figure. No module needs a display, GL or pyplot.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from cloudrc.report.figures.style import RC, Subject
 __all__ = ["NAMES", "Picture", "Subject", "draw_all"]
 
 NAMES = ("flight", "delay", "odom", "error", "snapshots")
-"""Figures in the order of the page; delay, odom and error are those of the paper."""
+"""Figures in the order of the page; the paper has the figures delay, odom and error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Picture:
 def draw_all(subject: Subject) -> list[Picture]:
     """Draw every figure.
 
-    The settings of matplotlib are global to the process: draw in one thread at a time.
+    The settings of matplotlib are global in the process: only one thread at a time may draw.
     """
     pictures = []
     with matplotlib.rc_context():

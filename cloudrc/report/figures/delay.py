@@ -1,4 +1,4 @@
-"""Draw the figure of delays: one-way delay of each datagram; loop delay and its estimate."""
+"""Draw the figure of delays: one-way delay of each datagram, loop delay and estimated delay."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def _dots(axes: Axes, time: Array, delay: Array, colour: str, name: str) -> None
 
 
 def _finish(axes: Axes, subject: Subject, label: str, shown: list[Array]) -> None:
-    """Scale the axis so that outliers do not flatten the rest; write how many are cut off."""
+    """Scale the axis so that outliers do not flatten the curves, and write how many are cut off."""
     values = [v[np.isfinite(v)] for v in shown]
     top = max((float(np.percentile(v, 99.5)) for v in values if len(v)), default=1.0) * MARGIN
     top = max(top, 1.0)

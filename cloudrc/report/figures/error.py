@@ -1,4 +1,4 @@
-"""Draw the figure of errors: distance to the setpoint, as in the paper; error of the estimate."""
+"""Draw the figure of errors: distance to the setpoint (as in the paper), and estimation error."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _draw_accuracy(axes: Axes, subject: Subject) -> None:
 
 
 def _moving_rms(time: Array, values: Array) -> Array:
-    """Compute the RMS of the values in the last `SPAN` seconds at each instant."""
+    """Compute at each instant the RMS of the values in the last `SPAN` seconds."""
     known = np.isfinite(values)
     squares = np.concatenate([[0.0], np.cumsum(np.where(known, np.square(values), 0.0))])
     counts = np.concatenate([[0], np.cumsum(known)])

@@ -1,4 +1,4 @@
-"""Draw the figure of the flight: path from above, height and clearance along the path."""
+"""Draw the figure of the flight: the path from above, and height and clearance along the path."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ CAPTION_PIPES = (
 CAPTION_FREE = "Flight. (a) Path from above, waypoints numbered. (b) Height along the path."
 COLOURS = "viridis"
 CLEARANCE_SHOWN = 0.40
-"""Clearance at the end of the colour scale [m]; inside a pipe it is never larger."""
+"""Clearance at the end of the colour scale [m]; inside a pipe the clearance is never larger."""
 CEILING = 2 * CLEARANCE_SHOWN
 """Upper end of the axis of panel (c) [m]."""
 
 
 def caption(subject: Subject) -> str:
-    """Write the caption; without pipes it mentions no clearance."""
+    """Write the caption; the caption mentions clearance only if the scene has pipes."""
     if not subject.flight.scene.pipes:
         return CAPTION_FREE
     return CAPTION_PIPES.format(ceiling=CEILING)
@@ -73,7 +73,7 @@ def _distance_flown(position: Array) -> Array:
 
 
 def _draw_path(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollection | None:
-    """Draw a path coloured by clearance; in one colour if there are no pipes."""
+    """Draw a path, coloured by clearance, or in one colour if the scene has no pipes."""
     clearance = subject.flight.clearance
     if len(clearance) != len(x) or len(x) < 2:
         axes.plot(x, y, color=BLACK, lw=1.4)
@@ -167,7 +167,7 @@ def _draw_side(axes: Axes, subject: Subject, distance: Array, position: Array) -
 def _passages(
     subject: Subject, distance: Array, position: Array
 ) -> list[tuple[Pipe, float, float]]:
-    """List the pipes in the order flown, with the distances flown at both ends of each [m]."""
+    """List the pipes in the order flown, with the distances flown up to entry and exit [m]."""
     inside = pipe_index(subject.flight.scene, position)
     changes = np.flatnonzero(np.diff(inside, prepend=-1, append=-1))
     spans = []

@@ -1,6 +1,6 @@
 """Draw the figure of a link profile: delay and loss over time, delay distribution, runs of losses.
 
-`cloudrc link show` uses it.
+`cloudrc link show` uses this figure.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from cloudrc.report.figures.style import (
 )
 
 RUNS_SHOWN = 20
-"""Longest run of losses in the figure [1]; longer runs count as this long."""
+"""Longest run of losses in the figure [1]; a longer run counts as one of this length."""
 BLACKOUT = "#f7dccb"
 """Colour of blackouts, a light variant of the colour of losses."""
 DOTS = 6000
-"""Largest number of dots in one panel [1]; more would hide each other."""
+"""Largest number of dots in one panel [1]; more dots would hide each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,12 +64,12 @@ _LabelledWay: TypeAlias = tuple[DirectionSample, str, str]
 def render_link(
     title: str, uplink: DirectionSample, downlink: DirectionSample | None, kind: str
 ) -> bytes:
-    """Draw a link as a file.
+    """Draw the figure of a link, as the content of a file.
 
     Args:
         title: Title above the panels.
-        uplink: World to cloud.
-        downlink: Cloud to world; None for a trace, which has one direction.
+        uplink: Direction from world to cloud.
+        downlink: Direction from cloud to world; None for a trace, which has one direction.
         kind: "png", "svg" or "pdf".
 
     Returns:
@@ -141,7 +141,7 @@ def _draw_delay(axes: Axes, way: DirectionSample, colour: str, top: float) -> No
 
 
 def _mark_blackouts(axes: Axes, asked: Direction, duration: float) -> None:
-    """Mark blackouts; a short one is drawn at least as wide as a line."""
+    """Mark blackouts; a short blackout is drawn at least as wide as a line."""
     shown = [blackout for blackout in asked.blackouts if blackout.start_s < duration]
     for index, blackout in enumerate(shown):
         axes.axvspan(
@@ -155,7 +155,7 @@ def _mark_blackouts(axes: Axes, asked: Direction, duration: float) -> None:
 
 
 def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
-    """Draw the share of packets with more than a given delay, on a log scale for the tail."""
+    """Draw the share of packets with more than a given delay; a log scale shows the tail."""
     panel(axes, letter, "distribution")
     least = 1e-2
     for (way, name, colour), style in zip(ways, ("-", "--"), strict=False):

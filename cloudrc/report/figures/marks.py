@@ -1,7 +1,7 @@
 """Mark HOLD, blackouts and link changes in figures; compute the delays that the profile allows.
 
-A span is a time with one link profile. Each change recorded in flight ends a span and begins the
-next. Within a span the profile follows its own time line.
+A span is an interval with one link profile. Each change recorded in flight ends a span and begins
+the next span. Within a span the profile follows its own time line.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class Band:
 def band(direction: Direction) -> Band | None:
     """Compute the band of delays that a link profile sets.
 
-    The band is delay plus and minus jitter: the bounds for uniform jitter, one standard deviation
-    for other distributions.
+    The band is delay plus and minus jitter. For uniform jitter the band contains all delays; for
+    other distributions it has a half-width of one standard deviation.
 
     Returns:
-        None if the delays come from a trace that no longer exists.
+        The band; None if the delays come from a trace that no longer exists.
     """
     trace = direction.trace
     try:
@@ -73,7 +73,7 @@ def bounds_at(steps: Band, time: Array) -> tuple[Array, Array]:
 
 
 def _trace_delays(path: Path, direction: Direction) -> list[tuple[float, float]]:
-    """Read times [s] and delays [ms] of a trace; the first row also applies before its time."""
+    """Read times [s] and delays [ms] of a trace; the first delay also applies before its time."""
     profile = DirectionProfile(trace=replace(read_trace(path), loop=direction.loop))
     timeline = Timeline(profile)
     starts_ns = timeline.starts_ns
@@ -81,18 +81,18 @@ def _trace_delays(path: Path, direction: Direction) -> list[tuple[float, float]]
 
 
 SAME_CHANGE = 0.05
-"""Time between two records below which both describe the same change [s]."""
+"""Two records less than this time apart describe the same change [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A time in which a direction has one link profile.
+    """An interval in which a direction has one link profile.
 
     Attributes:
-        begin: Time since the start of the flight [s]; -inf if it began before.
-        end: Likewise; inf if it lasts to the end.
+        begin: Begin, as time since the start of the flight [s]; -inf if the span began before.
+        end: End, likewise [s]; inf if the span lasts to the end of the flight.
         origin: Start of the profile's time line, likewise [s].
-        direction: The link profile.
+        direction: The link profile of this direction.
         cause: Cause of the change; "" if the link started with this profile.
     """
 
@@ -104,7 +104,7 @@ class Span:
 
 
 def spans(subject: Subject, *, uplink: bool) -> list[Span]:
-    """List the times with one link profile of a direction, in order."""
+    """List the spans of a direction, in the order of time."""
     configured = subject.uplink if uplink else subject.downlink
     found = [Span(-inf, inf, subject.link_start, configured, "")]
     for begin, origin, direction, cause in _changes(subject, uplink):
@@ -177,7 +177,7 @@ HATCH = "#b0b0b0"
 LABEL_WIDTH = 0.05
 """Width of a number beside a triangle, as a share of the narrowest panel's time axis [1]."""
 ROW_HEIGHT = 8
-"""Distance of two rows of numbers [points]."""
+"""Distance between two rows of numbers [points]."""
 ROWS = 8
 """Number of rows of numbers for which a panel has room [1]."""
 LEGEND = (

@@ -1,6 +1,6 @@
-"""Draw the figure of snapshots: the robot at six instants, with pipes cut open and the board.
+"""Draw the figure of snapshots: the robot at six instants, with the board and with pipes cut open.
 
-No 3-D engine is needed: all bodies are small convex polygons, drawn in the order of their depth.
+This needs no 3-D engine: all bodies are small convex polygons, drawn in the order of their depth.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def pipe_faces(pipe: Pipe, towards_eye: Array, near: Array, reach: float) -> lis
 
 
 def is_inside_pipe(face: Face, other: Pipe) -> bool:
-    """Return whether a cut through a pipe's wall lies inside another pipe, where they meet.
+    """Tell whether a face cut through a pipe's wall lies inside another pipe that meets the pipe.
 
     Such a face is not drawn: sorted by depth, it would appear between faces of the other pipe.
     """
@@ -161,12 +161,13 @@ CAPTION = (
 COUNT = 6
 """Number of panels in the figure [1]."""
 MOVING = 0.05
-"""Smallest distance in a second [m] that defines a direction of flight; a robot that moves less
-hovers."""
+"""Smallest distance in one second that defines a direction of flight [m]; a robot that moves less
+counts as hovering."""
 REACH = 1.0
 """Distance that a panel shows on either side of the robot [m]."""
 ELEVATION, AZIMUTH = np.radians(28.0), np.radians(118.0)
-"""Angles of the eye [rad]: above the horizon; from the heading, behind the robot on its right."""
+"""Direction from the robot to the eye [rad]: angle above the horizon, and angle from the heading.
+The eye is behind the robot, on its right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +206,7 @@ def draw(subject: Subject) -> Figure:
 
 
 def _instants(subject: Subject) -> Array:
-    """Choose rows of the true states, evenly spaced by distance or, in a hover, by time."""
+    """Choose rows of the true states, evenly spaced by distance flown or, in a hover, by time."""
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]
     if touch is not None:
@@ -256,7 +257,10 @@ def _label(axes: Axes, subject: Subject, row: int, letter: str) -> None:
 
 
 def _heading(subject: Subject, row: int) -> float:
-    """Compute the heading of the view [rad]: along the pipe around the robot, else its path."""
+    """Compute the heading of the view [rad].
+
+    The view looks along the pipe that contains the robot, else along the robot's path.
+    """
     scene, positions = subject.flight.scene, subject.flight.truth["position"]
     position = positions[row]
     inside = pipe_index(scene, position[None])[0]

@@ -1,7 +1,7 @@
 """Define the style of all figures and `Subject`, the flight that they show.
 
-Fonts and sizes are those of a two-column paper. Readers with any colour vision can distinguish the
-colours. Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
+Fonts and sizes suit a two-column paper. Colour-blind readers can distinguish the colours, too.
+Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
 """
 
 from __future__ import annotations
@@ -105,7 +105,10 @@ class Subject:
 
     @cached_property
     def waypoints(self) -> dict[int, Vector]:
-        """Positions [m] of the waypoints flown to, by index: the first setpoint of each."""
+        """Positions [m] of the waypoints to which the robot flew, by index.
+
+        The position is that of the first setpoint with this index.
+        """
         control = self.flight.control
         indices, rows = np.unique(control["waypoint"], return_index=True)
         points = control["setpoint"][rows].tolist()

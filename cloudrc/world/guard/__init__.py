@@ -1,1 +1,1 @@
-"""The onboard guard, which keeps the robot safe whatever the cloud sends."""
+"""The onboard guard: it keeps the robot safe, whatever the cloud sends."""

@@ -1,7 +1,7 @@
 """Brake, hold a position, land and take off with the onboard sensors alone.
 
 Braking starts hard and ends gently, because the low-level controller follows late and overshoots.
-It is always harder than the stop rule assumes: BRAKE after REACTION.
+The robot always brakes harder than the stop rule assumes (deceleration BRAKE after time REACTION).
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ BRAKE_MAX, BRAKE_MIN = 5.5, 1.0
 BRAKE_TIME_CONSTANT = 0.25
 """Time constant of the exponential end of braking [s]."""
 BRAKE_LEAD, BRAKE_SHARE_MIN = 1.0, 0.2
-"""When braking starts, the reference is BRAKE_LEAD [m/s] below the robot's speed, but at least
-BRAKE_SHARE_MIN of that speed [1]."""
+"""When braking starts, the reference is BRAKE_LEAD [m/s] below the robot's speed, but not below
+BRAKE_SHARE_MIN [1] times that speed."""
 STILL_SPEED = 0.1
-"""Speed below which the robot is at rest [m/s]."""
+"""Speed below which the robot counts as at rest [m/s]."""
 LAND_SPEED = 0.5
 """Speed of the descent [m/s]. Source: docs/reference/plant.md, "Landing"."""
 STILL_SHARE = 0.2
-"""A descent slower than this share of its planned speed has stopped [1]. It matters with a low
-speed cap, where every descent is slower than STILL_SPEED and would count as touched down."""
+"""A descent has stopped when its speed is below this share of the planned speed [1]. The share
+matters with a low speed cap: there every descent is slower than STILL_SPEED, and would count as
+touched down."""
 TOUCH_DOWN_NS = 400_000_000
 """Time without motion after which a descent has touched down [ns]."""
 STILL_TICKS = 200
-"""Number of ticks at rest after which the robot lies still (0.4 s). A robot that was thrown up
-rests at its highest point, too, but for less time."""
+"""Number of ticks at rest after which the robot counts as lying still [1]: 0.4 s. A robot that was
+thrown up is also at rest at its highest point, but for less time."""
 POSITION_GAIN = 0.8
-"""Gain of the position hold: velocity towards the hold point per distance from it [1/s]."""
+"""Gain of the position hold: velocity towards the hold point per distance from that point [1/s]."""
 DAMPING_GAIN = 1.6
 """Damping of the position hold: share of the robot's velocity that is subtracted [1]."""
 HOLD_SPEED_MAX = 0.5
@@ -41,30 +42,32 @@ HOLD_SPEED_MAX = 0.5
 INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
 """Position hold: integral gain [1/s^2], largest integral term per axis [m/s], and largest distance
 from the hold point at which it integrates [m]. The arm makes the robot lopsided, and the low-level
-controller's own integral is too small: without this the robot would stand 30 mm off its point."""
+controller's own integral is too small. Without the integral of the position hold, the robot would
+stand 30 mm off the hold point."""
 TAKE_OFF_MARGIN = 0.5
-"""Distance from the walls that a stopped robot needs to take off [m]. A tilted robot scrapes along
-the floor before it rises, by 0.35 m at most: `pytest -m "" -k scrapes tests/world`."""
+"""Smallest distance from the fence's walls at which a stopped robot may take off [m]. A tilted
+robot scrapes along the floor before it rises, by at most 0.35 m:
+`pytest -m "" -k scrapes tests/world`."""
 LIFT_OFF_HEIGHT, GROUND_SPEED_MAX = 0.02, 0.2
-"""Change of height after which the robot has left the ground [m]. The rotors may stop while the
-change is smaller and the robot is slower than GROUND_SPEED_MAX [m/s]: it then falls from a small
-height and hits nothing at speed."""
+"""The robot has left the ground once its height has changed by LIFT_OFF_HEIGHT [m]. If the change
+is smaller and the robot is slower than GROUND_SPEED_MAX [m/s], the rotors may stop: the robot then
+falls from a small height, at low speed."""
 
 
 class PositionHold:
-    """Brakes, holds the point where the robot came to rest, or descends from there.
+    """Brakes the robot, holds it where it came to rest, or lets it descend from that point.
 
     Attributes:
         brakes: Whether the robot still brakes and has no hold point yet.
     """
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Start without a hold point.
+        """Set the limits; there is no hold point yet.
 
         Args:
             low: Lower corner of the box for hold points [m], world frame, shape (3,).
             high: Upper corner [m], shape (3,).
-            speed_max: Largest speed of the position hold, if below HOLD_SPEED_MAX [m/s].
+            speed_max: Speed cap [m/s]; if it is below HOLD_SPEED_MAX, it limits the position hold.
         """
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
@@ -73,7 +76,7 @@ class PositionHold:
         self.brakes = False
 
     def forget(self) -> None:
-        """Forget the hold point: the robot moves on."""
+        """Forget the hold point, because the robot flies on."""
         self._hold_point, self.brakes = None, False
 
     def follow(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
@@ -100,7 +103,7 @@ class PositionHold:
         return step_towards(reference, (x, y, z - sink), BRAKE * dt)
 
     def _integrate(self, distance: Vector, dt: float) -> Vector:
-        """Integrate the `distance` [m] from the hold point, shape (3,), over `dt` [s]."""
+        """Integrate the distance from the hold point, `distance` [m], shape (3,), over `dt` [s]."""
         (ix, iy, iz), (dx, dy, dz), gain = self._integral, distance, INTEGRAL_GAIN * dt
         return (
             clamp(ix + gain * dx, -INTEGRAL_MAX, INTEGRAL_MAX),
@@ -109,7 +112,7 @@ class PositionHold:
         )
 
     def _brake(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
-        """Slow the reference down; once the robot is at rest, set the hold point."""
+        """Slow the reference down. Set the hold point once the robot is at rest."""
         if not self.brakes:
             reference, self.brakes = brake_start(reference, readings.velocity), True
         x, y, z = reference
@@ -125,7 +128,8 @@ class PositionHold:
 def brake_start(reference: Vector, velocity: Vector) -> Vector:
     """Return the reference at the start of braking, below the robot's speed.
 
-    The robot follows late. One that is slower than its reference would still speed up for a while.
+    The robot follows the reference late. A robot that is slower than its reference would otherwise
+    speed up for a while.
 
     Args:
         reference: Finite reference of the last tick [m/s], shape (3,).
@@ -141,15 +145,16 @@ def brake_start(reference: Vector, velocity: Vector) -> Vector:
 
 
 def brake_rate(speed: float) -> float:
-    """Return the deceleration of a reference of this `speed` [m/s]: hard first, gentle at last."""
+    """Return the deceleration at which to brake from `speed` [m/s]: hard first, gentle last."""
     return min(BRAKE_MAX, max(BRAKE_MIN, speed / BRAKE_TIME_CONSTANT))
 
 
 class Descent:
     """Detects touch-down, and whether a descent may still stop in the air.
 
-    A robot that stands, or that is too low to stop in the air, would scrape along the ground or
-    into a pipe. It descends to touch-down although the operator has acknowledged.
+    After an acknowledgement a descent stops in the air only if the robot sinks freely and is high
+    enough. A robot that stands on something or flies too low would scrape along the ground or into
+    a pipe, so it continues its descent to touch-down.
 
     Attributes:
         speed: Speed of the descent [m/s].
@@ -157,27 +162,27 @@ class Descent:
     """
 
     def __init__(self, floor: float, speed_max: float) -> None:
-        """Start without a landing.
+        """Set the limits of descents.
 
         Args:
             floor: Lowest height of a hold point [m].
-            speed_max: Speed of the descent, if below LAND_SPEED [m/s].
+            speed_max: Speed cap [m/s]; if it is below LAND_SPEED, it is the speed of the descent.
         """
         self._floor, self.speed = floor, min(LAND_SPEED, speed_max)
         self._still_speed = min(STILL_SPEED, STILL_SHARE * self.speed)
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Begin a descent at `now_ns` [ns], not yet acknowledged."""
+        """Begin a descent at `now_ns` [ns], without an acknowledgement."""
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
-        """Tell whether the operator acknowledged while the robot sinks freely and high enough."""
+        """Tell whether the operator has acknowledged and the robot sinks freely and high enough."""
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
 
     def is_over(self, now_ns: int, reference: Vector, readings: Readings) -> bool:
-        """Take in the motion of this tick; tell whether the robot has touched down.
+        """Take the motion of this tick into account; tell whether the robot has touched down.
 
         Args:
             now_ns: World's clock [ns].
@@ -190,19 +195,20 @@ class Descent:
 
 
 class TakeOff:
-    """Detects when the robot has left the ground, and whether it may take off.
+    """Detects when the robot has left the ground, and whether the robot may take off.
 
-    Before take-off a HOLD would scrape along the floor, so the rotors stop instead. A robot whose
-    rotors were stopped in the air may still be falling, or lie outside the fence, when the operator
-    acknowledges. It may take off once it is at rest, inside the fence and at least TAKE_OFF_MARGIN
-    from its walls.
+    Before take-off a robot in HOLD would scrape along the floor, so the rotors stop instead.
+
+    A robot whose rotors were stopped in the air may still fall, or lie outside the fence, when the
+    operator acknowledges. This robot may take off once it lies still, inside the fence and at least
+    TAKE_OFF_MARGIN from the fence's walls.
 
     Attributes:
         over: Whether the robot has left the ground.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
-        """Start on the ground.
+        """Set the fence; the robot is on the ground.
 
         Args:
             low: Lower corner of the fence [m], shape (3,).
@@ -221,11 +227,11 @@ class TakeOff:
 
     @property
     def condition(self) -> Cause:
-        """The cause of GROUND after an acknowledgement: whether the robot must be still first."""
+        """Cause of GROUND after an acknowledgement; STILL_FIRST if the robot must lie still."""
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
-        """Forget the last take-off: the robot stands, or falls to the ground.
+        """Reset to the state before take-off, because the robot stands or falls to the ground.
 
         Args:
             stopped: Whether the rotors may have been stopped in the air or on an obstacle.
@@ -235,7 +241,7 @@ class TakeOff:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Take in where the robot stands, or whether it has left the ground.
+        """Note where the robot stands or, while it flies, whether it has left the ground.
 
         Args:
             readings: Readings of the onboard sensors.

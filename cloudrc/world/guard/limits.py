@@ -1,9 +1,10 @@
 """The limits of the guard, and the arithmetic that keeps a velocity reference within them.
 
-World alone sets the limits. Each is finite and above 0: no value switches a limit off.
-The functions are pure. For any input, NaN and infinity included, they return a finite result within
-its bound; therefore every comparison is written so that NaN fails it.
-`tests/world/guard/test_proof.py` proves this for the scalar functions and all 64-bit floats.
+World alone sets the limits. Each limit is finite and above 0: no value switches a limit off.
+
+The functions are pure. For any input, NaN and infinity included, each returns a finite result
+within its bound. For this purpose, every comparison is false for NaN.
+`tests/world/guard/test_proof.py` proves the bounds of the scalar functions for all 64-bit floats.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from cloudrc.geometry.fence import FLOOR_MARGIN, WALL_MARGIN
 from cloudrc.messages import ZERO, Vector
 
 BRAKE = 3.0
-"""Deceleration that the robot always reaches [m/s^2].
+"""Deceleration that the robot reaches in any case [m/s^2].
 Source: docs/reference/plant.md, "Stop rule"."""
 REACTION = 0.2
 """Time until the robot decelerates at BRAKE [s]. Source: docs/reference/plant.md, "Stop rule"."""
@@ -23,32 +24,34 @@ STOPPING_DISTANCE = 8.7
 """Distance within which the robot stops from the speed cap [m].
 Source: docs/reference/plant.md, "Speed cap"."""
 STOP_COEFFICIENT = 1.0 / (2.0 * BRAKE)
-"""Braking distance over speed squared [s^2/m]."""
+"""Braking distance divided by the square of the speed [s^2/m]."""
 FENCE_REACTION, FENCE_MARGIN = 0.6, WALL_MARGIN
-"""Towards a wall or the ceiling of the fence, the speed v keeps
-FENCE_REACTION v + v^2/6 <= distance - FENCE_MARGIN [s], [m]. Towards the floor, REACTION and
-FLOOR_MARGIN replace them, because the robot climbs readily.
-Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With those, a hostile cloud
-moves the robot 0.3 m beyond the fence, because the low-level controller follows late."""
+"""Reaction time [s] and margin [m] towards a wall or the ceiling of the fence: the guard limits the
+speed v so that FENCE_REACTION · v + v^2/6 <= distance - FENCE_MARGIN. Towards the floor, the guard
+uses REACTION and FLOOR_MARGIN, because the robot climbs readily.
+Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With these values, a hostile
+cloud can move the robot 0.3 m beyond the fence, because the low-level controller follows late."""
 FAR = 1e6
 """Distance beyond which a face of the fence limits nothing [m]."""
 RECHECK_DISTANCE, RECHECK_NS = 0.25, 10_000_000
-"""Where the fence limits nothing within RECHECK_DISTANCE [m] of the robot, the guard checks the
-fence only once per RECHECK_NS [ns]. In that time the robot moves by less than this distance, since
-it is never faster than 25 m/s."""
+"""If the fence limits nothing within RECHECK_DISTANCE [m] of the robot, the guard checks the fence
+only once per RECHECK_NS [ns]. In this time the robot moves by less than RECHECK_DISTANCE, since the
+robot is never faster than 25 m/s."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
-"""Return to the fence from beyond its margin: velocity per distance [1/s], largest speed [m/s]."""
+"""Return from beyond the margin to the inside of the fence: velocity per distance [1/s], largest
+speed [m/s]."""
 LOW_HEIGHT, LOW_SPEED = 0.25, 1.0
-"""Below LOW_HEIGHT [m] the robot flies sideways at most at LOW_SPEED [m/s]."""
+"""Below LOW_HEIGHT [m] above the fence's floor, the horizontal speed is at most LOW_SPEED [m/s]."""
 SINK_LEAD_MAX = 0.5
-"""Largest speed by which the reference may sink faster than the robot [m/s]. If it sank faster than
-a free fall, the low-level controller would turn the robot over and could not brake."""
+"""Largest difference by which the reference may sink faster than the robot [m/s]. If the reference
+sank faster than a free fall, the low-level controller would turn the robot over and could not
+brake."""
 ROUNDING_FACTOR = 1.0 - 2.0**-45
 """Factor on the speed cap that leaves room for rounding errors [1]."""
 
 
 def stopping_distance(speed: float, reaction: float) -> float:
-    """Return the distance [m] from `speed` [m/s] to rest: `reaction` [s], then braking at BRAKE."""
+    """Return the stopping distance [m] from `speed` [m/s]; braking begins after `reaction` [s]."""
     return speed * (reaction + speed * STOP_COEFFICIENT)
 
 
@@ -65,8 +68,8 @@ def clamp(value: float, low: float, high: float) -> float:
 def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
     """Return the largest reference speed towards a face of the fence [m/s].
 
-    The largest v with t v + v^2/6 <= d is 2 d / (t + sqrt(t^2 + 2 d/3)). In this form no difference
-    cancels. Beyond the face v is negative, so that the robot returns.
+    The largest v with t · v + v^2/6 <= d is 2 · d / (t + sqrt(t^2 + 2 · d/3)). This form avoids
+    cancellation. If the robot is beyond the face, v is negative, so that the robot returns.
 
     Args:
         distance: Distance to the face minus the margin, d of the formula [m].
@@ -86,8 +89,8 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
 def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
     """Tell whether the fence is too far away to limit a velocity.
 
-    It is if `limit_to_fence` leaves the velocity unchanged at every point that is less than
-    RECHECK_DISTANCE from `position`.
+    The answer is True if `limit_to_fence` leaves the velocity unchanged at every point that is less
+    than RECHECK_DISTANCE from `position`.
 
     Args:
         velocity: Reference [m/s], world frame, shape (3,).
@@ -118,8 +121,8 @@ def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vec
 def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vector:
     """Slow a reference, axis by axis, so that the robot can stop before the faces of the fence.
 
-    Near the floor the reference is also slowed sideways, because a rotor that touches the floor at
-    speed turns the robot over.
+    Near the floor the horizontal reference is slowed, too, because a rotor that touches the floor
+    at speed turns the robot over.
 
     Args:
         velocity: Finite reference [m/s], world frame, shape (3,).
@@ -139,7 +142,7 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
 
 
 def limit_length(a: Vector, length_max: float) -> Vector:
-    """Shorten `a` [m/s] to at most `length_max` [m/s] and keep its direction.
+    """Shorten `a` [m/s] to a length of at most `length_max` [m/s] and keep its direction.
 
     The result is zero if a component is NaN or infinite.
     """
@@ -173,11 +176,11 @@ def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
     """Limit how much a velocity speeds up from `before` to `after`; slowing down is not limited.
 
     The fence may turn one axis back while another axis speeds up. Then each axis may be within the
-    cap and their sum beyond it.
+    cap, while the speed of all axes together is above the cap.
 
     Args:
-        before: Finite [m/s], shape (3,).
-        after: Finite [m/s], shape (3,).
+        before: Finite velocity of the last tick [m/s], shape (3,).
+        after: Finite wanted velocity [m/s], shape (3,).
         step: Largest speed-up [m/s].
     """
     (ax, ay, az), (bx, by, bz) = before, after
@@ -194,7 +197,7 @@ def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
 
 
 def growth(before: float, after: float) -> float:
-    """Return how much faster `after` is than `before` in the direction of `after`, in [m/s]."""
+    """Return by how much `after` is faster than `before`, in the direction of `after` [m/s]."""
     if after < 0.0:
         before, after = -before, -after
     return max(after - max(before, 0.0), 0.0)
@@ -217,13 +220,13 @@ def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float
 AGE_MAX_NS = 10_000_000_000
 """Largest command age that an experiment may allow [ns]."""
 GROUND_WAIT_MIN_NS = 10_000_000_000
-"""Shortest time that a robot on the ground waits for a mission's first command [ns]. The command
-comes at least one round trip after the start: 0.6 s with the profile `satellite`."""
+"""Lower limit of the time for which a robot on the ground waits for a mission's first command [ns].
+The command arrives at least one round trip after the start: 0.6 s with the profile `satellite`."""
 RAMP_MIN = 1.0
-"""Shortest time for which the reference grows slowly after a HOLD [s]."""
+"""Lower limit of the time for which the reference speeds up slowly after a HOLD [s]."""
 COMMAND_MAX = 1000.0
-"""Largest value in a command that is shortened to a cap and not rejected [m/s, rad/s]. A larger one
-comes from a bug, and its direction is as wrong as its length.
+"""Largest value of a command that the guard shortens to a cap [m/s, rad/s]. The guard rejects a
+command with a larger value: it comes from a bug, and its direction is as wrong as its length.
 Source: docs/reference/faults.md, "F23"."""
 
 
@@ -238,7 +241,8 @@ class Limits:
         speed_max: Largest speed [m/s].
         acceleration_max: Largest change of the reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: Longest HOLD in a mission; then LAND [ns]. See `alone_max_ns`.
+        hold_max_ns: Longest HOLD in a mission [ns]; after this time LAND begins. See
+            `alone_max_ns`.
     """
 
     fence_low: Vector
@@ -254,7 +258,7 @@ class Limits:
 
         Raises:
             ValueError: If a limit is not finite or not above 0, if the robot cannot stop in time
-                from that speed with that age, or if the fence leaves no room.
+                from `speed_max` with `command_age_max_ns`, or if the fence leaves no room.
         """
         for name in self.__slots__[2:]:
             value = getattr(self, name)
@@ -274,10 +278,11 @@ class Limits:
 
     @property
     def ramp_ns(self) -> int:
-        """Time for which the reference grows at most at BRAKE after a HOLD [ns].
+        """How long the acceleration of the reference is limited to BRAKE after a HOLD [ns].
 
-        It is long enough to reach the speed cap. The ramp ends by time only: the first commands
-        after a silence may be zero, and the reference reaches those at once.
+        This time, the ramp, is long enough to reach the speed cap. The ramp ends by time only, not
+        when the reference reaches its command: the first commands after a silence may be zero, and
+        the reference reaches zero at once.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
@@ -287,7 +292,7 @@ class Limits:
         return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
 
     def age_text(self, beyond_ns: int) -> str:
-        """Describe the age of a command that is `beyond_ns` too old [ns]."""
+        """Describe the age of a command that is too old by `beyond_ns` [ns]."""
         age, limit = self.command_age_max_ns + beyond_ns, self.command_age_max_ns
         return f"command age {age * 1e-9:.3f} s above {limit * 1e-9:.3f} s"
 
@@ -296,7 +301,7 @@ class Limits:
         return f"held for {self.alone_max_ns(flies) * 1e-9:g} s without the cloud"
 
     def inner_corners(self) -> tuple[Vector, Vector]:
-        """Return the corners of the fence, margins taken off [m], shape (3,) each."""
+        """Return both corners of the fence, margins taken off [m], shape (3,) each."""
         (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high
         low = (ax + FENCE_MARGIN, ay + FENCE_MARGIN, az + FLOOR_MARGIN)
         return low, (bx - FENCE_MARGIN, by - FENCE_MARGIN, bz - FENCE_MARGIN)

@@ -1,7 +1,8 @@
 """The guard: the state machine that decides which commands the robot flies.
 
-It stands between the tunnel and the low-level controller and gives a velocity reference every 2 ms.
-It uses only its own clock and the onboard sensors, and it assumes that the cloud is hostile.
+The guard stands between the tunnel and the low-level controller. Every 2 ms it gives a velocity
+reference. The guard uses only its own clock and the onboard sensors, and assumes that the cloud is
+hostile.
 
                  fresh command of a         command too old, mission over,
                   started mission                   new session
@@ -13,17 +14,18 @@ It uses only its own clock and the onboard sensors, and it assumes that the clou
           |                          |   5 impossible commands within 1 s   |
           +------------------------ LAND <----------------------------------+
 
-A command is fresh while its *basis*, the odometry that it was computed from, is at most
-`command_age_max` old.
+The *basis* of a command is the odometry from which the command was computed. A command is fresh
+while its basis is at most `command_age_max` old.
 
-- ESTOP: entered from every state by the operator's request, or when the robot has turned over: its
-  rotors would push it in any direction. An acknowledgement leads to GROUND.
-- LAND: an acknowledgement in the air leads to HOLD; low above the ground or on an obstacle it leads
-  to GROUND at touch-down. LAND and ESTOP end the mission: only a start arms again.
-- HOLD before the robot has left the ground becomes GROUND. The rotors stop and the mission
-  continues, for 60 s without the cloud, as in HOLD.
-- HOLD after the end of a mission has no time limit: the robot waits for the next mission. HOLD
-  within a mission has one, because the operator may be gone.
+- ESTOP begins from every state: by the operator's request, or when the robot has turned over,
+  because the rotors would push it in any direction. An acknowledgement leads to GROUND.
+- LAND: an acknowledgement in the air leads to HOLD. An acknowledgement low above the ground or on
+  an obstacle leads to GROUND at touch-down.
+- LAND and ESTOP end the mission: only a new start arms the robot again.
+- HOLD before the robot has left the ground becomes GROUND: the rotors stop and the mission
+  continues. The robot waits 60 s for the cloud, as in HOLD.
+- HOLD within a mission has a time limit, because the operator may be gone. HOLD after the end of a
+  mission has no time limit: the robot waits for the next mission.
 
 A robot that touches nothing never turns over: no command tilts it as far as OVERTURNED_COSINE.
 """
@@ -41,8 +43,8 @@ from cloudrc.world.guard.limits import COMMAND_MAX, Limits
 from cloudrc.world.readings import Readings
 
 OVERTURNED_COSINE = 0.2
-"""Cosine of the tilt below which the robot has turned over [1], and its rotors stop. Without a hit,
-the worst commands reach 0.4."""
+"""Below this cosine of the tilt the robot counts as turned over, and its rotors stop [1]. Commands
+alone tilt the robot to a cosine of 0.4 at worst; only a collision tilts it further."""
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # looking up a member of an enum is slow
 
@@ -61,11 +63,11 @@ Source: docs/reference/faults.md, "F23"."""
 
 
 class Guard:
-    """The state machine of the guard, on world's clock; it starts in GROUND.
+    """The state machine of the guard, on world's clock. It begins in GROUND.
 
     Attributes:
         state: Current state.
-        cause: Why the guard is in this state; after touch-down in LAND, why it landed.
+        cause: Why the guard is in this state; after touch-down in LAND, why the robot landed.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Last velocity reference for the low-level controller [m/s], shape (3,).
         yaw_rate: Capped yaw rate [rad/s]; the published low-level controller ignores it.
@@ -75,7 +77,7 @@ class Guard:
     """
 
     def __init__(self, limits: Limits) -> None:
-        """Start on the ground."""
+        """Set the limits; the state is GROUND."""
         self._limits = limits
         self._speed_max = limits.speed_max * rules.ROUNDING_FACTOR
         self._low, self._high = limits.inner_corners()
@@ -110,13 +112,13 @@ class Guard:
         return changes
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Reset to GROUND: the robot stands at its spawn with its rotors off."""
+        """Reset to GROUND: the robot stands at its spawn with stopped rotors."""
         self.forget_commands()
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._enter(GROUND, now_ns, Cause.SPAWN, cause)
 
     def start_mission(self, now_ns: int) -> None:
-        """Arm for a mission that the operator starts; from now on fresh commands are flown.
+        """Arm for a mission that the operator starts: from now on the robot flies fresh commands.
 
         A latched guard ignores this: the operator must acknowledge first.
         """
@@ -128,7 +130,7 @@ class Guard:
         self.armed = True
 
     def end_mission(self, now_ns: int) -> None:
-        """End the mission: hold here until the operator starts the next one."""
+        """End the mission: hold the position until the operator starts the next mission."""
         self.armed = False
         if self.state is TRACK:
             self._enter(HOLD, now_ns, Cause.ENDED)
@@ -139,14 +141,14 @@ class Guard:
             self._enter(ESTOP, now_ns, Cause.STOPPED)
 
     def acknowledge(self, now_ns: int) -> None:
-        """Release a landing or stop that the operator has acknowledged; this arms nothing."""
+        """Release a landing or stop that the operator has acknowledged; do not arm the robot."""
         if self.latched and not self._flies:
             self._enter(GROUND, now_ns, self._take_off.condition)
         elif self.state is LAND:
             self._descent.acknowledged = True
 
     def forget_commands(self) -> None:
-        """Forget earlier commands: a new session or mission begins."""
+        """Forget earlier commands, because a new session or mission begins."""
         self._track_until_ns = self._steady_until_ns = NEVER_NS
         self._fresh_ns.clear()
         self._invalid_ns.clear()
@@ -156,12 +158,13 @@ class Guard:
         """Accept or reject a command that arrived through the tunnel.
 
         Args:
-            command: A command with any numbers.
+            command: A command; its numbers may have any value, even NaN.
             now_ns: World's clock [ns].
 
         Returns:
-            None if it is accepted, else the reason: "range" for a value that is too large or NaN;
-            "future" for a basis that is not yet measured; "stale" for a basis that is too old.
+            None if the command is accepted, else the reason: "range" for a value that is too large
+            or NaN; "future" for a basis that is not yet measured; "stale" for a basis that is too
+            old.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
@@ -199,7 +202,7 @@ class Guard:
         return None
 
     def _leave_hold(self, now_ns: int, fresh_until_ns: int) -> None:
-        """Count a fresh command; after enough of them in a short time, fly again."""
+        """Count a fresh command. Begin TRACK after RESUME_COMMANDS of them within RESUME_NS."""
         self._fresh_ns.append(now_ns)
         took_ns = now_ns - self._fresh_ns[0]
         enough = len(self._fresh_ns) == RESUME_COMMANDS and took_ns <= RESUME_NS
@@ -209,12 +212,12 @@ class Guard:
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Tell whether TRACK may begin: a take-off is allowed and SETTLE_NS has passed."""
+        """Tell whether TRACK may begin: the robot may leave the ground and SETTLE_NS has passed."""
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS
 
     def _note_invalid(self, now_ns: int) -> None:
-        """Count an impossible command, which no honest cloud sends; after some of them, land."""
+        """Count an impossible command, which no honest cloud sends; land after several of them."""
         self._invalid_ns.append(now_ns)
         if len(self._invalid_ns) < INVALID_COMMANDS or now_ns - self._invalid_ns[0] > INVALID_NS:
             return
@@ -252,7 +255,7 @@ class Guard:
         return self.reference
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
-        """Set the reference, limited so that the robot stays upright and inside the fence."""
+        """Set the reference, limited so that the robot neither turns over nor leaves the fence."""
         climb, position = readings.velocity[2], readings.position
         if reference[2] < climb - rules.SINK_LEAD_MAX:
             reference = rules.limit_sink(reference, self.reference, climb, self._speed_max)
@@ -293,7 +296,7 @@ class Guard:
             self._enter(GROUND, now_ns, Cause.NOT_OFF)
 
     def _enter(self, state: GuardState, now_ns: int, cause: Cause, text: str = "") -> None:
-        """Change the state and note the change; `text` replaces the words of the cause."""
+        """Change the state and record the change; a `text` replaces the words of the cause."""
         self.cause = self.cause if cause is Cause.DOWN and state is LAND else cause
         if self.state is not HOLD or state is not LAND:  # LAND descends from the hold point
             self._position_hold.forget()
