@@ -131,7 +131,11 @@ below list the other columns of each topic. An `int` is an int64, a `float` is a
 | `geometry_msgs/msg/PointStamped` | `setpoint` | `point` |
 """
 ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
-CLOCKS = {"world": "world's", "cloud": "cloud's", "either": "that of the end that writes it"}
+CLOCKS = {
+    "world": "on world's clock",
+    "cloud": "on cloud's clock",
+    "either": "on the clock of the end that wrote the row",
+}
 
 
 def outputs() -> dict[Path, str]:
@@ -279,7 +283,7 @@ def _facts(topic: Topic) -> str:
     stamp, often = SAMPLING[topic.name]
     return (
         f"- Message: `{topic.ros_type}`, written by {ENDS[topic.end]}, {often}.\n"
-        f"- Stamp: {stamp}. Clock in the end's own file: {CLOCKS[topic.end]}.\n"
+        f"- Stamp: {stamp}, {CLOCKS[topic.end]}.\n"
     )
 
 

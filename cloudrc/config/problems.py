@@ -219,8 +219,8 @@ def raise_problems(document: Document, problems: Iterable[Problem], name: str) -
 def _deepest(problems: Iterable[Problem]) -> list[Problem]:
     """Drop the problem of a value if a part of the value has a problem, too.
 
-    For example, a plug-in that lacks a parameter is not replaced by a mapping. Its value is still a
-    name, for which the schema reports a second problem.
+    For example, a plug-in is named but lacks a parameter. The missing parameter is one problem. The
+    schema also reports that the value is a name and not a mapping; that problem is dropped.
     """
     every = list(problems)
     above = {problem.path[:n] for problem in every for n in range(1, len(problem.path))}

@@ -23,7 +23,8 @@ PACKETS_MAX = 10_000_000
 """Limit of packets in a log, because a number may be forged: three weeks at five packets a
 second."""
 STEP_BACK = 0.02
-"""Largest step back in the computed times of sending between successive numbers [s]."""
+"""Limit of the time [s] by which a packet may seem to be sent before the packet with the number
+before its own."""
 _WRAP = 1 << 16
 _STAMP = re.compile(
     r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"

@@ -126,10 +126,10 @@ class PositionHold:
 
 
 def brake_start(reference: Vector, velocity: Vector) -> Vector:
-    """Return the reference at the start of braking, below the robot's speed.
+    """Return the reference for the start of braking, which is slower than the robot.
 
-    The robot follows the reference late. A robot that is slower than its reference would otherwise
-    speed up for a while.
+    The robot follows the reference with a delay. If the reference were faster than the robot when
+    braking starts, the robot would first speed up.
 
     Args:
         reference: Finite reference of the last tick [m/s], shape (3,).
