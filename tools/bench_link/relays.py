@@ -23,6 +23,8 @@ from cloudrc.errors import MissingPrerequisiteError
 from tools.bench_link.flow import Address, Array, Way
 
 HERE = Path(__file__).parent
+EMPTY: dict[str, object] = {"mission": "hover", "world": {"scene": "empty"}}
+"""What an experiment of the bench flies, if it flew."""
 DELAY = 0.020
 """Delay of the C relay and the asyncio relay, and of ours beside them [s]."""
 _TICKS = os.sysconf("SC_CLK_TCK")
@@ -74,7 +76,7 @@ class Process:
 def ours(folder: Path, link: dict[str, object], *flags: str) -> Process:
     """Start `cloudrc relay` on a link: the section `link` of an experiment file."""
     config = folder / f"{link.get('profile', 'link')}-{len(list(folder.iterdir()))}.yaml"
-    config.write_text(json.dumps({"seed": 1, "mission": "hover", "link": link}))
+    config.write_text(json.dumps({"seed": 1, **EMPTY, "link": link}))
     world_side, cloud_side, world, cloud = _free_addresses(4)
     command = [sys.executable, "-m", "cloudrc", "relay", f"--config={config}", "--feed", *flags]
     addresses = {

@@ -21,7 +21,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Trace
 from cloudrc.link.traces import write_trace
 from tools.bench_link.flow import SIZE, Flow, Judged, Way, flood, judge, run_flow
-from tools.bench_link.relays import DELAY, Process, of_asyncio, of_c, ours, wake_lateness
+from tools.bench_link.relays import DELAY, EMPTY, Process, of_asyncio, of_c, ours, wake_lateness
 
 OURS, OF_C, OF_ASYNCIO, WAKE = "cloudrc relay", "C relay", "asyncio relay", "C clock_nanosleep"
 SEED = 1
@@ -179,7 +179,7 @@ def _send(task: tuple[list[Way], float, float, float, float]) -> list[Flow]:
 def profiles_of(folder: Path, link: dict[str, object]) -> tuple[DirectionProfile, DirectionProfile]:
     """Read what a link asks for: uplink, downlink."""
     path = folder / "asked.yaml"
-    path.write_text(json.dumps({"seed": SEED, "mission": "hover", "link": link}))
+    path.write_text(json.dumps({"seed": SEED, **EMPTY, "link": link}))
     experiment = load_experiment(str(path))
     return link_profile(experiment.uplink), link_profile(experiment.downlink)
 
