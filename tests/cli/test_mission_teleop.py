@@ -25,7 +25,9 @@ def test_without_fastapi_the_api_is_refused_and_the_extra_named(
 
 @pytest.mark.process
 def test_a_missing_resource_is_named(tmp_path: Path) -> None:
-    (tmp_path / "operator").write_text("a token of the operator".replace(" ", "-"))
+    token = tmp_path / "operator"
+    token.touch(0o600)
+    token.write_text("a-token-of-the-operator")
     tokens = f"--tokens={tmp_path}"
     with socket.create_server(("127.0.0.1", 0)) as taken:
         api = f"--api=127.0.0.1:{taken.getsockname()[1]}"

@@ -136,7 +136,7 @@ def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
     assert json.loads(found.stdout)["mission"]["state"] == "flying"
     assert "INTERRUPTED" in operate(folder, "cancel").stdout
     run.communicate(timeout=60)
-    assert run.returncode == 1
+    assert run.returncode == 130
     assert report(folder)["failures"][0]["code"] == "cancelled"
     audit = [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
     said = [(line["action"].rpartition("/")[2], line["status"], line["client"]) for line in audit]
