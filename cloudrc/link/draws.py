@@ -267,6 +267,10 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
         return [erf(_HALF_ROOT * z) for z in normals(key, purpose, block, correlation)]
     if distribution == "table":
         return _from_table(key, purpose, block, profile.table, correlation)
+    return _from_pareto(key, purpose, block, correlation)
+
+
+def _from_pareto(key: StreamKey, purpose: Purpose, block: int, correlation: float) -> list[float]:
     if correlation:
         correlated = normals(key, purpose, block, correlation)
         survival = [0.5 * erfc(_HALF_ROOT * z) for z in correlated]

@@ -388,6 +388,32 @@ _LATE = {"s": 1e11, "ms": 1e14, "us": 1e17}
 true unit is finer than the column's name says."""
 
 
+def _csv_rows(
+    table: Table, log: Log, time: tuple[str, str], delay: str, loss: str | None
+) -> tuple[list[tuple[float, float | None]], int]:
+    """Read time and delay of each row, in their units, and the largest number of decimals.
+
+    Args:
+        table: The file.
+        log: Collects the rows that cannot be used.
+        time: Column of the time of sending, and its unit.
+        delay: Column of the delay.
+        loss: Column of the loss; None if there is none.
+    """
+    raw: list[tuple[float, float | None]] = []
+    decimals = 0
+    for row in table.rows():
+        try:
+            if row.problem:
+                raise BadInputError(f"{row.where}: {row.problem}")
+            sent = _csv_time(table, row, *time)
+            raw.append((sent, _csv_delay(table, row, delay, loss)))
+            decimals = max(decimals, decimals_of(row.cells[delay]))
+        except BadInputError as error:
+            log.unusable.append(str(error))
+    return raw, decimals
+
+
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:
     """Read a CSV log with a header; unknown columns are skipped.
 
@@ -417,17 +443,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     if round_trip and not halve:
         raise _refusal(f"{name}, column {delay}")
     loss = next((column for column in LOSSES if column in table.columns), None)
-    raw: list[tuple[float, float | None]] = []
-    decimals = 0
-    for row in table.rows():
-        try:
-            if row.problem:
-                raise BadInputError(f"{row.where}: {row.problem}")
-            sent = _csv_time(table, row, time, time_unit)
-            raw.append((sent, _csv_delay(table, row, delay, loss)))
-            decimals = max(decimals, decimals_of(row.cells[delay]))
-        except BadInputError as error:
-            log.unusable.append(str(error))
+    raw, decimals = _csv_rows(table, log, (time, time_unit), delay, loss)
     # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
     start = min((sent for sent, _ in raw), default=0.0)
     marks = _marks([value for _, value in raw if value is not None], delay, loss, decimals, log)
