@@ -115,10 +115,10 @@ class FlightsOnly:
     """
 
     def __init__(self, flies: Callable[[], bool]) -> None:
-        """Set `flies`; at first the robot does not fly.
+        """Store `flies`.
 
         Args:
-            flies: Whether the robot follows the cloud.
+            flies: Tells whether the robot flies, that is, follows the commands of cloud.
         """
         self._flies = flies
         self._until_ns = 0

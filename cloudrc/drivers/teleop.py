@@ -83,7 +83,7 @@ class UnixPeer:
 
 
 PERIOD_NS = 20_000_000
-"""Time between two deadlines of teleop's machine [ns]."""
+"""Period of teleop's state machine [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
 """Shortest time between two robot states sent to teleop [ns]. With this value teleop gets every
 second telemetry message."""

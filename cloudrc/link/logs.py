@@ -478,7 +478,11 @@ def _check_unit(packets: Packets, unit: str, name: str) -> None:
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the only column of these kinds; return its name and its unit ("" without a unit)."""
+    """Find the column of one of these kinds; there must be exactly one.
+
+    Returns:
+        Name of the column, and its unit; "" without a unit.
+    """
     known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
     found = [column for column in columns if column in known]
     found = found or [column for column in columns if column in kinds]

@@ -48,14 +48,14 @@ class Topic:
 
     Attributes:
         name: Name in the MCAP file, with its slash.
-        ros_type: Message type; `fields` defines the types in `cloudrc_msgs`.
+        ros_type: Message type. A type of `cloudrc_msgs` is defined by `fields`.
         source: Record class of the rows.
         end: End that records the topic: "world", "cloud" or "either".
         text: Meaning of a row.
         fields: The columns after `stamp_ns`.
         stamp_path: Dotted path of the row's stamp in the record.
-        part: Dotted path, with its last dot, to the nested record with the fields that the record
-            itself does not have; "" without a nested record.
+        part: Path to a nested record, with a dot at its end: "telemetry.". Fields that the row's own
+            record does not have are read from there. "" without a nested record.
     """
 
     name: str

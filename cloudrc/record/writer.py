@@ -194,7 +194,7 @@ class McapWriter:
         return self._open_records
 
     def close(self) -> None:
-        """Write the index and close the file; after an error, call `abandon`."""
+        """Write the index and close the file. After an error the caller calls `abandon` instead."""
         self.flush()  # keeps the last chunk even if there is no space for the index
         self.note({COUNTS: json.dumps(self._counts), SHA256: self._sha256.hexdigest()})
         self._mcap.finish()

@@ -40,7 +40,7 @@ class Leg:
         position: Waypoint [m], world frame, shape (3,).
         yaw: Heading to hold [rad].
         tolerance: Largest distance from the waypoint that counts as reached [m]. If the tolerance
-            is infinite, the leg always lasts `dwell`; steps at fixed instants use this.
+            is infinite, the leg always lasts `dwell`; missions of random steps use this.
         dwell: Time to stay within the tolerance without interruption [s].
         time_limit: Longest duration of the leg, without the time in which it is held [s].
     """
