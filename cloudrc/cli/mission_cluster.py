@@ -1,7 +1,7 @@
 """Run the verbs of `cloudrc mission` in a cluster, where a mission is a Kubernetes Job.
 
-The command checks a mission before it creates the Job, so that an error shows at once. Teleop's API
-checks the mission again with the same code when the Job's pod runs.
+The command checks a mission before it creates the Job, so that an error shows at once. Teleop's
+API checks the mission again with the same code when the Job's pod runs.
 """
 
 from __future__ import annotations
