@@ -54,8 +54,8 @@ class Topic:
         text: Meaning of a row.
         fields: The columns after `stamp_ns`.
         stamp_path: Dotted path of the row's stamp in the record.
-        part: Path to a nested record, with a dot at its end: "telemetry.". Fields that the row's own
-            record does not have are read from there. "" without a nested record.
+        part: Path to a nested record, with a dot at its end: "telemetry.". Fields that the record
+            itself does not have are read from there. "" without a nested record.
     """
 
     name: str
