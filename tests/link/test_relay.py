@@ -208,6 +208,7 @@ def test_a_signal_ends_it_in_a_fifth_of_a_second(bench: Callable[..., Bench]) ->
 
 
 @pytest.mark.process
+@pytest.mark.full
 def test_a_flood_is_bounded_counted_and_over_in_a_second(tmp_path: Path) -> None:
     for _ in range(TRIES):
         memory, counted, recovered = overload(tmp_path, 60_000, 1.0)
