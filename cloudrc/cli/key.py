@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,8 +46,6 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _make(options: argparse.Namespace) -> int:
-    import os
-
     from cloudrc.drivers.keyfile import read_keys
     from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet
 
@@ -79,8 +78,6 @@ def _drop(path: Path) -> int:
 
 def _replace(path: Path, keys: KeySet) -> None:
     """Write keys to a file; if the path is a symbolic link, write to the target of that link."""
-    import os
-
     from cloudrc.files import write_atomically
     from cloudrc.tunnel.keys import write
 

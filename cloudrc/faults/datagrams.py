@@ -99,8 +99,7 @@ def check_no_effect(
     if both:
         flight.cloud.tamper = tamper(flight.cloud)
     flight.fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
+    measures.safe_and_done(outcome, flight)
     outcome.true("the same path, bit by bit", measures.same_path(clean, flight))
     for refusal in refusals:
         labels = ("downlink", refusal)

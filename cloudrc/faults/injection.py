@@ -90,12 +90,8 @@ def _inject_into_ends(flight: Flight, event: Event) -> None:
             world.at(at, lambda _: flight.replace_key("world", NEXT_KEY))
             cloud.at(event.end, lambda _: flight.replace_key("cloud", NEXT_KEY))
         case "key_wrong":
-
-            def repair(now_ns: int) -> None:
-                flight.replace_key("cloud", flight.secrets["world"])
-
             cloud.at(at, lambda _: flight.replace_key("cloud", WRONG_KEY))
-            cloud.at(event.end, repair)
+            cloud.at(event.end, lambda _: flight.replace_key("cloud", flight.secrets["world"]))
 
 
 def _inject_into_teleop(flight: Flight, event: Event) -> None:

@@ -20,30 +20,28 @@ limits come from the configuration, none from the guard.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from math import hypot, inf, sqrt
 from typing import NamedTuple
 
 from cloudrc.config.load import ResolvedGuard
-from cloudrc.faults.hold_invariants import HoldInvariants, OperatorInvariants, growth
-from cloudrc.geometry.fence import HIGH, LOW, inside
-from cloudrc.messages import (
-    ZERO,
-    Command,
-    GuardState,
-    OperatorRequest,
-    Request,
-    Start,
-    Vector,
+from cloudrc.faults.hold_invariants import (
+    ESTOP,
+    HOLD,
+    LAND,
+    SLACK,
+    TRACK,
+    HoldInvariants,
+    Note,
+    OperatorInvariants,
+    growth,
 )
+from cloudrc.geometry.fence import HIGH, LOW, inside
+from cloudrc.messages import ZERO, Command, GuardState, OperatorRequest, Request, Start, Vector
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.rotors import STOPPED
 
-GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 FLOWN = (TRACK, HOLD, LAND)
-SLACK = 1e-9
-"""Tolerance for rounding [m/s]."""
 REPORTED = 5
 """Number of breaches of each kind that are kept."""
 STILL = 0.12
@@ -65,9 +63,6 @@ REELS_NS = 1_000_000_000
 """Time after a hit in which the hit explains the robot's motion [ns]."""
 THROWN_NS = 3_000_000_000
 """Time after a hit in which the robot may be thrown out of the fence [ns]."""
-
-Note = Callable[[int, str, str], None]
-"""Takes a breach: time [ns, world's clock], kind, text."""
 
 
 class Breach(NamedTuple):

@@ -11,7 +11,7 @@ from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, generator
-from cloudrc.messages import Cause, GuardState, Vector
+from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import (
     CommandApplied,
@@ -149,8 +149,12 @@ def changes_into(flight: Flight, state: GuardState, before: float = inf) -> list
 
 def held(flight: Flight) -> list[GuardChange]:
     """Return the HOLDs that are not a mission's end."""
-    changes = [change for change in flight.changes if change.state is GuardState.HOLD]
-    return [change for change in changes if change.cause != ENDED]
+    return [c for c in flight.changes if c.state is GuardState.HOLD and c.cause != ENDED]
+
+
+def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> None:
+    """Check that every HOLD began before the commands were too old."""
+    outcome.most(text, basis_age_at_hold(flight), AGE_MAX, "s")
 
 
 def basis_age_at_hold(flight: Flight) -> float:
@@ -291,13 +295,8 @@ def stopping_time(flight: Flight, since: float) -> float:
 
 def drift(flight: Flight, start: float, end: float) -> float:
     """Return the largest distance [m] from the place at `start`, until `end` [s]."""
-    path = positions(flight, start, end)
-    return max((dist(path[0], place) for place in path), default=nan) if path else nan
-
-
-def positions(flight: Flight, start: float, end: float) -> list[Vector]:
-    """Return the positions of the base [m] from `start` to `end` [s], every 10 ms."""
-    return [r.odometry.position for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
+    path = [r.odometry for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
+    return max((dist(path[0].position, each.position) for each in path), default=nan)
 
 
 def same_path(one: Flight, other: Flight) -> bool:
@@ -327,16 +326,18 @@ def epochs(flight: Flight) -> list[int]:
     return [r.epoch for r in records if isinstance(r, SessionOpened) and r.end == "world"]
 
 
-def waypoints_in_order(flight: Flight) -> bool:
-    """Tell whether each waypoint was reached exactly once, in its order."""
-    reached = [event.waypoint for event in flight.events("reached")]
-    return reached == list(range(len(reached)))
-
-
 def done(outcome: Outcome, flight: Flight) -> None:
     """Check that the mission was flown to its end, each waypoint once and in order."""
     outcome.true("mission done", flight.mission.state == "done")
-    outcome.true("each waypoint reached once, in order", waypoints_in_order(flight))
+    reached = [event.waypoint for event in flight.events("reached")]
+    in_order = reached == list(range(len(reached)))
+    outcome.true("each waypoint reached once, in order", in_order)
+
+
+def safe_and_done(outcome: Outcome, flight: Flight) -> None:
+    """Check `safe` and `done`."""
+    safe(outcome, flight)
+    done(outcome, flight)
 
 
 def safe(outcome: Outcome, flight: Flight) -> None:

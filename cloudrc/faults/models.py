@@ -489,5 +489,5 @@ class SeparateTeleop(InProcessTeleop):
         return calls
 
     def _take_stops(self) -> list[Callable[[int], None]]:
-        stops, self._stops = self._stops, []
-        return [partial(super(SeparateTeleop, self).ask, stop) for stop in stops]
+        ask, stops, self._stops = super().ask, self._stops, []
+        return [partial(ask, stop) for stop in stops]

@@ -10,7 +10,7 @@ raw `mj_step`. Its end state equals the simulator's bit by bit, so the compariso
 
 from __future__ import annotations
 
-from math import dist, inf
+from math import dist
 from struct import Struct
 from typing import Any, NamedTuple
 
@@ -53,6 +53,7 @@ class Simulator:
     Attributes:
         model: The compiled `MjModel`.
         dt: Duration of a step [s].
+        steps: Number of steps since the last reset.
         readings: State of the base after the last step.
         touches: Contacts that began since the last call of `take_contacts`.
         tape: None, or a list to which every step since the last reset appends its controls, for
@@ -89,7 +90,7 @@ class Simulator:
         mujoco.mj_resetData(self.model, self._data)
         mujoco.mj_forward(self.model, self._data)
         self._rotors.speeds = STOPPED
-        self._steps = self._contacts = 0
+        self.steps = self._contacts = 0
         if self.tape is not None:
             self.tape.clear()
         self.touches: list[Touch] = []
@@ -112,21 +113,16 @@ class Simulator:
             self.tape.append(controls)
 
         _mj_step(self.model, data)
-        self._steps += 1
+        self.steps += 1
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
         contacts = data.ncon
         if contacts or self._contacts:
             self._check_contacts(contacts, before)
 
     @property
-    def steps(self) -> int:
-        """Number of steps since the last reset."""
-        return self._steps
-
-    @property
     def touch_age(self) -> float:
-        """Time since the robot last touched something [s]; infinite if it has touched nothing."""
-        return (self._steps - max(self._last_touch.values(), default=-inf)) * self.dt
+        """Time since the robot last touched something [s]; at the reset it touches the floor."""
+        return (self.steps - max(self._last_touch.values())) * self.dt
 
     @property
     def rotor_speeds(self) -> RotorSpeeds:
@@ -151,7 +147,7 @@ class Simulator:
 
     def _check_contacts(self, contacts: int, before: Readings) -> None:
         """Note the contacts at once if their number has changed, else only every few steps."""
-        if contacts and (contacts != self._contacts or self._steps % CONTACT_CHECK_STEPS == 0):
+        if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
             self._note_contacts(before)
         self._contacts = contacts
 
@@ -164,10 +160,10 @@ class Simulator:
             body = self._bodies[first] or self._bodies[second]
             touched = (body, dist(place, tip) <= self._tip_radius)
             last = self._last_touch.get(touched)
-            if last is None or self._steps - last > self._gap_steps:
+            if last is None or self.steps - last > self._gap_steps:
                 tip_velocity = _velocity_at(before, self._tip_offset)
                 self.touches.append(Touch(*touched, before.position, before.velocity, tip_velocity))
-            self._last_touch[touched] = self._steps
+            self._last_touch[touched] = self.steps
 
 
 def _velocity_at(readings: Readings, offset: Vector) -> Vector:

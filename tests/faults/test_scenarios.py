@@ -19,13 +19,11 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.report import Result
 from cloudrc.faults.scenario import Check, Outcome, Scenario
 from cloudrc.faults.scenarios import SCENARIOS, find
-from cloudrc.messages import GuardState
 from cloudrc.records import Counted
 from tests.conftest import nightly
 
 NUMBERS = (*range(1, 14), 15, 17, *range(20, 26), 27, 28, 40)
 QUICK = ("F6", "F13", "F17", "F40")
-GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
 
 def test_the_faults_have_their_numbers_and_own_names() -> None:

@@ -24,7 +24,6 @@ from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
 
 Patch = pytest.MonkeyPatch
-GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 MS = 1_000_000
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
 SHORT = [path for path in REGRESSIONS if load(path).duration < 45.0]
@@ -140,7 +139,7 @@ def needs_no_start(patch: Patch) -> None:
     accept = Guard.accept_command
 
     def arm(guard: Guard, command: Command, now_ns: int) -> str | None:
-        guard.armed = guard.armed or guard.state is GROUND
+        guard.armed = guard.armed or guard.state is GuardState.GROUND
         return accept(guard, command, now_ns)
 
     patch.setattr(Guard, "accept_command", arm)

@@ -95,9 +95,7 @@ def _two_clouds(seed: int) -> Outcome:
     outcome.most("it says so after", said - at, 1.0, "s")
     by_first = [r for r in measures.seen_by(flight, "cloud", at + 6.0) if isinstance(r, Fault)]
     outcome.same("faults that the first tells of", len(by_first), 0)
-    outcome.most(
-        "HOLD once the first is gone", measures.basis_age_at_hold(flight), measures.AGE_MAX, "s"
-    )
+    measures.held_in_time(outcome, flight, "HOLD once the first is gone")
     later = [epoch for epoch in measures.epochs(flight) if epoch > 2]
     outcome.true("then the second gets a higher epoch", bool(later))
     outcome.true("commands applied in order, none twice", measures.applied_in_order(flight))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 
@@ -14,27 +14,15 @@ THINGS = ("uplink", "downlink", "cloud", "world", "teleop")
 """Order in which the things freeze: a direction before its sender, so that datagrams are lost."""
 
 
-class Span(NamedTuple):
-    """When a thing is frozen.
-
-    Attributes:
-        start: Instant of virtual time [s].
-        duration: [s].
-    """
-
-    start: float
-    duration: float
-
-
-def _spans(seed: int) -> dict[str, Span]:
-    """Choose when the things freeze, one by one, and return, in random order.
+def _spans(seed: int) -> dict[str, tuple[float, float]]:
+    """Choose when each thing freezes, and for how long [s]; they return in random order.
 
     Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
     """
     rng, count = generator(seed, 40), len(THINGS)
     starts = measures.instant(seed) + np.cumsum(rng.uniform(0.1, 1.0, count))
     ends = rng.permutation(starts[-1] + np.cumsum(rng.uniform(0.1, 1.5, count)))
-    spans = [Span(float(a), float(b - a)) for a, b in zip(starts, ends, strict=True)]
+    spans = [(float(a), float(b - a)) for a, b in zip(starts, ends, strict=True)]
     return dict(zip(THINGS, spans, strict=True))
 
 
@@ -48,22 +36,21 @@ def _swizzle(seed: int) -> Outcome:
     )
     for name, end in (("cloud", flight.cloud), ("world", flight.world)):
         start, duration = spans[name]
-        end.at(start, lambda now_ns, end=end, duration=duration: end.freeze(now_ns, duration))  # type: ignore[misc]
+        end.at(start, partial(end.freeze, duration=duration))
     start, duration = spans["teleop"]
     flight.cloud.at(start, lambda _: flight.teleop.kill())
     flight.cloud.at(start + duration, lambda _: flight.teleop.start())
     flight.fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
-    outcome.most("HOLD after", measures.basis_age_at_hold(flight), measures.AGE_MAX, "s")
+    measures.safe_and_done(outcome, flight)
+    measures.held_in_time(outcome, flight)
     _chain(outcome, flight, spans)
     return outcome
 
 
-def _chain(outcome: Outcome, flight: Flight, spans: dict[str, Span]) -> None:
+def _chain(outcome: Outcome, flight: Flight, spans: dict[str, tuple[float, float]]) -> None:
     """Check that the guard tells why it held, and that each thing tells that it was frozen."""
     measures.causes_told(outcome, flight)
-    since, over = spans[THINGS[0]].start, max(sum(span) for span in spans.values())
+    since, over = spans[THINGS[0]][0], max(sum(span) for span in spans.values())
     for role, *metric in (
         ("cloud", "datagrams_lost_total", "uplink"),
         ("world", "datagrams_lost_total", "downlink"),

@@ -15,9 +15,8 @@ def _cloud_killed(seed: int) -> Outcome:
     flight = Flight(seed=seed)
     flight.cloud.at(at, lambda now_ns: flight.kill_cloud(now_ns, down))
     flight.fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
-    outcome.most("HOLD after", measures.basis_age_at_hold(flight), measures.AGE_MAX, "s")
+    measures.safe_and_done(outcome, flight)
+    measures.held_in_time(outcome, flight)
     commands = [r.stamp_ns * 1e-9 - at for r in flight.of_world if isinstance(r, CommandApplied)]
     again = min((t for t in commands if t > down), default=nan)
     outcome.most("the new process commands after", again, 2.0, "s")
@@ -35,9 +34,8 @@ def _cloud_paused(seed: int) -> Outcome:
     flight.cloud.at(at, lambda now_ns: flight.cloud.freeze(now_ns, 5.0))
     shown = measures.look(flight, at + 4.0)
     flight.fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
-    outcome.most("HOLD after", measures.basis_age_at_hold(flight), measures.AGE_MAX, "s")
+    measures.safe_and_done(outcome, flight)
+    measures.held_in_time(outcome, flight)
     measures.silence_told(outcome, shown, 4.0, cloud=False, what="cloud stalled")
     measures.causes_told(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]

@@ -38,9 +38,8 @@ def _corruption(seed: int) -> Outcome:
 
     flight.world.tamper, flight.cloud.tamper = tamper(flight.world), tamper(flight.cloud)
     flight.fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
-    outcome.most("HOLD after", measures.basis_age_at_hold(flight), measures.AGE_MAX, "s")
+    measures.safe_and_done(outcome, flight)
+    measures.held_in_time(outcome, flight)
     metric = ("datagrams_total", "downlink", "tag")
     measures.moves(outcome, flight, "world", *metric, since=at)
     before, after = (  # world tells its counts once a second
@@ -101,8 +100,7 @@ def _another_version(outcome: Outcome, seed: int) -> None:
     flight.fly(2.0)
     outcome.same("a cloud of another version: sessions", len(measures.epochs(flight)), 0)
     flight.fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
+    measures.safe_and_done(outcome, flight)
     told = [r.text for r in flight.of_world if isinstance(r, Fault) and r.code == "version"]
     text = f"peer speaks v{newer}, we speak v{codec.VERSION}"
     outcome.true(f"it is told once: {text}", len(told) == 1 and told[0].startswith(text))
@@ -147,8 +145,7 @@ def _greet_again(outcome: Outcome, seed: int, captured: list[bytes]) -> None:
 
     flight.world.tamper = flight.cloud.tamper = tamper
     flight.fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
+    measures.safe_and_done(outcome, flight)
     late = _opened_at(flight) - _opened_at(clean)
     outcome.most("amid captured greetings the session opens later by", late, 0.5, "s")
     outcome.true("and no other one", measures.epochs(flight) == measures.epochs(clean))

@@ -24,8 +24,7 @@ def _short_silence(seed: int) -> Outcome:
         ("down", steady, silent),
     ):
         flight = Flight(seed=seed, uplink=up, downlink=down).fly_mission()
-        measures.safe(outcome, flight)
-        measures.done(outcome, flight)
+        measures.safe_and_done(outcome, flight)
         outcome.same(f"silent {what}: HOLDs", len(measures.held(flight)), 0)
         ends = ("cloud", "uplink", flight.uplink, up), ("world", "downlink", flight.downlink, down)
         for role, way, link, shape in ends:
@@ -62,13 +61,10 @@ def _silence(seed: int) -> Outcome:
         )
         shown = measures.look(flight, at + 0.9 * duration)
         flight.fly_mission(150.0)
-        measures.safe(outcome, flight)
-        measures.done(outcome, flight)
+        measures.safe_and_done(outcome, flight)
         began = next(iter(measures.changes_into(flight, GuardState.HOLD)), at)
         what = f"{duration:g} s of silence"
-        outcome.most(
-            f"{what}: HOLD after", measures.basis_age_at_hold(flight), measures.AGE_MAX, "s"
-        )
+        measures.held_in_time(outcome, flight, f"{what}: HOLD after")
         measures.causes_told(outcome, flight, what)
         back = at + duration
         if duration >= 3.0:
@@ -133,8 +129,7 @@ def _loss(seed: int) -> Outcome:
     lossy: Shape = lambda profile: replace(profile, loss=0.3)  # noqa: E731
     clean = Flight(seed=seed).fly_mission()
     flight = Flight(seed=seed, uplink=lossy, downlink=lossy).fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
+    measures.safe_and_done(outcome, flight)
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     ratio = measures.number(flight, "tracking_rms_measured") / measures.number(
         clean, "tracking_rms_measured"

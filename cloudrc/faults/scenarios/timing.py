@@ -23,8 +23,7 @@ def _disorder(seed: int) -> Outcome:
         profile, delay=0.05, jitter=0.0, reorder=0.25
     )
     flight = Flight(seed=seed, uplink=shape, downlink=shape).fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
+    measures.safe_and_done(outcome, flight)
     outcome.true("commands applied in order, none twice", measures.applied_in_order(flight))
     for name, labels in (("datagrams_reordered_total", ()), ("datagrams_total", ("late",))):
         measures.moves(outcome, flight, "world", name, "downlink", *labels, since=0.0)
@@ -38,8 +37,7 @@ def _copies(seed: int) -> Outcome:
     twice: Shape = lambda profile: replace(profile, jitter=0.0, duplicate=1.0)  # noqa: E731
     clean = Flight(seed=seed, uplink=steady, downlink=steady).fly_mission()
     flight = Flight(seed=seed, uplink=twice, downlink=twice).fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
+    measures.safe_and_done(outcome, flight)
     outcome.true("the same path, bit by bit", measures.same_path(clean, flight))
     measures.moves(outcome, flight, "world", "datagrams_total", "downlink", "repeated", since=0.0)
     outcome.least("copies dropped", flight.count("repeated"), 1000)
@@ -55,8 +53,7 @@ def _clocks(seed: int) -> Outcome:
         outcome.true(text, measures.same_path(clean, apart))
     for ppm in (-500, 500):
         drifting = Flight(seed=seed, cloud_clock=Clock(HOUR_NS, ppm)).fly_mission()
-        measures.safe(outcome, drifting)
-        measures.done(outcome, drifting)
+        measures.safe_and_done(outcome, drifting)
         outcome.same(f"drift of {ppm} ppm: HOLDs", len(measures.held(drifting)), 0)
     return outcome
 
@@ -68,8 +65,7 @@ def _delay_step(seed: int) -> Outcome:
         profile, delay=0.01, jitter=0.001, changes=(Change(at, delay=0.1),)
     )
     flight = Flight("cloud.estimator=split", seed=seed, uplink=shape, downlink=shape).fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
+    measures.safe_and_done(outcome, flight)
     late = [
         abs(r.horizon - r.loop_delay) / r.loop_delay
         for r in flight.of_cloud
@@ -100,8 +96,7 @@ def _asymmetry(seed: int) -> Outcome:
         seed=seed,
         cloud_clock=Clock(offset_ns=HOUR_NS),
     ).fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
+    measures.safe_and_done(outcome, flight)
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     rtt = measures.reading("cloud", flight.of_cloud, "rtt_seconds")
     outcome.most("metric rtt_seconds, its mean is off 0.2 s by", abs(rtt - 0.2), 0.01, "s")
@@ -116,8 +111,7 @@ def _jitter(seed: int) -> Outcome:
     wild: Shape = lambda profile: replace(profile, delay=0.15, jitter=0.15)  # noqa: E731
     without = Flight("link.profile=paper-p3", seed=seed, uplink=steady, downlink=steady)
     flight = Flight("link.profile=paper-p3", seed=seed).fly_mission()
-    measures.safe(outcome, flight)
-    measures.done(outcome, flight)
+    measures.safe_and_done(outcome, flight)
     outcome.same("jitter 40 ms: HOLDs", len(measures.held(flight)), 0)
     young, old = _ages(without.fly_mission())
     outcome.most(f"without jitter: metric {AGE}: outside 0.1 to 0.15 s", young + old, 0.01)
