@@ -105,7 +105,8 @@ def execute(options: argparse.Namespace) -> int:
         return of_api(options, Api(options.api, token_reader(token_file(options))))
     if (url := find_local_run(options, api_url_of, NO_API)) is not None:
         return of_api(options, Api(url))  # a local run asks for no token, so send none
-    if verb in mission_cluster.VERBS:
+    without_job = verb in mission_cluster.OF_ONE_JOB and options.id is None
+    if verb in mission_cluster.VERBS and not without_job:
         in_cluster: Callable[[argparse.Namespace], int] = mission_cluster.VERBS[verb]
         return in_cluster(options)
     with mission_cluster.api(options) as forwarded:

@@ -169,11 +169,6 @@ def _list(options: argparse.Namespace) -> int:
 
 
 def _status(options: argparse.Namespace) -> int:
-    if options.id is None:
-        from cloudrc.cli.mission_local import VERBS as API_VERBS
-
-        with api(options) as forwarded:
-            return API_VERBS["status"](options, forwarded)
     release = _place(options)
     from cloudrc.cluster.jobs import read_job
 
@@ -185,11 +180,6 @@ def _status(options: argparse.Namespace) -> int:
 
 
 def _cancel(options: argparse.Namespace) -> int:
-    if options.id is None:
-        from cloudrc.cli.mission_local import VERBS as API_VERBS
-
-        with api(options) as forwarded:
-            return API_VERBS["cancel"](options, forwarded)
     release = _place(options)
     from cloudrc.cluster.jobs import cancel
 
@@ -223,6 +213,8 @@ VERBS: dict[str, Callable[[argparse.Namespace], int]] = {
     "cancel": _cancel,
     "logs": _logs,
 }
+OF_ONE_JOB = ("status", "cancel")
+"""Verbs that need the name of a Job; without a name, the API carries them out."""
 
 
 def _place(options: argparse.Namespace) -> Release:

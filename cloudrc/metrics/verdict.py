@@ -326,9 +326,8 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
         evidence: Evidence by `flight_evidence`.
         numbers: Measured numbers of the flight.
     """
-    stamps, basis = flight.control["stamp_ns"], flight.control["basis_stamp_ns"]
-    before = basis[stamps <= (flight.end_ns or 0)]
-    seen_ns = int(before[-1]) if len(before) else 0
+    basis = flight.control["basis_stamp_ns"]
+    seen_ns = int(basis[-1]) if len(basis) else 0
     touch = first_touch(flight)
     shown = evidence.touch if touch is not None and touch["stamp_ns"] <= seen_ns else None
     factor = numbers.get("real_time_factor")
@@ -378,7 +377,7 @@ class Observations:
             touch_speed: Speed of the touch, as in `see` [m/s].
             slip_ns: Slip, as in `see` [ns].
         """
-        return cls(pipe_contacts, 0, _known(touch_speed), None, slip_ns, slip_ns)
+        return cls(pipe_contacts, 0, finite_or_none(touch_speed), None, slip_ns, slip_ns)
 
     def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
         """Process new telemetry; return the same object if nothing has changed.
@@ -389,7 +388,7 @@ class Observations:
                 touch.
             slip_ns: Lag of world's clock behind its machine's clock [ns].
         """
-        touch = _known(touch_speed)
+        touch = finite_or_none(touch_speed)
         if self.touch_speed is not None or touch == self.touch_before:
             touch = self.touch_speed
         new = pipe_contacts - self.pipe_contacts
@@ -443,5 +442,6 @@ class Observations:
         return asdict(self)
 
 
-def _known(speed: float) -> float | None:
-    return speed if isfinite(speed) else None
+def finite_or_none(value: float) -> float | None:
+    """Return `value`, any unit; return None for NaN and infinity, which JSON does not have."""
+    return value if isfinite(value) else None

@@ -34,11 +34,6 @@ HEADLINES = {
 }
 
 
-def headline(verdict: Verdict) -> str:
-    """Write the outcome as one short sentence."""
-    return HEADLINES[verdict.outcome]
-
-
 def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:
     """Summarize the flight in a few sentences, with the known numbers."""
     if flight.start_ns is None:
@@ -152,7 +147,7 @@ def render(
         kicker=escape(
             f"cloudrc run report · {experiment.name} · {run.mode} · seed {experiment.seed}"
         ),
-        headline=escape(headline(verdict)),
+        headline=escape(HEADLINES[verdict.outcome]),
         summary=_UNIT.sub("\\1\u00a0\\2", escape(summary(flight, numbers))),
         failures=_list([_failure(failure) for failure in verdict.failures], "failures"),
         notes=_list([escape(note) for note in notes], "note"),

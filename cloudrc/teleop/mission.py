@@ -556,7 +556,7 @@ class Teleop:
         """End the mission, and ask the robot to hold its position."""
         waypoint = min(self.leg, len(self._plan.legs) - 1)
         self.state = ENDS.get(code, State.FAILED)
-        self.outcome = Outcome(code, text, waypoint, reached=self.leg)
+        self.outcome = Outcome(code, text, reached=self.leg)
         if code != "done" and self._mission_id:
             self.requests.report(self._mission_id, MISSION_OVER)
         on_ground = self._seen is not None and self._seen.guard is GuardState.GROUND

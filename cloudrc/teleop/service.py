@@ -14,12 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from math import isfinite
 from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
-from cloudrc.metrics.verdict import Ending, Observations, judge
+from cloudrc.metrics.verdict import Ending, Observations, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.mission import Teleop
@@ -68,17 +67,12 @@ class RobotView:
         self._heard_ns: int | None = None
 
     @property
-    def guard(self) -> GuardState:
-        """State of the guard; GROUND before the first telemetry."""
-        return GROUND if self.seen is None else self.seen.guard
-
-    @property
     def latched(self) -> str:
         """Why the guard needs an acknowledgement before the robot can fly; "" if none is needed."""
-        guard = self.guard
-        if self.seen is None or guard not in LATCHED:
+        seen = self.seen
+        if seen is None or seen.guard not in LATCHED:
             return ""
-        return f"the guard is in {guard.name} ({self.seen.cause.words}) and lets nothing fly"
+        return f"the guard is in {seen.guard.name} ({seen.cause.words}) and lets nothing fly"
 
     def hear(self, now_ns: int) -> None:
         """Note a message from cloud at `now_ns` [ns]."""
@@ -121,16 +115,16 @@ class RobotView:
             "age_s": age,
             "epoch": seen.epoch,
             "world": seen.world,
-            "position_m": [_known(value) for value in seen.position],
+            "position_m": [finite_or_none(value) for value in seen.position],
             "guard": seen.guard.name,
             "cause": seen.cause.words,
             "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
             "next_step": next_step(seen.guard, age, cloud_age, mission),
             "pipe_contacts": seen.pipe_contacts,
-            "touch_speed_mps": _known(seen.touch_speed),
-            "horizon_s": _known(seen.horizon),
-            "rtt_s": _known(seen.rtt),
-            "loop_delay_s": _known(seen.loop_delay),
+            "touch_speed_mps": finite_or_none(seen.touch_speed),
+            "horizon_s": finite_or_none(seen.horizon),
+            "rtt_s": finite_or_none(seen.rtt),
+            "loop_delay_s": finite_or_none(seen.loop_delay),
         }
 
 
@@ -148,11 +142,6 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     if mission == "held" and guard is TRACK:
         return HELD
     return (ALONE if mission is None else IN_MISSION)[guard]
-
-
-def _known(value: float) -> float | None:
-    """Replace NaN and infinity by None, because JSON does not have them."""
-    return value if isfinite(value) else None
 
 
 def describe_session(mission: Mission) -> str:
@@ -417,8 +406,7 @@ class MissionService:
 
         If the mission has begun, it continues. If it waits, it starts only with `queued`.
         """
-        waiting = self.book.open()
-        if self._current is None and waiting:
+        if self._current is None and (waiting := self.book.open()):
             if queued and waiting[0].state == store.QUEUED:
                 self.book.begin(waiting[0], now_ns)
             if waiting[0].state != store.QUEUED:

@@ -373,7 +373,7 @@ class MissionStore:
             sqlite3.DatabaseError: If a row cannot be read.
         """
         self._db, self._salt, self.notice, self.damaged = connection, salt, notice, damaged
-        self._numbered = self._events = 0
+        self._events = 0
         self._unsaved: dict[str, int] = {}  # mission -> its first event that is not on the disk
         self.missions: dict[str, Mission] = {}
         self.trouble, self._told, self._keep_ns = "", "", 0
@@ -442,13 +442,12 @@ class MissionStore:
         Raises:
             UnavailableError: If the mission cannot be stored; then it does not exist.
         """
-        mission_id = f"m{self._numbered + 1}"
+        mission_id = f"m{int(next(reversed(self.missions), 'm0')[1:]) + 1}"
         number = number_of(mission_id, self._salt)
         mission = Mission(mission_id, replace(order, queue=False), number)
         ended = [each.id for each in self.missions.values() if each.ended]
         old = ended[: max(0, len(ended) - KEPT)]
         self._commit("no mission can start", mission, old)
-        self._numbered += 1
         self.missions[mission_id] = mission
         for each in old:
             del self.missions[each]
@@ -578,7 +577,7 @@ class MissionStore:
     def _read(self) -> None:
         for row, order, status in self._db.execute("SELECT * FROM mission ORDER BY n"):
             mission = from_json(f"m{row}", order, **json.loads(status))
-            self.missions[mission.id], self._numbered = mission, row
+            self.missions[mission.id] = mission
         for row, *reached in self._db.execute("SELECT * FROM reached ORDER BY mission, waypoint"):
             each = dict(zip(("waypoint", "time_s"), reached, strict=True))
             self.missions[f"m{row}"].reached.append(each)

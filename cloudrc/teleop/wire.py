@@ -190,13 +190,11 @@ class Outcome:
         code: "done", "cancelled", "leg_timed_out", "timed_out", "world_restarted",
             "guard_stopped", "emergency_stopped", "taken_over" or "end_lost".
         text: Description of the outcome.
-        waypoint: Index of the current waypoint at the end.
         reached: Number of reached waypoints.
     """
 
     code: str
     text: str
-    waypoint: int
     reached: int
 
     @property

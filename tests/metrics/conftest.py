@@ -85,13 +85,13 @@ class Log:
         waypoints: int = 1,
         time_limit: float = 60.0,
     ) -> Flight:
-        # A stable sort: records with equal stamps keep their order.
-        world, cloud = (sorted(r, key=lambda record: record.stamp_ns) for r in self._both())
         criteria = Criteria(contact=contact, time_limit_s=time_limit)
-        return Flight(Recording.from_records(world, cloud), criteria, waypoints, scene)
+        return Flight(Recording.from_records(*self.ends()), criteria, waypoints, scene)
 
-    def _both(self) -> tuple[list[Record], list[Record]]:
-        return self.world, self.cloud
+    def ends(self) -> tuple[list[Record], list[Record]]:
+        """Return the records of world and of cloud by stamp; equal stamps keep their order."""
+        world, cloud = (sorted(r, key=lambda each: each.stamp_ns) for r in (self.world, self.cloud))
+        return world, cloud
 
 
 def flown(path: Callable[[float], Vector] = straight) -> Log:
@@ -162,6 +162,13 @@ def straight_flight() -> Flight:
 def touch(seconds: float, body: str = "board", *, tip: bool = True) -> Contact:
     """Make a contact with the tip at 0.15 m/s."""
     return Contact(at(seconds), body, straight(seconds), ZERO, (0.12, 0.09, 0.0), tip)
+
+
+def good() -> Log:
+    """Log a flight whose tip touches the board slowly."""
+    log = flown()
+    log.world.append(touch(8))
+    return log
 
 
 def pressing(log: Log, since: float, force: Callable[[int], float]) -> None:

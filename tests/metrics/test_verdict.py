@@ -29,13 +29,7 @@ from cloudrc.records import (
     Record,
     SessionOpened,
 )
-from tests.metrics.conftest import ONE_PIPE, SECOND, Log, at, flown, touch
-
-
-def good() -> Log:
-    log = flown()
-    log.world.append(touch(8))
-    return log
+from tests.metrics.conftest import ONE_PIPE, SECOND, Log, at, flown, good, touch
 
 
 def measured(flight: Flight) -> dict[str, Number]:

@@ -18,28 +18,21 @@ from cloudrc.config.load import dump
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording, merged
 from cloudrc.record.writer import McapWriter
-from cloudrc.records import Counted, Record
+from cloudrc.records import Counted
 from cloudrc.report.document import Run
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
-from tests.metrics.conftest import at, flown, paper, touch
+from tests.metrics.conftest import at, good, paper
 from tests.record.conftest import rewrite, write_mission
 
 RUN = Run("virtual", "virtual", "f" * 64)
 Change = Callable[[Path, Path], object]
 
 
-def ends() -> tuple[list[Record], list[Record]]:
-    log = flown()
-    log.world.append(touch(8))
-    world, cloud = (sorted(r, key=lambda record: record.stamp_ns) for r in (log.world, log.cloud))
-    return world, cloud
-
-
 @pytest.fixture(scope="module")
 def flown_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run in virtual time, with its report."""
-    folder, (world, cloud) = tmp_path_factory.mktemp("run"), ends()
+    folder, (world, cloud) = tmp_path_factory.mktemp("run"), good().ends()
     (folder / "config.yaml").write_text(dump(paper()[0]))
     write_report(folder, Recording.from_records(world, cloud), paper()[0], RUN, page=False)
     kept = {name: (folder / name).read_bytes() for name in ("config.yaml", "report.json")}
@@ -101,7 +94,7 @@ def recorded(*, more: int = 0, config: bytes = b"") -> Change:
     """Record the flight anew: with more records of ground truth, or of another experiment."""
 
     def change(source: Path, target: Path) -> None:
-        world, cloud = ends()
+        world, cloud = good().ends()
         world[more:more] = world[:more]
         write_mission(target, world, cloud, attachments={"config.yaml": config} if config else {})
 
@@ -162,7 +155,7 @@ def test_a_killed_runs_topics_are_compared(
     (run / "report.json").unlink()
     for left_out in ("", topic):
         with McapWriter(run / "mission.mcap", clock="world") as writer:
-            for log_time_ns, row in merged(*ends()):
+            for log_time_ns, row in merged(*good().ends()):
                 if row[0] != left_out:
                     writer.write_row(row, log_time_ns)
         if not left_out:
@@ -185,7 +178,7 @@ def test_a_torn_recording_still_gives_a_report(run: Path) -> None:
 
 
 def test_a_hash_is_of_the_recording_beside_it(run: Path) -> None:
-    world, cloud = ends()
+    world, cloud = good().ends()
     longer = [*world, Counted(world[-1].stamp_ns, "world", "sent", 1)]
     write_mission(run / "mission.mcap", longer, cloud)
     found = write_report(run, *read_run(run), page=False)
@@ -193,7 +186,7 @@ def test_a_hash_is_of_the_recording_beside_it(run: Path) -> None:
 
 
 def test_an_interrupted_run_stays_interrupted(run: Path) -> None:
-    world, cloud = ([r for r in part if r.stamp_ns < at(4)] for part in ends())
+    world, cloud = ([r for r in part if r.stamp_ns < at(4)] for part in good().ends())
     write_mission(run / "mission.mcap", world, cloud)
     recording = Recording.from_records(world, cloud)
     stopped = Run("local", "relay", interrupted=True, notes=("the relay died",))
@@ -206,7 +199,7 @@ def test_an_interrupted_run_stays_interrupted(run: Path) -> None:
 
 
 def test_the_ends_are_merged_if_nobody_has(run: Path) -> None:
-    world, cloud = ends()
+    world, cloud = good().ends()
     for end, part in (("world", world), ("cloud", cloud)):
         with McapWriter(run / f"{end}.mcap", clock=end, clock_id="same") as writer:
             writer.write(part)

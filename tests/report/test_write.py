@@ -5,7 +5,6 @@ from __future__ import annotations
 import builtins
 import json
 import sys
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +12,11 @@ import pytest
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.record.columns import Recording
-from cloudrc.records import Record
 from cloudrc.report.document import Run
 from cloudrc.report.write import write_report
-from tests.metrics.conftest import flown, paper, touch
+from tests.metrics.conftest import good, paper
 
 RUN = Run("virtual", "virtual", "f" * 64)
-
-
-@cache
-def records() -> tuple[list[Record], list[Record]]:
-    log = flown()
-    log.world.append(touch(8))
-    world, cloud = (sorted(r, key=lambda record: record.stamp_ns) for r in (log.world, log.cloud))
-    return world, cloud
-
-
-def _in_memory() -> tuple[Recording, Any]:
-    return Recording.from_records(*records()), paper()[0]
 
 
 def test_without_matplotlib_the_numbers_are_written(
@@ -47,6 +33,6 @@ def test_without_matplotlib_the_numbers_are_written(
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(builtins, "__import__", refuse)
     with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[report\]"):
-        write_report(tmp_path, *_in_memory(), RUN)
+        write_report(tmp_path, Recording.from_records(*good().ends()), paper()[0], RUN)
     assert json.loads((tmp_path / "report.json").read_text())["schemaVersion"] == 1
     assert not (tmp_path / "report.html").exists()

@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import pytest
+
 from cloudrc import assembly
 from cloudrc.cli.client import Api
 from cloudrc.cloud.operator import EmergencyStopRepeater
@@ -432,3 +434,16 @@ def running(**options):
         yield one
     finally:
         one.stop()
+
+
+@pytest.fixture(scope="module")
+def server():
+    with running() as one:
+        yield one
+
+
+@pytest.fixture
+def api(server):
+    """The server of the module, with a robot and a service of the test's own."""
+    server.reset()
+    return server

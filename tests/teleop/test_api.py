@@ -44,18 +44,6 @@ MISSION = {"name": "round", "waypoints": [{"position_m": p, **LEG} for p in (A, 
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 
 
-@pytest.fixture(scope="module")
-def server():
-    with running() as one:
-        yield one
-
-
-@pytest.fixture
-def api(server):
-    server.reset()
-    return server
-
-
 def fly(api, mission=MISSION):
     _, view = api.post("/v1/missions", mission)
     api.until(lambda: api.state_of(view["id"]) == "flying")

@@ -8,23 +8,11 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.teleop import models
-from tests.teleop.conftest import DIRECT, running
+from tests.teleop.conftest import DIRECT
 
 POINT = {"position_m": [0.5, 0.0, 1.0]}
 WEST, BORE, EAST = (-2.5, 0.0, 0.8), (-1.0, 0.0, 0.8), (0.5, 0.0, 0.8)
 """Beside and in pipe 1, which lies from y = 2.5 to -2.5 at x = -1, z = 0.8, 1.3 m wide [m]."""
-
-
-@pytest.fixture(scope="module")
-def server():
-    with running() as one:
-        yield one
-
-
-@pytest.fixture
-def api(server):
-    server.reset()
-    return server
 
 
 def waypoint(**more):
