@@ -127,11 +127,11 @@ def _values(part: BaseModel, above: str = "") -> Iterator[tuple[str, str, str]]:
             yield f"`{key}`", f"`{json.dumps(shown)}`", info.description or ""
 
 
-def table(columns: str, rows: Iterable[tuple[str, ...]]) -> str:
+def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
     """Write a table in Markdown; `columns` are their heads, with bars between them."""
     lines = [f"| {columns} |", f"|{'---|' * len(columns.split('|'))}"]
     for row in rows:
-        lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |")
+        lines.append(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |")
     return "\n".join(lines) + "\n"
 
 
