@@ -34,7 +34,7 @@ def outputs() -> dict[Path, str]:
     found = {
         CHART / "values.yaml": HEAD + values_text(ChartValues()),
         CHART / "values.schema.json": json.dumps(schema(), indent=2) + "\n",
-        CHART / "README.md": readme((CHART / "README.md").read_text()),
+        **insert(CHART / "README.md", table("key | default | meaning", _values(ChartValues()))),
     }
     for folder, source in COPIED.items():
         for path in sorted(source.glob("*.yaml")):
@@ -108,31 +108,30 @@ def _adapt(part: Any) -> Any:
     return kept
 
 
-def readme(page: str) -> str:
-    """Insert the table of values between its marks."""
-    head, mark, rest = page.partition("<!-- values: make docs -->\n")
-    _, end, tail = rest.partition("<!-- end -->")
-    if not end:
-        raise ValueError("README.md: no place for the table of values")
-    rows = ((f"`{key}`", f"`{default}`", text) for key, default, text in _rows(ChartValues()))
-    return f"{head}{mark}{table('key | default | meaning', rows)}{end}{tail}"
+def insert(page: Path, text: str) -> dict[Path, str]:
+    """Put generated text between the marks of a page; the rest is written by hand."""
+    parts = re.split("(<!-- made by `make docs`.*-->\n|<!-- end -->\n)", page.read_text())
+    if len(parts) != 5:
+        raise ValueError(f"{page.name}: no place for generated text")
+    parts[2] = text
+    return {page: "".join(parts)}
 
 
-def _rows(part: BaseModel, above: str = "") -> Iterator[tuple[str, str, str]]:
+def _values(part: BaseModel, above: str = "") -> Iterator[tuple[str, str, str]]:
     for name, info in type(part).model_fields.items():
         value, key = getattr(part, name), f"{above}{info.alias or name}"
         if isinstance(value, BaseModel) and not isinstance(value, (*COMPACT, Experiment)):
-            yield from _rows(value, f"{key}.")
+            yield from _values(value, f"{key}.")
         else:
             shown = {} if isinstance(value, Experiment) else plain(value)
-            yield key, json.dumps(shown), info.description or ""
+            yield f"`{key}`", f"`{json.dumps(shown)}`", info.description or ""
 
 
-def table(columns: str, rows: Iterable[tuple[str, ...]]) -> str:
+def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
     """Write a table in Markdown; `columns` are their heads, with bars between them."""
     lines = [f"| {columns} |", f"|{'---|' * len(columns.split('|'))}"]
     for row in rows:
-        lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |")
+        lines.append(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -1,8 +1,9 @@
 """Write every generated file: `make docs` runs it, a test compares each file with it.
 
-docs/experiment.md comes from the models of `cloudrc/config/schema.py` and the signatures of the
-shipped plug-ins, docs/topics.md from `cloudrc/record/topics.py`, docs/metrics.md from
-`cloudrc/exposition/table.py`, the chart's values, schema and table from `tools/chart_values.py`.
+The tables of docs/experiment.md come from the models of `cloudrc/config/schema.py` and the
+signatures of the shipped plug-ins, those of docs/topics.md from `cloudrc/record/topics.py`; the
+text above the tables is written by hand. docs/metrics.md comes from `cloudrc/exposition/table.py`,
+the chart's values, schema and table from `tools/chart_values.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from cloudrc.config.schema import Direction, Experiment, Mission, Profile
 from cloudrc.exposition import document as metrics
 from cloudrc.record.topics import SAMPLING, TOPICS, Topic
 from tools import chart_docs
-from tools.chart_docs import ROOT, flow, plain, table
+from tools.chart_docs import ROOT, flow, insert, plain, table
 
 PARTS = {
     "mission": "#a-mission",
@@ -32,104 +33,6 @@ PARTS = {
 }
 """Keys whose own keys have a section, and its link."""
 
-EXPERIMENT = """\
-# The experiment file
-
-<!-- Written by `make docs` from cloudrc/config/schema.py: edit that, or tools/docs.py. -->
-
-An experiment file is YAML and says what to fly: the mission, the robot and its guard, the link,
-the controller in the cloud, and what counts as a success. Every key has a default, so a file
-contains only the keys with other values. This is a complete file:
-
-<!-- test: my_experiment.yaml -->
-```yaml
-description: Two points over LTE, the uplink slower than usual
-seed: 7
-mission:                           # inline; or a name: pipes, steps, hover; or ./my_mission.yaml
-  waypoints:
-    - {position_m: [1.0, 0.0, 1.2]}
-    - {position_m: [1.0, 1.0, 1.2], dwell_s: 2.0}
-world: {scene: empty}
-link:
-  profile: lte                     # a shipped profile; or ./my_profile.yaml
-  uplink: {delay_ms: 60}           # this value replaces the profile's
-cloud:
-  estimator: split                 # a shipped plug-in; or ./my_estimator.py
-  controller: {name: pid, gain_p: [1.0, 1.0, 1.5]}   # a plug-in with parameters
-criteria: {contact: false}
-```
-
-```bash
-cloudrc run ./my_experiment.yaml --mode virtual
-cloudrc run ./my_experiment.yaml --mode virtual --set seed=8 --set link.profile=satellite
-```
-
-- **Names and paths.** `cloudrc run steps` flies a shipped experiment, `cloudrc run ./mine.yaml`
-  flies your own file. A mission, a link profile, a plug-in, a robot or a scene is given by a
-  shipped name or by a path. A text is a path if it contains a slash or ends in `.yaml` (plug-ins:
-  `.py`; robots and scenes: `.xml`).
-- **Relative paths** start at the folder of the file that contains them. In `--set` they start at
-  the working folder.
-- **`--set key=value`** sets one value after the file is read. Dots separate the parts of the key;
-  the value is YAML. You may give the option several times, in any order.
-  - A number selects an entry of a list (`mission.waypoints.0.dwell_s=2`). The first unused number
-    appends an entry.
-  - A name may have parameters. With `controller: pid`, the key `cloud.controller.speed_max=2` keeps
-    the name `pid` and sets a parameter of `pid`.
-- **Precedence.** A value under `link.uplink` or `link.downlink` replaces the value of the profile.
-  A value of `--set` replaces the value of any file.
-- **Errors.** An unknown key, a wrong type, a value out of range, NaN or infinity is refused before
-  anything flies. The message names the line and the nearest known key.
-- **Units** are in the name of a key and in the tables. Every delay of a link is one way.
-- **The run's folder** contains `config.yaml`: the experiment with every value filled in.
-  `cloudrc run` with this file flies the same run again.
-
-The Helm chart takes the same keys under `experiment`. `cloudrc list` prints all shipped names.
-"""
-
-TOPIC_HEAD = """\
-# The topics of a recording
-
-<!-- Written by `make docs` from cloudrc/record/topics.py: edit that, or tools/docs.py. -->
-
-`mission.mcap` contains ROS 2 messages (encoded as CDR). Foxglove and Lichtblick open this file.
-Python reads the file without ROS:
-
-```python
-from pathlib import Path
-
-from cloudrc.record.columns import Recording
-
-recording = Recording.read(Path("runs/latest/mission.mcap"))
-recording["/odometry"]["position"]  # numpy, shape (n, 3)
-```
-
-Every topic is a table with one message per row. The first column is `stamp_ns` [ns]; the sections
-below list the other columns of each topic. An `int` is an int64, a `float` is a float64. A
-`vector` has three floats, a `quaternion` has four (wxyz).
-
-- **Clocks.** Each end writes its own file (`world.mcap`, `cloud.mcap`) with stamps of its own
-  monotonic clock; the sections below name this clock. `mission.mcap` merges both files. In
-  `mission.mcap`, `stamp_ns` of every row is converted to world's clock. Stamps in other columns are
-  not converted: the meaning of the column names the clock.
-- **Frames.** World frame: x forward, y left, z up. Body frame: the same axes, fixed to the robot.
-- **Modes.** `/link`, `/link_check` and `/lateness` exist in real time only. In a cluster, topics
-  with a row per period or per datagram are recorded only during a flight and for 90 s after the
-  flight.
-- **Messages.** The stamp in the header of a message is `stamp_ns`, the frame is `world`. Messages
-  of `cloudrc_msgs` have one field per column. In messages of ROS itself, the columns are in these
-  fields:
-
-| message | column | field |
-|---|---|---|
-| `nav_msgs/msg/Odometry` | `position` | `pose.pose.position` |
-| | `orientation_wxyz` | `pose.pose.orientation`, in ROS's order xyzw |
-| | `velocity` | `twist.twist.linear`, in the frame `base_link` as ROS requires |
-| | `angular_velocity_body` | `twist.twist.angular`; NaN where the topic has no such column |
-| `geometry_msgs/msg/TwistStamped` | `reference` or `command` | `twist.linear` |
-| | `yaw_rate` | `twist.angular.z` |
-| `geometry_msgs/msg/PointStamped` | `setpoint` | `point` |
-"""
 ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
 CLOCKS = {
     "world": "on world's clock",
@@ -141,8 +44,8 @@ CLOCKS = {
 def outputs() -> dict[Path, str]:
     """Make everything that `make docs` writes: file -> text."""
     pages = {
-        ROOT / "docs" / "experiment.md": experiment_page(),
-        ROOT / "docs" / "topics.md": topics_page(),
+        **insert(ROOT / "docs" / "experiment.md", _experiment()),
+        **insert(ROOT / "docs" / "topics.md", _topics()),
         ROOT / "docs" / "metrics.md": metrics.page(),
     }
     return pages | chart_docs.outputs()
@@ -153,10 +56,10 @@ def leftovers() -> list[Path]:
     return [path for path in (chart_docs.CHART / "files").glob("*/*.yaml") if path not in outputs()]
 
 
-def experiment_page() -> str:
-    """Write the page of all keys of an experiment, a mission and a link profile."""
+def _experiment() -> str:
+    """Write the tables of all keys of an experiment, a mission and a link profile."""
     own = [key for key, info in Experiment.model_fields.items() if not _is_section(info.annotation)]
-    blocks = [EXPERIMENT, "## Top level\n", _keys(Experiment, own)]
+    blocks = ["\n## Top level\n", _keys(Experiment, own)]
     for key, info in Experiment.model_fields.items():
         if _is_section(info.annotation):
             blocks += [f"## `{key}`\n", _summary(info.annotation), _keys(Experiment, [key])]
@@ -261,9 +164,9 @@ def _shipped() -> str:
     return "\n".join(blocks)
 
 
-def topics_page() -> str:
-    """Write the page of all topics."""
-    blocks = [TOPIC_HEAD, "## All topics\n", table(*_overview())]
+def _topics() -> str:
+    """Write the tables of all topics."""
+    blocks = ["\n## All topics\n", table(*_overview())]
     for topic in TOPICS.values():
         text = re.sub(r", (world's clock|cloud's clock|clock of its end)", "", topic.text)
         blocks += [f"## `{topic.name}`\n", f"{text}.\n", _facts(topic)]

@@ -17,6 +17,7 @@ from typing import Any
 
 from cloudrc.faults.report import search_rows, search_summary
 from cloudrc.report.document import environment_document, write_json
+from tools.chart_docs import table
 
 Rows = Iterable[Iterable[object]]
 
@@ -80,10 +81,7 @@ def fault_rows(folder: Path) -> Rows:
 
 def section(title: str, head: Iterable[str], rows: Rows) -> str:
     """Lay out a section with a table."""
-    head = list(head)
-    lines = [" | ".join(str(cell).replace("|", "\\|") for cell in row) for row in rows]
-    table = [" | ".join(head), "|".join(["---"] * len(head)), *lines]
-    return "\n".join([f"## {title}\n", *(f"| {line} |" for line in table), ""])
+    return f"## {title}\n\n{table(' | '.join(head), rows)}"
 
 
 def page(folder: Path, here: dict[str, Any], found: list[dict[str, Any]]) -> str:

@@ -110,9 +110,7 @@ auto
   {{- include "cloudrc.probes" "link-metrics" | nindent 2 }}
   terminationMessagePolicy: FallbackToLogsOnError
   {{- if eq $mode "relay" }}
-  {{- with include "cloudrc.containerSecurity" .root }}
-  {{- . | nindent 2 }}
-  {{- end }}
+  {{- include "cloudrc.containerSecurity" .root | nindent 2 }}
   {{- else }}
   securityContext:
     allowPrivilegeEscalation: false

@@ -38,9 +38,7 @@
         fieldRef:
           fieldPath: {{ .uid }}
   terminationMessagePolicy: FallbackToLogsOnError
-  {{- with include "cloudrc.containerSecurity" .root }}
-  {{- . | nindent 2 }}
-  {{- end }}
+  {{- include "cloudrc.containerSecurity" .root | nindent 2 }}
   resources:
     {{- toYaml .root.Values.mission.resources | nindent 4 }}
   volumeMounts:
