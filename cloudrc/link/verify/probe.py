@@ -50,8 +50,7 @@ def plan_probes(
     trains, which it draws out. `drawn`: the shaper draws its own chance, as netem does.
     """
     timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
-    pieces = [timeline.at(start_ns).rate or inf for start_ns in timeline.starts_ns]
-    if (rate := min(pieces)) <= RATE_MAX:
+    if (rate := min(piece.rate or inf for piece in timeline.pieces)) <= RATE_MAX:
         flow = flow._replace(size=TRAIN_SIZE)
         wire = (TRAIN_SIZE + HEADER_BYTES) * 8.0 / rate
         train = max(4, min(64, profile.queue_packets // 2, ceil(TRAIN_SPAN / wire)))
@@ -63,7 +62,7 @@ def plan_probes(
         starts = FIRST_PROBE + np.arange(ceil(max(time, 2 * step) / length)) * length
         return Plan(profile, flow, (starts[:, None] + block).ravel(), train)
 
-    last = timeline.starts_ns[-1] * 1e-9
+    last = timeline.last_ns * 1e-9
     found = plan(seconds or max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
     if drawn and not last and not seconds:
         found = plan(max(COUNT * step, min(needed(found) * step, LONGEST)))
