@@ -191,6 +191,7 @@ class Timeline:
 
     Attributes:
         pieces: The pieces of the time line; of a looping time line, those of one pass.
+        pass_ns: Start of each of these pieces, as time since the link came up, rising [ns].
         period_ns: Length of one pass of a looping time line [ns]; None if the time line does not
             loop.
     """
@@ -206,14 +207,14 @@ class Timeline:
         self.period_ns = None if period is None else round(period * 1e9)
         if self.period_ns is not None:
             ordered = [instant for instant in ordered if round(instant * 1e9) < self.period_ns]
-        self._pass_ns = [round(instant * 1e9) for instant in ordered]
+        self.pass_ns = [round(instant * 1e9) for instant in ordered]
         self.pieces = [_conditions(profile, instant) for instant in ordered]
 
     def at(self, elapsed_ns: int) -> Conditions:
         """Return the conditions `elapsed_ns` [ns] after the link came up."""
         if self.period_ns is not None and elapsed_ns > 0:
             elapsed_ns %= self.period_ns
-        return self.pieces[max(bisect_right(self._pass_ns, elapsed_ns) - 1, 0)]
+        return self.pieces[max(bisect_right(self.pass_ns, elapsed_ns) - 1, 0)]
 
     @cached_property
     def starts_ns(self) -> list[int]:
@@ -222,15 +223,15 @@ class Timeline:
         A looping time line is unrolled over `LOOP_SPAN`.
         """
         if self.period_ns is None:
-            return self._pass_ns
+            return self.pass_ns
         passes = ceil(LOOP_SPAN * 1e9 / self.period_ns)
-        count = min(passes, max(LOOP_PIECES // len(self._pass_ns), 1))
-        return [n * self.period_ns + start_ns for n in range(count) for start_ns in self._pass_ns]
+        count = min(passes, max(LOOP_PIECES // len(self.pass_ns), 1))
+        return [n * self.period_ns + start_ns for n in range(count) for start_ns in self.pass_ns]
 
     @property
     def last_ns(self) -> float:
         """When the conditions change for the last time [ns]; infinite for a looping time line."""
-        return self._pass_ns[-1] if self.period_ns is None else inf
+        return self.pass_ns[-1] if self.period_ns is None else inf
 
     def only(self) -> Conditions | None:
         """Return the conditions if they never change, otherwise None."""
