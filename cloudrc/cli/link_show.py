@@ -144,20 +144,21 @@ def _way(
     from cloudrc.report.figures.link import DirectionSample
 
     profile = link_profile(asked)
-    starts_ns = Timeline(profile).starts_ns
+    timeline = Timeline(profile)
     seed, rate = options.seed, options.rate
     if profile.trace is not None and options.seconds is None:
         shown = _rows(profile, profile.trace, name, seed)
     else:
-        seconds = options.seconds or max(SECONDS, 1.1e-9 * starts_ns[-1])
+        seconds = options.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
         if seconds * rate > PACKETS_MAX:
             raise BadInputError(
                 f"{seconds:g} s at {rate:g} packets a second are more than {PACKETS_MAX} packets; "
                 "give less with --seconds or --rate"
             )
         shown = stream(profile, name, seed, round(seconds * rate), rate)
-    steady = len(starts_ns) == 1
-    many = stream(profile, name, seed, options.packets, rate) if steady else shown
+    many = shown
+    if timeline.only() is not None:
+        many = stream(profile, name, seed, options.packets, rate)
     counted = numbers(many)
     return DirectionSample(asked, shown.sent, shown.delays, many.delays, counted.runs), counted
 

@@ -223,10 +223,6 @@ def refuse_others(lines: list[str], name: str) -> None:
             raise BadInputError(f"{name}: {what}")
 
 
-class _NoStampsError(Exception):
-    """Report that a log of irtt has no one-way delays."""
-
-
 def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool) -> Packets:
     """Read the output of `irtt client -o FILE.json`.
 
@@ -260,8 +256,6 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
             _check_clocks(trips, name)
         log.entries = _irtt_entries(trips, "halves" if halve or not direction else direction)
         log.halved = halve
-    except _NoStampsError:
-        raise _refusal(f"{name} (irtt's server sent no stamps)") from None
     except _MISSHAPEN as error:
         raise BadInputError(
             f"{name}: not a log of irtt ({type(error).__name__}: {error}); "
@@ -285,10 +279,12 @@ def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log
 
 
 def _check_clocks(trips: list[dict[str, Any]], name: str) -> None:
-    """Reject one-way delays if the clocks differ or step; check both directions."""
+    """Reject one-way delays that are missing, or if the clocks differ or step, in both ways."""
     arrived = [trip for trip in trips if _lost(trip) == "false"]
+    if any(not {"send", "receive"} <= trip["delay"].keys() for trip in arrived):
+        raise _refusal(f"{name} (irtt's server sent no stamps)")
     least = min(
-        (_delay(trip, key) or 0 for trip in arrived for key in ("send", "receive")), default=0
+        (int(trip["delay"][key]) for trip in arrived for key in ("send", "receive")), default=0
     )
     if least < 0:
         early = f"a packet arrived {-least * 1e-6:.4g} ms before it was sent"
@@ -357,11 +353,7 @@ def _lost(trip: dict[str, Any]) -> str:
 
 def _delay(trip: dict[str, Any], key: str) -> int | None:
     """Return a delay of a packet [ns]; None if it was lost."""
-    if _lost(trip) != "false":
-        return None
-    if key not in trip["delay"]:
-        raise _NoStampsError
-    return int(trip["delay"][key])
+    return int(trip["delay"][key]) if _lost(trip) == "false" else None
 
 
 def _refusal(name: str) -> BadInputError:

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass, replace
-from math import ceil
+from functools import cached_property
+from math import ceil, inf
 from typing import Literal, NamedTuple, TypeAlias
 
 
@@ -189,10 +190,10 @@ class Timeline:
     """The conditions of one direction over time.
 
     Attributes:
-        starts_ns: Start of each piece, as time since the link came up, rising [ns]. A looping time
-            line is unrolled over `LOOP_SPAN`.
-        period_ns: Length of the unrolled time line [ns], after which it begins again; None if the
-            time line does not loop.
+        pieces: The pieces of the time line; of a looping time line, those of one pass.
+        pass_ns: Start of each of these pieces, as time since the link came up, rising [ns].
+        period_ns: Length of one pass of a looping time line [ns]; None if the time line does not
+            loop.
     """
 
     def __init__(self, profile: DirectionProfile) -> None:
@@ -202,35 +203,44 @@ class Timeline:
         for blackout in profile.blackouts:
             instants.update((blackout.start, blackout.start + blackout.duration))
         ordered = sorted(instants)
-        self.starts_ns = [round(instant * 1e9) for instant in ordered]
-        self._pieces = [_conditions(profile, instant) for instant in ordered]
         period = profile.trace.period if profile.trace else None
-        self.period_ns = None if period is None else self._repeat(round(period * 1e9))
+        self.period_ns = None if period is None else round(period * 1e9)
+        if self.period_ns is not None:
+            ordered = [instant for instant in ordered if round(instant * 1e9) < self.period_ns]
+        self.pass_ns = [round(instant * 1e9) for instant in ordered]
+        self.pieces = [_conditions(profile, instant) for instant in ordered]
 
     def at(self, elapsed_ns: int) -> Conditions:
         """Return the conditions `elapsed_ns` [ns] after the link came up."""
         if self.period_ns is not None and elapsed_ns > 0:
             elapsed_ns %= self.period_ns
-        return self._pieces[max(bisect_right(self.starts_ns, elapsed_ns) - 1, 0)]
+        return self.pieces[max(bisect_right(self.pass_ns, elapsed_ns) - 1, 0)]
 
-    def _repeat(self, period_ns: int) -> int:
-        """Unroll a looping time line over `LOOP_SPAN`; return the length of the result [ns]."""
-        pieces = list(zip(self.starts_ns, self._pieces, strict=True))
-        pieces = [(start_ns, piece) for start_ns, piece in pieces if start_ns < period_ns]
-        count = min(ceil(LOOP_SPAN * 1e9 / period_ns), max(LOOP_PIECES // len(pieces), 1))
-        self.starts_ns = [n * period_ns + start_ns for n in range(count) for start_ns, _ in pieces]
-        self._pieces = [piece for _ in range(count) for _, piece in pieces]
-        return count * period_ns
+    @cached_property
+    def starts_ns(self) -> list[int]:
+        """Start of each piece, as time since the link came up, rising [ns].
+
+        A looping time line is unrolled over `LOOP_SPAN`.
+        """
+        if self.period_ns is None:
+            return self.pass_ns
+        passes = ceil(LOOP_SPAN * 1e9 / self.period_ns)
+        count = min(passes, max(LOOP_PIECES // len(self.pass_ns), 1))
+        return [n * self.period_ns + start_ns for n in range(count) for start_ns in self.pass_ns]
+
+    @property
+    def last_ns(self) -> float:
+        """When the conditions change for the last time [ns]; infinite for a looping time line."""
+        return self.pass_ns[-1] if self.period_ns is None else inf
 
     def only(self) -> Conditions | None:
         """Return the conditions if they never change, otherwise None."""
-        return self._pieces[0] if len(self._pieces) == 1 else None
+        return self.pieces[0] if len(self.pieces) == 1 else None
 
 
 def settled(profile: DirectionProfile) -> DirectionProfile:
     """Return a constant profile: the conditions after the end of a profile's time line."""
-    timeline = Timeline(profile)
-    last = timeline.at(timeline.starts_ns[-1])
+    last = Timeline(profile).pieces[-1]
     return replace(
         profile,
         delay=last.delay_ns * 1e-9,

@@ -264,7 +264,7 @@ class Sidecar:
             return None
         state, profile = self._in_force
         elapsed_ns = self._machine.clock() - (state.origin_ns or 0)
-        over = elapsed_ns >= Timeline(profile).starts_ns[-1]
+        over = elapsed_ns >= Timeline(profile).last_ns
         return Told(state.shaper, state.reason, settled(profile) if over else None)
 
     def _check_netem(self) -> None:

@@ -221,7 +221,7 @@ _TABLE_END = 4.0
 
 def check(profile: DirectionProfile) -> None:
     """Raise a BadInputError if netem cannot realise a profile; the text names the reason."""
-    pieces = _pieces(profile)
+    pieces = Timeline(profile).pieces
     if profile.trace is not None and profile.trace.loop:
         _refuse("loop", "a trace that begins again")
     if any(isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces):
@@ -298,7 +298,7 @@ def limit(profile: DirectionProfile) -> int:
     The limit is the same along the whole time line. Otherwise a step to a shorter delay would drop
     packets, because packets with the longer delay are still under way.
     """
-    pieces = _pieces(profile)
+    pieces = Timeline(profile).pieces
     if all(piece.rate is None for piece in pieces):
         return LIMIT
     reach, most = stretch(profile) * _TABLE_END, 0.0
@@ -306,11 +306,6 @@ def limit(profile: DirectionProfile) -> int:
         longest = piece.delay_ns * 1e-9 + piece.jitter * reach
         most = max(most, longest * (piece.rate / _PACKET_BITS if piece.rate else _PACKETS))
     return ceil(profile.queue_packets + most)
-
-
-def _pieces(profile: DirectionProfile) -> list[Conditions]:
-    timeline = Timeline(profile)
-    return [timeline.at(start_ns) for start_ns in timeline.starts_ns]
 
 
 def _loss(loss: Loss) -> list[str]:

@@ -249,3 +249,10 @@ ENDLESS = {"lost": "false", "timestamps": {"client": {"send": {"wall": float("in
 def test_other_json_is_refused(text: str) -> None:
     with pytest.raises(BadInputError, match="not a log of irtt"):
         read_irtt(text, "x", "uplink", halve=False)
+
+
+def test_a_log_of_irtt_without_round_trips_is_not_told_to_halve_them() -> None:
+    torn = trip(0)
+    del torn["delay"]["rtt"]
+    with pytest.raises(BadInputError, match=r"not a log of irtt \(KeyError: 'rtt'"):
+        irtt([torn])

@@ -15,7 +15,7 @@ from cloudrc.cli.link_run import EMPTY_STATUS, LinkStatusSource
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link import sidecar
 from cloudrc.link.follow import Loaded
-from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott
+from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott, Trace
 from cloudrc.link.profile import Change as Step
 from cloudrc.link.sidecar import Mode, Near, Told, look_near, read_told, write_told
 from cloudrc.link.state import Change, publish
@@ -277,6 +277,14 @@ def test_while_a_time_line_runs_nothing_is_applied(tmp_path: Path) -> None:
     assert running.applied is None
     assert over is not None
     assert over.applied == DirectionProfile(0.08, 0.01)
+
+
+def test_a_time_line_that_loops_is_never_over(tmp_path: Path) -> None:
+    """Once it counted as over after an hour, with its last row in force."""
+    looping = DirectionProfile(trace=Trace((0.0, 1.0), (0.040, 0.050), loop=True))
+    (later,) = statuses(Bench(tmp_path, "relay", profile=looping), 3700.0)
+    assert later is not None
+    assert later.applied is None
 
 
 def test_tools_are_started_at_most_once_a_second(tmp_path: Path) -> None:

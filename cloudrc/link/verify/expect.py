@@ -187,8 +187,10 @@ class Plan:
 def requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
     """Return the delay that a profile requests at each time since the link came up [s]."""
     timeline = Timeline(profile)
-    starts = np.array(timeline.starts_ns) * 1e-9
-    delays = np.array([timeline.at(start_ns).delay_ns for start_ns in timeline.starts_ns]) * 1e-9
+    if timeline.period_ns is not None:
+        sent = np.where(sent > 0.0, sent % (timeline.period_ns * 1e-9), sent)
+    starts = np.array(timeline.pass_ns) * 1e-9
+    delays = np.array([piece.delay_ns for piece in timeline.pieces]) * 1e-9
     found: Floats = delays[np.maximum(np.searchsorted(starts, sent, side="right") - 1, 0)]
     return found
 

@@ -60,7 +60,7 @@ class LinkMonitor:
         self._asked: Asked | None = None
         self._plans: list[Plan] = []  # of what is received, and of the other direction
         self._epoch, self._trip, self._fresh, self._seen = -1, nan, True, ""
-        self._since_ns = self._due_ns = 0
+        self._since_ns, self._due_ns = 0.0, 0
         self._suspects, self._complained = set[str](), False
         self._pause: Callable[[], None] = lambda: None
         self._inbox: queue.SimpleQueue[tuple[Sequence[Record], int]] | None = None
@@ -133,7 +133,7 @@ class LinkMonitor:
         if self._asked is None:
             return []
         if self._fresh:  # a time line that runs is not judged: where it began is not known here
-            lengths_ns = [Timeline(profile).starts_ns[-1] for profile in self._asked]
+            lengths_ns = [Timeline(profile).last_ns for profile in self._asked]
             self._since_ns = now_ns + SETTLE_NS + max(lengths_ns)
             self._due_ns = now_ns + SETTLE_NS + CHECK_NS
             self._fresh, self._suspects = False, set()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import select
 import socket
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,6 +18,7 @@ import numpy as np
 
 from cloudrc.link.model import HEADER_BYTES, Stream
 from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.relay import ANCILLARY_SIZE, DATAGRAM_MAX, Stamps, ask_for_stamps
 from cloudrc.link.verify.expect import Flow, Plan
 from cloudrc.link.verify.judge import needed
 from cloudrc.tunnel.codec import Direction, encode_header, peek
@@ -38,7 +38,7 @@ RATE_MAX = 1e8
 """Highest rate that this process can measure [bit/s]."""
 TRAIN_SIZE, TRAIN_SPAN = 1400, 0.06
 """UDP payload of a probe of a train [bytes], one Ethernet frame, and time of a train [s]."""
-_SO_TIMESTAMPNS, _BUFFER, _DATAGRAM_MAX, _DRAIN = 35, 4_000_000, 2048, 64
+_BUFFER, _DRAIN = 4_000_000, 64
 
 
 def plan_probes(
@@ -50,8 +50,7 @@ def plan_probes(
     trains, which it draws out. `drawn`: the shaper draws its own chance, as netem does.
     """
     timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
-    pieces = [timeline.at(start_ns).rate or inf for start_ns in timeline.starts_ns]
-    if (rate := min(pieces)) <= RATE_MAX:
+    if (rate := min(piece.rate or inf for piece in timeline.pieces)) <= RATE_MAX:
         flow = flow._replace(size=TRAIN_SIZE)
         wire = (TRAIN_SIZE + HEADER_BYTES) * 8.0 / rate
         train = max(4, min(64, profile.queue_packets // 2, ceil(TRAIN_SPAN / wire)))
@@ -63,7 +62,7 @@ def plan_probes(
         starts = FIRST_PROBE + np.arange(ceil(max(time, 2 * step) / length)) * length
         return Plan(profile, flow, (starts[:, None] + block).ravel(), train)
 
-    last = timeline.starts_ns[-1] * 1e-9
+    last = timeline.last_ns * 1e-9
     found = plan(seconds or max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
     if drawn and not last and not seconds:
         found = plan(max(COUNT * step, min(needed(found) * step, LONGEST)))
@@ -78,11 +77,11 @@ class ProbeEnd:
     ) -> None:
         """Set up; `route` is where it sends, `origin_ns` when the link came up, wall clock [ns]."""
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        if sys.platform == "linux":
-            own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        ask_for_stamps(own)
         self.socket, self.plan, self._route, self._origin_ns = own, plan, route, origin_ns
         late = max(0.0, (time.time_ns() - origin_ns) * 1e-9 + 0.05 - float(plan.sent[0]))
         self._due_ns = (origin_ns + np.rint((plan.sent + late) * 1e9)).astype(np.int64).tolist()
+        self._stamps = Stamps()
         self._sent_ns, self._arrivals = list[int](), list[tuple[int, int]]()
 
     def data(self, number: int) -> bytes:
@@ -114,16 +113,12 @@ class ProbeEnd:
         """Note the probes of this end that wait in the other end's socket, nothing else."""
         for _ in range(_DRAIN):
             try:
-                data, ancillary, _, _ = own.recvmsg(_DATAGRAM_MAX, 64)
+                data, ancillary, _, _ = own.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
             except BlockingIOError:
                 return
             except OSError:  # an earlier probe found nobody listening
                 continue
-            at_ns = time.time_ns()
-            for _, kind, stamp in ancillary:
-                if kind == _SO_TIMESTAMPNS:
-                    parts = (int.from_bytes(one, sys.byteorder) for one in (stamp[:8], stamp[8:16]))
-                    at_ns = next(parts) * 1_000_000_000 + next(parts)
+            at_ns = self._stamps.wall_ns(ancillary) or time.time_ns()
             with suppress(ValueError):
                 number = peek(data)[2]
                 if number < len(self._sent_ns) and data == self.data(number):

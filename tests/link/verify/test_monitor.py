@@ -13,7 +13,7 @@ import pytest
 
 from cloudrc.config.shipped import names
 from cloudrc.exposition.ends import LinkVerdict
-from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.profile import DirectionProfile, Trace
 from cloudrc.link.state import STATE_MAX
 from cloudrc.link.verify.monitor import KEPT, Asked, LinkMonitor
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
@@ -147,6 +147,16 @@ def test_a_new_profile_is_judged_from_then_on() -> None:
     moments, faults = checked(monitor, later)
     assert faults == []
     assert moments[-1]["mean"].asked == pytest.approx(0.120, abs=1e-3)
+
+
+def test_a_time_line_that_loops_is_not_judged_after_an_hour_either() -> None:
+    looping = replace(PAPER, trace=Trace((0.0, 1.0), (0.040, 0.120), loop=True))
+    monitor = hearing(looping, looping)
+    hour = [one._replace(stamp_ns=one.stamp_ns + 3_700_000_000_000) for one in arrivals(PAPER)]
+    moments, faults = checked(monitor, [*arrivals(PAPER, 1.0), *hour])
+    assert faults == []
+    assert moments
+    assert set(moments[-1]) == {"datagrams", "time_line"}
 
 
 @pytest.mark.parametrize("gap", [20_000, 10**6, 10**18])
