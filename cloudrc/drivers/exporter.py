@@ -1,9 +1,9 @@
 """Serve the metrics and probes of a process over HTTP.
 
     exporter = Exporter("world")
-    exporter.serve("127.0.0.1:9100")    /metrics, /healthz and /readyz, on separate threads
-    exporter.see(records)               on the loop's thread: less than 1 us per record
-    exporter.ready(True)                only in a process that is not an end of the tunnel
+    exporter.serve(("127.0.0.1", 9100))  /metrics, /healthz and /readyz, on separate threads
+    exporter.see(records)                on the loop's thread: less than 1 us per record
+    exporter.ready(True)                 only in a process that is not an end of the tunnel
 
 `see` updates plain numbers. A scrape turns these numbers into Prometheus' text, at most four times
 a second.
@@ -296,8 +296,8 @@ class Exporter:
         """Whether `ready` was set or, for an end of the tunnel, its peer has answered."""
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
-    def serve(self, address: str | tuple[str, int]) -> int:
-        """Start to answer on HOST:PORT.
+    def serve(self, address: tuple[str, int]) -> int:
+        """Start to answer at a host and port.
 
         Returns:
             The port; for port 0, the port that the kernel has chosen.
@@ -305,9 +305,6 @@ class Exporter:
         Raises:
             MissingPrerequisiteError: If the address cannot be bound.
         """
-        if isinstance(address, str):
-            host, _, port = address.rpartition(":")
-            address = host, int(port)
         pages = {"/metrics": self._page, "/healthz": self._liveness, "/readyz": self._readiness}
         end, link = self._live.end, self._live.link
         if end is not None:

@@ -140,8 +140,8 @@ START_LIMIT = 60.0
 STOP_LIMIT = 1.5
 """Time limit for a process to end after SIGTERM [s]; then the process is killed."""
 SILENCE_LIMIT = 5.0
-"""A process counts as hung when no line of its feed arrives for this long [s]. World and cloud send
-records all the time, relay and teleop send a sign of life every second."""
+"""A process counts as hung when no line of its feed arrives for this long [s]. Every process sends
+a sign of life every second."""
 PAUSE = 1.0
 """If a turn of the supervisor's loop takes longer than this, the supervisor itself stood still [s]:
 it was stopped, or this machine is overloaded."""
@@ -177,7 +177,7 @@ class Child:
         process: The process, running or ended.
         log: File with the process's standard error.
         unread: Start of a feed line whose end has not arrived yet.
-        heard: When the last line of the feed arrived [s], monotonic clock; None before the flight.
+        heard: When the last line of the feed arrived [s], monotonic clock.
         ready: Whether the process can receive.
         garbled: Whether the process has written a line that is not a record.
     """
@@ -186,7 +186,7 @@ class Child:
     process: subprocess.Popen[bytes]
     log: Path
     unread: bytes = field(default=b"")
-    heard: float | None = field(default=None)
+    heard: float = field(default=0.0)
     ready: bool = field(default=False)
     garbled: bool = field(default=False)
 
@@ -263,6 +263,7 @@ class LocalRun:
             self._start_teleop(sockets)
             self._wait_until_ready()
             self._start_end("cloud", cloud, from_cloud, f"--teleop={sockets}")
+            self._wait_until_ready()
             self._watch(limit)
         finally:
             self._stop()
@@ -313,7 +314,7 @@ class LocalRun:
         while waiting := [child.name for child in self._children if not child.ready]:
             if deadline.passed():
                 raise TimedOutError(f"{' and '.join(waiting)}: not ready within {START_LIMIT:g} s")
-            self._listen()
+            self._see(self._listen())
             self._check_alive()
 
     def _watch(self, limit: float) -> None:
@@ -361,7 +362,7 @@ class LocalRun:
     def _check_silence(self) -> None:
         now = time.monotonic()
         for child in self._children:
-            if child.heard is not None and now - child.heard > SILENCE_LIMIT:
+            if now - child.heard > SILENCE_LIMIT:
                 raise TimedOutError(
                     f"the {child.name} process was silent for {SILENCE_LIMIT:g} s and was ended; "
                     f"see {child.log}"

@@ -239,7 +239,8 @@ def run_end(
     thread.start()
     feed.ready()
     try:
-        serve(endpoint, peer, end=end, sink=sink, stop=lambda: stop() or over(), slip_ns=slip_ns)
+        ends = feed.alive_while(lambda: stop() or over())
+        serve(endpoint, peer, end=end, sink=sink, stop=ends, slip_ns=slip_ns)
     finally:
         sink.record_losses(time.monotonic_ns() - slip_ns())
         thread.stop()

@@ -78,8 +78,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
         Offset 0 if both files name the same clock; else the centre of the interval that the packets
         allow; without packets in both directions, the difference of the first stamps.
     """
-    clock_id = world.metadata.get("clock_id")
-    if clock_id and clock_id == cloud.metadata.get("clock_id"):
+    if _share_clock(world, cloud):
         return SAME_CLOCK
     uplink = _smallest_difference(world["/telemetry"], cloud["/uplink_delay"])
     downlink = _smallest_difference(cloud["/delay_estimate"], world["/downlink_delay"])
@@ -88,6 +87,11 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
     # uplink = d1 - offset and downlink = d2 + offset, where d1, d2 >= 0 are one-way delays.
     uncertainty_ns = (abs(downlink + uplink) + 1) // 2
     return ClockOffset((downlink - uplink) // 2, uncertainty_ns, "packets")
+
+
+def _share_clock(world: Recording | Contents, cloud: Recording | Contents) -> bool:
+    clock_id = world.metadata.get("clock_id")
+    return bool(clock_id) and clock_id == cloud.metadata.get("clock_id")
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
@@ -218,12 +222,12 @@ def merge(world: Path, cloud: Path) -> Mission:
 
 
 def _join(world: Contents, cloud: Contents) -> Mission:
-    of_world = Recording.from_contents(world)
-    offset = clock_offset(of_world, Recording.from_contents(cloud))
     logged_ns = np.array([message[1] for message in cloud.messages], dtype=np.int64)
-    moved_ns = logged_ns + offset.offset_ns
-    if offset == SAME_CLOCK:
-        moved_ns = WorldTime(of_world["/telemetry"]).at(logged_ns)
+    if _share_clock(world, cloud):
+        offset, moved_ns = SAME_CLOCK, WorldTime(_table(world, "/telemetry")).at(logged_ns)
+    else:
+        offset = clock_offset(Recording.from_contents(world), Recording.from_contents(cloud))
+        moved_ns = logged_ns + offset.offset_ns
     moved = [
         (topic, to_ns, shifted(data, to_ns - from_ns))
         for (topic, from_ns, data), to_ns in zip(cloud.messages, moved_ns.tolist(), strict=True)
@@ -273,8 +277,7 @@ def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
 
 def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
     """Find the stamps [ns] of the last mission's start and end; None for a missing stamp."""
-    events = [message for message in contents.messages if message[0] == "/mission"]
-    table = Recording.from_contents(Contents(events))["/mission"]
+    table = _table(contents, "/mission")
     began = ended = None
     for stamp_ns, event in zip(table["stamp_ns"].tolist(), table["event"].tolist(), strict=True):
         if event == "started":
@@ -284,3 +287,9 @@ def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
         elif event in UNDER_WAY and began is None:
             ended = None  # resumed by a new pod: the start is in the old pod's recording
     return began, ended
+
+
+def _table(contents: Contents, topic: str) -> Table:
+    """Decode only one topic; decoding a whole flight takes as long as reading it."""
+    messages = [message for message in contents.messages if message[0] == topic]
+    return Recording.from_contents(Contents(messages))[topic]

@@ -55,7 +55,7 @@ def release(monkeypatch: pytest.MonkeyPatch) -> Iterator[Release]:
 
         def served(role: str) -> tuple[Exporter, str]:
             exporter = open_ones.enter_context(closing(Exporter(role)))
-            return exporter, f"http://127.0.0.1:{exporter.serve('127.0.0.1:0')}"
+            return exporter, f"http://127.0.0.1:{exporter.serve(('127.0.0.1', 0))}"
 
         (world, at_world), (cloud, at_cloud) = served("world"), served("cloud")
         (up, at_up), (down, at_down) = served("link"), served("link")

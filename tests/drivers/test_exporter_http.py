@@ -119,7 +119,7 @@ def test_the_text_is_what_it_says_it_is(served: tuple[Exporter, int]) -> None:
 
 def test_a_port_that_is_taken_is_told_in_one_sentence(served: tuple[Exporter, int]) -> None:
     with pytest.raises(MissingPrerequisiteError) as failure:
-        Exporter("world").serve(f"{HOST}:{served[1]}")
+        Exporter("world").serve((HOST, served[1]))
     assert str(failure.value).startswith(f"metrics port {served[1]} is taken: ")
     assert "\n" not in str(failure.value)
     assert failure.value.exit_code == 3
@@ -127,7 +127,7 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(served: tuple[Exporter, in
 
 def test_an_address_of_another_machine_is_told_likewise() -> None:
     with pytest.raises(MissingPrerequisiteError, match=r"cannot be served on 192\.0\.2\.1:9100: "):
-        Exporter("world").serve("192.0.2.1:9100")
+        Exporter("world").serve(("192.0.2.1", 9100))
 
 
 def test_it_answers_while_many_clients_hang(

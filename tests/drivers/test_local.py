@@ -213,6 +213,16 @@ def test_a_process_that_hangs_ends_the_run_and_is_named(tmp_path, victim):
     assert f"the {victim} process was silent" in errors
 
 
+def test_a_link_that_comes_up_late_ends_no_run(tmp_path):
+    """Without a session world has no telemetry to tell of, but it is alive."""
+    late = f"blackouts=[{{start_s: 0, duration_s: {flights.SILENCE_LIMIT + 1.0}}}]"
+    run = start(tmp_path / "run", f"link.uplink.{late}", f"link.downlink.{late}")
+    wait_until_flying(run)
+    os.kill(run.pid, signal.SIGINT)
+    run.communicate(timeout=60)
+    assert run.returncode == 130
+
+
 def test_a_supervisor_that_stood_still_takes_the_flight_up_again(tmp_path):
     run = start(tmp_path / "run", dwell=8.0)
     wait_until_flying(run)
