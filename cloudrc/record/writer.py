@@ -12,11 +12,13 @@ import errno
 import hashlib
 import json
 import os
+import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from io import BytesIO, FileIO
+from io import FileIO
+from itertools import accumulate, islice, pairwise
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -29,7 +31,7 @@ from cloudrc.records import Record
 
 try:
     import zstandard  # noqa: F401  (mcap imports it, but with a worse error if it is missing)
-    from mcap.data_stream import ReadDataStream, RecordBuilder
+    from mcap.data_stream import RecordBuilder
     from mcap.records import ChunkIndex, DataEnd, Footer, Metadata
     from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 except ImportError as error:
@@ -225,25 +227,46 @@ class McapWriter:
 
 
 class _ChunkIndexes:
-    """The writer's list of the chunks so far, as compressed bytes.
+    """The writer's list of the chunks so far, compressed.
 
-    The list of mcap takes 12 MB for an hour of recording. This list takes a tenth of that.
+    The list of mcap takes 12 MB for an hour of recording. This list takes a third of a megabyte: it
+    stores differences, which compress best.
     """
 
     def __init__(self) -> None:
         self._blocks: list[bytes] = []
         self._compress = zlib.compressobj()
-        self._records: Any = RecordBuilder()  # without type annotations
+        self._before = (0, 0, 0)  # times and position of the last chunk
 
     def append(self, index: ChunkIndex) -> None:
         """Add the index of a chunk."""
-        index.write(self._records)
-        if block := self._compress.compress(self._records.end()):
+        now = (index.message_start_time, index.message_end_time, index.chunk_start_offset)
+        channels = list(index.message_index_offsets)
+        places = [now[2] + index.chunk_length, *index.message_index_offsets.values()]
+        row = (
+            *[value - before for value, before in zip(now, self._before, strict=True)],
+            *(index.chunk_length, index.message_index_length),
+            *(index.compressed_size, index.uncompressed_size),
+            *channels,
+            *[after - before for before, after in pairwise(places)],
+        )
+        self._before = now
+        if block := self._compress.compress(struct.pack(f"<{1 + len(row)}q", len(row), *row)):
             self._blocks.append(block)
 
     def __iter__(self) -> Iterator[ChunkIndex]:
-        data = zlib.decompress(b"".join([*self._blocks, self._compress.copy().flush()]))
-        stream = ReadDataStream(BytesIO(data))
-        while stream.count < len(data):
-            stream.read(1 + 8)  # opcode and length
-            yield ChunkIndex.read(stream)
+        packed = b"".join([*self._blocks, self._compress.copy().flush()])
+        data = zlib.decompress(packed)
+        values = iter(struct.unpack(f"<{len(data) // 8}q", data))
+        first = last = start = 0
+        for size in values:
+            row = list(islice(values, size))
+            first, last, start = first + row[0], last + row[1], start + row[2]
+            length, index_length, compressed, uncompressed = row[3:7]
+            count = (size - 7) // 2
+            places = accumulate(row[7 + count :], initial=start + length)
+            offsets = dict(zip(row[7 : 7 + count], islice(places, 1, None), strict=True))
+            yield ChunkIndex(
+                *(length, start, "zstd", compressed, last, index_length),
+                *(offsets, first, uncompressed),
+            )
