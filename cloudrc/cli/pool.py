@@ -94,9 +94,7 @@ def map_in_order(
         pool = ProcessPoolExecutor(workers, context, exit_with_parent, (os.getpid(),))
     try:
         waiting = iter(work)
-        while (
-            True
-        ):  # in batches: a broken pool accepts no work, and its finished results come first
+        while True:  # a broken pool accepts no work, so finished results come before the next batch
             with _isolated_start():
                 futures = deque(pool.submit(function, each) for each in islice(waiting, BATCH_MAX))
             if not futures:

@@ -261,6 +261,8 @@ def open_store(path: Path, salt: bytes, factory: Any = sqlite3.Connection) -> Mi
         raise BadInputError(f"--journal {path}: is no journal; move it away, or name another file")
     try:
         return MissionStore(connect(path, factory), salt)
+    except sqlite3.OperationalError as error:
+        raise _not_opened(path, error) from None
     except sqlite3.DatabaseError as error:
         aside = _set_aside(path, "damaged")
         reason = " ".join(str(error).split())
@@ -381,6 +383,9 @@ class MissionStore:
         self._log: deque[Event] = deque(maxlen=LOGGED)
         try:
             self._read()
+        except sqlite3.OperationalError:  # the disk fails, which is no damage of the content
+            connection.close()
+            raise
         except (sqlite3.DatabaseError, BadInputError, LookupError, TypeError, ValueError) as error:
             connection.close()
             raise sqlite3.DatabaseError(f"a row cannot be read: {error!r}") from error

@@ -119,6 +119,22 @@ def test_a_damaged_file_is_set_aside_and_named(path, damage):
     assert store.add(ORDER).id == "m1"
 
 
+def test_a_disk_that_fails_is_no_damage(path, monkeypatch):
+    """The missions are kept for the next start."""
+
+    def fail(store):
+        error = sqlite3.OperationalError("disk I/O error")
+        error.sqlite_errorcode = sqlite3.SQLITE_IOERR
+        raise error
+
+    begun(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(MissionStore, "_read", fail)
+        with pytest.raises(BadInputError, match="disk I/O error; free or repair its volume"):
+            open_store(path, b"")
+    assert list(open_store(path, b"").missions) == ["m1"]
+
+
 def test_an_old_journal_is_named_and_not_read(path):
     path.parent.mkdir()
     path.write_bytes(old := b"\x93CRJ\r\n\x1a\n" + bytes(40))
