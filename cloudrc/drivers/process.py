@@ -217,8 +217,7 @@ def run_end(
         peer: Socket of the endpoint.
         recorder: Gets the endpoint's records.
         end: "world" or "cloud".
-        stop: Whether somebody has asked this end to stop. Create `stop` before anything slow, so
-            that no request is missed.
+        stop: Whether somebody has asked this end to stop; create it before anything slow.
         over: Whether this end has finished by itself.
         slip_ns: Lag of world's clock [ns].
         exporter: Turns the records into metrics; None for no metrics.
