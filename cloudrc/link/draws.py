@@ -1,14 +1,13 @@
 """Draw the random impairments of each packet from counter-based random numbers.
 
-All functions are pure, with a cache for speed. Seed, direction, epoch and kind of datagram select a
-stream; the packet's counter is its place in the stream. So the impairment of a packet does not
-depend on earlier calls. The functions draw for blocks of 256 packets, with one column of numbers
-per purpose. A purpose that a profile does not use needs no draws and does not change the numbers of
-other purposes.
+Seed, direction, epoch and kind of datagram select a stream; the packet's counter is its place in
+the stream. So the impairment of a packet does not depend on earlier calls. The functions are pure,
+with a cache for speed, and draw for blocks of 256 packets, with one column of numbers per purpose.
+So a purpose that a profile does not use does not change the numbers of other purposes.
 
 A state that carries over from packet to packet (burst, correlation) restarts from its stationary
 distribution every 64 blocks (16,384 packets, 164 s at 100 Hz). The restart bounds the work for any
-counter, even a forged one. It interrupts the chain once in 16,384 packets.
+counter, even a forged one.
 
 The impairment of a packet is a tuple with one entry per copy that arrives: no entry if the packet
 is lost, two entries if it is duplicated. An entry is OVERTAKES or the sum that jitter and the bad
@@ -31,16 +30,24 @@ from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 
 BLOCK = 256
 """Number of packets whose draws are made together."""
-BLOCK_BITS = 8
-"""How many low bits of a counter give the packet's place in its block."""
 CHAIN_BLOCKS = 64
 """Number of blocks after which states restart."""
+OVERTAKES = -(1 << 62)
+"""Entry of a packet that skips queue and delay (`reorder`)."""
+PARETO_CUT = 1e-3
+"""Share of the Pareto distribution's tail that is cut off [1]."""
 
 _CACHED = 256
 _OUTPUTS_PER_COUNT = 4
 _NORMAL_QUANTILE = NormalDist().inv_cdf
+_HALF_ROOT = sqrt(0.5)
+# Moments of s^(-1/3) for s uniform in (cut, 1).
+_PARETO_MEAN = 1.5 * (1.0 - PARETO_CUT ** (2 / 3)) / (1.0 - PARETO_CUT)
+_PARETO_SQUARE = 3.0 * (1.0 - PARETO_CUT ** (1 / 3)) / (1.0 - PARETO_CUT)
+_PARETO_DEVIATION = sqrt(_PARETO_SQUARE - _PARETO_MEAN**2)
 
 StreamKey: TypeAlias = tuple[int, int]
+Fate: TypeAlias = tuple[int, ...]
 
 
 class Purpose(IntEnum):
@@ -57,17 +64,7 @@ class Purpose(IntEnum):
 
 
 def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
-    """Compute the stream key for one kind of datagram in one session and direction.
-
-    Args:
-        seed: Seed of the experiment.
-        uplink: True for world to cloud.
-        epoch: Epoch of the session.
-        kind: Message type in the header.
-
-    Returns:
-        Key of a Philox generator, two 64-bit words.
-    """
+    """Compute the key of a Philox generator for one kind of datagram in a session and direction."""
     name = f"cloudrc link {seed} {'up' if uplink else 'down'} {epoch} {kind}"
     digest = blake2b(name.encode(), digest_size=16).digest()
     return int.from_bytes(digest[:8], "little"), int.from_bytes(digest[8:], "little")
@@ -75,13 +72,10 @@ def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
 
 @lru_cache(maxsize=_CACHED)
 def uniforms(key: StreamKey, purpose: Purpose, block: int) -> NDArray[np.float64]:
-    """Draw independent uniform variates for the 256 packets of a block.
+    """Draw independent uniform variates for the packets of a block: in (0, 1), shape (256,).
 
     Source: J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011:
     Philox 4x64-10.
-
-    Returns:
-        Variates in the open interval (0, 1), read-only, shape (256,).
     """
     counter = np.array([block * (BLOCK // _OUTPUTS_PER_COUNT), 0, 0, purpose], dtype=np.uint64)
     generator = np.random.Philox(key=np.array(key, dtype=np.uint64), counter=counter)
@@ -94,21 +88,12 @@ def uniforms(key: StreamKey, purpose: Purpose, block: int) -> NDArray[np.float64
 
 @lru_cache(maxsize=_CACHED)
 def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) -> tuple[float, ...]:
-    """Draw standard normal variates, each correlated with its predecessor.
+    """Draw standard normal variates, each correlated with its predecessor, shape (256,).
 
     The variates follow the autoregression z_n = c · z_(n-1) + sqrt(1 - c²) · e_n. So every variate
     is exactly standard normal.
 
     Deviation: tc-netem mixes (1 - c) · new + c · old, which narrows the distribution.
-
-    Args:
-        key: Stream.
-        purpose: Column.
-        block: Number of the block.
-        correlation: c in [0, 1].
-
-    Returns:
-        Shape (256,).
     """
     fresh = map(_NORMAL_QUANTILE, uniforms(key, purpose, block).tolist())
     if not correlation:
@@ -128,44 +113,20 @@ def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) ->
 
 @lru_cache(maxsize=_CACHED)
 def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> tuple[bool, ...]:
-    """Run the two-state chain over the packets of a block.
-
-    Args:
-        key: Stream.
-        block: Number of the block.
-        bad_start: Probability per packet to enter the bad state, in [0, 1].
-        bad_end: Probability per packet to leave the bad state, in [0, 1].
-
-    Returns:
-        True for packets in the bad state, shape (256,).
-    """
+    """Run the two-state chain over a block: True for packets in the bad state, shape (256,)."""
+    if not bad_start:
+        return (False,) * BLOCK
     draws = iter(uniforms(key, Purpose.STATE, block).tolist())
     states = []
     if block % CHAIN_BLOCKS:
         bad = bad_states(key, block - 1, bad_start, bad_end)[-1]
     else:
-        # Start with the stationary share of the bad state; it is 0 if bad_start is 0.
-        bad = bad_start > 0.0 and next(draws) < bad_start / (bad_start + bad_end)
-        states = [bad] if bad_start > 0.0 else []
+        bad = next(draws) < bad_start / (bad_start + bad_end)  # the stationary share
+        states.append(bad)
     for draw in draws:
         bad = draw >= bad_end if bad else draw < bad_start
         states.append(bad)
     return tuple(states)
-
-
-OVERTAKES = -(1 << 62)
-"""Entry of a packet that skips queue and delay (`reorder`)."""
-
-Fate: TypeAlias = tuple[int, ...]
-
-PARETO_CUT = 1e-3
-"""Share of the Pareto distribution's tail that is cut off [1]."""
-
-# Moments of s^(-1/3) for s uniform in (cut, 1).
-_PARETO_MEAN = 1.5 * (1.0 - PARETO_CUT ** (2 / 3)) / (1.0 - PARETO_CUT)
-_PARETO_SQUARE = 3.0 * (1.0 - PARETO_CUT ** (1 / 3)) / (1.0 - PARETO_CUT)
-_PARETO_DEVIATION = sqrt(_PARETO_SQUARE - _PARETO_MEAN**2)
-_HALF_ROOT = sqrt(0.5)
 
 
 def impairments(
@@ -184,35 +145,26 @@ def impairments(
         profile: Supplies distribution, correlation, duplicate and reorder.
         jitter: Jitter in force [s].
         loss: Loss in force.
-
-    Returns:
-        Impairments in the order of the counter, shape (256,).
     """
     offsets = _offsets(key, Purpose.DELAY, block, profile, jitter)
     table: list[Fate] = [(offset,) for offset in offsets]
-    if profile.reorder:
-        for n in _packets_hit(key, Purpose.REORDER, block, profile.reorder):
-            table[n] = (OVERTAKES,)
+    for n in _packets_hit(key, Purpose.REORDER, block, profile.reorder):
+        table[n] = (OVERTAKES,)
     if profile.duplicate:
         copies = _offsets(key, Purpose.COPY_DELAY, block, profile, jitter)
         for n in _packets_hit(key, Purpose.DUPLICATE, block, profile.duplicate):
             table[n] = (*table[n], copies[n])
     if isinstance(loss, GilbertElliott):
         _lose_in_bursts(table, key, block, loss)
-    elif loss:
-        for n in _packets_hit(key, Purpose.LOSS, block, loss):
-            table[n] = ()
+        return table
+    for n in _packets_hit(key, Purpose.LOSS, block, loss):
+        table[n] = ()
     return table
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=_CACHED)
 def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
-    """Draw which packets of a block are damaged, and which bit is flipped.
-
-    Args:
-        key: Stream.
-        block: Number of the block.
-        corrupt: Probability per packet, in [0, 1].
+    """Draw which packets of a block are damaged, with probability `corrupt` per packet.
 
     Returns:
         Index in the block -> place of the flipped bit, as a share of the datagram in (0, 1).
@@ -222,7 +174,7 @@ def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
 
 
 def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfile) -> list[float]:
-    """Draw the jitter of a block in units of `jitter`, with mean 0.
+    """Draw the jitter of a block in units of `jitter`, with mean 0, shape (256,).
 
     The distributions:
 
@@ -230,67 +182,35 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
     - normal: standard deviation 1.
     - pareto: exponent 3, cut off at the 99.9 % quantile, then shifted and scaled to mean 0 and
       standard deviation 1. It ranges from -0.69 to 12.1, with median -0.32 and 99 % quantile 4.3.
-      Without the cut, jitter would sometimes delay a packet by seconds; with `keep_order`, the
-      packets behind it would also wait.
+      Without the cut, jitter would sometimes delay a packet by seconds.
     - table: the profile's values, with mean 0 and standard deviation 1.
 
     With a correlation c, the function transforms normal variates that have correlation c. So the
-    distribution stays exact, but the correlation of the result differs from c:
-
-    - uniform: (6/π) · asin(c/2), at most 0.018 below c.
-    - pareto: 0.39 for c = 0.5, 0.86 for c = 0.9.
-    - table: depends on the table.
+    distribution stays exact, but the correlation of the result differs from c: uniform
+    (6/π) · asin(c/2), at most 0.018 below c; pareto 0.39 for c = 0.5 and 0.86 for c = 0.9.
 
     Source: tc-netem(8) for the meaning of jitter, iproute2 netem/pareto.c for the exponent.
     Deviation: netem cuts its normal table off at ±4 and its Pareto table at 4. So netem's Pareto
     jitter has only 0.82 of the specified standard deviation; cloudrc's jitter has the full
     standard deviation.
-
-    Args:
-        key: Stream.
-        purpose: Column.
-        block: Number of the block.
-        profile: Supplies distribution and correlation.
-
-    Returns:
-        Variates [1], shape (256,).
     """
-    distribution, correlation = profile.distribution, profile.correlation
-    if purpose is Purpose.COPY_DELAY:
-        correlation = 0.0
-    if distribution == "normal":
+    correlation = 0.0 if purpose is Purpose.COPY_DELAY else profile.correlation
+    if profile.distribution == "normal":
         return list(normals(key, purpose, block, correlation))
-    if distribution == "uniform":
-        if not correlation:
-            drawn: list[float] = (2.0 * uniforms(key, purpose, block) - 1.0).tolist()
-            return drawn
-        return [erf(_HALF_ROOT * z) for z in normals(key, purpose, block, correlation)]
-    if distribution == "table":
-        return _from_table(key, purpose, block, profile.table, correlation)
-    return _from_pareto(key, purpose, block, correlation)
-
-
-def _from_pareto(key: StreamKey, purpose: Purpose, block: int, correlation: float) -> list[float]:
-    if correlation:
-        correlated = normals(key, purpose, block, correlation)
-        survival = [0.5 * erfc(_HALF_ROOT * z) for z in correlated]
-    else:
-        survival = [1.0 - u for u in uniforms(key, purpose, block).tolist()]
+    # The variates z (normal) or u (uniform) as their share of the distribution below or above.
+    z = normals(key, purpose, block, correlation) if correlation else ()
+    u = [] if correlation else uniforms(key, purpose, block).tolist()
+    if profile.distribution == "uniform":
+        return [erf(_HALF_ROOT * one) for one in z] or [2.0 * one - 1.0 for one in u]
+    if profile.distribution == "table":
+        shares = [0.5 * erfc(-_HALF_ROOT * one) for one in z] or u
+        count = len(profile.table)
+        return [profile.table[min(int(share * count), count - 1)] for share in shares]
+    survival = [0.5 * erfc(_HALF_ROOT * one) for one in z] or [1.0 - one for one in u]
     kept = 1.0 - PARETO_CUT
     return [
         ((PARETO_CUT + kept * s) ** (-1 / 3) - _PARETO_MEAN) / _PARETO_DEVIATION for s in survival
     ]
-
-
-def _from_table(
-    key: StreamKey, purpose: Purpose, block: int, table: tuple[float, ...], correlation: float
-) -> list[float]:
-    """Draw values of a table with equal probability; a correlation acts on the ranks of values."""
-    shares: list[float] = uniforms(key, purpose, block).tolist()
-    if correlation:
-        shares = [0.5 * erfc(-_HALF_ROOT * z) for z in normals(key, purpose, block, correlation)]
-    count = len(table)
-    return [table[min(int(share * count), count - 1)] for share in shares]
 
 
 def _offsets(
@@ -306,6 +226,8 @@ def _offsets(
 
 def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) -> list[int]:
     """Draw which packets of a block are hit by an event with probability `chance` (in [0, 1])."""
+    if not chance:
+        return []
     return [int(n) for n in np.flatnonzero(uniforms(key, purpose, block) < chance)]
 
 
@@ -313,8 +235,7 @@ def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: Gilbert
     """Remove the lost packets from a table; delay the packets in the bad state."""
     extra = round(loss.delay_bad * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
-    states = bad_states(key, block, loss.bad_start, loss.bad_end)
-    for n, bad in enumerate(states):
+    for n, bad in enumerate(bad_states(key, block, loss.bad_start, loss.bad_end)):
         if draws[n] < (loss.loss_bad if bad else loss.loss_good):
             table[n] = ()
         elif bad and extra:

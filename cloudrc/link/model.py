@@ -2,8 +2,7 @@
 
 The model has no clock, no socket and no stateful random generator. The virtual driver and the relay
 use the same model, so both get the same delays and losses. `sample` sends packets through the
-model, and `numbers` computes statistics of the delays and losses. So these statistics of a profile
-hold for a flight, too.
+model, and `numbers` computes statistics of the delays and losses.
 """
 
 from __future__ import annotations
@@ -11,20 +10,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.link.draws import (
-    BLOCK,
-    BLOCK_BITS,
-    OVERTAKES,
-    Fate,
-    bit_flips,
-    impairments,
-    stream_key,
-)
+from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 
 HEADER_BYTES = 28
@@ -32,23 +23,17 @@ HEADER_BYTES = 28
 
 Source: RFC 791, RFC 768.
 """
-
-_Key = TypeVar("_Key")
-
 _TABLES = 64
-_IN_BLOCK = BLOCK - 1
+"""Number of blocks of impairments that are kept [1]."""
 
 
 class LinkDirection:
     """One direction of the link.
 
     The random impairment of a packet depends only on seed, direction, epoch, kind and counter, not
-    on the order of calls, the mode or other kinds of datagram. Two effects depend on earlier
-    packets: the queue of a bottleneck (`rate`) and `keep_order`. If the profile uses one of them,
-    call `send` in the order of sending.
-
-    Packets with the same counter get the same impairment. So repeated hellos need different
-    counters.
+    on the order of calls, the mode or other kinds of datagram. Packets with the same counter get
+    the same impairment. Two effects depend on earlier packets: the queue of a bottleneck (`rate`)
+    and `keep_order`. If the profile uses one of them, call `send` in the order of sending.
 
     Attributes:
         corrupts: Whether the link may damage datagrams; if true, `corrupted` must be called.
@@ -66,13 +51,12 @@ class LinkDirection:
             origin_ns: When the link came up [ns], on the clock of `send`. The times of time line,
                 trace and blackouts count from this instant.
         """
-        self._seed = seed
-        self._uplink = uplink
+        self._seed, self._uplink = seed, uplink
         self._origin_ns: int | None = origin_ns
         self._departures: deque[int] = deque()
         self._last_release_ns = 0
-        self._passed = self._lost = self._blackout = self._queue = self._duplicated = 0
-        self._corrupted = 0
+        outcomes = ("passed", "lost", "blackout", "queue", "duplicated", "corrupted")
+        self._counts = dict.fromkeys(outcomes, 0)
         self.replace_profile(profile)
 
     def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
@@ -91,14 +75,15 @@ class LinkDirection:
         self.corrupts = profile.corrupt > 0.0
         self._profile = profile
         self._timeline = Timeline(profile)
-        only = self._timeline.only()
-        shaped = only is None or only.blackout or only.rate is not None or profile.keep_order
-        self._always = None if shaped else only
-        self._delays: dict[tuple[int, int, int], list[Fate]] = {}
+        self._only = self._timeline.only()
+        self._plain = not profile.keep_order and all(p.rate is None for p in self._timeline.pieces)
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
         """Send one packet.
+
+        As in tc-netem, a packet is lost before the bottleneck, and a reordered packet skips the
+        bottleneck.
 
         Args:
             epoch: Epoch in the packet's header.
@@ -111,18 +96,25 @@ class LinkDirection:
             Times of arrival [ns], never before `now_ns`: no time for a lost packet, two times for a
             duplicated packet. The second time is that of the copy; it may be the earlier one.
         """
-        constant = self._always
-        if constant is None:
-            return self._send_shaped(epoch, kind, counter, size, now_ns)
-        block = counter >> BLOCK_BITS
-        table = self._delays.get((epoch, kind, block))
-        if table is None:
-            table = self._delay_table(epoch, kind, block, constant)
-        delays = table[counter & _IN_BLOCK]
-        if len(delays) == 1:
-            self._passed += 1
-            return (now_ns + delays[0],)
-        return self._counted(tuple([now_ns + delay for delay in delays]))
+        if self._origin_ns is None:
+            self._origin_ns = now_ns
+        conditions = self._only or self._timeline.at(now_ns - self._origin_ns)
+        if conditions.blackout:
+            self._counts["blackout"] += 1
+            return ()
+        block, index = divmod(counter, BLOCK)
+        key = (epoch, kind, block, conditions.jitter, conditions.loss)
+        table = self._fates.get(key) or self._draw(key)
+        fate = table[index]
+        if len(fate) == 1 and self._plain:  # nearly all packets: save time
+            self._counts["passed"] += 1
+            delay_ns = conditions.delay_ns + fate[0]
+            return (now_ns + delay_ns if delay_ns > 0 else now_ns,)
+        arrivals = [self._arrival(entry, conditions, size, now_ns) for entry in fate]
+        found = tuple([arrival for arrival in arrivals if arrival is not None])
+        self._counts["passed" if found else "queue" if fate else "lost"] += 1
+        self._counts["duplicated"] += len(found) == 2
+        return found
 
     def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
         """Return a datagram as it arrives, perhaps with one bit flipped.
@@ -133,13 +125,12 @@ class LinkDirection:
         receiving kernel drops most damaged frames by their checksums. This model flips a bit of
         the datagram.
         """
+        block, index = divmod(counter, BLOCK)
         key = stream_key(self._seed, self._uplink, epoch, kind)
-        place = bit_flips(key, counter >> BLOCK_BITS, self._profile.corrupt).get(
-            counter & _IN_BLOCK
-        )
+        place = bit_flips(key, block, self._profile.corrupt).get(index)
         if place is None or not data:
             return data
-        self._corrupted += 1
+        self._counts["corrupted"] += 1
         bit = int(place * 8 * len(data))
         damaged = bytearray(data)
         damaged[bit >> 3] ^= 1 << (bit & 7)
@@ -152,96 +143,40 @@ class LinkDirection:
             `passed`: at least one copy arrives; `duplicated`: two copies arrive; `lost`,
             `blackout` and `queue`: no copy arrives, by cause; `corrupted`: damaged.
         """
-        return {
-            "passed": self._passed,
-            "lost": self._lost,
-            "blackout": self._blackout,
-            "queue": self._queue,
-            "duplicated": self._duplicated,
-            "corrupted": self._corrupted,
-        }
+        return dict(self._counts)
 
-    def _send_shaped(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
-        """Send a packet if conditions change over time or depend on earlier packets.
+    def _arrival(self, entry: int, conditions: Conditions, size: int, now_ns: int) -> int | None:
+        """Compute when a copy arrives [ns]; None if the queue of the bottleneck is full."""
+        arrival = now_ns
+        if entry != OVERTAKES:
+            if conditions.rate is not None:
+                if not self._queue(size, conditions.rate, now_ns):
+                    return None
+                arrival = self._departures[-1]
+            arrival += max(0, conditions.delay_ns + entry)
+        if self._profile.keep_order:
+            arrival = self._last_release_ns = max(arrival, self._last_release_ns)
+        return arrival
 
-        As in tc-netem, a packet is lost before the bottleneck, and a reordered packet skips the
-        bottleneck.
-        """
-        if self._origin_ns is None:
-            self._origin_ns = now_ns
-        conditions = self._timeline.at(now_ns - self._origin_ns)
-        if conditions.blackout:
-            self._blackout += 1
-            return ()
-        block = counter >> BLOCK_BITS
-        key = (epoch, kind, block, conditions.jitter, conditions.loss)
-        table = self._fates.get(key) or self._fate_table(key)
-        fate = table[counter & _IN_BLOCK]
-        releases = []
-        for entry in fate:
-            release = now_ns
-            if entry != OVERTAKES:
-                departure = self._departure(size, conditions.rate, now_ns)
-                if departure is None:
-                    continue
-                release = departure + max(0, conditions.delay_ns + entry)
-            if self._profile.keep_order:
-                release = self._last_release_ns = max(release, self._last_release_ns)
-            releases.append(release)
-        if fate and not releases:
-            self._queue += 1
-            return ()
-        return self._counted(tuple(releases))
-
-    def _departure(self, size: int, rate: float | None, now_ns: int) -> int | None:
-        """Queue a packet; return when it leaves the bottleneck [ns]; None if the queue is full."""
-        if rate is None:
-            return now_ns
+    def _queue(self, size: int, rate: float, now_ns: int) -> bool:
+        """Put a packet into the bottleneck's queue; return False if the queue is full."""
         departures = self._departures
         while departures and departures[0] <= now_ns:
             departures.popleft()
         if len(departures) >= self._profile.queue_packets:
-            return None
+            return False
         start = departures[-1] if departures else now_ns
         departures.append(start + round((size + HEADER_BYTES) * 8e9 / rate))
-        return departures[-1]
+        return True
 
-    def _counted(self, releases: Fate) -> Fate:
-        if not releases:
-            self._lost += 1
-        else:
-            self._passed += 1
-            self._duplicated += len(releases) - 1
-        return releases
-
-    def _delay_table(self, epoch: int, kind: int, block: int, constant: Conditions) -> list[Fate]:
-        """Compute the delays of a block if conditions never change; this is `send`'s fast path."""
-        base = constant.delay_ns
-        key = stream_key(self._seed, self._uplink, epoch, kind)
-        # Nearly all packets have one copy; a special case saves time, since a relay does this live.
-        table = [
-            (base + fate[0] if base + fate[0] > 0 else 0,)
-            if len(fate) == 1
-            else tuple([max(0, base + entry) for entry in fate])
-            for fate in impairments(key, block, self._profile, constant.jitter, constant.loss)
-        ]
-        _forget_oldest(self._delays)
-        self._delays[epoch, kind, block] = table
-        return table
-
-    def _fate_table(self, key: tuple[int, int, int, float, Loss]) -> list[Fate]:
-        """Compute the impairments of a block for one jitter and one loss."""
+    def _draw(self, key: tuple[int, int, int, float, Loss]) -> list[Fate]:
+        """Draw the impairments of a block for one jitter and one loss; keep the latest blocks."""
         epoch, kind, block, jitter, loss = key
         stream = stream_key(self._seed, self._uplink, epoch, kind)
-        _forget_oldest(self._fates)
+        if len(self._fates) >= _TABLES:
+            del self._fates[next(iter(self._fates))]
         table = self._fates[key] = impairments(stream, block, self._profile, jitter, loss)
         return table
-
-
-def _forget_oldest(tables: dict[_Key, list[Fate]]) -> None:
-    """Drop the oldest cached table if there are too many tables."""
-    if len(tables) >= _TABLES:
-        del tables[next(iter(tables))]
 
 
 Array: TypeAlias = NDArray[Any]

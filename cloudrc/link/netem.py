@@ -358,7 +358,7 @@ class Netem:
 
     def _apply(self, verb: str) -> None:
         """Bring the present conditions into force, unless they already are."""
-        elapsed_ns, starts_ns = self._clock() - self._origin_ns, self._timeline.starts_ns
+        elapsed_ns, starts_ns = self._clock() - self._origin_ns, self._timeline.pass_ns
         before, self._piece = self._piece, max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
         wanted = options(self._profile, self._timeline.at(elapsed_ns), self._room)
         if wanted != self._applied:
@@ -375,9 +375,9 @@ class Netem:
     def _next_ns(self) -> int | None:
         """Return when the next step may take effect [ns]; None after the last step."""
         following = self._piece + 1
-        if following >= len(self._timeline.starts_ns):
+        if following >= len(self._timeline.pass_ns):
             return None
-        due_ns = self._origin_ns + self._timeline.starts_ns[following]
+        due_ns = self._origin_ns + self._timeline.pass_ns[following]
         return max(due_ns, self._stepped_ns + STEP_NS)
 
     def _confirm(self) -> None:

@@ -1,19 +1,14 @@
 """Define the conditions of a link direction and how they change over time, in SI units.
 
-All delays are ONE WAY. The classes mirror `config/schema.py`, which reads files in milliseconds;
-`assembly.py` converts the values. `config` and `link/traces.py` check the values; this module does
-not.
-
-A `Timeline` merges a direction's changes, trace and blackouts into one list of pieces. The model
-finds the piece for each packet by the time since the link came up.
+All delays are ONE WAY. The classes mirror `config/schema.py`, which reads files in milliseconds.
+`config` and `link/traces.py` check the values; this module does not.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass, replace
-from functools import cached_property
-from math import ceil, inf
+from math import inf
 from typing import Literal, NamedTuple, TypeAlias
 
 
@@ -43,17 +38,12 @@ Loss: TypeAlias = float | GilbertElliott
 """Probability of an independent loss in [0, 1], or loss in bursts."""
 
 
-def bad_share(loss: GilbertElliott) -> float:
-    """Return the long-run share of packets in the bad state, in [0, 1]."""
-    return loss.bad_start / (loss.bad_start + loss.bad_end) if loss.bad_start else 0.0
-
-
 def mean_loss(loss: Loss) -> float:
     """Return the share of packets that is lost in the long run, in [0, 1]."""
     if not isinstance(loss, GilbertElliott):
         return loss
-    share = bad_share(loss)
-    return share * loss.loss_bad + (1.0 - share) * loss.loss_good
+    bad = loss.bad_start / (loss.bad_start + loss.bad_end) if loss.bad_start else 0.0
+    return bad * loss.loss_bad + (1.0 - bad) * loss.loss_good
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +67,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Blackout:
-    """An interval in which all packets that are sent are lost.
+    """An interval, from `start` [s] since the link came up, in which all packets are lost.
 
     Attributes:
         start: Time since the link came up [s].
@@ -92,11 +82,9 @@ class Blackout:
 class Trace:
     """Measured conditions over time: each row holds until the next row; the last row holds forever.
 
-    In a looping trace, the last row lasts as long as the mean of the other rows; then the trace
-    begins again.
-
-    The delays of a trace replace the profile's `delay`; jitter is added to them. If the trace has
-    losses, they replace the profile's `loss`.
+    The delays replace the profile's `delay`; jitter is added to them. The losses, if there are any,
+    replace the profile's `loss`. If the trace loops, its last row lasts as long as the mean of the
+    other rows; then the trace begins again.
 
     Attributes:
         times: Time since the link came up, strictly rising [s], shape (n,), n >= 1. The first row
@@ -114,10 +102,9 @@ class Trace:
     @property
     def period(self) -> float | None:
         """Return the length of one pass of a looping trace [s]; None if the trace does not loop."""
-        count = len(self.times)
-        if not self.loop or count < 2:
+        if not self.loop or len(self.times) < 2:
             return None
-        return self.times[-1] + (self.times[-1] - self.times[0]) / (count - 1)
+        return self.times[-1] + (self.times[-1] - self.times[0]) / (len(self.times) - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +116,6 @@ class DirectionProfile:
         jitter: Half width (uniform) or standard deviation (normal, pareto, table) of the delay
             [s]. A delay below 0 becomes 0.
         distribution: Distribution of the delay about its mean.
-        table: Values of the distribution "table" [1], drawn with equal probability: mean 0,
-            standard deviation 1, rising, shape (n,). () for other distributions.
         correlation: Correlation of the jitter of successive packets, in [0, 1].
         loss: Probability of an independent loss, or loss in bursts.
         duplicate: Probability in [0, 1] that a packet arrives twice; the copy has its own delay.
@@ -143,6 +128,8 @@ class DirectionProfile:
         changes: Changes of the conditions, strictly rising in `at`.
         trace: Measured delay over time.
         blackouts: Blackouts in any order; they may overlap.
+        table: Values of the distribution "table" [1], drawn with equal probability: mean 0,
+            standard deviation 1, rising, shape (n,). () for other distributions.
     """
 
     delay: float = 0.0
@@ -163,15 +150,7 @@ class DirectionProfile:
 
 
 class Conditions(NamedTuple):
-    """The conditions during one piece of the time line.
-
-    Attributes:
-        delay_ns: Mean delay, one way [ns].
-        jitter: As in `DirectionProfile` [s].
-        loss: Probability of an independent loss, or loss in bursts.
-        rate: Rate of the bottleneck [bit/s]; None without a bottleneck.
-        blackout: True if all packets are lost.
-    """
+    """The conditions during one piece of a time line: mean one-way delay [ns], else as above."""
 
     delay_ns: int
     jitter: float
@@ -180,14 +159,8 @@ class Conditions(NamedTuple):
     blackout: bool
 
 
-LOOP_SPAN = 3600.0
-"""How far a looping time line is unrolled [s], for users of `starts_ns`."""
-LOOP_PIECES = 500_000
-"""Limit of the pieces of an unrolled time line; one pass is always complete."""
-
-
 class Timeline:
-    """The conditions of one direction over time.
+    """The conditions of one direction over time: its changes, trace and blackouts.
 
     Attributes:
         pieces: The pieces of the time line; of a looping time line, those of one pass.
@@ -197,16 +170,14 @@ class Timeline:
     """
 
     def __init__(self, profile: DirectionProfile) -> None:
-        instants = {0.0}
-        instants.update(change.at for change in profile.changes)
+        instants = {0.0, *(change.at for change in profile.changes)}
         instants.update(profile.trace.times if profile.trace else ())
         for blackout in profile.blackouts:
             instants.update((blackout.start, blackout.start + blackout.duration))
-        ordered = sorted(instants)
         period = profile.trace.period if profile.trace else None
         self.period_ns = None if period is None else round(period * 1e9)
-        if self.period_ns is not None:
-            ordered = [instant for instant in ordered if round(instant * 1e9) < self.period_ns]
+        end_ns = inf if self.period_ns is None else self.period_ns
+        ordered = [instant for instant in sorted(instants) if round(instant * 1e9) < end_ns]
         self.pass_ns = [round(instant * 1e9) for instant in ordered]
         self.pieces = [_conditions(profile, instant) for instant in ordered]
 
@@ -215,18 +186,6 @@ class Timeline:
         if self.period_ns is not None and elapsed_ns > 0:
             elapsed_ns %= self.period_ns
         return self.pieces[max(bisect_right(self.pass_ns, elapsed_ns) - 1, 0)]
-
-    @cached_property
-    def starts_ns(self) -> list[int]:
-        """Start of each piece, as time since the link came up, rising [ns].
-
-        A looping time line is unrolled over `LOOP_SPAN`.
-        """
-        if self.period_ns is None:
-            return self.pass_ns
-        passes = ceil(LOOP_SPAN * 1e9 / self.period_ns)
-        count = min(passes, max(LOOP_PIECES // len(self.pass_ns), 1))
-        return [n * self.period_ns + start_ns for n in range(count) for start_ns in self.pass_ns]
 
     @property
     def last_ns(self) -> float:
@@ -255,18 +214,15 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
     """Compute the conditions from `instant` [s] until the next instant of the time line."""
-    delay, jitter, loss, rate = profile.delay, profile.jitter, profile.loss, profile.rate
+    found = {name: getattr(profile, name) for name in ("delay", "jitter", "loss", "rate")}
     for change in profile.changes:
-        if change.at > instant:
-            break
-        delay = delay if change.delay is None else change.delay
-        jitter = jitter if change.jitter is None else change.jitter
-        loss = loss if change.loss is None else change.loss
-        rate = rate if change.rate is None else change.rate
-    trace = profile.trace
-    if trace is not None:
+        if change.at <= instant:
+            given = {name: getattr(change, name) for name in found}
+            found |= {name: value for name, value in given.items() if value is not None}
+    if (trace := profile.trace) is not None:
         row = max(bisect_right(trace.times, instant) - 1, 0)
-        delay = trace.delays[row]
-        loss = loss if trace.losses is None else trace.losses[row]
+        found["delay"] = trace.delays[row]
+        found["loss"] = found["loss"] if trace.losses is None else trace.losses[row]
     blackout = any(b.start <= instant < b.start + b.duration for b in profile.blackouts)
-    return Conditions(round(delay * 1e9), jitter, loss, rate, blackout)
+    delay_ns = round(found["delay"] * 1e9)
+    return Conditions(delay_ns, found["jitter"], found["loss"], found["rate"], blackout)

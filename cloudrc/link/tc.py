@@ -254,7 +254,7 @@ def notes(profile: DirectionProfile) -> list[str]:
             "netem corrupts frames, not datagrams: the receiving kernel drops most of them by "
             f"their checksums, so that corrupt {profile.corrupt:g} is seen as loss"
         )
-    starts = Timeline(profile).starts_ns
+    starts = Timeline(profile).pass_ns
     passed_over = sum(after - before < STEP_NS for before, after in pairwise(starts))
     if passed_over:
         said.append(

@@ -117,5 +117,3 @@ def test_a_trace_that_loops_begins_again(hours: int) -> None:
     for elapsed, delay in ((0.0, 40), (2.9, 60), (3.1, 40), (3.6, 50), (5.5, 60), (602.0, 60)):
         now = timeline.at(round((hours * 3600 + elapsed) * 1e9))
         assert (now.delay_ns, now.loss) == (delay * 1_000_000, float(delay == 60))
-    written = timeline.at(timeline.starts_ns[-1])
-    assert (written.delay_ns, timeline.starts_ns[3]) == (60_000_000, 3_000_000_000)

@@ -46,3 +46,12 @@ def test_a_trace_replaces_the_delay(tmp_path: Path, encoding: str) -> None:
 
 def test_a_missing_trace_has_no_band(tmp_path: Path) -> None:
     assert band(Direction(trace=str(tmp_path / "gone.csv"))) is None
+
+
+def test_a_trace_that_loops_has_a_band_after_hours(tmp_path: Path) -> None:
+    """Its last row lasts as long as a mean row, so one pass takes 2 s."""
+    trace = tmp_path / "trace.csv"
+    trace.write_text("time_s,delay_ms\n0,30\n1,90\n")
+    direction = Direction(jitter_ms=10.0, trace=str(trace), loop=True)
+    for time, low in ((0.5, 0.020), (1.5, 0.080), (7200.5, 0.020), (7201.5, 0.080)):
+        assert bounds(direction, time) == pytest.approx((low, low + 0.020))

@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 
 from cloudrc.config.schema import Direction
 from cloudrc.errors import BadInputError
-from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.profile import Change, DirectionProfile, Timeline
 from cloudrc.link.traces import read_trace
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import holds
@@ -33,11 +33,13 @@ class Band:
         time: Start of each step, since the start of the link [s], shape (n,).
         low: Delay minus jitter, not below 0 [s], shape (n,).
         high: Delay plus jitter [s], shape (n,).
+        period: Time after which the steps begin again [s]; infinite if they do not.
     """
 
     time: Array
     low: Array
     high: Array
+    period: float
 
 
 def band(direction: Direction) -> Band | None:
@@ -49,35 +51,36 @@ def band(direction: Direction) -> Band | None:
     Returns:
         The band; None if the delays come from a trace that no longer exists.
     """
-    trace = direction.trace
     try:
-        steps = _trace_delays(Path(trace), direction) if trace else [(0.0, direction.delay_ms)]
+        trace = read_trace(Path(direction.trace)) if direction.trace else None
     except BadInputError:
         return None
-    delay, jitter = steps[0][1], direction.jitter_ms
-    changes = {} if direction.trace else {c.at_s: c.delay_ms for c in direction.changes}
-    delays = {**dict(steps), **{at: ms for at, ms in changes.items() if ms is not None}}
-    jitters = {c.at_s: c.jitter_ms for c in direction.changes if c.jitter_ms is not None}
-    rows = []
-    for at in sorted({*delays, *jitters}):
-        delay, jitter = delays.get(at, delay), jitters.get(at, jitter)
-        rows.append((at, max(delay - jitter, 0.0) * 1e-3, (delay + jitter) * 1e-3))
-    time, low, high = np.array(rows).T
-    return Band(time, low, high)
+    profile = DirectionProfile(
+        delay=direction.delay_ms * 1e-3,
+        jitter=direction.jitter_ms * 1e-3,
+        changes=tuple(
+            Change(change.at_s, _seconds(change.delay_ms), _seconds(change.jitter_ms))
+            for change in direction.changes
+        ),
+        trace=replace(trace, loop=direction.loop) if trace else None,
+    )
+    timeline = Timeline(profile)
+    delay = np.array([piece.delay_ns * 1e-9 for piece in timeline.pieces])
+    jitter = np.array([piece.jitter for piece in timeline.pieces])
+    period = inf if timeline.period_ns is None else timeline.period_ns * 1e-9
+    time = np.array(timeline.pass_ns) * 1e-9
+    return Band(time, np.maximum(delay - jitter, 0.0), delay + jitter, period)
 
 
 def bounds_at(steps: Band, time: Array) -> tuple[Array, Array]:
     """Look up the lower and upper bound [s] at each `time` [s] since the start of the link."""
-    rows = np.maximum(np.searchsorted(steps.time, time, side="right") - 1, 0)
+    inside = np.where(time > 0.0, np.mod(time, steps.period), time)
+    rows = np.maximum(np.searchsorted(steps.time, inside, side="right") - 1, 0)
     return steps.low[rows], steps.high[rows]
 
 
-def _trace_delays(path: Path, direction: Direction) -> list[tuple[float, float]]:
-    """Read times [s] and delays [ms] of a trace; the first delay also applies before its time."""
-    profile = DirectionProfile(trace=replace(read_trace(path), loop=direction.loop))
-    timeline = Timeline(profile)
-    starts_ns = timeline.starts_ns
-    return [(start_ns * 1e-9, timeline.at(start_ns).delay_ns * 1e-6) for start_ns in starts_ns]
+def _seconds(value_ms: float | None) -> float | None:
+    return None if value_ms is None else value_ms * 1e-3
 
 
 SAME_CHANGE = 0.05
