@@ -47,7 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 ALWAYS = {"errors", "messages", "records", "__version__"}
 
 # Parts that run in real time besides the drivers: link shapers and teleop's API.
-SHAPERS = ("link/relay", "link/lateness", "link/verify/probe", "link/verify/monitor")
+SHAPERS = ("link/relay", "link/verify/probe", "link/verify/monitor")
 API = ("teleop/api", "teleop/auth", "teleop/bridge")
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it.

@@ -42,9 +42,9 @@ def run(options: argparse.Namespace) -> int:
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
     from cloudrc.drivers.iproute2 import Programs
     from cloudrc.link.follow import HANDED_FILE, Profiles
+    from cloudrc.link.netem import write_tables
     from cloudrc.link.sidecar import Settings, Sidecar
     from cloudrc.link.state import STATE_FILE
-    from cloudrc.link.tc import write_tables
 
     warn_if_exposed(options.listen)
     exporter = open_exporter(options, "link")
@@ -88,11 +88,10 @@ def make_profile_loader(direction: str) -> Load:
 def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> Machine:
     from cloudrc.config.load import read_experiment
     from cloudrc.link.model import LinkDirection
-    from cloudrc.link.netem import Netem
+    from cloudrc.link.netem import Netem, may_shape, try_netem
     from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.relay import RelayShaper, ask_for_fifo, settle
     from cloudrc.link.sidecar import Machine
-    from cloudrc.link.tc import may_shape, try_netem
     from cloudrc.tunnel.codec import peek
 
     seed, clock = read_experiment(str(options.config)).seed, time.monotonic_ns

@@ -34,9 +34,9 @@ from cloudrc.drivers.machine import interpreter
 from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.realtime import bind, free_ports, parse
 from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError, TimedOutError
+from cloudrc.link.netem import check
 from cloudrc.link.sidecar import Told, read_told
 from cloudrc.link.state import STATE_FILE, from_text
-from cloudrc.link.tc import check
 from cloudrc.link.verify.causes import Findings, read_evidence, read_metrics
 from cloudrc.link.verify.expect import Flow, Plan
 from cloudrc.link.verify.judge import judge, look_twice, verdict_of

@@ -13,7 +13,7 @@ import subprocess
 import time
 from collections.abc import Sequence
 
-from cloudrc.link.tc import NOT_FOUND, Answer
+from cloudrc.link.netem import NOT_FOUND, Answer
 
 TOOL_TIMEOUT = 5.0
 """Time limit of one call of tc or ip [s]."""

@@ -5,69 +5,334 @@
                                           only UDP to the peer's tunnel port
 
 After a restart `Netem` finds its qdiscs by their handles. In flight it changes the qdiscs by `tc
-qdisc change`, which keeps the queued packets. `close` removes the qdiscs. `Netem` never touches a
-root qdisc of another program. If another program removes or changes the qdiscs of `Netem`, the log
-says so and a metric counts the case; `Netem` does not repair the damage.
+qdisc change`, which keeps the queued packets but does not reset what it does not name; so every
+call names all options. `Netem` never touches a root qdisc of another program. If another program
+removes or changes the qdiscs of `Netem`, the log says so and a metric counts the case.
 
 tc and the kernel clamp numbers without a message: a rate below 1 byte/s turns into no rate limit, a
-probability below 2**-32 turns into 0. So `Netem` reads back the options in force and compares them.
+probability below 2**-32 turns into 0. So `Netem` reads back the options in force.
 
-Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8); iproute2 tc/q_netem.c, netem_print_opt.
+netem draws jitter from a table of at most 16,384 integers of 16 bits; the entry 8192 means one
+times the jitter. The tables that come with tc differ from the model's distributions.
+
+Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8); iproute2 tc/q_netem.c (netem_print_opt)
+and netem/README.distribution; Linux, net/sched/sch_netem.c (tabledist).
 """
 
 from __future__ import annotations
 
+import json
 import re
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from math import ceil
+from hashlib import blake2b
+from itertools import pairwise
+from math import ceil, inf, sqrt
 from pathlib import Path
-from typing import Any
+from statistics import NormalDist, fmean
+from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
-from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.draws import PARETO_CUT
+from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
 from cloudrc.link.relay import Address
-from cloudrc.link.tc import STEP_NS, Iproute2, Run, check, limit, options, write_measured
 
-ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
-"""Handles of the root qdisc, of its band for the tunnel's flow, and of the netem there."""
+NOT_FOUND = 127
+"""Exit code when the program does not exist."""
+ROOT, BAND, LEAF, TRIAL = "7400:", "7400:4", "7401:", "7402:"
+"""Handles of the root qdisc, of its band for the tunnel's flow, of the netem there, of a trial."""
 PERIOD_NS = 1_000_000_000
 """Time between two checks of the qdiscs [ns]."""
+STEP_NS = 5_000_000
+"""Shortest time between two steps of the qdisc [ns]; steps that follow sooner are skipped."""
 LATE_NS = 20_000_000
 """A step counts as late if its lateness is above this [ns]: two periods of the loop."""
+LIMIT = 10_000
+"""Limit of packets in a qdisc without a bottleneck [1], as in the relay."""
+DELAY_MAX_NS = 274_000_000_000
+"""Longest delay that tc accepts [ns]: ticks of 64 ns in 32 bits."""
+ENTRIES = 4096
+"""Number of entries of a table [1]."""
+STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
+"""Distribution -> factor that divides the table's entries, so that the tail fits in 16 bits. The
+jitter that tc gets is multiplied by the same factor."""
+_ONE = 8192
+_END_OF_TABLE = 32_767 / _ONE
+"""Largest 16-bit entry, in units of the jitter [1]."""
 _KEPT = 10_000
 """Number of latest steps that the percentiles cover [1]."""
+_IN_ORDER = "100gbit"
+"""Rate that has no effect except that netem keeps the order of packets."""
+_ETHERNET_BYTES = 14
+"""Length of the Ethernet header, which netem counts and the model does not [bytes]."""
+_PACKET_BITS = 8 * 116
+"""Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
+_PACKETS = 1_000
+"""Assumed packet rate without a bottleneck [1/s], higher than that of a tunnel or a probe."""
 # The kernel's own default for three bands: nothing falls into the fourth by its type of service.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
-
-# Option of tc -> the object and the keys in its listing; what is not listed is 0.
+_INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
 _LISTED = {
     "limit": ("", ("limit",)),
     "delay": ("delay", ("delay", "jitter", "correlation")),
     "random": ("loss-random", ("loss",)),
     "gemodel": ("loss-gemodel", ("p", "r", "1-h", "1-k")),
-    "duplicate": ("duplicate", ("duplicate",)),
-    "corrupt": ("corrupt", ("corrupt",)),
-    "reorder": ("reorder", ("reorder",)),
-    "rate": ("rate", ("rate",)),
 }
+"""Option of tc -> object and keys in its listing; of other options both are the option's name."""
 _UNITS = {"us": 1e-6, "%": 1e-2, "gbit": 1.25e8, "bit": 0.125, "": 1.0}
 """Unit in tc's arguments -> factor to the unit in tc's listing: [s], [1], [byte/s]."""
-_SLACK = {"limit": 0.0, "rate": 0.0, "delay": 128e-9}
-"""Option -> tolerance for tc's rounding: 128 ns for delays [s]. Options that are not listed are
-probabilities, which tc cuts to 32 bits."""
-_CHANCE = 2.0**-30
-_RELATIVE = 1e-3
-"""Relative tolerance for rounding [1]."""
+_SLACK, _RELATIVE = 128e-9, 1e-3
+"""Absolute and relative tolerance for tc's rounding: delays to 64 ns [s], chances to 32 bits."""
+
+
+class Answer(NamedTuple):
+    """Exit code, standard output and standard error of a program."""
+
+    code: int
+    output: str
+    error: str
+
+
+Run: TypeAlias = Callable[[Sequence[str]], Answer]
+"""Function that runs a program to its end."""
+
+
+class Iproute2:
+    """Runs `tc` and `ip`; raises the error that `explain` makes if a call fails."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    def tc(self, *words: str) -> str:
+        """Run tc and return its output."""
+        return self._checked("tc", words)
+
+    def show(self, *words: str) -> list[dict[str, Any]]:
+        """Run `tc -s -j` with these words and return the objects that it prints."""
+        return list(json.loads(self._checked("tc", ("-s", "-j", *words)) or "[]"))
+
+    def device(self, host: str) -> str:
+        """Return the interface that leads to an address."""
+        return str(json.loads(self._checked("ip", ("-j", "route", "get", host)))[0]["dev"])
+
+    def _checked(self, program: str, words: Sequence[str]) -> str:
+        answer = self._run((program, *words))
+        if answer.code:
+            raise explain(program, words, answer)
+        return answer.output
+
+
+def try_netem(run: Run) -> None:
+    """Check whether this kernel has netem: add a netem without delay to the loopback interface.
+
+    If the loopback already has a qdisc of another program, nothing is changed or checked.
+
+    Raises:
+        MissingPrerequisiteError: If the kernel has no netem, or this container may not use it.
+    """
+    iproute2 = Iproute2(run)
+    root = next((q for q in iproute2.show("qdisc", "show", "dev", "lo") if q.get("root")), {})
+    if (handle := root.get("handle", "0:")) == "0:":
+        iproute2.tc("qdisc", "add", "dev", "lo", "root", "handle", TRIAL, "netem")
+    if handle in ("0:", TRIAL):
+        iproute2.tc("qdisc", "del", "dev", "lo", "root")
+
+
+def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
+    """Make the error for a failed call: the cause and the remedy."""
+    text = answer.error or answer.output
+    kind = next((word for word in words if word in ("netem", "prio")), "")
+    if kind and "change" not in words and "No such file or directory" in text:
+        text = "qdisc kind is unknown"
+    module = f"sch_{kind or 'netem'}"
+    known = {
+        "qdisc kind is unknown": (
+            f"this kernel has no {module}; {_INSTEAD}, or use nodes whose kernel has it "
+            f"('modprobe {module}' there) and a namespace for privileged pods"
+        ),
+        "classifier not found": (
+            f"this kernel has neither cls_u32 nor cls_flower; {_INSTEAD}, or use another node"
+        ),
+        "Operation not permitted": (
+            "tc may not change the network of this container; give it NET_ADMIN and uid 0, or "
+            f"{_INSTEAD}"
+        ),
+    }
+    line = " ".join(text.split()) or f"exit code {answer.code}"
+    said = f"'{program} {' '.join(words)}' failed: {line}; {_INSTEAD}"
+    said = next((remedy for sign, remedy in known.items() if sign in text), said)
+    if answer.code == NOT_FOUND:
+        said = f"no program {program} (package iproute2); install it, or {_INSTEAD}"
+    return MissingPrerequisiteError(said)
+
+
+def may_shape(status: str) -> bool:
+    """Return whether a process is root with NET_ADMIN, from the text of its /proc/PID/status.
+
+    Source: Linux, include/uapi/linux/capability.h: CAP_NET_ADMIN is bit 12.
+    """
+    uid = re.search(r"^Uid:\s+\d+\s+0\s", status, re.MULTILINE)
+    effective = re.search(r"^CapEff:\s+([0-9a-fA-F]+)", status, re.MULTILINE)
+    return bool(uid and effective and int(effective[1], 16) >> 12 & 1)
+
+
+_QUANTILES: dict[str, Callable[[float], float]] = {
+    "uniform": lambda share: 2.0 * share - 1.0,
+    "normal": NormalDist().inv_cdf,
+    "pareto": lambda share: float((PARETO_CUT + (1.0 - PARETO_CUT) * (1.0 - share)) ** (-1 / 3)),
+}
+
+
+def table(distribution: str) -> list[int]:
+    """Make the table of "uniform", "normal" or "pareto": quantiles at the centres of equal shares.
+
+    Returns:
+        Quantile · 8192 / STRETCH in units of the jitter, rounded, rising, shape (4096,).
+    """
+    quantile = _QUANTILES[distribution]
+    values = [quantile((index + 0.5) / ENTRIES) for index in range(ENTRIES)]
+    if distribution != "uniform":  # mean 0, standard deviation 1
+        mean = fmean(values)
+        deviation = sqrt(fmean([(value - mean) ** 2 for value in values]))
+        values = [(value - mean) / deviation for value in values]
+    return [round(value * _ONE / STRETCH[distribution]) for value in values]
+
+
+def stretch(profile: DirectionProfile) -> int:
+    """Return the factor that multiplies the profile's jitter for tc, as in `STRETCH`."""
+    if profile.distribution != "table":
+        return STRETCH[profile.distribution]
+    return ceil(max(map(abs, profile.table)) / _END_OF_TABLE) or 1
+
+
+def distribution_name(profile: DirectionProfile) -> str:
+    """Return tc's name of a profile's distribution: a name in `STRETCH`, or one for its table."""
+    if profile.distribution != "table":
+        return profile.distribution
+    # tc makes a file name of it, so only letters and digits; another table is another file.
+    return "table" + blake2b(repr(profile.table).encode(), digest_size=8).hexdigest()
+
+
+def write_tables(folder: Path) -> None:
+    """Write all tables into a folder; tc finds them if TC_LIB_DIR names this folder."""
+    for distribution in STRETCH:
+        _write(folder, distribution, table(distribution))
+
+
+def write_measured(folder: Path, profile: DirectionProfile) -> None:
+    """Write the table of a profile with a measured distribution; do nothing for other profiles."""
+    if profile.distribution == "table":
+        unit, values = _ONE / stretch(profile), sorted(profile.table)
+        picked = [values[(2 * i + 1) * len(values) // (2 * ENTRIES)] for i in range(ENTRIES)]
+        _write(folder, distribution_name(profile), [round(value * unit) for value in picked])
+
+
+def _write(folder: Path, name: str, entries: Sequence[int]) -> None:
+    (folder / f"{name}.dist").write_text("\n".join([f"# {name}", *map(str, entries), ""]))
+
+
+def check(profile: DirectionProfile) -> None:
+    """Raise a BadInputError if netem cannot realise a profile; the text names the reason."""
+    pieces = Timeline(profile).pieces
+    found = ""
+    if profile.trace is not None and profile.trace.loop:
+        found = "loop (a trace that begins again)"
+    if any(isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces):
+        found = "loss.delay_bad_ms (more delay while a burst of losses lasts)"
+    if any(piece.rate and piece.jitter for piece in pieces) and not profile.keep_order:
+        found = "rate_kbit with jitter_ms but without keep_order (overtaking behind a bottleneck)"
+    if (slowest := max(piece.delay_ns for piece in pieces)) > DELAY_MAX_NS:
+        found = f"delay_ms above 274000 (its clock ends there, here {slowest * 1e-6:g} ms)"
+    for one in profile.blackouts:
+        if one.duration * 1e9 < STEP_NS:
+            found = f"blackouts shorter than {STEP_NS * 1e-6:g} ms (here {one.duration * 1e3:g} ms "
+            found += f"at {one.start:g} s)"
+    if found:
+        raise BadInputError(
+            f"netem cannot do {found}; set link.mode=relay, which can, or leave it out"
+        )
+
+
+def notes(profile: DirectionProfile) -> list[str]:
+    """Return notes about the parts of a profile that netem realises differently."""
+    said = []
+    if profile.jitter and profile.correlation:
+        said.append(f"netem realises next to nothing of correlation {profile.correlation:g}")
+    if profile.corrupt:
+        said.append(
+            "netem corrupts frames, not datagrams: the receiving kernel drops most of them by "
+            f"their checksums, so that corrupt {profile.corrupt:g} is seen as loss"
+        )
+    starts = Timeline(profile).pass_ns
+    passed_over = sum(after - before < STEP_NS for before, after in pairwise(starts))
+    if passed_over:
+        said.append(
+            f"netem is stepped every {STEP_NS * 1e-6:g} ms at most: {passed_over} of "
+            f"{len(starts)} steps of the time line come sooner, and some are passed over"
+        )
+    return said
+
+
+def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
+    """Translate the conditions at one instant into arguments of `tc qdisc add|change ... netem`.
+
+    Args:
+        profile: A profile that has passed `check`.
+        conditions: Conditions at this instant.
+        room: Limit of the qdisc [packets].
+    """
+    words = ["limit", str(room), "delay", _microseconds(conditions.delay_ns)]
+    if conditions.jitter:
+        words += [_microseconds(conditions.jitter * 1e9 * stretch(profile))]
+        words += [_percent(profile.correlation), "distribution", distribution_name(profile)]
+    words += ["loss", *_loss(1.0 if conditions.blackout else conditions.loss)]
+    # Of a packet that is doubled and lost one copy arrives: in a blackout none may.
+    copied = 0.0 if conditions.blackout else profile.duplicate
+    words += ["duplicate", _percent(copied), "corrupt", _percent(profile.corrupt)]
+    # tc refuses it without a delay, where there is nothing to overtake.
+    if profile.reorder and conditions.delay_ns and not profile.keep_order:
+        words += ["reorder", _percent(profile.reorder)]
+    if conditions.rate is not None:
+        return [*words, "rate", f"{conditions.rate:.0f}bit", str(-_ETHERNET_BYTES)]
+    return [*words, "rate", _IN_ORDER if profile.keep_order else "0bit"]  # 0bit: no rate any more
+
+
+def limit(profile: DirectionProfile) -> int:
+    """Return the limit of the qdisc: packets under way plus the queue of a bottleneck [packets].
+
+    The limit is the same along the whole time line. Otherwise a step to a shorter delay would drop
+    packets, because packets with the longer delay are still under way.
+    """
+    pieces = Timeline(profile).pieces
+    if all(piece.rate is None for piece in pieces):
+        return LIMIT
+    reach = stretch(profile) * _END_OF_TABLE
+    under_way = [
+        (piece.delay_ns * 1e-9 + piece.jitter * reach)
+        * (piece.rate / _PACKET_BITS if piece.rate else _PACKETS)
+        for piece in pieces
+    ]
+    return ceil(profile.queue_packets + max(under_way))
+
+
+def _loss(loss: Loss) -> list[str]:
+    if isinstance(loss, GilbertElliott):
+        chances = (loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good)
+        return ["gemodel", *map(_percent, chances)]
+    return ["random", _percent(loss)]
+
+
+def _microseconds(duration_ns: float) -> str:
+    return f"{duration_ns * 1e-3:.3f}us"  # iproute2 before 6.2 knows no "ns"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.9g}%"
 
 
 def differences(words: Sequence[str], listed: Mapping[str, Any]) -> list[str]:
-    """Compare the requested options with those in force.
-
-    Args:
-        words: The requested options, from `tc.options`.
-        listed: "options" of the qdisc, as `tc -j qdisc show` prints them.
+    """Compare the requested options, from `options`, with those that `tc -j qdisc show` lists.
 
     Returns:
         One text per number that differs, such as "rate: asked 0.5, in force 0".
@@ -78,30 +343,30 @@ def differences(words: Sequence[str], listed: Mapping[str, Any]) -> list[str]:
         if number is None:  # a keyword, or the name of a distribution
             option, index = word, 0
             continue
-        place, keys = _LISTED.get(option, ("", ()))
+        place, keys = _LISTED.get(option, (option, (option,)))
         if index < len(keys):
             asked, key = float(number[1]) * _UNITS[number[2]], keys[index]
             shown = float((listed.get(place, {}) if place else listed).get(key, 0.0))
-            slack = max(_SLACK.get(option, _CHANCE), _RELATIVE * abs(asked))
-            if abs(shown - asked) > slack or (asked and not shown):
+            off = abs(shown - asked) > max(_SLACK, _RELATIVE * abs(asked))
+            if off or (asked and not shown):
                 name = key if len(keys) == 1 else f"{option} {key}"
                 found.append(f"{name}: asked {asked:g}, in force {shown:g}")
         index += 1
     return found
 
 
-def is_ours(qdiscs: Sequence[dict[str, Any]]) -> bool:
-    """Return whether the root qdisc of an interface is from `Netem`."""
-    return any(
-        one.get("root") and one.get("handle") == ROOT and one.get("kind") == "prio"
-        for one in qdiscs
-    )
-
-
 def leaf_of(qdiscs: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """Find the netem qdisc of `Netem` among the qdiscs of an interface; None if it is missing."""
     found = (one for one in qdiscs if one.get("handle") == LEAF and one.get("kind") == "netem")
-    return next(found, None) if is_ours(qdiscs) else None
+    return next(found, None) if _is_ours(_root_of(qdiscs)) else None
+
+
+def _root_of(qdiscs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    return next((one for one in qdiscs if one.get("root")), {"handle": "0:"})
+
+
+def _is_ours(root: dict[str, Any]) -> bool:
+    return root["handle"] == ROOT and root.get("kind") == "prio"
 
 
 def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
@@ -115,23 +380,6 @@ def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
     if leaf is None:
         return {}
     return {"forwarded": leaf["packets"], "lost": leaf["drops"], "held": leaf["qlen"]}
-
-
-def damage(qdiscs: Sequence[dict[str, Any]], applied: Sequence[str]) -> str:
-    """Describe how another program has changed the qdiscs.
-
-    Args:
-        qdiscs: Qdiscs of the interface.
-        applied: Options that netem got last.
-
-    Returns:
-        The damage in words; "" without damage.
-    """
-    leaf = leaf_of(qdiscs)
-    if leaf is None:
-        return "was removed"
-    found = differences(applied, leaf.get("options", {}))
-    return f"was changed ({'; '.join(found)})" if found else ""
 
 
 class Steps:
@@ -148,45 +396,35 @@ class Steps:
         self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
 
     def note(self, lateness_ns: int, passed_over: int) -> None:
-        """Count a step.
+        """Count a step, and the steps that were skipped just before it.
 
-        Args:
-            lateness_ns: Time from when the step was due until tc reported that it is in force [ns].
-            passed_over: Number of steps that were skipped just before this step.
+        The lateness [ns] is the time from when the step was due until tc reports it in force.
         """
         self.applied += 1
         self.late += lateness_ns > LATE_NS
         self.passed_over += passed_over
         self._lateness_ns.append(lateness_ns)
 
-    def lateness_ns(self) -> tuple[int, int]:
-        """Return median and 99th percentile of the lateness of the last 10,000 steps [ns].
-
-        Both are 0 before the first step.
-        """
-        ordered = sorted(self._lateness_ns) or [0]
-        return ordered[(len(ordered) - 1) // 2], ordered[ceil(0.99 * (len(ordered) - 1))]
-
     def counts(self) -> dict[str, int]:
         """Return the number of steps and their lateness; empty before the first."""
         if not self.applied:
             return {}
-        median_ns, worst_ns = self.lateness_ns()
+        ordered = sorted(self._lateness_ns)
         return {
             "steps": self.applied,
             "steps_late": self.late,
             "steps_passed_over": self.passed_over,
-            "step_lateness_p50_ns": median_ns,
-            "step_lateness_p99_ns": worst_ns,
+            "step_lateness_p50_ns": ordered[(len(ordered) - 1) // 2],
+            "step_lateness_p99_ns": ordered[ceil(0.99 * (len(ordered) - 1))],
         }
 
     def in_words(self) -> str:
-        """Describe the steps so far."""
-        median, worst = (late_ns * 1e-6 for late_ns in self.lateness_ns())
-        over = f", {self.passed_over} passed over" if self.passed_over else ""
+        """Describe the steps so far, at least one."""
+        applied, late, over, median_ns, worst_ns = self.counts().values()
         return (
-            f"{self.applied} steps of the time line, late by {median:.2f} ms in the median and "
-            f"{worst:.2f} ms at the 99th percentile, {self.late} above {LATE_NS * 1e-6:g} ms{over}"
+            f"{applied} steps of the time line, late by {median_ns * 1e-6:.2f} ms in the median "
+            f"and {worst_ns * 1e-6:.2f} ms at the 99th percentile, {late} above "
+            f"{LATE_NS * 1e-6:g} ms, {over} passed over"
         )
 
 
@@ -212,14 +450,8 @@ class Netem:
     ) -> None:
         """Set up; do not touch the network yet.
 
-        Args:
-            run: Runs tc and ip.
-            profile: Conditions.
-            origin_ns: When the link came up [ns]; the time line starts at this instant.
-            clock: Returns the time on the clock of `origin_ns` [ns].
-            wait: Sleeps for a time [s].
-            tables: Folder of tc's tables, for a profile's measured distribution.
-            log: Receives lines for people.
+        `origin_ns` is when the link came up [ns], on `clock`; `wait` sleeps for a time [s];
+        `tables` is the folder of tc's tables, for a profile's measured distribution.
         """
         self._iproute2 = Iproute2(run)
         self._clock, self._wait = clock, wait
@@ -233,7 +465,7 @@ class Netem:
     def _take(self, profile: DirectionProfile, origin_ns: int) -> None:
         self._profile, self._timeline = profile, Timeline(profile)
         self._origin_ns, self._piece = origin_ns, -1
-        self._room = self._least_room = limit(profile)
+        self._room = limit(profile)
         if self._tables is not None:
             write_measured(self._tables, profile)
 
@@ -255,12 +487,7 @@ class Netem:
         return peer
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on; queued datagrams keep their delay.
-
-        Args:
-            profile: Conditions.
-            restart: True: the time line starts now. False: the time line continues.
-        """
+        """Shape by this profile from now on, as `Shaper.follow_profile`."""
         check(profile)
         qdiscs = self._look()
         if self._damage:
@@ -282,13 +509,12 @@ class Netem:
         until_ns = self._clock() + round(timeout * 1e9)
         if self._clock() - self._looked_ns >= PERIOD_NS:
             # The limit is as asked again once what was under way at a change has left.
-            if counters(self._look()).get("held", 0) < self._least_room:
-                self._room = self._least_room
+            if counters(self._look()).get("held", 0) < limit(self._profile):
+                self._room = limit(self._profile)
         while True:
             self._step()
-            due_ns = self._next_ns()
-            wake_ns = until_ns if due_ns is None else min(due_ns, until_ns)
-            self._wait(max(0, wake_ns - self._clock()) * 1e-9)
+            wake_ns = min(until_ns, self._next_ns())
+            self._wait(max(0.0, wake_ns - self._clock()) * 1e-9)
             if wake_ns >= until_ns:
                 return
 
@@ -306,46 +532,49 @@ class Netem:
 
     def close(self) -> None:
         """Remove the qdiscs if they are from `Netem`; queued datagrams are lost."""
-        if self._device and is_ours(self._qdiscs()):
+        if self._device and _is_ours(_root_of(self._qdiscs())):
             self._iproute2.tc("qdisc", "del", "dev", self._device, "root")
         self._device, self._applied = "", []
 
     def _look(self) -> list[dict[str, Any]]:
         """Read the qdiscs; log and count damage by another program."""
         self._looked_ns, qdiscs = self._clock(), self._qdiscs()
-        what = damage(qdiscs, self._applied) if self._applied else ""
+        found = self._differences(qdiscs) if self._applied else []
+        what = f"was changed ({'; '.join(found)})" if found else "was removed"
         said = (
             f"the qdisc of {self._device} {what} by another program, so the link is not as asked; "
             "find out which, and restart this pod to set it up again"
         )
-        if what and said != self._damage:
+        said = "" if found == [] else said
+        if said and said != self._damage:
             self._damages += 1
             self._log(f"error: {said}")
-        self._damage = said if what else ""
+        self._damage = said
         return qdiscs
+
+    def _differences(self, qdiscs: list[dict[str, Any]]) -> list[str] | None:
+        """Compare the options in force with the requested ones; None if the qdisc is missing."""
+        leaf = leaf_of(qdiscs)
+        return None if leaf is None else differences(self._applied, leaf.get("options", {}))
 
     def _set_up(self) -> None:
         """Add the qdiscs, or take over the qdiscs of an earlier process."""
-        qdiscs, device = self._qdiscs(), self._device
-        root = next((one for one in qdiscs if one.get("root")), {"handle": "0:"})
-        if root["handle"] != "0:" and not is_ours(qdiscs):
+        qdiscs, place = self._qdiscs(), ("dev", self._device, "root")
+        root = _root_of(qdiscs)
+        if root["handle"] != "0:" and not _is_ours(root):
             raise MissingPrerequisiteError(
-                f"{device} has a qdisc already ({root['kind']} {root['handle']}) that is not "
-                f"cloudrc's; remove it ('tc qdisc del dev {device} root'), or set link.mode=relay"
+                f"{self._device} has a qdisc already ({root['kind']} {root['handle']}) that is not "
+                f"cloudrc's; remove it ('tc qdisc del {' '.join(place)}'), or set link.mode=relay"
             )
-        if not is_ours(qdiscs):
-            self._add_root()
+        if not _is_ours(root):
+            try:
+                self._iproute2.tc("qdisc", "add", *place, "handle", ROOT, *_PRIO)
+            except MissingPrerequisiteError:
+                # A kernel without prio mostly lacks netem, too, which is what people look for.
+                self._iproute2.tc("qdisc", "add", *place, "netem")
+                self._iproute2.tc("qdisc", "del", *place)
+                raise
         self._apply("add" if leaf_of(qdiscs) is None else "change")
-
-    def _add_root(self) -> None:
-        place = ("dev", self._device, "root")
-        try:
-            self._iproute2.tc("qdisc", "add", *place, "handle", ROOT, *_PRIO)
-        except MissingPrerequisiteError:
-            # A kernel without sch_prio mostly lacks sch_netem, too, which is what people look for.
-            self._iproute2.tc("qdisc", "add", *place, "netem")
-            self._iproute2.tc("qdisc", "del", *place)
-            raise
 
     def _step(self) -> None:
         """Apply the present step of the time line; tolerate damage by another program."""
@@ -360,7 +589,7 @@ class Netem:
         """Bring the present conditions into force, unless they already are."""
         elapsed_ns, starts_ns = self._clock() - self._origin_ns, self._timeline.pass_ns
         before, self._piece = self._piece, max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
-        wanted = options(self._profile, self._timeline.at(elapsed_ns), self._room)
+        wanted = options(self._profile, self._timeline.pieces[self._piece], self._room)
         if wanted != self._applied:
             place = ("dev", self._device, "parent", BAND, "handle", LEAF)
             self._iproute2.tc("qdisc", verb, *place, "netem", *wanted)
@@ -372,23 +601,21 @@ class Netem:
             if self._piece == len(starts_ns) - 1:
                 self._log(self.steps.in_words())
 
-    def _next_ns(self) -> int | None:
-        """Return when the next step may take effect [ns]; None after the last step."""
+    def _next_ns(self) -> float:
+        """Return when the next step may take effect [ns]; infinite after the last step."""
         following = self._piece + 1
         if following >= len(self._timeline.pass_ns):
-            return None
+            return inf
         due_ns = self._origin_ns + self._timeline.pass_ns[following]
         return max(due_ns, self._stepped_ns + STEP_NS)
 
     def _confirm(self) -> None:
         """Read back the options in force; raise an error if they differ from the requested ones."""
-        leaf = leaf_of(self._qdiscs())
-        if leaf is None:
+        found = self._differences(self._qdiscs())
+        if found is None:
             raise MissingPrerequisiteError(
-                f"the qdisc of {self._device} was removed by another program meanwhile; find out "
-                "which"
+                f"the qdisc of {self._device} was removed by another program; find out which"
             )
-        found = differences(self._applied, leaf.get("options", {}))
         if found:
             raise BadInputError(
                 f"netem cannot do what is asked ({'; '.join(found)}); set link.mode=relay, which "

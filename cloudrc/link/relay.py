@@ -5,16 +5,11 @@ Local mode runs `Relay`, with both directions. In a pod, `RelayShaper` shapes wh
     world <-> [world side]  Relay  [cloud side] <-> cloud
     tunnel end > [listen]  RelayShaper  [any port] > the other pod's tunnel end
 
-Due time of a datagram = time of arrival at the kernel + delay that the model draws. The time in
-which the datagram waits for this process does not count. A datagram never leaves before it is due.
+Due time of a datagram = time of arrival at the kernel + delay that the model draws. A datagram
+never leaves before it is due. The relay sleeps in `select` until shortly before the next datagram
+is due, then reads the clock in a loop, since a sleeping thread wakes 15 to 50 us late.
 
-The relay sleeps in `select` until a datagram arrives, or until shortly before the next datagram is
-due. Then it reads the clock in a loop until the due time, since a sleeping thread wakes 15 to 50 us
-late. The relay first releases the datagrams that are due and then takes in new ones: these have the
-kernel's time stamp and can wait.
-
-A socket is connected to its end of the tunnel. So the kernel drops datagrams from any other address
-without waking this process.
+A socket is connected to its end of the tunnel, so the kernel drops datagrams from others.
 """
 
 from __future__ import annotations
@@ -27,13 +22,12 @@ import select
 import socket
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import count
 from time import monotonic_ns
 from typing import TypeAlias
 
-from cloudrc.link.lateness import Recent, ReleaseErrors, in_ns
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 
@@ -51,39 +45,111 @@ DATAGRAM_MAX = 2_048
 BATCH = 32
 """Limit of datagrams that a lane takes in or releases before the next lane's turn [1]."""
 SPIN_NS = 60_000
-"""How long before a due time the relay starts to read the clock in a loop [ns]. If a thread wakes
-later than this, the cause is not the timer but, for example, another program."""
+"""How long before a due time the relay starts to read the clock in a loop [ns]."""
 STOP_PERIOD = 0.1
 """Longest time between two calls of `stop` [s]."""
-
 ANCILLARY_SIZE = 64
 """Size of the buffer for the kernel's time stamp and its count of drops [bytes]."""
 AGE_MAX_NS = 50_000_000
 """Limit of a datagram's age when it is read [ns]; an older datagram counts as this old."""
+QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
+"""Percentiles of the lateness that are reported."""
+
+_BITS = 7
+"""How many significant bits of a lateness select its bucket [1]: buckets are 1.6 % wide."""
+_RECENT = 10
+"""Number of calls of `Recent.counts` that its percentiles cover [1]."""
 _STEP_MIN_NS = 1_000_000
 """If the clock offset changes by more than this between two checks, the wall clock was set [ns]."""
-_COUNT_MASK = 0xFFFF_FFFF
-# Source: Linux, include/uapi/asm-generic/socket.h; Python has no names for them.
-_SO_TIMESTAMPNS = 35
-_SO_RXQ_OVFL = 40
+_FIFO_PRIORITY = 10
+"""Real-time priority [1]: above ordinary processes, below the kernel's own threads (50)."""
+_SWITCH_INTERVAL = 0.0002
+"""Longest time for which another thread of this process keeps the interpreter [s]."""
+_COLLECT_AFTER = 50_000
+"""Number of new objects that triggers a garbage collection [1]. The number is high, because new
+objects are mostly datagrams in flight, which are not garbage."""
+# Source: Linux, include/uapi/asm-generic/socket.h, prctl.h; Python has no names for them.
+_SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
+
+
+class ReleaseErrors:
+    """Histogram of the lateness: the time from when a datagram was due until it left.
+
+    Attributes:
+        early: Number of datagrams that left before they were due; above 0 is a fault.
+    """
+
+    def __init__(self, early: int = 0, counts: Counter[int] | None = None) -> None:
+        self.early, self._counts = early, Counter[int]() if counts is None else counts
+
+    def observe(self, error_ns: int) -> None:
+        """Count one datagram that left `error_ns` [ns] after it was due."""
+        if error_ns < 0:
+            self.early += 1
+            error_ns = 0
+        shift = max(0, error_ns.bit_length() - _BITS)
+        self._counts[(shift << _BITS) + (error_ns >> shift)] += 1
+
+    @classmethod
+    def together(cls, parts: Iterable[ReleaseErrors]) -> ReleaseErrors:
+        """Add up the counts of several directions; other threads may count meanwhile."""
+        whole = cls()
+        for part in parts:
+            whole.early += part.early
+            whole._counts += part._counts.copy()
+        return whole
+
+    def since(self, before: ReleaseErrors) -> ReleaseErrors:
+        """Return the counts since an earlier copy: these counts minus `before`."""
+        return ReleaseErrors(self.early - before.early, self._counts - before._counts)
+
+    def in_ns(self) -> dict[str, int]:
+        """Return the lateness in whole nanoseconds.
+
+        Returns:
+            `released`, `released_early`, and `release_error_p50_ns`, `_p99_ns` and `_p999_ns` [ns];
+            empty before the first datagram.
+        """
+        counts, below = sorted(self._counts.copy().items()), 0
+        whole = sum(number for _, number in counts)
+        wanted = [(f"release_error_{name}_ns", share) for name, share in QUANTILES.items()]
+        found = {"released": whole, "released_early": self.early} if whole else {}
+        for bucket, number in counts:
+            below += number
+            shift, start = divmod(bucket, 1 << _BITS)
+            while wanted and below >= wanted[0][1] * whole:
+                found[wanted.pop(0)[0]] = (start + 1) << shift
+        return found
+
+
+class Recent:
+    """Percentiles over the last ten calls of `counts`: ten seconds if called once a second."""
+
+    def __init__(self) -> None:
+        """Start before the first datagram."""
+        self._past: deque[ReleaseErrors] = deque([ReleaseErrors()], maxlen=_RECENT)
+
+    def counts(self, errors: ReleaseErrors) -> dict[str, int]:
+        """Return `released_early` since the beginning, and the recent percentiles [ns], if any.
+
+        `errors` are the counts since the beginning, as a copy that no thread changes any more.
+        """
+        recent = errors.since(self._past[0]).in_ns()
+        self._past.append(errors)
+        recent.pop("released", None)
+        return {**recent, "released_early": errors.early}
 
 
 def ask_for_stamps(one: socket.socket) -> bool:
-    """Ask the kernel to time-stamp arriving datagrams and to count dropped ones.
-
-    Returns:
-        Whether the kernel stamps datagrams.
-    """
-    if sys.platform != "linux":
-        return False
-    granted = []
-    for option in (_SO_TIMESTAMPNS, _SO_RXQ_OVFL):
+    """Ask the kernel to count dropped datagrams and to stamp arriving ones; return if it stamps."""
+    granted = False
+    for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():
         try:
             one.setsockopt(socket.SOL_SOCKET, option, 1)
-            granted.append(option)
+            granted = True
         except OSError:  # without stamps a datagram arrives when it is read
-            continue
-    return _SO_TIMESTAMPNS in granted
+            granted = False
+    return granted
 
 
 class Stamps:
@@ -100,34 +166,25 @@ class Stamps:
     def __init__(self) -> None:
         """Start before the first datagram."""
         self.dropped = 0
-        self._dropped_told = 0
         self._offset_ns: int | None = None
 
     def look_at_clocks(self) -> int | None:
-        """Compare the wall clock with the monotonic clock, before a batch of datagrams is read.
-
-        The wall clock is read first. So a pause between the two readings makes a datagram seem
-        later, never earlier.
+        """Compare the clocks before a batch of datagrams is read.
 
         Returns:
             Monotonic minus wall clock [ns]; None if the wall clock was set since the last call, so
             that stamps cannot be converted.
         """
-        before = self._offset_ns
-        wall_ns = time.time_ns()
+        # The wall clock first: a pause between the readings makes a datagram later, never earlier.
+        before, wall_ns = self._offset_ns, time.time_ns()
         offset_ns = self._offset_ns = time.monotonic_ns() - wall_ns
-        if before is not None and abs(offset_ns - before) > _STEP_MIN_NS:
-            return None
-        return offset_ns
+        stepped = before is not None and abs(offset_ns - before) > _STEP_MIN_NS
+        return None if stepped else offset_ns
 
     def wall_ns(self, ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
-        """Read the kernel's time stamp of a datagram; update `dropped`.
+        """Return a datagram's arrival by the wall clock [ns], if stamped; update `dropped`.
 
-        Args:
-            ancillary: Ancillary data as `recvmsg` returns them.
-
-        Returns:
-            Arrival on the wall clock [ns]; None without a stamp.
+        `ancillary` are the ancillary data that `recvmsg` returns.
         """
         wall_ns = None
         for _, kind, data in ancillary:
@@ -136,21 +193,14 @@ class Stamps:
                 wall_ns = seconds * 1_000_000_000 + rest
             elif kind == _SO_RXQ_OVFL:  # a 32-bit count
                 told = int.from_bytes(data, sys.byteorder)
-                self.dropped += (told - self._dropped_told) & _COUNT_MASK
-                self._dropped_told = told
+                self.dropped += (told - self.dropped) & 0xFFFF_FFFF
         return wall_ns
 
 
 def instant_ns(wall_ns: int | None, offset_ns: int | None, now_ns: int) -> int:
-    """Convert a stamp to the monotonic clock.
+    """Convert a stamp [ns] by an offset of `Stamps` [ns] to the monotonic clock [ns].
 
-    Args:
-        wall_ns: From `Stamps.wall_ns` [ns].
-        offset_ns: From `Stamps.look_at_clocks` [ns].
-        now_ns: Monotonic clock after the datagram was read [ns].
-
-    Returns:
-        Arrival on the monotonic clock [ns], between `AGE_MAX_NS` ago and `now_ns`.
+    The result is at most `AGE_MAX_NS` before `now_ns`, the time at which the datagram was read.
     """
     if wall_ns is None or offset_ns is None:
         return now_ns
@@ -161,7 +211,7 @@ class Lane:
     """Takes datagrams in, asks the model, and sends them when they are due.
 
     Attributes:
-        source: Socket at which the datagrams arrive.
+        source: Bound UDP socket at which the datagrams arrive; the caller closes it.
         direction: Model of the link.
         origin_ns: Start of the model's time [ns], monotonic clock; None before the first datagram,
             which sets it.
@@ -169,34 +219,20 @@ class Lane:
     """
 
     def __init__(
-        self,
-        source: socket.socket,
-        send: Send,
-        direction: LinkDirection,
-        peek: Peek,
-        in_flight_max: int = IN_FLIGHT_MAX,
+        self, source: socket.socket, send: Send, direction: LinkDirection, peek: Peek
     ) -> None:
-        """Set up.
-
-        Args:
-            source: Bound UDP socket; the caller closes it.
-            send: Sends a datagram to the other end.
-            direction: Model of the link.
-            peek: Reads kind, epoch and counter of a datagram.
-            in_flight_max: Limit of datagrams held at once.
-        """
         source.setblocking(False)
         ask_for_stamps(source)
         self.source, self.direction = source, direction
         self.origin_ns: int | None = None
         self.errors = ReleaseErrors()
-        self._output, self._peek, self._in_flight_max = send, peek, in_flight_max
+        self._output, self._peek = send, peek
         # Due instant [ns], a number that keeps equal instants in order, data.
         self._in_flight: list[tuple[int, int, bytes]] = []
         self._numbers = count()
         self._stamps = Stamps()
-        self._received = self._forwarded = self._lost = 0
-        self._malformed = self._overflow = self._unsent = self._stalled = 0
+        outcomes = ("received", "forwarded", "lost", "malformed", "overflow", "unsent")
+        self._counts, self._stalled = dict.fromkeys(outcomes, 0), 0
 
     def due_ns(self) -> int | None:
         """Return when the next datagram is due [ns], monotonic clock; None if none is held."""
@@ -212,7 +248,7 @@ class Lane:
                 continue
             except OSError:  # nothing waits
                 return
-            self._received += 1
+            self._counts["received"] += 1
             now_ns = monotonic_ns()
             received_ns = instant_ns(read(beside), offset_ns, now_ns)
             self._stalled += now_ns - received_ns >= AGE_MAX_NS
@@ -221,7 +257,7 @@ class Lane:
                     raise ValueError("too long")
                 header = self._peek(data)
             except ValueError:
-                self._malformed += 1
+                self._counts["malformed"] += 1
             else:
                 self._put_on_link(data, *header, received_ns)
 
@@ -233,33 +269,26 @@ class Lane:
                 return
             due_ns, _, data = heapq.heappop(self._in_flight)
             if self._send(data):
-                self._forwarded += 1
+                self._counts["forwarded"] += 1
                 self.errors.observe(now_ns - due_ns)
             else:
-                self._unsent += 1
+                self._counts["unsent"] += 1
 
     def counts(self) -> dict[str, int]:
         """Return the number of datagrams by outcome; `Lanes.outcomes` explains the names."""
-        return {
-            "received": self._received,
-            "forwarded": self._forwarded,
-            "lost": self._lost,
-            "malformed": self._malformed,
-            "overflow": self._overflow,
-            "unread": self._stamps.dropped,
-            "unsent": self._unsent,
-        }
+        return {**self._counts, "unread": self._stamps.dropped}
 
     def released(self) -> dict[str, int]:
         """Return how late datagrams left since the beginning; any thread may call this.
 
         Returns:
-            The values of `lateness.in_ns`, and two numbers of datagrams. `overflow`: there was no
-            room. `stalled`: the datagram waited for this process for `AGE_MAX_NS` or longer, so it
-            may have left later than `errors` says. Empty before the first datagram.
+            The values of `ReleaseErrors.in_ns`, the number of datagrams for which there was no room
+            (`overflow`) or that waited for this process for `AGE_MAX_NS` or longer (`stalled`).
+            Empty before the first datagram.
         """
-        told = in_ns(self.errors)
-        return {**told, "overflow": self._overflow, "stalled": self._stalled} if told else {}
+        told = self.errors.in_ns()
+        more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
+        return {**told, **more} if told else {}
 
     def _put_on_link(
         self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
@@ -270,12 +299,12 @@ class Lane:
         elapsed_ns = received_ns - self.origin_ns
         releases = self.direction.send(epoch, kind, counter, len(data), elapsed_ns)
         if not releases:
-            self._lost += 1
+            self._counts["lost"] += 1
         elif self.direction.corrupts:
             data = self.direction.corrupted(epoch, kind, counter, data)
         for release_ns in releases:
-            if len(self._in_flight) >= self._in_flight_max:
-                self._overflow += 1
+            if len(self._in_flight) >= IN_FLIGHT_MAX:
+                self._counts["overflow"] += 1
             else:
                 due_ns = release_ns + self.origin_ns
                 heapq.heappush(self._in_flight, (due_ns, next(self._numbers), data))
@@ -295,40 +324,38 @@ class Lane:
 
 
 class Lanes:
-    """Lanes that share one thread and one wait."""
+    """Lanes that share one thread and one wait.
+
+    The models' time starts at `origin_ns` [ns], monotonic clock. If it is None, their time starts
+    at the first datagram on any lane, as in virtual time.
+    """
 
     def __init__(self, lanes: Sequence[Lane], origin_ns: int | None) -> None:
-        """Set up.
+        self._lanes, self._recent = tuple(lanes), Recent()
+        for lane in self._lanes:
+            lane.origin_ns = origin_ns
 
-        Args:
-            lanes: The lanes, at least one.
-            origin_ns: Start of the models' time [ns], monotonic clock; None: the models' time
-                starts at the first datagram on any lane, as in virtual time.
-        """
-        self._lanes = tuple(lanes)
-        self._sources = [lane.source for lane in self._lanes]
-        self._recent = Recent()
-        self._origin_known = False
-        self._set_origin(origin_ns)
-
-    def run_for(self, timeout: float) -> None:
+    def step(self, timeout: float) -> None:
         """Forward datagrams for `timeout` [s], or a little longer."""
         until_ns = monotonic_ns() + round(timeout * 1e9)
         while (rest_ns := until_ns - monotonic_ns()) > 0:
-            self.step(rest_ns * 1e-9)
+            self._step_once(rest_ns * 1e-9)
 
-    def step(self, timeout: float) -> None:
+    def _step_once(self, timeout: float) -> None:
         """Wait at most `timeout` [s] for an arrival or a due time; read and release datagrams."""
         due_ns = min((due for lane in self._lanes if (due := lane.due_ns()) is not None), default=0)
         if due_ns:
             timeout = min(timeout, max(0.0, (due_ns - SPIN_NS - monotonic_ns()) * 1e-9))
-        readable, _, _ = select.select(self._sources, (), (), timeout)
+        sources = [lane.source for lane in self._lanes]
+        readable, _, _ = select.select(sources, (), (), timeout)
         if due_ns and due_ns - monotonic_ns() <= SPIN_NS:
             while monotonic_ns() < due_ns:
                 pass
-            self._release()
+            for lane in self._lanes:  # first: new datagrams have a time stamp and can wait
+                lane.release()
         self.take_in(readable)
-        self._release()  # what has no delay
+        for lane in self._lanes:  # what has no delay
+            lane.release()
 
     def take_in(self, readable: Collection[socket.socket] | None = None) -> None:
         """Read waiting datagrams from these sockets into the models, by default from all sockets.
@@ -337,22 +364,18 @@ class Lanes:
         """
         for lane in self._lanes:
             if readable is None or lane.source in readable:
+                known = lane.origin_ns is not None
                 lane.take_in()
-                if not self._origin_known:
-                    self._set_origin(lane.origin_ns)
+                if not known:
+                    for other in self._lanes:
+                        other.origin_ns = lane.origin_ns
 
     def outcomes(self) -> dict[str, int]:
         """Return the number of datagrams of all lanes by outcome.
 
-        Returns:
-            - `received`: arrived at the relay.
-            - `lost`: lost on the link by any cause.
-            - `malformed`: not from the tunnel.
-            - `overflow`: dropped because the lane already held `in_flight_max` datagrams.
-            - `unread`: dropped because the socket's buffer was full; the kernel reports this with
-              the next datagram.
-            - `unsent`: not sent because the other end is unknown or the kernel refused.
-            - `forwarded`: sent, copies included.
+        The outcomes: `received`; `forwarded` (copies included); `lost` on the link; `malformed`
+        (not from the tunnel); `overflow` (`IN_FLIGHT_MAX` were held); `unread` (the socket's buffer
+        was full); `unsent` (the other end is unknown or the kernel refused).
         """
         outcomes: Counter[str] = Counter()
         for lane in self._lanes:
@@ -361,29 +384,7 @@ class Lanes:
 
     def recent(self) -> dict[str, int]:
         """Return the recent lateness as from `Recent.counts`; call this method once a second."""
-        return self._recent.counts(self._errors())
-
-    def counts(self) -> dict[str, float]:
-        """Return `outcomes`, and the lateness since the beginning.
-
-        The lateness is `released_early`, `release_error_p50`, `_p99` and `_p999` [s]. The
-        percentiles are absent before the first datagram.
-        """
-        errors = self._errors()
-        return {**self.outcomes(), "released_early": errors.early, **errors.quantiles()}
-
-    def _errors(self) -> ReleaseErrors:
-        return ReleaseErrors.together(lane.errors for lane in self._lanes)
-
-    def _release(self) -> None:
-        for lane in self._lanes:
-            lane.release()
-
-    def _set_origin(self, origin_ns: int | None) -> None:
-        if origin_ns is not None:
-            self._origin_known = True
-            for lane in self._lanes:
-                lane.origin_ns = origin_ns
+        return self._recent.counts(ReleaseErrors.together(lane.errors for lane in self._lanes))
 
 
 class Relay(Lanes):
@@ -399,20 +400,10 @@ class Relay(Lanes):
         cloud_side: socket.socket,
         world_peer: Address,
         cloud_peer: Address,
-        in_flight_max: int = IN_FLIGHT_MAX,
     ) -> None:
-        """Connect both sockets to their ends; the caller closes them.
+        """Connect the bound UDP sockets of both sides to their ends; the caller closes them.
 
-        Args:
-            uplink: World to cloud, with origin 0. The relay sets the start of its time at the first
-                datagram, as in virtual time, however long the processes take to start.
-            downlink: Cloud to world, with origin 0, likewise.
-            peek: Reads kind, epoch and counter of a datagram.
-            world_side: Bound UDP socket that world sends to.
-            cloud_side: Bound UDP socket that cloud sends to.
-            world_peer: Address at which world receives and from which it sends.
-            cloud_peer: Likewise for cloud.
-            in_flight_max: Limit of datagrams held at once in each direction.
+        The origin of both models is 0. An end sends from the address at which it receives.
 
         Raises:
             OSError: If an end cannot be reached from its socket's address.
@@ -420,8 +411,8 @@ class Relay(Lanes):
         world_side.connect(world_peer)
         cloud_side.connect(cloud_peer)
         self._ways = {
-            "uplink": Lane(world_side, cloud_side.send, uplink, peek, in_flight_max),
-            "downlink": Lane(cloud_side, world_side.send, downlink, peek, in_flight_max),
+            "uplink": Lane(world_side, cloud_side.send, uplink, peek),
+            "downlink": Lane(cloud_side, world_side.send, downlink, peek),
         }
         super().__init__(tuple(self._ways.values()), origin_ns=None)
 
@@ -429,14 +420,19 @@ class Relay(Lanes):
         """Forward datagrams until `stop` returns True; call `stop` at least every 0.1 s."""
         tighten_slack()
         while not stop():
-            self.run_for(STOP_PERIOD)
+            self.step(STOP_PERIOD)
+
+    def counts(self) -> dict[str, int]:
+        """Return `outcomes`, and the lateness since the beginning as from `ReleaseErrors.in_ns`."""
+        errors = ReleaseErrors.together(lane.errors for lane in self._lanes)
+        return {**self.outcomes(), **errors.in_ns()}
 
     def released(self, way: str) -> dict[str, int]:
         """Return how late datagrams of "uplink" or "downlink" left, as from `Lane.released`."""
         return self._ways[way].released()
 
 
-class RelayShaper:
+class RelayShaper(Lanes):
     """One direction of the link in userspace; a `Shaper`."""
 
     name = "relay"
@@ -469,7 +465,7 @@ class RelayShaper:
         self._outside.setblocking(False)
         self._peer: Address | None = None
         self._lane = Lane(self._inside, self._send, direction, peek)
-        self._lanes = Lanes((self._lane,), origin_ns=0)
+        super().__init__((self._lane,), origin_ns=0)
         tighten_slack()
 
     def follow_peer(self, peer: Address) -> Address:
@@ -479,22 +475,13 @@ class RelayShaper:
         return host, port
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on; datagrams in flight keep their delay.
-
-        Args:
-            profile: Conditions.
-            restart: True: the time line starts now. False: the time line continues.
-        """
-        self._lanes.take_in()  # what has arrived until now belongs to the old profile
+        """Shape by this profile from now on, as `Shaper.follow_profile`."""
+        self.take_in()  # what has arrived until now belongs to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
 
-    def step(self, timeout: float) -> None:
-        """Forward datagrams for `timeout` [s]."""
-        self._lanes.run_for(timeout)
-
     def counts(self) -> dict[str, int]:
-        """Return `Lanes.outcomes` and `Lanes.recent`."""
-        return self._lanes.outcomes() | self._lanes.recent()
+        """Return `outcomes` and `recent`."""
+        return self.outcomes() | self.recent()
 
     def released(self) -> dict[str, int]:
         """Return how late datagrams left since the beginning, as from `Lane.released`."""
@@ -511,16 +498,6 @@ class RelayShaper:
         self._outside.sendto(data, self._peer)
 
 
-_FIFO_PRIORITY = 10
-"""Real-time priority [1]: above ordinary processes, below the kernel's own threads (50)."""
-_SWITCH_INTERVAL = 0.0002
-"""Longest time for which another thread of this process keeps the interpreter [s]."""
-_COLLECT_AFTER = 50_000
-"""Number of new objects that triggers a garbage collection [1]. The number is high, because new
-objects are mostly datagrams in flight, which are not garbage."""
-_SET_TIMERSLACK = 29
-
-
 def settle() -> None:
     """Make garbage collections rare and cheap; shorten the turns of other threads."""
     sys.setswitchinterval(_SWITCH_INTERVAL)
@@ -530,9 +507,9 @@ def settle() -> None:
 
 
 def tighten_slack() -> None:
-    """Let sleeps of the calling thread end on time, not up to 50 us late.
+    """Let sleeps of the calling thread end on time, not up to 50 us late (Linux only).
 
-    Source: PR_SET_TIMERSLACK, prctl(2); Linux only.
+    Source: PR_SET_TIMERSLACK, prctl(2).
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)

@@ -17,6 +17,7 @@ from pydantic import TypeAdapter
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
+from cloudrc.link.netem import Iproute2, Run, check, notes
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.relay import Address
 from cloudrc.link.state import (
@@ -29,7 +30,6 @@ from cloudrc.link.state import (
     to_text,
     withdraw,
 )
-from cloudrc.link.tc import Iproute2, Run, check, notes
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 COUNT_PERIOD_NS = 1_000_000_000

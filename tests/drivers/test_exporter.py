@@ -22,8 +22,8 @@ from cloudrc.exposition.table import (
     Kind,
     of_role,
 )
-from cloudrc.link.lateness import Recent, ReleaseErrors
 from cloudrc.link.netem import Steps
+from cloudrc.link.relay import Recent, ReleaseErrors
 from cloudrc.messages import ZERO
 from cloudrc.records import (
     Contact,

@@ -13,7 +13,7 @@ import pytest
 
 from cloudrc.drivers.feed import Feed, in_words
 from cloudrc.drivers.process import LinkNotes
-from cloudrc.link.lateness import ReleaseErrors, in_ns
+from cloudrc.link.relay import ReleaseErrors
 from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
 from cloudrc.messages import GuardState
 from cloudrc.records import Counted, GuardChange, LinkChanged, Record, SessionOpened
@@ -169,7 +169,7 @@ def test_only_what_a_relay_tells_is_counted(tmp_path: Path) -> None:
     path = tmp_path / "link.json"
     errors = ReleaseErrors()
     errors.observe(5)
-    told = in_ns(errors) | {"overflow": 1, "stalled": 2}
+    told = errors.in_ns() | {"overflow": 1, "stalled": 2}
     path.with_suffix(".released").write_text(json.dumps(told | {"another": 3}))
     counted = LinkNotes(path, uplink=True).after([], 0)
     assert [one.name for one in counted if isinstance(one, Counted)] == [

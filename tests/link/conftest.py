@@ -26,11 +26,10 @@ from cloudrc.drivers.iproute2 import Programs
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.netem import Netem
+from cloudrc.link.netem import Answer, Netem, write_tables
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Machine, Mode, Settings, Sidecar
 from cloudrc.link.state import Change
-from cloudrc.link.tc import Answer, write_tables
 
 
 @pytest.fixture(scope="module")

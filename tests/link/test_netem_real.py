@@ -21,9 +21,8 @@ from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
-from cloudrc.link.netem import Netem
+from cloudrc.link.netem import STRETCH, Netem, check, table
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
-from cloudrc.link.tc import STRETCH, check, table
 from cloudrc.tunnel.codec import Kind
 from tests.link import conftest as lab
 from tests.link.conftest import SIZE, WITHIN, Flow, least, measure, show

@@ -15,11 +15,11 @@ from cloudrc.cli.link_run import EMPTY_STATUS, LinkStatusSource
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link import sidecar
 from cloudrc.link.follow import Loaded
+from cloudrc.link.netem import Answer, notes
 from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott, Trace
 from cloudrc.link.profile import Change as Step
 from cloudrc.link.sidecar import Mode, Near, Told, look_near, read_told, write_told
 from cloudrc.link.state import Change, publish
-from cloudrc.link.tc import Answer, notes
 from tests.link.conftest import PEER, REFUSED, Bench, told
 
 NEXT = ("10.244.0.9", 7400)

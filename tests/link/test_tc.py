@@ -13,8 +13,7 @@ from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError
 from cloudrc.link.draws import Purpose, shape, stream_key
-from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Timeline, Trace
-from cloudrc.link.tc import (
+from cloudrc.link.netem import (
     ENTRIES,
     STRETCH,
     Answer,
@@ -30,6 +29,7 @@ from cloudrc.link.tc import (
     write_measured,
     write_tables,
 )
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Timeline, Trace
 
 EVERYTHING = DirectionProfile(
     0.045, 0.0255, "normal", 0.25, loss=0.015, duplicate=0.02, reorder=0.1, corrupt=0.005

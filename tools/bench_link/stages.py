@@ -164,7 +164,7 @@ def measure_profiles(
     rows: list[Row] = []
     for name, relay in relays.items():
         relay.stop()
-        own_p99 = relay.counts().get("release_error_p99", 0.0)
+        own_p99 = relay.counts().get("release_error_p99_ns", 0.0) * 1e-9
         origin_ns = min(min(flow.sent.values()) for flow in flows[name])
         for flow, profile in zip(flows[name], profiles_of(folder, links[name]), strict=True):
             direction = "uplink" if flow.uplink else "downlink"

@@ -15,8 +15,8 @@ from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection, Stream
+from cloudrc.link.netem import check, stretch, table
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Timeline
-from cloudrc.link.tc import check, stretch, table
 from cloudrc.link.verify.causes import Evidence, Findings
 from cloudrc.link.verify.expect import Flow, Plan
 from cloudrc.link.verify.judge import Row, judge

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from cloudrc.config.shipped import names
+from cloudrc.link.netem import check
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
-from cloudrc.link.tc import check
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
 from cloudrc.link.verify.expect import Flow, netem_makes
 from cloudrc.link.verify.judge import Row, look_twice, verdict_of
