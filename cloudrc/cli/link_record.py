@@ -146,8 +146,7 @@ def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_unit
     Raises:
         BadInputError: If the file is none of these, or cannot be used.
     """
-    from cloudrc.link.logs import read_csv, read_irtt, refuse_others
-    from cloudrc.link.ping import is_ping, read_ping
+    from cloudrc.link.logs import is_ping, read_csv, read_irtt, read_ping, refuse_others
     from cloudrc.link.traces import read_lines
 
     name = str(path)

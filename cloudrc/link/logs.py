@@ -1,17 +1,19 @@
-"""Read the packets of measured links from logs of irtt and from CSV files.
+"""Read the packets of measured links from logs of ping, fping and irtt, and from CSV files.
 
+    ping -D -O HOST, ping --apple-time HOST, fping -D HOST
     irtt client -i 10ms -l 203 -d 1m -o irtt.json HOST
 
 A telemetry datagram has 203 bytes, a command datagram 88 bytes. irtt measures both directions if
-the clocks of the two hosts agree. `link/ping.py` reads logs of ping.
-
-The columns of a CSV log name their units. `time_ms,delay_us,loss` are the time of sending, the
-one-way delay and the loss (0 or 1). `timestamp_ns,rtt_ms` has round trips; the reader takes half of
-each round trip if the user asks for that.
+the clocks of the two hosts agree; ping measures round trips. The columns of a CSV log name their
+units: `time_ms,delay_us,loss` are the time of sending, the one-way delay and the loss (0 or 1);
+`timestamp_ns,rtt_ms` has round trips. The readers take half of each round trip if the user asks for
+that.
 
 Every reader fills a `Log`, and `Log.packets` makes the same checks for all logs. `Packets.notes`
 counts the rows that are left out, merged or sorted. A log is refused if more than 1 % of its rows
 cannot be used.
+
+Source: ping(8) of iputils, macOS and BusyBox; fping(8); irtt-client(1), JSON format 1.
 """
 
 from __future__ import annotations
@@ -19,34 +21,39 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import pairwise
 from math import isfinite, isnan
 from operator import itemgetter
-from statistics import median
+from statistics import fmean, median
 from typing import Any, Literal, TypeAlias
+
+import numpy as np
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Trace
-from cloudrc.link.traces import Row, Table, decimals_of, looks_lost, shown
+from cloudrc.link.traces import Row, decimals_of, looks_lost, read_rows
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
+Entry: TypeAlias = tuple[float, float | None]
+"""Time of sending [s] and delay [s], None if the packet was lost."""
 LONGEST = 5.0
 """Longest plausible median delay [s]; values with a larger median are probably in another unit."""
 UNUSABLE_MAX = 0.01
 """Largest share of rows that may be left out [1]; above this share the log is refused."""
-GAP = 20
-"""Shortest gap that a note reports, as a multiple of the median time between packets [1]. The gap
-must also be longer than `GAP_MIN`."""
-GAP_MIN = 1.0
-"""Shortest gap that a note reports [s]."""
+GAP, GAP_MIN = 20, 1.0
+"""Shortest gap that a note reports: as a multiple of the median time between packets [1], and
+[s]."""
 STEPS_MAX = 3
 """Up to this number of jumps back in time, a jump is a step of the clock or a new session [1]. More
 jumps mean that the rows are shuffled."""
-_MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
-"""Errors that JSON with an unexpected layout can raise."""
+PACKETS_MAX = 10_000_000
+"""Limit of packets in a log of ping, since a number may be forged: three weeks at five a second."""
+STEP_BACK = 0.02
+"""Limit of the time [s] by which a packet may seem to be sent before the packet with the number
+before its own."""
 HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
@@ -92,7 +99,7 @@ class Log:
 
     Attributes:
         name: Name of the source, for messages.
-        entries: Time of sending [s] and delay [s] (None if lost), in the order of the source.
+        entries: The packets in the order of the source.
         counts: What was left out, merged or changed -> how often.
         unusable: One reason for each row that cannot be used.
         facts: Further notes.
@@ -101,7 +108,7 @@ class Log:
     """
 
     name: str
-    entries: list[tuple[float, float | None]] = field(default_factory=list)
+    entries: list[Entry] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
     unusable: list[str] = field(default_factory=list)
     facts: list[str] = field(default_factory=list)
@@ -122,9 +129,7 @@ class Log:
             raise BadInputError(
                 f"{self.name}: no packet arrived; give a log with at least one reply"
             )
-        if (least := min(arrived)) < 0.0:
-            early = f"a packet arrived {-least * 1e3:.4g} ms before it was sent"
-            raise BadInputError(f"{self.name}: {early}: {self.clocks}")
+        self.refuse_early(min(arrived))
         self._refuse_steps()
         unique = dict(reversed(self.entries))  # of packets with the same time the first remains
         repeated = len(self.entries) - len(unique)
@@ -132,21 +137,20 @@ class Log:
         self._refuse_beyond_limit(
             repeated, f"{self.name}: {repeated} of {len(self.entries)} packets {same}"
         )
-        newest = self.entries[0][0]
-        for sent, _ in self.entries:
-            self.counts["out of order, sorted"] += sent < newest
-            newest = max(newest, sent)
+        times = np.array([sent for sent, _ in self.entries])
+        late = int(np.sum(times < np.maximum.accumulate(times)))
+        self.counts["out of order, sorted"] += late
         self.counts["left out, at the time of another one"] += repeated
         self.counts["left out, unreadable"] += len(self.unusable)
-        ordered = sorted(unique.items(), key=itemgetter(0))
         notes = [f"{count} {what}" for what, count in self.counts.items() if count]
-        times = tuple(sent for sent, _ in ordered)
-        return Packets(
-            times,
-            tuple(delay for _, delay in ordered),
-            (*notes, *self.facts, *_gaps(times)),
-            self.halved,
-        )
+        sent, delays = zip(*sorted(unique.items(), key=itemgetter(0)), strict=True)
+        return Packets(sent, delays, (*notes, *self.facts, *_gaps(sent)), self.halved)
+
+    def refuse_early(self, least: float) -> None:
+        """Refuse a log whose shortest delay, `least` [s], is negative."""
+        if least < 0.0:
+            early = f"a packet arrived {-least * 1e3:.4g} ms before it was sent"
+            raise BadInputError(f"{self.name}: {early}: {self.clocks}")
 
     def _refuse_steps(self) -> None:
         """Refuse times that jump far back one to three times: sorting would mix two sessions."""
@@ -154,10 +158,10 @@ class Log:
         far = max(GAP_MIN, GAP * median([abs(step) for step in steps] or [0.0]))
         back = [row for row, step in enumerate(steps, 1) if step < -far]
         if 1 <= len(back) <= STEPS_MAX:
-            by = -steps[back[0] - 1]
             raise BadInputError(
-                f"{self.name}: after row {back[0]} the times go back by {by:.4g} s: a step of "
-                "the clock, or two sessions in one log; give the rows before or after it"
+                f"{self.name}: after row {back[0]} the times go back by "
+                f"{-steps[back[0] - 1]:.4g} s: a step of the clock, or two sessions in one log; "
+                "give the rows before or after it"
             )
 
     def _refuse_beyond_limit(self, count: int, reason: str) -> None:
@@ -167,16 +171,15 @@ class Log:
             raise BadInputError(reason + more)
 
 
-def _gaps(times: tuple[float, ...]) -> list[str]:
+def _gaps(times: Sequence[float]) -> list[str]:
     """Report the longest time without a packet, if it is unusual for this log."""
     steps = [after - before for before, after in pairwise(times)]
     longest = max(steps, default=0.0)
     if longest <= max(GAP_MIN, GAP * median(steps or [0.0])):
         return []
-    row = steps.index(longest) + 1
     return [
-        f"nothing sent for {longest:.4g} s after packet {row}: a pause, two sessions in one log, or"
-        " a step of the clock"
+        f"nothing sent for {longest:.4g} s after packet {steps.index(longest) + 1}: a pause, two "
+        "sessions in one log, or a step of the clock"
     ]
 
 
@@ -190,20 +193,19 @@ def trace_of(packets: Packets) -> Trace:
         One row per packet; the losses are None if nothing was lost.
     """
     sent = packets.sent
-    times = [0.0]
-    times += [(before + after) / 2 - sent[0] for before, after in pairwise(sent)]
-    delays = []
-    delay = packets.arrived[0]
+    halfway = [(before + after) / 2 - sent[0] for before, after in pairwise(sent)]
+    delays, delay = [], packets.arrived[0]
     for given in packets.delays:
         delay = delay if given is None else given
         delays.append(delay)
     losses = tuple(1.0 if given is None else 0.0 for given in packets.delays)
-    return Trace(tuple(times), tuple(delays), losses if packets.lost else None)
+    return Trace((0.0, *halfway), tuple(delays), losses if packets.lost else None)
 
 
-_IPERF = "the output of iperf, which has no delay of each packet; measure with irtt or ping -D"
 _OTHERS = {
-    r'"start":\s*\{\s*"connected"|"version":\s*"iperf|^iperf|^\[ *ID\] +Interval': _IPERF,
+    r'"start":\s*\{\s*"connected"|"version":\s*"iperf|^iperf|^\[ *ID\] +Interval': (
+        "the output of iperf, which has no delay of each packet; measure with irtt or ping -D"
+    ),
     r"[=<]\d+ ?\S{1,3} TTL=\d+|^Pinging ": (
         "the output of ping of Windows, which has neither numbers nor times of sending; measure "
         "with ping -D in WSL, or with irtt"
@@ -223,14 +225,16 @@ def refuse_others(lines: list[str], name: str) -> None:
             raise BadInputError(f"{name}: {what}")
 
 
+_MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
+"""Errors that JSON with an unexpected layout can raise."""
+
+
 def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool) -> Packets:
     """Read the output of `irtt client -o FILE.json`.
 
     The client stands for the robot: its packets are the uplink. If irtt does not know in which
     direction a packet was lost, the packet counts as lost in both directions. Times of sending are
     on the client's monotonic clock, so steps of its wall clock do not matter.
-
-    Source: irtt-client(1), JSON format 1.
 
     Args:
         text: Content of the file.
@@ -242,7 +246,7 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
         BadInputError: If the file is not such an output, if it contradicts its own counts, or if
             `halve` is false and the file has no usable one-way delays.
     """
-    log = Log(name)
+    log = Log(name, halved=halve)
     try:
         document = json.loads(text)
         trips = document["round_trips"]
@@ -253,9 +257,8 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
             )
         _compare_counts(document.get("stats") or {}, trips, log)
         if not halve:
-            _check_clocks(trips, name)
+            _check_clocks([trip for trip in trips if _arrived(trip)], log)
         log.entries = _irtt_entries(trips, "halves" if halve or not direction else direction)
-        log.halved = halve
     except _MISSHAPEN as error:
         raise BadInputError(
             f"{name}: not a log of irtt ({type(error).__name__}: {error}); "
@@ -264,9 +267,13 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
     return log.packets()
 
 
+def _arrived(trip: dict[str, Any]) -> bool:
+    return str(trip["lost"]).lower() == "false"
+
+
 def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log) -> None:
     """Compare the packets of an irtt log with the counts in the same log."""
-    arrived = sum(_lost(trip) == "false" for trip in trips)
+    arrived = sum(map(_arrived, trips))
     copies = int(stats.get("duplicates", 0))
     log.counts["duplicates left out"] += copies
     sent = int(stats.get("packets_sent", len(trips)))
@@ -278,17 +285,12 @@ def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log
         )
 
 
-def _check_clocks(trips: list[dict[str, Any]], name: str) -> None:
+def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
     """Reject one-way delays that are missing, or if the clocks differ or step, in both ways."""
-    arrived = [trip for trip in trips if _lost(trip) == "false"]
     if any(not {"send", "receive"} <= trip["delay"].keys() for trip in arrived):
-        raise _refusal(f"{name} (irtt's server sent no stamps)")
-    least = min(
-        (int(trip["delay"][key]) for trip in arrived for key in ("send", "receive")), default=0
-    )
-    if least < 0:
-        early = f"a packet arrived {-least * 1e-6:.4g} ms before it was sent"
-        raise BadInputError(f"{name}: {early}: {_CLOCKS}")
+        raise BadInputError(f"{log.name} (irtt's server sent no stamps): has round trips; {HALVE}")
+    both = [int(trip["delay"][key]) for trip in arrived for key in ("send", "receive")]
+    log.refuse_early(min(both, default=0) * 1e-9)
     for end, event in (("client", "send"), ("server", "receive")):
         stamps = [trip["timestamps"][end][event] for trip in arrived]
         if not all("monotonic" in stamp for stamp in stamps):
@@ -298,7 +300,7 @@ def _check_clocks(trips: list[dict[str, Any]], name: str) -> None:
             step = int(after["wall"]) - int(before["wall"]) - passed
             if abs(step) > 1_000_000 + passed // 1000:  # 1 ms, and 0.1 % for a clock in adjustment
                 raise BadInputError(
-                    f"{name}: the clock of irtt's {end} made a step of {step * 1e-6:.4g} ms; "
+                    f"{log.name}: the clock of irtt's {end} made a step of {step * 1e-6:.4g} ms; "
                     "measure again, or take half of each round trip (--halve-rtt)"
                 )
 
@@ -311,31 +313,26 @@ _IRTT_NAMES = {
 """What is read -> irtt's value of `lost` for packets to leave out, irtt's name of the delay."""
 
 
-def _irtt_entries(
-    trips: list[dict[str, Any]], what: Literal["halves", "uplink", "downlink"]
-) -> list[tuple[float, float | None]]:
+def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     """Read the time of sending and the delay of each packet [s]; time 0 is the first packet.
 
     Packets lost in the other direction are left out. A packet lost on the uplink never reached the
-    downlink; the uplink delay of a packet lost on the downlink is unknown.
-
-    For a packet lost on the downlink, the downlink's time of sending is estimated with the median
-    uplink delay.
+    downlink; the uplink delay of a packet lost on the downlink is unknown, so its time of sending
+    on the downlink is estimated with the median uplink delay.
     """
-    clock = "monotonic" if all("monotonic" in _client(trip) for trip in trips) else "wall"
     other, key = _IRTT_NAMES[what]
-    median_up = 0
+    clients = [trip["timestamps"]["client"]["send"] for trip in trips]
+    clock = "monotonic" if all("monotonic" in stamps for stamps in clients) else "wall"
+    usual = 0
     if what == "downlink":
-        ups = [_delay(trip, "send") for trip in trips if _lost(trip) == "false"]
-        median_up = round(median([up or 0 for up in ups] or [0]))
+        usual = round(median([int(t["delay"]["send"]) for t in trips if _arrived(t)] or [0]))
     entries: list[tuple[int, int | None]] = []
-    for trip in trips:
-        if _lost(trip) == other:
-            continue
-        sent, delay = int(_client(trip)[clock]), _delay(trip, key)
-        if what == "downlink":
-            sent += median_up if delay is None else _delay(trip, "send") or 0
-        entries.append((sent, delay))
+    for trip, stamps in zip(trips, clients, strict=True):
+        if str(trip["lost"]).lower() != other:
+            sent, delay = int(stamps[clock]), int(trip["delay"][key]) if _arrived(trip) else None
+            if what == "downlink":
+                sent += usual if delay is None else int(trip["delay"]["send"])
+            entries.append((sent, delay))
     start, part = min((sent for sent, _ in entries), default=0), 0.5 if what == "halves" else 1.0
     return [
         ((sent - start) * 1e-9, None if delay is None else delay * part * 1e-9)
@@ -343,28 +340,8 @@ def _irtt_entries(
     ]
 
 
-def _client(trip: dict[str, Any]) -> dict[str, Any]:
-    return dict(trip["timestamps"]["client"]["send"])
-
-
-def _lost(trip: dict[str, Any]) -> str:
-    return str(trip["lost"]).lower()
-
-
-def _delay(trip: dict[str, Any], key: str) -> int | None:
-    """Return a delay of a packet [ns]; None if it was lost."""
-    return int(trip["delay"][key]) if _lost(trip) == "false" else None
-
-
-def _refusal(name: str) -> BadInputError:
-    """Make the error for a source that has only round trips."""
-    return BadInputError(f"{name}: has round trips; {HALVE}")
-
-
 SCALES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-TIMES = ("time", "timestamp", "sent")
-DELAYS = ("delay", "rtt")
-LOSSES = ("loss", "lost")
+TIMES, DELAYS, LOSSES = ("time", "timestamp", "sent"), ("delay", "rtt"), ("loss", "lost")
 COLUMNS = "time_s and delay_ms, or with _s, _ms, _us or _ns; rtt_ for round trips; and loss"
 _LOST_WORDS = {
     *("", "-", "*", "nan", "inf", "none", "null", "na", "n/a"),
@@ -380,41 +357,12 @@ _LATE = {"s": 1e11, "ms": 1e14, "us": 1e17}
 true unit is finer than the column's name says."""
 
 
-def _csv_rows(
-    table: Table, log: Log, time: tuple[str, str], delay: str, loss: str | None
-) -> tuple[list[tuple[float, float | None]], int]:
-    """Read time and delay of each row, in their units, and the largest number of decimals.
-
-    Args:
-        table: The file.
-        log: Collects the rows that cannot be used.
-        time: Column of the time of sending, and its unit.
-        delay: Column of the delay.
-        loss: Column of the loss; None if there is none.
-    """
-    raw: list[tuple[float, float | None]] = []
-    decimals = 0
-    for row in table.rows():
-        try:
-            if row.problem:
-                raise BadInputError(f"{row.where}: {row.problem}")
-            sent = _csv_time(table, row, *time)
-            raw.append((sent, _csv_delay(table, row, delay, loss)))
-            decimals = max(decimals, decimals_of(row.cells[delay]))
-        except BadInputError as error:
-            log.unusable.append(str(error))
-    return raw, decimals
-
-
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:
     """Read a CSV log with a header; unknown columns are skipped.
 
-    A packet counts as lost in these cases:
-
-    - Its delay is empty or a word for a loss, such as "timeout".
-    - Its delay is -1, -999 or -9999, and the column has no other negative number.
-    - Its delay is 0, all other delays are far from 0, and there is no column `loss`.
-    - Its `loss` is 1. Values other than 0 and 1 are only allowed in a trace.
+    A packet counts as lost if its `loss` is 1; if its delay is empty or a word such as "timeout";
+    if its delay is -1, -999 or -9999, and the column has no other negative number; or if its delay
+    is 0, all other delays are far from 0, and there is no column `loss`.
 
     Args:
         lines: Lines of the file.
@@ -425,27 +373,31 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     Raises:
         BadInputError: If the log cannot be used; the text names line, value and remedy.
     """
-    table, log = Table(lines, name), Log(name)
-    time, time_unit = _find(table.columns, TIMES, name)
-    delay, unit = _find(table.columns, DELAYS, name)
+    columns, rows = read_rows(lines, name)
+    time, time_unit = _find(columns, TIMES, name)
+    delay, unit = _find(columns, DELAYS, name)
     if not unit:
-        raise BadInputError(f"{name}: column {delay} does not say its unit; {_named(delay)}")
-    log.halved = round_trip = delay.startswith("rtt")
+        raise BadInputError(f"{name}: {_no_unit(delay)}")
+    log = Log(name, halved=delay.startswith("rtt"))
     log.clocks = "the two clocks differ; synchronise them, or record round trips as rtt_ms"
-    if round_trip and not halve:
-        raise _refusal(f"{name}, column {delay}")
-    loss = next((column for column in LOSSES if column in table.columns), None)
-    raw, decimals = _csv_rows(table, log, (time, time_unit), delay, loss)
+    if log.halved and not halve:
+        raise BadInputError(f"{name}, column {delay}: has round trips; {HALVE}")
+    loss = next((column for column in LOSSES if column in columns), None)
+    raw, decimals = list[Entry](), 0
+    for row in rows:
+        try:
+            raw.append((_csv_time(row, time, time_unit), _csv_delay(row, delay, loss)))
+            decimals = max(decimals, decimals_of(row.text(delay)))
+        except BadInputError as error:
+            log.unusable.append(str(error))
+    raw = _without_marks(raw, delay, -1 if loss else decimals, log)
     # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
     start = min((sent for sent, _ in raw), default=0.0)
-    marks = _marks([value for _, value in raw if value is not None], delay, loss, decimals, log)
-    scale = SCALES[unit] * (0.5 if round_trip else 1.0)
-    for sent, value in raw:
-        log.counts[marks.get(value, "")] += 1
-        gone = value in marks
-        at = (sent - start) * SCALES[time_unit or "s"]
-        log.entries.append((at, None if value is None or gone else value * scale))
-    del log.counts[""]
+    scales = SCALES[time_unit or "s"], SCALES[unit] * (0.5 if log.halved else 1.0)
+    log.entries = [
+        ((sent - start) * scales[0], None if value is None else value * scales[1])
+        for sent, value in raw
+    ]
     packets = log.packets()
     if not trust_units:
         _check_unit(packets, unit, f"{name}: {delay}")
@@ -456,25 +408,18 @@ def _check_unit(packets: Packets, unit: str, name: str) -> None:
     """Reject delays that are probably in another unit than the column says; name the other unit."""
     factor = 1 / SCALES[unit]
     top, middle = max(packets.arrived), median(packets.arrived)
-    remedy = "name the column after its unit, or say --trust-units"
+    found = ""
     if unit != "s" and 0.0 < top * factor < 1.0:
-        raise BadInputError(
-            f"{name} is at most {top * factor:.4g} {unit}, which looks like seconds; {remedy}"
-        )
-    if middle > LONGEST:
+        found = f"is at most {top * factor:.4g} {unit}, which looks like seconds"
+    elif middle > LONGEST:
         finer = {"s": "ms", "ms": "us", "us": "ns", "ns": "ns"}[unit]
-        raise BadInputError(
-            f"{name} has a median of {middle * factor:.6g} {unit}, which looks like {finer}; "
-            f"{remedy}"
-        )
+        found = f"has a median of {middle * factor:.6g} {unit}, which looks like {finer}"
+    if found:
+        raise BadInputError(f"{name} {found}; name the column after its unit, or say --trust-units")
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the column of one of these kinds; there must be exactly one.
-
-    Returns:
-        Name of the column, and its unit; "" without a unit.
-    """
+    """Find the only column of one of these kinds; return its name and its unit ("" without)."""
     known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
     found = [column for column in columns if column in known]
     found = found or [column for column in columns if column in kinds]
@@ -482,65 +427,266 @@ def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, s
         return found[0], known.get(found[0], "")
     if found:
         raise BadInputError(f"{name}: has {' and '.join(found)}; keep only one of them")
-    shown_columns = ",".join(columns)[:200] or "nothing"
-    raise BadInputError(f"{name}: no column {kinds[0]}, found {shown_columns}; name them {COLUMNS}")
+    shown = ",".join(columns)[:200] or "nothing"
+    raise BadInputError(f"{name}: no column {kinds[0]}, found {shown}; name them {COLUMNS}")
 
 
-def _named(column: str) -> str:
-    return f"call it {column}_s, {column}_ms, {column}_us or {column}_ns"
+def _no_unit(column: str) -> str:
+    names = ", ".join(f"{column}_{unit}" for unit in ("s", "ms", "us"))
+    return f"column {column} does not say its unit; call it {names} or {column}_ns"
 
 
-def _csv_time(table: Table, row: Row, column: str, unit: str) -> float:
+def _csv_time(row: Row, column: str, unit: str) -> float:
     """Read a time in its column's unit; if the column has no unit, read date and time [s]."""
-    text = row.cells[column]
+    text = row.text(column)
     if not unit:
         try:
             return datetime.fromisoformat(text).timestamp()
         except ValueError:
-            raise BadInputError(
-                f"{table.name}: column {column} does not say its unit; {_named(column)}"
-            ) from None
-    value = table.number(text)
+            raise BadInputError(f"{row.where}: {_no_unit(column)}") from None
+    value = row.number(column)
     if value is None or not isfinite(value):
-        raise BadInputError(f"{row.where}: {column} is {shown(text)}; give a number")
+        raise row.no_number(column)
     if value > _LATE.get(unit, float("inf")):
         raise BadInputError(f"{row.where}: {column} is {text}, a finer unit than {unit}; rename it")
     return value
 
 
-def _csv_delay(table: Table, row: Row, column: str, loss: str | None) -> float | None:
+def _csv_delay(row: Row, column: str, loss: str | None) -> float | None:
     """Read a delay in its column's unit; None if the row says that the packet was lost."""
     if loss is not None:
-        text = row.cells[loss].lower()
-        flag = table.number(text)
-        gone = _FLAGS.get(text, {0.0: False, 1.0: True}.get(flag) if flag is not None else None)
+        flag = row.number(loss)
+        known = {0.0: False, 1.0: True}.get(flag) if flag is not None else None
+        gone = _FLAGS.get(row.text(loss).lower(), known)
         if gone is None:
-            raise BadInputError(
-                f"{row.where}: {loss} is {shown(row.cells[loss])}; give 0 or 1 for a packet; a "
-                "profile can use a trace with other shares directly"
-            )
+            remedy = "0 or 1 for a packet; a profile can use a trace with other shares directly"
+            raise row.no_number(loss, remedy)
         if gone:
             return None
-    text = row.cells[column]
-    value = table.number(text)
-    if text.lower() in _LOST_WORDS or (value is not None and isnan(value)):
+    value = row.number(column)
+    if row.text(column).lower() in _LOST_WORDS or (value is not None and isnan(value)):
         return None
     if value is None or not isfinite(value):
-        raise BadInputError(f"{row.where}: {column} is {shown(text)}; give a number")
+        raise row.no_number(column)
     return value
 
 
-def _marks(
-    values: list[float], column: str, loss: str | None, decimals: int, log: Log
-) -> dict[float | None, str]:
-    """Find the numbers that mark lost packets; return number -> note for the user."""
+def _without_marks(raw: list[Entry], column: str, decimals: int, log: Log) -> list[Entry]:
+    """Replace the numbers that mark lost packets, and count them.
+
+    `decimals` is the largest number of decimals in the column; -1 if a column `loss` tells losses.
+    """
+    values = {value for _, value in raw if value is not None}
     below = {value for value in values if value < 0.0}
-    marks = [value for value in below if below == {value} and value in _LOST_NUMBERS]
-    if below and not marks and column.startswith("rtt"):
+    marks = {value for value in below if len(below) == 1 and value in _LOST_NUMBERS}
+    if below and not marks and log.halved:
         raise BadInputError(
             f"{log.name}: {column} is {min(below):g}, which is no round trip; leave the cell of a "
             "lost packet empty"
         )
-    if loss is None and looks_lost(set(values) - below, decimals):
-        marks.append(0.0)
-    return {mark: f"with {column} {mark:g} taken as lost" for mark in marks}
+    marks |= {0.0} if decimals >= 0 and looks_lost(values - below, decimals) else set()
+    for mark in marks:
+        what = f"with {column} {mark:g} taken as lost"
+        log.counts[what] = sum(value == mark for _, value in raw)
+    return [(sent, None if value in marks else value) for sent, value in raw]
+
+
+_WRAP = 1 << 16
+_STAMP = re.compile(
+    r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"
+    r"|(?P<date>\d{4}-\d\d-\d\d)?[T ]?(?P<hour>\d\d):(?P<minute>\d\d):(?P<second>\d\d\.\d+)\S* +"
+)
+"""Time stamp of a line: from `ping -D`, `ts '[%.s]'` or `ping --apple-time`, or date and time."""
+_NUMBER = re.compile(r"\b(?:icmp6?_)?(?:seq|req)[= ](\d{1,12})\b|(?<= : )\[(\d{1,12})\], ")
+_ROUND_TRIP = re.compile(r"(?:[=<] ?|, )(\d+(?:[.,]\d+)?) ?(?:ms|msec|msek|мс|毫秒|ミリ秒)(?=\W|$)")
+_REPLY = re.compile(r"ttl=|hlim=|bytes from", re.IGNORECASE)
+_SUMMARY = re.compile(r"xmt/rcv/%loss = (\d+)/(\d+)/|^(?!.*xmt/)\D*(\d+)\D+(\d+)\D.*%")
+"""Summary at the end: packets sent, packets received."""
+_MEAN = re.compile(r"min/avg/\S+ = [\d.]+/([\d.]+)/")
+_NO_STAMPS = {
+    r"(?<!_)\bseq=\d": "BusyBox's ping gives no times: ping HOST | ts '[%.s]', or use irtt",
+    r"\d data bytes|Request timeout": (
+        "on macOS -D forbids fragments: use ping --apple-time there; BSD: ping HOST | ts '[%.s]'"
+    ),
+    r"\], \d+ bytes": "run fping with -D",
+    "": "run ping with -D",
+}
+"""Pattern in a log without time stamps -> remedy for this kind of ping; the first match counts."""
+
+
+def is_ping(lines: list[str]) -> bool:
+    """Return whether a text looks like the output of ping."""
+    return any(_NUMBER.search(line) or line.startswith("PING ") for line in lines[:1000])
+
+
+def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
+    """Read the output of `ping -D` or of a similar program, in any language.
+
+    These packets count as lost: sequence numbers that are missing between replies, packets with a
+    line such as "no answer yet", and packets that only the summary counts. Without a summary,
+    packets after the last line are unknown, because their replies may have been under way.
+
+    Args:
+        lines: Lines of the log.
+        name: Name of the file, for messages.
+        halve: Must be true: the user accepts half of each round trip as the one-way delay.
+
+    Raises:
+        BadInputError: If `halve` is false, if the log has no replies, no time stamps, too many
+            packets or several sessions, or if it contradicts its summary.
+    """
+    if not halve:
+        raise BadInputError(f"{name}: ping measures round trips; {HALVE}")
+    log = Log(name, halved=True)
+    ping = _Ping(lines, log)
+    if not ping.replies:
+        nothing = f"{name}: has no replies; give the output of: ping -D -O HOST"
+        raise BadInputError([*log.unusable, nothing][0])
+    first, last = ping.check_range()
+    period = ping.check_clock()
+    known = np.array(sorted(ping.replies))
+    sent = np.array([ping.replies[number][0] for number in known])
+    numbers = np.arange(first, last + 1)
+    # Without a reply, the time of sending lies on a straight line between the replies around.
+    outside = np.minimum(numbers - known[0], 0) + np.maximum(numbers - known[-1], 0)
+    times = np.interp(numbers, known, sent) + outside * period
+    for number, at in zip(numbers.tolist(), times.tolist(), strict=True):
+        reply = ping.replies.get(number)
+        log.entries.append((at, reply[1] / 2 if reply else None))
+    return log.packets()
+
+
+class _Ping:
+    """Content of the lines of a log. A number is a packet's sequence number.
+
+    Attributes:
+        replies: Number -> time of sending and round trip [s].
+    """
+
+    def __init__(self, lines: list[str], log: Log) -> None:
+        self.replies: dict[int, tuple[float, float]] = {}
+        self._log, self._lines = log, lines
+        self._told: dict[int, float] = {}  # number -> time stamp of its line, 0 without one [s]
+        self._trips: list[float] = []  # with those of duplicates [s]
+        self._summaries: list[tuple[int, int]] = []  # packets sent and received
+        self._headers, self._base = 0, 1  # lines that begin a log; first number of this ping
+        self._wraps = self._newest = 0
+        self._day = self._last_stamp = 0.0
+        for line in lines:
+            if (number := _NUMBER.search(line)) is not None:
+                self._read_packet(line, number)
+            else:
+                self._read_other(line)
+
+    def _read_packet(self, line: str, number: re.Match[str]) -> None:
+        log, trip, stamp = self._log, _ROUND_TRIP.search(line), _STAMP.match(line)
+        if trip is None and _REPLY.search(line):
+            reason = f"a reply without a time that can be read: {line.strip()[:60]!r}"
+            log.unusable.append(f"{log.name}: {reason}; run: LC_ALL=C ping -D -O HOST")
+            return
+        if trip and stamp is None:
+            text = "\n".join(self._lines[:1000])
+            remedy = next(words for kind, words in _NO_STAMPS.items() if re.search(kind, text))
+            raise BadInputError(f"{log.name}: its lines have no [time]; {remedy}")
+        round_trip = float(trip[1].replace(",", ".")) * 1e-3 if trip else 0.0
+        self._trips += [round_trip] if trip else []
+        if "DUP!" in line:
+            log.counts["duplicates left out"] += 1
+            return
+        count = self._unwrap(int(number[1] or number[2]))
+        log.counts["out of order, sorted"] += bool(trip) and count < self._newest
+        self._newest = max(self._newest, count)
+        at = self._time(stamp) if stamp else 0.0
+        if trip and count in self.replies:
+            self._refuse_sessions(f"number {count} comes twice")
+        if trip:
+            self.replies[count] = at - round_trip, round_trip
+        self._told[count] = at
+        if count == 0 or number[2]:
+            self._base = 0
+
+    def _unwrap(self, number: int) -> int:
+        """Count on after 65535, where ping continues with 0; a late reply may be from before."""
+        count = number + self._wraps * _WRAP
+        if self._newest - count > _WRAP // 2:
+            self._wraps += 1
+            return count + _WRAP
+        return count - _WRAP if count - self._newest > _WRAP // 2 and self._wraps else count
+
+    def _time(self, stamp: re.Match[str]) -> float:
+        """Convert a time stamp to the time since 1970, or since the midnight before the log [s]."""
+        if stamp["unix"]:
+            return float(stamp["unix"])
+        day = datetime.fromisoformat((stamp["date"] or "1970-01-01") + "T00:00:00+00:00")
+        clock = int(stamp["hour"]) * 3600 + int(stamp["minute"]) * 60 + float(stamp["second"])
+        at = day.timestamp() + clock + self._day
+        if not stamp["date"] and self._last_stamp - at > 43_200:  # midnight
+            at, self._day = at + 86_400.0, self._day + 86_400.0
+        self._last_stamp = at
+        return at
+
+    def _read_other(self, line: str) -> None:
+        """Read a line without a sequence number: header, summary, or another line."""
+        log, summary, mean = self._log, _SUMMARY.search(line), _MEAN.search(line)
+        if line.startswith(("PING ", "PING6(")):
+            self._headers += 1
+            self._base = 0 if " data bytes" in line else self._base
+        elif mean is not None:
+            told, read = float(mean[1]), fmean(self._trips or [0.0]) * 1e3
+            if abs(told - read) > 0.1 + 0.01 * told:
+                raise BadInputError(
+                    f"{log.name}: its summary gives a mean of {told:g} ms, but its replies have "
+                    f"{read:.4g} ms; give the whole log as ping wrote it"
+                )
+        if summary is not None:
+            sent, received = (int(word) for word in summary.groups() if word)
+            self._summaries.append((sent, received))
+        elif line.strip() and mean is None and not line.startswith(("PING", "---")):
+            log.counts["other lines left out"] += 1
+
+    def check_range(self) -> tuple[int, int]:
+        """Return the first and the last sequence number; compare the log with its own summary."""
+        beginnings = max(self._headers, len(self._summaries))
+        if beginnings > 1:
+            self._refuse_sessions(f"{beginnings} beginnings or ends")
+        first, last = min(self._told), max(self._told)
+        for sent, received in self._summaries:
+            if received != len(self.replies) or sent < last - self._base + 1:
+                raise BadInputError(
+                    f"{self._log.name}: its summary counts {sent} sent and {received} received, but"
+                    f" it has {len(self.replies)} replies up to number {last}; give the whole log"
+                )
+            first, last = self._base, self._base + sent - 1
+        if last - first >= PACKETS_MAX:
+            raise BadInputError(
+                f"{self._log.name}: its sequence numbers span {last - first + 1} packets, more than"
+                f" {PACKETS_MAX}; give the output of one ping"
+            )
+        return first, last
+
+    def check_clock(self) -> float:
+        """Check the times of sending by the numbers; return the median time between packets [s]."""
+        sent = {number: at for number, (at, _) in sorted(self.replies.items())}
+        times = sent if len(sent) > 1 else {n: at for n, at in sorted(self._told.items()) if at}
+        pairs = list(pairwise(times.items()))
+        period = median([(b - a) / (m - n) for (n, a), (m, b) in pairs] or [1.0])
+        for (before, at), (after, later) in pairwise(sent.items()):
+            usual = (after - before) * period
+            step = later - at - usual
+            if later - at < -STEP_BACK or step < -max(2.0, 5 * period):
+                raise BadInputError(
+                    f"{self._log.name}: after number {before} the times go back by {-step:.3g} s: a"
+                    " step of the clock, or two sessions in one log; give the lines before or after"
+                    " it"
+                )
+            if step > max(2.0, 5 * period, 0.2 * usual):
+                self._log.facts.append(
+                    f"after number {before} the clock stepped by {step:.4g} s, or ping stood still"
+                )
+        return max(period, 1e-6)
+
+    def _refuse_sessions(self, sign: str) -> None:
+        raise BadInputError(
+            f"{self._log.name}: has more than one session of ping ({sign}); give the lines of one "
+            "session"
+        )

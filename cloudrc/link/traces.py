@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from itertools import pairwise
 from math import fsum, inf, sqrt
 from pathlib import Path
@@ -26,23 +26,14 @@ START_MAX = 600.0
 UNIX_TIME = 1e8
 """If the first row has this time or a later one, times are Unix times [s] (1e8 is March 1973), and
 the first time is subtracted."""
-_TIME, _LOSS = "time_s", "loss"
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
-_HEADER = "the header is time_s,delay_ms[,loss]"
 _ROWS_TO_JUDGE = 10
 """A delay of 0 may mark a lost packet only in traces with at least this number of rows [1]; shorter
 traces are typed by hand."""
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
-    """Read a trace from a CSV file.
-
-    Args:
-        path: The file.
-        size_max: Size limit of the file [bytes].
-
-    Returns:
-        Times [s], delays [s] and, if the file has the column, losses in [0, 1].
+    """Read a trace from a CSV file of at most `size_max` [bytes].
 
     Raises:
         BadInputError: If the file cannot be read or is not a trace; the text names file, line,
@@ -80,10 +71,6 @@ def decode(data: bytes) -> list[str]:
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
     """Read the distribution of a trace's delays; ignore lost packets.
 
-    Args:
-        path: The file.
-        size_max: Size limit of the file [bytes].
-
     Returns:
         The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,) [1].
 
@@ -104,44 +91,28 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
 
 
 def parse_trace(lines: Iterable[str], name: str) -> Trace:
-    """Read a trace from the lines of a CSV file.
+    """Read a trace from the lines of the file `name`; raise the errors of `read_trace`.
 
     If the times are Unix times, time 0 is the first row.
-
-    Args:
-        lines: Header and rows; blank lines and lines that begin with # are skipped.
-        name: Name of the file, for messages.
-
-    Returns:
-        The same as `read_trace`.
-
-    Raises:
-        BadInputError: In the cases of `read_trace`.
     """
-    table = Table(lines, f"trace {name}")
-    delay_column = _check_columns(table.columns, name)
-    times: list[float] = []
-    delays: list[float] = []
-    losses: list[float] = []
-    for row in table.rows():
-        if row.problem:
-            raise BadInputError(f"{row.where}: {row.problem}")
-        times.append(_number(table, row, _TIME))
-        delays.append(_number(table, row, delay_column))
-        if _LOSS in row.cells:
-            losses.append(_number(table, row, _LOSS, maximum=1.0))
+    place = f"trace {name}"
+    columns, rows = read_rows(lines, place)
+    delay = _delay_column(columns, place)
+    times, delays, losses = list[float](), list[float](), list[float]()
+    for row in rows:
+        times.append(_number(row, "time_s"))
+        delays.append(_number(row, delay))
+        if "loss" in columns:
+            losses.append(_number(row, "loss", 1.0))
         if len(times) > 1 and times[-1] <= times[-2]:
             raise BadInputError(
                 f"{row.where}: time_s {times[-1]:.12g} does not come after {times[-2]:.12g}; "
                 "sort the rows by time and give each time once"
             )
     if not times:
-        raise BadInputError(f"trace {name}: no rows; give at least one, for example: 0,45")
-    if delay_column == "delay_ms":
-        _refuse_seconds(max(delays), name)
-    if not losses:
-        _refuse_marks(delays, delay_column, name)
-    scaled = tuple(delay * _SCALES[delay_column] for delay in delays)
+        raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
+    _check_delays(delays, delay, place, may_be_lost=not losses)
+    scaled = tuple(one * _SCALES[delay] for one in delays)
     return Trace(_from_start(times, name), scaled, tuple(losses) or None)
 
 
@@ -170,107 +141,99 @@ class Row(NamedTuple):
 
     Attributes:
         where: File and line of the row, for messages.
-        cells: Column -> text, stripped.
-        problem: Why the row cannot be used; "" without a problem.
+        cells: Column -> text, stripped; the last columns may be missing.
+        decimal: Decimal point of the file: "." or ",".
     """
 
     where: str
     cells: dict[str, str]
-    problem: str = ""
+    decimal: str
+
+    def text(self, column: str) -> str:
+        """Return a cell's text; raise a BadInputError if the row ends before the column."""
+        if column not in self.cells:
+            raise BadInputError(f"{self.where}: {column} is nothing; give a number")
+        return self.cells[column]
+
+    def number(self, column: str) -> float | None:
+        """Parse a cell; None if it is not a number."""
+        return _parse(self.text(column).replace(self.decimal, "."))
+
+    def no_number(self, column: str, wanted: str = "a number") -> BadInputError:
+        """Make the error for a cell that should have what is wanted."""
+        text = self.text(column)
+        shown = repr(text[:40]) if text else "nothing"
+        return BadInputError(f"{self.where}: {column} is {shown}; give {wanted}")
 
 
-class Table:
-    """A CSV file with a header, separated by commas, semicolons or tabs.
+def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]]:
+    """Read a CSV file with a header, separated by commas, semicolons or tabs.
 
-    Attributes:
-        columns: Names of the columns in lower case; "RTT (ms)" becomes rtt_ms.
+    Semicolons and tabs allow decimal commas. Blank lines and comments are skipped.
+
+    Args:
+        lines: Lines of the file.
+        name: Name of the file, for messages.
+
+    Returns:
+        Names of the columns in lower case ("RTT (ms)" becomes rtt_ms), and the rows.
+
+    Raises:
+        BadInputError: If the file has only numbers, or a row has more cells than the header.
     """
+    data = ((n, one) for n, one in enumerate(lines, 1) if one.strip() and one[:1] != "#")
+    kept = ((n, line) for n, line in data if not line.startswith("sep="))
+    _, header = next(kept, (1, ""))
+    separator = next((mark for mark in ";\t" if mark in header), ",")
+    columns = [_column(cell) for cell in _cells(header, separator, f"{name}, line 1")]
+    if len(columns) == 1 and _parse(header) is not None:
+        raise _bare_numbers([header, *(line for _, line in kept)], name)
 
-    def __init__(self, lines: Iterable[str], name: str) -> None:
-        """Read the header; raise a BadInputError if the file has only numbers.
-
-        Args:
-            lines: Lines of the file; blank lines and comments are skipped.
-            name: Name of the file, for messages.
-        """
-        kept = ((n, line) for n, line in enumerate(lines, 1) if _is_data(line))
-        self.name = name
-        self._first = next(kept, (1, ""))
-        self._lines = kept
-        header = self._first[1]
-        self._separator = next((mark for mark in ";\t" if mark in header), ",")
-        self.columns = [_column(cell) for cell in self._cells(header, 1)]
-        if len(self.columns) == 1 and _is_number(header):
-            self._refuse_bare_numbers()
-
-    def rows(self) -> Iterator[Row]:
-        """Yield the rows; a row with fewer cells than the header gets a `problem`.
-
-        Raises:
-            BadInputError: If a row has more cells than the header: decimal commas may have split
-                its numbers.
-        """
-        columns = self.columns
-        for number, line in self._lines:
-            where = f"{self.name}, line {number}"
-            cells = self._cells(line, number)
+    def rows() -> Iterator[Row]:
+        for number, line in kept:
+            where = f"{name}, line {number}"
+            cells = _cells(line, separator, where)
             if len(cells) > len(columns):
                 raise BadInputError(
                     f"{where}: more values than columns; give {len(columns)}, and numbers without "
                     "commas"
                 )
-            if len(cells) < len(columns):
-                yield Row(where, {}, f"{columns[len(cells)]} is nothing; give a number")
-                continue
-            yield Row(where, dict(zip(columns, map(str.strip, cells), strict=True)))
+            named = dict(zip(columns, map(str.strip, cells), strict=False))
+            yield Row(where, named, "." if separator == "," else ",")
 
-    def number(self, text: str) -> float | None:
-        """Parse a number; None if the text is not a number.
+    return columns, rows()
 
-        If semicolons or tabs separate the cells, a comma is a decimal point.
-        """
-        if self._separator != ",":
-            text = text.replace(",", ".")
-        try:
-            return float(text)
-        except ValueError:
-            return None
 
-    def _cells(self, line: str, number: int) -> list[str]:
-        if '"' not in line:
-            return line.split(self._separator)
-        reader = csv.reader([line], delimiter=self._separator, skipinitialspace=True)
-        try:
-            return next(reader, [])
-        except csv.Error as error:
-            where = f"{self.name}, line {number}"
-            raise BadInputError(f"{where}: {error}; give a CSV file") from None
+def _cells(line: str, separator: str, where: str) -> list[str]:
+    if '"' not in line:
+        return line.split(separator)
+    try:
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error as error:
+        raise BadInputError(f"{where}: {error}; give a CSV file") from None
 
-    def _refuse_bare_numbers(self) -> None:
-        """Refuse one number per line: a rate trace of mahimahi, or delays without times."""
-        texts = [self._first[1], *(line for _, line in self._lines)]
-        values = [float(text) for text in texts if _is_number(text)]
-        rising = all(before <= after for before, after in pairwise(values))
-        if len(values) > 1 and rising and all(value.is_integer() for value in values):
-            rate = len(values) * 1500 * 8 / max(values[-1], 1.0)
-            raise BadInputError(
-                f"{self.name}: looks like a rate trace of mahimahi, times at which a packet may "
-                f"leave [ms]: it has no delays; its mean is rate_kbit: {rate:.4g}"
-            )
-        raise BadInputError(
-            f"{self.name}: has numbers without a header; of delays [ms], one every 0.1 s, make a "
-            'trace: awk \'BEGIN {print "time_s,delay_ms"} {print (NR-1)*0.1 "," $1}\' FILE'
+
+def _bare_numbers(lines: list[str], name: str) -> BadInputError:
+    """Make the error for one number per line: a rate trace of mahimahi, or delays without times."""
+    values = [value for value in map(_parse, lines) if value is not None]
+    rising = all(before <= after for before, after in pairwise(values))
+    if len(values) > 1 and rising and all(value.is_integer() for value in values):
+        rate = len(values) * 1500 * 8 / max(values[-1], 1.0)
+        return BadInputError(
+            f"{name}: looks like a rate trace of mahimahi, times at which a packet may "
+            f"leave [ms]: it has no delays; its mean is rate_kbit: {rate:.4g}"
         )
+    return BadInputError(
+        f"{name}: has numbers without a header; of delays [ms], one every 0.1 s, make a "
+        'trace: awk \'BEGIN {print "time_s,delay_ms"} {print (NR-1)*0.1 "," $1}\' FILE'
+    )
 
 
-def looks_lost(values: Iterable[float], decimals: int) -> bool:
+def looks_lost(values: Collection[float], decimals: int) -> bool:
     """Return whether zeros among delays mark lost packets: all other delays are far from 0.
 
-    Args:
-        values: Delays in the file's unit.
-        decimals: Largest number of decimals in the file, because a zero may be a rounded delay.
+    `decimals` is the largest number of decimals in the file, because a zero may be a rounded delay.
     """
-    values = list(values)
     shortest = min((value for value in values if value > 0.0), default=0.0)
     return 0.0 in values and shortest > 2 * 10.0**-decimals
 
@@ -280,16 +243,11 @@ def decimals_of(text: str) -> int:
     return len(re.sub(r"[eE].*", "", text).replace(",", ".").partition(".")[2])
 
 
-def _is_data(line: str) -> bool:
-    return bool(line.strip()) and not line.startswith(("#", "sep="))
-
-
-def _is_number(text: str) -> bool:
+def _parse(text: str) -> float | None:
     try:
-        float(text)
+        return float(text)
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def _column(text: str) -> str:
@@ -297,22 +255,35 @@ def _column(text: str) -> str:
     return words.replace("µ", "u").replace("μ", "u")
 
 
-def _number(table: Table, row: Row, column: str, maximum: float = inf) -> float:
+def _delay_column(columns: list[str], place: str) -> str:
+    """Check a header; reject missing, unknown or repeated columns; return the delay column."""
+    given = next((column for column in columns if column in _SCALES), "delay_ms")
+    for wanted in ("time_s", given):
+        if wanted not in columns:
+            raise BadInputError(
+                f"{place}, line 1: no column {wanted}, found {','.join(columns)[:200] or 'nothing'}"
+                "; the header is time_s,delay_ms[,loss]"
+            )
+    for column in columns:
+        if column not in ("time_s", given, "loss") or columns.count(column) > 1:
+            raise BadInputError(
+                f"{place}, line 1: column {column!r} is unknown or repeated; "
+                "the header is time_s,delay_ms[,loss]"
+            )
+    return given
+
+
+def _number(row: Row, column: str, maximum: float = inf) -> float:
     """Parse a value of a trace that is finite, at least 0 and at most `maximum`."""
-    text = row.cells[column]
-    value = table.number(text)
+    value = row.number(column)
     if value is None:
-        raise BadInputError(f"{row.where}: {column} is {shown(text)}; give a number")
+        raise row.no_number(column)
     if not 0.0 <= value < inf or value > maximum:
         bounds = "from 0 to 1" if maximum == 1.0 else "that is finite and not negative"
         mark = "; a lost packet has loss 1" if column in _SCALES else ""
-        raise BadInputError(f"{row.where}: {column} is {text[:40]}; give a number {bounds}{mark}")
+        text = row.text(column)[:40]
+        raise BadInputError(f"{row.where}: {column} is {text}; give a number {bounds}{mark}")
     return value
-
-
-def shown(text: str) -> str:
-    """Quote the text of a cell for a message: at most 40 characters; "nothing" if it is empty."""
-    return repr(text[:40]) if text else "nothing"
 
 
 def _from_start(times: list[float], name: str) -> tuple[float, ...]:
@@ -330,38 +301,17 @@ def _from_start(times: list[float], name: str) -> tuple[float, ...]:
     return tuple(times)
 
 
-def _refuse_seconds(longest_ms: float, name: str) -> None:
-    """Reject delays that seem to be in seconds, a common mistake: the link would seem ideal."""
-    if 0.0 < longest_ms < 1.0:
+def _check_delays(delays: list[float], column: str, place: str, *, may_be_lost: bool) -> None:
+    """Reject delays that seem to be in seconds (a common mistake), and zeros that mark losses."""
+    longest = max(delays)
+    if column == "delay_ms" and 0.0 < longest < 1.0:
         raise BadInputError(
-            f"trace {name}: delay_ms is at most {longest_ms:g}, which looks like seconds; "
-            f"multiply by 1000, or name the column delay_us and give {longest_ms * 1e3:g}"
+            f"{place}: delay_ms is at most {longest:g}, which looks like seconds; "
+            f"multiply by 1000, or name the column delay_us and give {longest * 1e3:g}"
         )
-
-
-def _refuse_marks(delays: list[float], column: str, name: str) -> None:
-    """Reject delays of 0 that seem to mark lost packets; otherwise these would be the fastest."""
     decimals = max(decimals_of(f"{delay:g}") for delay in delays)
-    if len(delays) >= _ROWS_TO_JUDGE and looks_lost(delays, decimals):
+    if may_be_lost and len(delays) >= _ROWS_TO_JUDGE and looks_lost(delays, decimals):
         raise BadInputError(
-            f"trace {name}: {column} is 0 in {delays.count(0.0)} of {len(delays)} rows, which "
+            f"{place}: {column} is 0 in {delays.count(0.0)} of {len(delays)} rows, which "
             "looks like lost packets; add the column loss: 1 where a packet was lost, else 0"
         )
-
-
-def _check_columns(columns: list[str], name: str) -> str:
-    """Check a header; reject missing, unknown or repeated columns; return the delay column."""
-    found = ",".join(columns)[:200] or "nothing"
-    for wanted in ((_TIME,), tuple(_SCALES)):
-        if not any(column in columns for column in wanted):
-            missing = f"trace {name}, line 1: no column {wanted[0]}, found {found}"
-            raise BadInputError(f"{missing}; {_HEADER}")
-    for column in columns:
-        if column not in (_TIME, *_SCALES, _LOSS) or columns.count(column) > 1:
-            raise BadInputError(
-                f"trace {name}, line 1: column {column!r} is unknown or repeated; {_HEADER}"
-            )
-    given = [column for column in _SCALES if column in columns]
-    if len(given) > 1:
-        raise BadInputError(f"trace {name}, line 1: {' and '.join(given)}; give one of them")
-    return given[0]

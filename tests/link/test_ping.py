@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.logs import Packets
-from cloudrc.link.ping import is_ping, read_ping
+from cloudrc.link.logs import Packets, is_ping, read_ping
 
 HEAD = "PING 192.0.2.1 (192.0.2.1) 56(84) bytes of data."
 

@@ -48,7 +48,7 @@ def test_a_trace_is_read_into_si(
         ("time_s\n0", "line 1: no column delay_ms, found time_s"),
         ("time_s,delay_ms,lost\n0,1,0", "line 1: column 'lost' is unknown"),
         ("time_s,delay_ms,delay_ms\n0,1,1", "column 'delay_ms' is unknown or repeated"),
-        ("time_s,delay_ms,delay_us\n0,1,1", "line 1: delay_ms and delay_us; give one"),
+        ("time_s,delay_ms,delay_us\n0,1,1", "column .delay_us. is unknown or repeated"),
         (HEAD, "no rows"),
         (f"{HEAD}\n1,45\n0.5,45", "line 3: time_s 0.5 does not come after 1; sort"),
         (f"{HEAD}\n1,45\n1,45", "line 3: time_s 1 does not come after 1"),
