@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,7 +23,6 @@ from cloudrc.link.state import CHANGE_FILE, Change, read_change
 
 if TYPE_CHECKING:
     from cloudrc.link.relay import Address
-
 
 PROFILE_PERIOD = 0.05
 """Time between two checks of the profile's file [s]."""
@@ -40,7 +38,6 @@ PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 _KNOWN = 64
 """Number of changes that are remembered [1]."""
-_REFUSED = "the new profile is refused, the old one stays"
 
 
 class Loaded(NamedTuple):
@@ -62,21 +59,20 @@ Load = Callable[[Path], Loaded]
 
 
 class ProfileFile:
-    """A profile's file that may change.
+    """A profile's file that may change; it need not exist at first.
 
-    Kubernetes mounts a ConfigMap as a folder of links into `..data`. `..data` is also a link, and
-    Kubernetes replaces it in one step; then the path leads to another file. A check is a single
-    system call, because the process checks 20 times per second and its shaper must not be late.
+    Kubernetes mounts a ConfigMap as a folder of links into `..data`, a link that Kubernetes
+    replaces in one step; then the path leads to another file. A check is a single system call,
+    because the process checks 20 times per second and its shaper must not be late.
     """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
-        self._path, self._place = path, str(path)
-        self._load, self._log = load, log
+        self._path, self._load, self._log = path, load, log
         self._seen: object = None
 
     def first(self) -> Loaded:
         """Read the file at the start; raise a BadInputError if that fails."""
-        self._seen = version(self._place)
+        self._seen = version(self._path)
         return self._read()
 
     def poll(self) -> Loaded | None:
@@ -85,19 +81,19 @@ class ProfileFile:
         A refusal is logged. If the file changes during the read, somebody is still writing, and
         the next call reads again.
         """
-        seen = version(self._place)
-        if seen == self._seen:
+        seen = version(self._path)
+        if seen is None or seen == self._seen:
             return None
         loaded, refusal = None, ""
         try:
             loaded = self._read()
-        except (BadInputError, OSError) as error:
-            refusal = str(error)
-        if version(self._place) != seen:
+        except (BadInputError, OSError, ValueError) as error:
+            refusal = f"the new profile is refused, the old one stays: {error}"
+        if version(self._path) != seen:
             return None
         self._seen = seen
         if refusal:
-            self._log(f"{_REFUSED}: {refusal}")
+            self._log(refusal)
         return loaded
 
     def _read(self) -> Loaded:
@@ -143,27 +139,38 @@ def read_handed(text: str) -> Handed:
     return handed
 
 
-class Profiles:
-    """The profile's file and the document: each change takes effect once.
+class _HandedFile(ProfileFile):
+    """The document. One that exists at the start is ignored: the ConfigMap has the same change."""
 
-    A document that exists at the start is ignored, because the ConfigMap has the same change.
-    """
+    def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
+        super().__init__(path, load, log)
+        self._seen = version(path)
+
+    def _read(self) -> Loaded:
+        """Read the document; refuse a ValueError's reason if it belongs to another user.
+
+        If the sidecar runs as root, the pod's other containers share the folder but do not run as
+        root.
+        """
+        if self._path.lstat().st_uid != os.geteuid():
+            raise ValueError(f"{self._path} belongs to another user")
+        handed = read_handed(read(self._path, SIZE_MAX).decode())
+        with TemporaryDirectory(prefix="handed-", dir=self._path.parent) as folder:
+            for name, text in handed.files.items():
+                (Path(folder) / name).write_text(text, encoding="utf-8")
+            loaded = self._load(Path(folder) / PROFILE)
+        return loaded._replace(change=read_change(handed.change))
+
+
+class Profiles:
+    """The profile's file and the document, which need not exist: each change takes effect once."""
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]
     ) -> None:
-        """Follow a profile's file and a document.
-
-        Args:
-            profile: The profile's file.
-            document: Path of the document; it need not exist.
-            load: Reads a profile's file.
-            log: Receives a line when a change is refused.
-        """
-        self._file, self._document = ProfileFile(profile, load, log), document
-        self._load, self._log = load, log
-        self._seen = version(document, follow=False)
-        self._known: OrderedDict[str, dict[str, Any]] = OrderedDict()
+        self._file = ProfileFile(profile, load, log)
+        self._sources = _HandedFile(document, load, log), self._file
+        self._known: dict[str, dict[str, Any]] = {}
 
     def first(self) -> Loaded:
         """Read the profile at the start; raise a BadInputError if that fails."""
@@ -173,34 +180,11 @@ class Profiles:
 
     def poll(self) -> Loaded | None:
         """Return the new profile after a change; None without a change."""
-        for source in (self._poll_document, self._file.poll):
-            loaded = source()
+        for source in self._sources:
+            loaded = source.poll()
             if loaded is not None and not self._is_known(loaded):
                 return loaded
         return None
-
-    def _poll_document(self) -> Loaded | None:
-        """Read the document if it has changed; None if it has not, or if it is refused.
-
-        A refusal is logged. The document must belong to this user: if the sidecar runs as root,
-        the pod's other containers share the folder but do not run as root.
-        """
-        seen = version(self._document, follow=False)
-        if seen == self._seen or seen is None:
-            return None
-        self._seen = seen
-        try:
-            if self._document.lstat().st_uid != os.geteuid():
-                raise ValueError(f"{self._document} belongs to another user")
-            handed = read_handed(read(self._document, SIZE_MAX).decode())
-            with TemporaryDirectory(prefix="handed-", dir=self._document.parent) as folder:
-                for name, text in handed.files.items():
-                    (Path(folder) / name).write_text(text, encoding="utf-8")
-                loaded = self._load(Path(folder) / PROFILE)
-        except (BadInputError, OSError, ValueError) as error:
-            self._log(f"{_REFUSED}: {error}")
-            return None
-        return loaded._replace(change=read_change(handed.change))
 
     def _is_known(self, loaded: Loaded) -> bool:
         """Remember a change; return whether the same change has arrived before.
@@ -211,15 +195,14 @@ class Profiles:
         number = loaded.change.number
         if not number:
             return False
-        before = self._known.get(number)
-        self._known[number] = loaded.values
+        before, self._known[number] = self._known.get(number), loaded.values
         if len(self._known) > _KNOWN:
-            self._known.popitem(last=False)
+            del self._known[next(iter(self._known))]
         return before == loaded.values
 
 
 class PeerName:
-    """The peer's name, whose address may change.
+    """The peer's name and port, whose address may change.
 
     While an old and a new pod overlap, a headless Service returns both addresses. The address that
     appeared later belongs to the new pod and is used.
@@ -234,13 +217,7 @@ class PeerName:
         resolve: Callable[[str], Sequence[str]],
         log: Callable[[str], None],
     ) -> None:
-        """Set up.
-
-        Args:
-            peer: Name or address, and port.
-            resolve: Returns the addresses of a name; raises an OSError if there is none.
-            log: Receives one line for each change.
-        """
+        """Set up; `resolve` returns the addresses of a name or raises an OSError."""
         self._name, self._port = peer
         self._resolve, self._log = resolve, log
         self._known: list[str] = []
@@ -248,7 +225,7 @@ class PeerName:
         self.failures = 0
 
     def poll(self) -> Address | None:
-        """Resolve the name once; return None before the first success.
+        """Resolve the name once; None before the first success. Log one line for each change.
 
         If a later attempt fails, the known address stays.
         """
@@ -258,17 +235,13 @@ class PeerName:
         except OSError as error:
             self.failures += 1
             keeps = f"keeps {before[0]}" if before else "waits for it"
-            self._say(f"{self._name} cannot be resolved ({error.strerror or error}); {keeps}")
+            said, was = f"cannot be resolved ({error.strerror or error}); {keeps}", ""
         else:
             kept = [address for address in self._known if address in addresses]
             self._known = kept + [address for address in addresses if address not in kept]
+            said = f"is {self._known[-1]}"
             was = f", was {before[0]}" if before and before != self._known[-1:] else ""
-            self._say(f"{self._name} is {self._known[-1]}{was}")
+        if said != self._said:
+            self._said = said
+            self._log(f"{self._name} {said}{was}")
         return (self._known[-1], self._port) if self._known else None
-
-    def _say(self, line: str) -> None:
-        """Log a line unless it repeats the last line."""
-        what = line.partition(", was")[0]
-        if what != self._said:
-            self._said = what
-            self._log(line)

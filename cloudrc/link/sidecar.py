@@ -20,18 +20,10 @@ from cloudrc.link.follow import Loaded
 from cloudrc.link.netem import Iproute2, Run, check, notes
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.relay import Address
-from cloudrc.link.state import (
-    RELEASED_SUFFIX,
-    Change,
-    LinkState,
-    publish,
-    publish_route,
-    summary,
-    to_text,
-    withdraw,
-)
+from cloudrc.link.state import RELEASED_SUFFIX, Change, LinkState, publish, summary, to_text
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
+"""Setting `link.mode`: "relay" and "netem" are strict, "auto" uses netem if possible."""
 COUNT_PERIOD_NS = 1_000_000_000
 """Time between two updates of the metrics [ns]."""
 RELEASED_PERIOD_NS = 2_000_000_000
@@ -49,13 +41,10 @@ class Shaper(Protocol):
         ...
 
     def follow_peer(self, peer: Address) -> Address:
-        """Shape the datagrams to this peer from now on.
+        """Shape the datagrams to this peer from now on; raise a CloudrcError if that fails.
 
         Returns:
             The route: the address to which this pod's tunnel end has to send.
-
-        Raises:
-            CloudrcError: If the shaper cannot do this.
         """
         ...
 
@@ -151,8 +140,7 @@ class Settings:
     """Settings of a sidecar.
 
     Attributes:
-        mode: The setting `link.mode`: "relay" and "netem" are strict, "auto" uses netem if
-            possible.
+        mode: The setting `link.mode`.
         direction: "uplink" or "downlink", for reports.
         route: File with the address to which this pod's tunnel end has to send.
         state: State file in the same folder, for reports.
@@ -240,7 +228,8 @@ class Sidecar:
         Raises:
             CloudrcError: If the mode is strict and its shaper cannot realise the profile.
         """
-        withdraw(self._settings.route)  # an earlier process may have left one
+        files = self._settings.route, self._released
+        files[0].unlink(missing_ok=True)  # an earlier process may have left one
         if self._settings.mode == "netem":
             self._check_netem()
         wait_for_peer()
@@ -252,8 +241,8 @@ class Sidecar:
             while not stop():
                 self._shape(self.peer, stop)
         finally:
-            withdraw(self._settings.route)
-            withdraw(self._released)
+            for file in files:
+                file.unlink(missing_ok=True)
 
     def told(self) -> Told | None:
         """Return shaper and conditions in force; None before the first shaper.
@@ -284,12 +273,18 @@ class Sidecar:
             self._origin_ns = self._machine.clock()
         shaper, route = self._choose(profile, peer)
         try:
-            self._announce(shaper, route, profile)
+            self._machine.log(
+                f"{shaper.name} shapes the {self._settings.direction} ({self._reason})"
+            )
+            self._tell(shaper, profile)
+            self._publish_route(route)
+            if self._watcher:
+                self._watcher.shapes(shaper.name)
             count_ns = self._machine.clock()
             while not stop():
                 if self.peer is not None and self.peer != peer:
                     peer = self.peer
-                    publish_route(self._settings.route, shaper.follow_peer(peer))
+                    self._publish_route(shaper.follow_peer(peer))
                 if self.profile is not profile:
                     profile = self.profile
                     if not self._replace(shaper, profile):
@@ -343,13 +338,6 @@ class Sidecar:
         """Return the change of a profile; an unknown change if its number is that of the last."""
         return profile.change if profile.change.number != self._number else Change()
 
-    def _announce(self, shaper: Shaper, route: Address, profile: Loaded) -> None:
-        self._machine.log(f"{shaper.name} shapes the {self._settings.direction} ({self._reason})")
-        self._tell(shaper, profile)
-        publish_route(self._settings.route, route)
-        if self._watcher:
-            self._watcher.shapes(shaper.name)
-
     def _tell(self, shaper: Shaper, profile: Loaded) -> None:
         """Publish shaper and profile in force from now on, for ends, users and reports."""
         before, change, asked = self._state, self._change_of(profile), summary(profile.direction)
@@ -379,19 +367,22 @@ class Sidecar:
         """Update the metrics, and tell this pod's end how late datagrams left."""
         if self._watcher:
             self._watcher.counted(now_ns, shaper.counts())
-        if self._published is not self._state:
-            self._publish()
+        self._publish()
         if now_ns >= self._released_ns and (released := shaper.released()):
             self._released_ns = now_ns + RELEASED_PERIOD_NS
             with suppress(OSError):  # a full disk is no reason to stop shaping
                 publish(self._released, json.dumps(released))
 
     def _publish(self) -> None:
-        """Write the state; if the disk is full, the next attempt follows a second later."""
-        if self._state is not None:
+        """Write a new state; if the disk is full, the next attempt follows a second later."""
+        if self._state is not None and self._state is not self._published:
             with suppress(OSError):
                 publish(self._settings.state, to_text(self._state))
                 self._published = self._state
+
+    def _publish_route(self, route: Address) -> None:
+        """Write the route file for this pod's tunnel end: one line HOST:PORT."""
+        publish(self._settings.route, f"{route[0]}:{route[1]}\n")
 
 
 def _cause(error: CloudrcError) -> str:

@@ -2,8 +2,7 @@
 
 The state file is in the folder of the route file. The tunnel's end on the same machine follows the
 state file and records its changes. `cloudrc link set` reads the file to see whether a change is in
-force.
-All files are written atomically, since other processes may read them at the same time.
+force. All files are written atomically, since other processes may read them at the same time.
 """
 
 from __future__ import annotations
@@ -127,20 +126,5 @@ def summary(profile: DirectionProfile) -> dict[str, float | None]:
 
 
 def publish(path: Path, text: str) -> None:
-    """Write a file atomically.
-
-    Args:
-        path: The file; its folder exists.
-        text: New content.
-    """
+    """Write a text file in one step."""
     write_atomically(path, text.encode("utf-8"))
-
-
-def publish_route(path: Path, route: tuple[str, int]) -> None:
-    """Write the route file for this pod's tunnel end: one line HOST:PORT."""
-    publish(path, f"{route[0]}:{route[1]}\n")
-
-
-def withdraw(path: Path) -> None:
-    """Remove a file if it exists."""
-    path.unlink(missing_ok=True)

@@ -21,7 +21,7 @@ from cloudrc.link.follow import (
     read_handed,
     write_handed,
 )
-from cloudrc.link.state import Change, publish, publish_route, withdraw
+from cloudrc.link.state import Change, publish
 
 
 class ConfigMap:
@@ -95,9 +95,9 @@ def test_an_invalid_file_is_refused_in_one_line_until_fixed(config_map: ConfigMa
         config_map.put(text)
         assert file.poll() is None
         assert file.poll() is None
+    assert len(log) == 3
     (config_map.file.parent / "..data").unlink()
     assert file.poll() is None
-    assert len(log) == 4
     assert all(line.startswith("the new profile is refused, the old one stays") for line in log)
     config_map.put("uplink: {delay_ms: 50}\n")
     assert file.poll() is not None
@@ -291,13 +291,3 @@ def test_of_two_pods_the_newer_is_the_peer() -> None:
         chosen.append((peer.poll() or ("", 0))[0])
     assert chosen == ["b", "a", "a", "c", "a", "b"]
     assert len(log) == 5
-
-
-def test_a_route_is_whole_or_not_there(tmp_path: Path) -> None:
-    route = tmp_path / "route"
-    for port in (7401, 7400):
-        publish_route(route, ("10.0.0.1", port))
-        assert route.read_text() == f"10.0.0.1:{port}\n"
-    for _ in range(2):
-        withdraw(route)
-    assert os.listdir(tmp_path) == []
