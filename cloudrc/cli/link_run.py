@@ -60,7 +60,8 @@ def run(options: argparse.Namespace) -> int:
         if exporter:
             exporter.tells(LinkStatusSource(sidecar).text)
         try:
-            sidecar.run(stop, lambda: _start_watching(sidecar, profiles, options, metrics))
+            _start_watching(sidecar, profiles, options, metrics)
+            sidecar.run(stop)
         finally:
             programs.close()
     return 0
@@ -88,7 +89,7 @@ def make_profile_loader(direction: str) -> Load:
 def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> Machine:
     from cloudrc.config.load import read_experiment
     from cloudrc.link.model import LinkDirection
-    from cloudrc.link.netem import Netem, may_shape, try_netem
+    from cloudrc.link.netem import Netem, may_shape
     from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.relay import RelayShaper, ask_for_fifo, settle
     from cloudrc.link.sidecar import Machine
@@ -118,7 +119,6 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
         relay=relay,
         netem=netem,
         may_shape=may_shape(Path("/proc/self/status").read_text(encoding="ascii")),
-        try_netem=lambda: try_netem(programs),
         clock=clock,
         today=lambda: datetime.now(UTC).isoformat(timespec="seconds"),
         wait=time.sleep,

@@ -40,8 +40,8 @@ from cloudrc.link.relay import Address
 
 NOT_FOUND = 127
 """Exit code when the program does not exist."""
-ROOT, BAND, LEAF, TRIAL = "7400:", "7400:4", "7401:", "7402:"
-"""Handles of the root qdisc, of its band for the tunnel's flow, of the netem there, of a trial."""
+ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
+"""Handles of the root qdisc, of its band for the tunnel's flow, and of the netem there."""
 PERIOD_NS = 1_000_000_000
 """Time between two checks of the qdiscs [ns]."""
 STEP_NS = 5_000_000
@@ -121,22 +121,6 @@ class Iproute2:
         if answer.code:
             raise explain(program, words, answer)
         return answer.output
-
-
-def try_netem(run: Run) -> None:
-    """Check whether this kernel has netem: add a netem without delay to the loopback interface.
-
-    If the loopback already has a qdisc of another program, nothing is changed or checked.
-
-    Raises:
-        MissingPrerequisiteError: If the kernel has no netem, or this container may not use it.
-    """
-    iproute2 = Iproute2(run)
-    root = next((q for q in iproute2.show("qdisc", "show", "dev", "lo") if q.get("root")), {})
-    if (handle := root.get("handle", "0:")) == "0:":
-        iproute2.tc("qdisc", "add", "dev", "lo", "root", "handle", TRIAL, "netem")
-    if handle in ("0:", TRIAL):
-        iproute2.tc("qdisc", "del", "dev", "lo", "root")
 
 
 def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
@@ -265,8 +249,7 @@ def notes(profile: DirectionProfile) -> list[str]:
             f"their checksums, so that corrupt {profile.corrupt:g} is seen as loss"
         )
     starts = Timeline(profile).pass_ns
-    passed_over = sum(after - before < STEP_NS for before, after in pairwise(starts))
-    if passed_over:
+    if passed_over := sum(after - before < STEP_NS for before, after in pairwise(starts)):
         said.append(
             f"netem is stepped every {STEP_NS * 1e-6:g} ms at most: {passed_over} of "
             f"{len(starts)} steps of the time line come sooner, and some are passed over"
@@ -383,16 +366,10 @@ def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
 
 
 class Steps:
-    """Counts the steps of a qdisc along a time line.
-
-    Attributes:
-        applied: Number of steps that took effect.
-        late: Number of these steps with a lateness above `LATE_NS`.
-        passed_over: Number of skipped steps: the next step was due before they could take effect.
-    """
+    """Counts the steps of a qdisc along a time line."""
 
     def __init__(self) -> None:
-        self.applied = self.late = self.passed_over = 0
+        self._applied = self._late = self._passed_over = 0
         self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
 
     def note(self, lateness_ns: int, passed_over: int) -> None:
@@ -400,20 +377,20 @@ class Steps:
 
         The lateness [ns] is the time from when the step was due until tc reports it in force.
         """
-        self.applied += 1
-        self.late += lateness_ns > LATE_NS
-        self.passed_over += passed_over
+        self._applied += 1
+        self._late += lateness_ns > LATE_NS
+        self._passed_over += passed_over
         self._lateness_ns.append(lateness_ns)
 
     def counts(self) -> dict[str, int]:
-        """Return the number of steps and their lateness; empty before the first."""
-        if not self.applied:
-            return {}
+        """Return the number of steps and their lateness [ns]; empty before the first."""
         ordered = sorted(self._lateness_ns)
+        if not ordered:
+            return {}
         return {
-            "steps": self.applied,
-            "steps_late": self.late,
-            "steps_passed_over": self.passed_over,
+            "steps": self._applied,
+            "steps_late": self._late,
+            "steps_passed_over": self._passed_over,
             "step_lateness_p50_ns": ordered[(len(ordered) - 1) // 2],
             "step_lateness_p99_ns": ordered[ceil(0.99 * (len(ordered) - 1))],
         }

@@ -17,7 +17,7 @@ from pydantic import TypeAdapter
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
-from cloudrc.link.netem import Iproute2, Run, check, notes
+from cloudrc.link.netem import Iproute2, Run, notes
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.relay import Address
 from cloudrc.link.state import RELEASED_SUFFIX, Change, LinkState, publish, summary, to_text
@@ -38,7 +38,6 @@ class Shaper(Protocol):
     @property
     def name(self) -> str:
         """Name as in the setting `link.mode`: "relay" or "netem"."""
-        ...
 
     def follow_peer(self, peer: Address) -> Address:
         """Shape the datagrams to this peer from now on; raise a CloudrcError if that fails.
@@ -46,35 +45,25 @@ class Shaper(Protocol):
         Returns:
             The route: the address to which this pod's tunnel end has to send.
         """
-        ...
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         """Shape by this profile from now on; datagrams in flight are not lost.
 
-        Args:
-            profile: Conditions.
-            restart: True: the time line starts now. False: the time line continues.
-
-        Raises:
-            CloudrcError: If the shaper cannot do this; then the old profile stays in force.
+        The time line starts now (`restart`) or continues. If the shaper cannot do this, the old
+        profile stays in force, and a CloudrcError is raised.
         """
-        ...
 
     def step(self, timeout: float) -> None:
         """Work or wait for about `timeout` [s]."""
-        ...
 
     def counts(self) -> dict[str, int]:
         """Return the number of datagrams so far, by outcome."""
-        ...
 
     def released(self) -> dict[str, int]:
         """Return how late datagrams left since the beginning; empty if unknown."""
-        ...
 
     def close(self) -> None:
         """Stop shaping and leave nothing behind."""
-        ...
 
 
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
@@ -87,8 +76,7 @@ class Near:
 
     Attributes:
         interface: Interface through which the tunnel's flow leaves.
-        netems: Interface -> its netem qdiscs, as objects of `tc -s -j qdisc show`. Interfaces
-            without netem are absent.
+        netems: Interface -> its netem qdiscs, if any, as objects of `tc -s -j qdisc show`.
     """
 
     interface: str
@@ -160,7 +148,6 @@ class Machine:
         relay: Makes the relay.
         netem: Makes the `Netem`, without touching the network yet.
         may_shape: Whether this process is root with NET_ADMIN.
-        try_netem: Raises a CloudrcError if this kernel has no netem; leaves no qdisc behind.
         clock: Returns the time on the monotonic clock [ns].
         today: Returns date and time in UTC as text, for reports.
         wait: Sleeps for a time [s].
@@ -170,7 +157,6 @@ class Machine:
     relay: Make
     netem: Make
     may_shape: bool
-    try_netem: Callable[[], None]
     clock: Callable[[], int]
     today: Callable[[], str]
     wait: Callable[[float], None]
@@ -182,15 +168,12 @@ class Watcher(Protocol):
 
     def shapes(self, shaper: str) -> None:
         """Note that this shaper is in force from now on, and that the route is published."""
-        ...
 
     def asked(self, delay: float) -> None:
         """Note the mean delay [s] that the profile in force requests."""
-        ...
 
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
         """Note the number of datagrams so far by outcome; called once a second."""
-        ...
 
 
 class Sidecar:
@@ -215,24 +198,14 @@ class Sidecar:
         self._released, self._released_ns = settings.state.with_suffix(RELEASED_SUFFIX), 0
         self._number = profile.change.number
 
-    def run(
-        self, stop: Callable[[], bool], wait_for_peer: Callable[[], None] = lambda: None
-    ) -> None:
-        """Shape until `stop` returns True.
-
-        Args:
-            stop: Returns True when the sidecar has to end.
-            wait_for_peer: Called after the check that the shaper of a strict mode works; starts
-                the search for the peer.
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Wait for the peer, then shape, until `stop` returns True.
 
         Raises:
             CloudrcError: If the mode is strict and its shaper cannot realise the profile.
         """
         files = self._settings.route, self._released
         files[0].unlink(missing_ok=True)  # an earlier process may have left one
-        if self._settings.mode == "netem":
-            self._check_netem()
-        wait_for_peer()
         while self.peer is None:
             if stop():
                 return
@@ -255,16 +228,6 @@ class Sidecar:
         elapsed_ns = self._machine.clock() - (state.origin_ns or 0)
         over = elapsed_ns >= Timeline(profile).last_ns
         return Told(state.shaper, state.reason, settled(profile) if over else None)
-
-    def _check_netem(self) -> None:
-        """Check whether netem works here, before the sidecar waits for the peer."""
-        if not self._machine.may_shape:
-            raise MissingPrerequisiteError(
-                "link.mode=netem needs uid 0 and NET_ADMIN; give this container both, or set "
-                "link.mode=relay, which needs neither"
-            )
-        check(self.profile.direction)
-        self._machine.try_netem()
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Shape with one shaper until `stop`, or until a new profile needs another shaper."""
@@ -304,7 +267,10 @@ class Sidecar:
             netem = machine.netem(profile.direction, self._origin_ns or 0)
             try:
                 if not machine.may_shape:
-                    raise MissingPrerequisiteError("no uid 0 with NET_ADMIN")
+                    raise MissingPrerequisiteError(
+                        "no uid 0 with NET_ADMIN; give this container both, or set "
+                        "link.mode=relay, which needs neither"
+                    )
                 return netem, netem.follow_peer(peer)
             except CloudrcError as error:
                 if mode == "netem":

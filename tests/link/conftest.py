@@ -413,7 +413,6 @@ class Bench:
         self.counted_ns: list[int] = []
         self.origins_ns: list[int] = []
         self.delays: list[float] = []
-        self.no_netem: Exception | None = None
         self.route, self.state = folder / "route", folder / "link.json"
         machine = Machine(
             relay=lambda _, origin_ns: self.make("relay", origin_ns),
@@ -421,7 +420,6 @@ class Bench:
                 "netem", origin_ns, REFUSED if asked.delay == 9.0 else refuses
             ),
             may_shape=may_shape,
-            try_netem=self.try_netem,
             clock=lambda: self.now_ns,
             today=lambda: "2026-01-02T03:04:05+00:00",
             wait=self.wait,
@@ -435,10 +433,6 @@ class Bench:
     def make(self, name: str, origin_ns: int, refuses: Exception | None = None) -> Shaper:
         self.origins_ns.append(origin_ns)
         return Shaper(self, name, refuses)
-
-    def try_netem(self) -> None:
-        if self.no_netem:
-            raise self.no_netem
 
     def at(self, time: float, action: Callable[[], None]) -> None:
         self.plan.append((time, action))
