@@ -9,14 +9,11 @@ qdisc change`, which keeps the queued packets but does not reset what it does no
 call names all options. `Netem` never touches a root qdisc of another program. If another program
 removes or changes the qdiscs of `Netem`, the log says so and a metric counts the case.
 
-tc and the kernel clamp numbers without a message: a rate below 1 byte/s turns into no rate limit, a
-probability below 2**-32 turns into 0. So `Netem` reads back the options in force.
-
 netem draws jitter from a table of at most 16,384 integers of 16 bits; the entry 8192 means one
 times the jitter. The tables that come with tc differ from the model's distributions.
 
-Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8); iproute2 tc/q_netem.c (netem_print_opt)
-and netem/README.distribution; Linux, net/sched/sch_netem.c (tabledist).
+Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8); iproute2 netem/README.distribution; Linux,
+net/sched/sch_netem.c (tabledist).
 """
 
 from __future__ import annotations
@@ -25,7 +22,7 @@ import json
 import re
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from hashlib import blake2b
 from itertools import pairwise
 from math import ceil, inf, sqrt
@@ -66,6 +63,8 @@ _IN_ORDER = "100gbit"
 """Rate that has no effect except that netem keeps the order of packets."""
 _ETHERNET_BYTES = 14
 """Length of the Ethernet header, which netem counts and the model does not [bytes]."""
+_RATE_MIN = 8.0
+"""Lowest rate [bit/s]: tc turns less than 1 byte/s into no limit, without a message."""
 _PACKET_BITS = 8 * 116
 """Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
 _PACKETS = 1_000
@@ -73,17 +72,6 @@ _PACKETS = 1_000
 # The kernel's own default for three bands: nothing falls into the fourth by its type of service.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
 _INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
-_LISTED = {
-    "limit": ("", ("limit",)),
-    "delay": ("delay", ("delay", "jitter", "correlation")),
-    "random": ("loss-random", ("loss",)),
-    "gemodel": ("loss-gemodel", ("p", "r", "1-h", "1-k")),
-}
-"""Option of tc -> object and keys in its listing; of other options both are the option's name."""
-_UNITS = {"us": 1e-6, "%": 1e-2, "gbit": 1.25e8, "bit": 0.125, "": 1.0}
-"""Unit in tc's arguments -> factor to the unit in tc's listing: [s], [1], [byte/s]."""
-_SLACK, _RELATIVE = 128e-9, 1e-3
-"""Absolute and relative tolerance for tc's rounding: delays to 64 ns [s], chances to 32 bits."""
 
 
 class Answer(NamedTuple):
@@ -226,6 +214,8 @@ def check(profile: DirectionProfile) -> None:
         found = "loss.delay_bad_ms (more delay while a burst of losses lasts)"
     if any(piece.rate and piece.jitter for piece in pieces) and not profile.keep_order:
         found = "rate_kbit with jitter_ms but without keep_order (overtaking behind a bottleneck)"
+    if any(0.0 < (piece.rate or inf) < _RATE_MIN for piece in pieces):
+        found = f"rate_kbit below {_RATE_MIN * 1e-3:g} (tc takes it for no limit)"
     if (slowest := max(piece.delay_ns for piece in pieces)) > DELAY_MAX_NS:
         found = f"delay_ms above 274000 (its clock ends there, here {slowest * 1e-6:g} ms)"
     for one in profile.blackouts:
@@ -312,30 +302,6 @@ def _microseconds(duration_ns: float) -> str:
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.9g}%"
-
-
-def differences(words: Sequence[str], listed: Mapping[str, Any]) -> list[str]:
-    """Compare the requested options, from `options`, with those that `tc -j qdisc show` lists.
-
-    Returns:
-        One text per number that differs, such as "rate: asked 0.5, in force 0".
-    """
-    found, option, index = list[str](), "", 0
-    for word in words:
-        number = re.fullmatch(r"(-?[\d.e-]+)(us|%|gbit|bit|)", word)
-        if number is None:  # a keyword, or the name of a distribution
-            option, index = word, 0
-            continue
-        place, keys = _LISTED.get(option, (option, (option,)))
-        if index < len(keys):
-            asked, key = float(number[1]) * _UNITS[number[2]], keys[index]
-            shown = float((listed.get(place, {}) if place else listed).get(key, 0.0))
-            off = abs(shown - asked) > max(_SLACK, _RELATIVE * abs(asked))
-            if off or (asked and not shown):
-                name = key if len(keys) == 1 else f"{option} {key}"
-                found.append(f"{name}: asked {asked:g}, in force {shown:g}")
-        index += 1
-    return found
 
 
 def leaf_of(qdiscs: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
@@ -436,6 +402,7 @@ class Netem:
         self._device, self._damage, self._damages = "", "", 0
         self._looked_ns, self._stepped_ns = -PERIOD_NS, origin_ns
         self._applied: list[str] = []
+        self._listed: object = None
         self.steps = Steps()
         self._take(profile, origin_ns)
 
@@ -456,7 +423,6 @@ class Netem:
             check(self._profile)
             if not self._applied:
                 self._set_up()
-                self._confirm()
             self._select(peer)
         except CloudrcError:
             self.close()
@@ -475,7 +441,6 @@ class Netem:
             self._room += counters(qdiscs).get("held", 0)
         try:
             self._apply("change")
-            self._confirm()
         except CloudrcError:
             self._take(*before)
             self._step()
@@ -514,25 +479,23 @@ class Netem:
         self._device, self._applied = "", []
 
     def _look(self) -> list[dict[str, Any]]:
-        """Read the qdiscs; log and count damage by another program."""
+        """Read the qdiscs; log and count changes by another program since the last own change."""
         self._looked_ns, qdiscs = self._clock(), self._qdiscs()
-        found = self._differences(qdiscs) if self._applied else []
-        what = f"was changed ({'; '.join(found)})" if found else "was removed"
-        said = (
-            f"the qdisc of {self._device} {what} by another program, so the link is not as asked; "
-            "find out which, and restart this pod to set it up again"
-        )
-        said = "" if found == [] else said
+        leaf = leaf_of(qdiscs)
+        found = leaf and leaf.get("options")
+        self._listed = found if self._listed is None and found else self._listed
+        said = ""
+        if self._applied and (not found or found != self._listed):
+            what = f"was changed to {json.dumps(found)}" if found else "was removed"
+            said = (
+                f"the qdisc of {self._device} {what} by another program, so the link is not as "
+                "asked; find out which, and restart this pod to set it up again"
+            )
         if said and said != self._damage:
             self._damages += 1
             self._log(f"error: {said}")
         self._damage = said
         return qdiscs
-
-    def _differences(self, qdiscs: list[dict[str, Any]]) -> list[str] | None:
-        """Compare the options in force with the requested ones; None if the qdisc is missing."""
-        leaf = leaf_of(qdiscs)
-        return None if leaf is None else differences(self._applied, leaf.get("options", {}))
 
     def _set_up(self) -> None:
         """Add the qdiscs, or take over the qdiscs of an earlier process."""
@@ -570,7 +533,7 @@ class Netem:
         if wanted != self._applied:
             place = ("dev", self._device, "parent", BAND, "handle", LEAF)
             self._iproute2.tc("qdisc", verb, *place, "netem", *wanted)
-            self._applied = wanted
+            self._applied, self._listed = wanted, None
         if 0 <= before < self._piece:  # the first piece of a time line is no step
             self._stepped_ns = self._clock()
             due_ns = self._origin_ns + starts_ns[self._piece]
@@ -585,19 +548,6 @@ class Netem:
             return inf
         due_ns = self._origin_ns + self._timeline.pass_ns[following]
         return max(due_ns, self._stepped_ns + STEP_NS)
-
-    def _confirm(self) -> None:
-        """Read back the options in force; raise an error if they differ from the requested ones."""
-        found = self._differences(self._qdiscs())
-        if found is None:
-            raise MissingPrerequisiteError(
-                f"the qdisc of {self._device} was removed by another program; find out which"
-            )
-        if found:
-            raise BadInputError(
-                f"netem cannot do what is asked ({'; '.join(found)}); set link.mode=relay, which "
-                "can, or ask for other values"
-            )
 
     def _select(self, peer: Address) -> None:
         """Direct the tunnel's flow to netem: add the new filter, then remove the old filters."""

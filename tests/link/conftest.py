@@ -6,52 +6,22 @@ shapers only store calls, on a clock that a test moves.
 
 from __future__ import annotations
 
-import ctypes
 import json
-import os
 import socket
-import struct
-import subprocess
-import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
-from cloudrc.drivers.iproute2 import Programs
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.netem import Answer, Netem, write_tables
+from cloudrc.link.netem import Answer, Netem
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Machine, Mode, Settings, Sidecar
 from cloudrc.link.state import Change
-
-
-@pytest.fixture(scope="module")
-def tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Make the laboratory; the value is the folder of tc's distributions."""
-    folder = tmp_path_factory.mktemp("tc")
-    write_tables(folder)
-    try:
-        with laboratory():
-            yield folder
-    except UnableError as error:
-        pytest.exit(f"netem cannot be tested here: {error}", MissingPrerequisiteError.exit_code)
-
-
-@pytest.fixture
-def shaped(tables: Path) -> Iterator[Netem]:
-    """Install netem without conditions."""
-    netem = real_netem(tables, DirectionProfile())
-    assert netem.follow_peer(FAR_PEER) == FAR_PEER
-    yield netem
-    netem.close()
-
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS
@@ -119,8 +89,8 @@ class Kernel:
         self.lacks = lacks
         self.held = 4
         self.said: list[str] = []
-        self.clamps: dict[str, object] = {}
-        self._clear()
+        self.refuses = "nothing"
+        self.clear()
 
     def run(self, words: Sequence[str]) -> Answer:
         line = " ".join(words)
@@ -135,11 +105,13 @@ class Kernel:
                 entries = [{"pref": number, "kind": "u32"} for number in self.filters]
                 return Answer(0, json.dumps(entries * 2), "")
             case ["tc", "qdisc", "del", *_]:
-                self._clear()
+                self.clear()
             case ["tc", "qdisc", verb, *rest]:
                 kind = "netem" if "netem" in rest else "prio"
                 if kind in self.lacks:
                     return UNKNOWN
+                if self.refuses in rest:
+                    return Answer(1, "", "Illegal delay")
                 if kind == "prio":
                     self.root = {"kind": "prio", "handle": "7400:", "root": True}
                 else:
@@ -159,10 +131,10 @@ class Kernel:
     def qdiscs(self) -> list[dict[str, object]]:
         leaf = {"kind": "netem", "handle": "7401:", "packets": 90, "drops": 10}
         leaf["qlen"] = self.held
-        leaf["options"] = {**listing(self.netem or []), **self.clamps}
+        leaf["options"] = listing(self.netem or [])
         return [self.root, *([leaf] if self.netem is not None else [])]
 
-    def _clear(self) -> None:
+    def clear(self) -> None:
         self.root = {"kind": "noqueue", "handle": "0:", "root": True}
         self.netem: list[str] | None = None
         self.filters: dict[int, str] = {}
@@ -170,16 +142,9 @@ class Kernel:
 
 def listing(words: Sequence[str]) -> dict[str, object]:
     """Return the "options" that `tc -j qdisc show` prints for the words of a netem command."""
-    text = " ".join(words)
-    found: dict[str, object] = {"limit": int(words[words.index("limit") + 1]) if words else 1000}
-    for name, key, unit in (("delay", "delay", 1e-6), ("duplicate", "duplicate", 0.01),
-                            ("corrupt", "corrupt", 0.01), ("random", "loss-random", 0.01),
-                            ("rate", "rate", 0.125)):  # fmt: skip
-        if name in words:
-            number = float(text.split(f"{name} ")[1].split(" ")[0].rstrip("usbitg%"))
-            scale = unit * (1e9 if f"{name} 100gbit" in text else 1.0)
-            found[key] = {"loss" if key == "loss-random" else key: number * scale}
-    return found
+    given = dict(pairwise(words))
+    delay = float(given.get("delay", "0us").removesuffix("us")) * 1e-6
+    return {"limit": int(given.get("limit", 1000)), "delay": {"delay": delay}, "words": words}
 
 
 class Clock:
@@ -200,164 +165,6 @@ def netem(
 ) -> Netem:
     clock = clock or Clock()
     return Netem(kernel.run, profile, origin_ns=0, clock=clock, wait=clock.wait, log=log)
-
-
-NEAR, FAR = f"crc-near-{os.getpid()}", f"crc-far-{os.getpid()}"
-NEAR_HOST, FAR_HOST = "10.79.0.1", "10.79.0.2"
-DEVICE = "wire"
-FAR_PEER = (FAR_HOST, 7400)
-WITHIN = 0.002
-"""Tolerance of medians [s]; means would show the stalls of a slow virtual machine."""
-_CLONE_NEWNET = 0x40000000
-_SO_TIMESTAMPNS = 35  # include/uapi/asm-generic/socket.h
-
-
-class UnableError(Exception):
-    """This machine cannot make the laboratory."""
-
-
-def sh(*words: str) -> str:
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise UnableError(f"{' '.join(words)}: {done.stderr.strip()}")
-    return done.stdout
-
-
-@contextmanager
-def laboratory() -> Iterator[None]:
-    """Make the namespaces and the cable; raise UnableError if that or netem is impossible here."""
-    if os.geteuid() != 0:
-        raise UnableError("the tests of netem need root")
-    try:
-        for name in (NEAR, FAR):
-            sh("ip", "netns", "add", name)
-        sh("ip", "-n", NEAR, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", FAR)
-        for name, host in ((NEAR, NEAR_HOST), (FAR, FAR_HOST)):
-            sh("ip", "-n", name, "addr", "add", f"{host}/24", "dev", DEVICE)
-            for device in ("lo", DEVICE):
-                sh("ip", "-n", name, "link", "set", device, "up")
-        sh("tc", "-n", NEAR, "qdisc", "add", "dev", DEVICE, "root", "netem")
-        sh("tc", "-n", NEAR, "qdisc", "del", "dev", DEVICE, "root")
-        yield
-    finally:
-        while _programs:
-            _programs.popitem()[1].close()
-        for name in (NEAR, FAR):
-            with suppress(UnableError):
-                sh("ip", "netns", "del", name)
-
-
-@contextmanager
-def inside(name: str) -> Iterator[None]:
-    """Move this thread to a namespace; sockets opened in it stay there."""
-    library = ctypes.CDLL(None, use_errno=True)
-    with open("/proc/thread-self/ns/net") as home, open(f"/run/netns/{name}") as there:
-        assert library.setns(there.fileno(), _CLONE_NEWNET) == 0, os.strerror(ctypes.get_errno())
-        try:
-            yield
-        finally:
-            library.setns(home.fileno(), _CLONE_NEWNET)
-
-
-_programs: dict[Path, Programs] = {}
-
-
-def run_near(tables: Path) -> Programs:
-    """Run tc and ip in the near namespace."""
-    if tables not in _programs:
-        _programs[tables] = Programs(str(tables), ("ip", "netns", "exec", NEAR))
-    return _programs[tables]
-
-
-def real_netem(tables: Path, profile: DirectionProfile, origin_ns: int = 0) -> Netem:
-    return Netem(
-        run_near(tables),
-        profile,
-        origin_ns=origin_ns,
-        clock=time.monotonic_ns,
-        wait=time.sleep,
-        tables=tables,
-    )
-
-
-def qdiscs() -> str:
-    return sh("tc", "-n", NEAR, "qdisc", "show", "dev", DEVICE)
-
-
-class Flow:
-    """Numbered datagrams from near to a port of far, with the arrival of each copy."""
-
-    def __init__(self, port: int = 7400) -> None:
-        self.port = port
-        self.sent_ns: list[int] = []
-        self.arrived: list[tuple[int, int]] = []
-        with inside(NEAR):
-            self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        with inside(FAR):
-            self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._in.bind((FAR_HOST, port))
-        self._in.settimeout(0.1)
-        self._in.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)  # the kernel's time of arrival
-        self._open = True
-        self._thread = threading.Thread(target=self._receive, daemon=True)
-        self._thread.start()
-
-    def send(self, count: int, period: float = 0.01, meanwhile: Callable[[], None] = int) -> None:
-        """Send `count` datagrams, one per period; call `meanwhile` after each."""
-        begin = time.monotonic()
-        for index in range(count):
-            number = len(self.sent_ns)
-            self.sent_ns.append(time.time_ns())
-            self._out.sendto(number.to_bytes(4, "little") + bytes(168), (FAR_HOST, self.port))
-            meanwhile()
-            time.sleep(max(0.0, begin + (index + 1) * period - time.monotonic()))
-
-    def settle(self, quiet: float = 0.5) -> Flow:
-        """Wait until nothing arrives any more, then close."""
-        count = -1
-        while count != len(self.arrived):
-            count = len(self.arrived)
-            time.sleep(quiet)
-        self._open = False
-        self._thread.join()
-        self._out.close()
-        self._in.close()
-        return self
-
-    def delays(self) -> NDArray[np.float64]:
-        """Return the one-way delay of each copy that arrived [s]."""
-        return np.array([(at_ns - self.sent_ns[n]) * 1e-9 for n, at_ns in self.arrived])
-
-    def numbers(self) -> list[int]:
-        return [number for number, _ in self.arrived]
-
-    def _receive(self) -> None:
-        while self._open:
-            with suppress(TimeoutError):
-                data, notes, _, _ = self._in.recvmsg(512, 64)
-                seconds, rest_ns = struct.unpack("=qq", notes[0][2])
-                number = int.from_bytes(data[:4], "little")
-                self.arrived.append((number, seconds * 1_000_000_000 + rest_ns))
-
-
-def measure(count: int, period: float = 0.01) -> Flow:
-    """Send a flow and wait for its end."""
-    flow = Flow()
-    flow.send(count, period)
-    return flow.settle()
-
-
-def show(words: str, **values: float) -> None:
-    """Print a number, which pytest shows with -s."""
-    print(words, {name: round(float(value), 5) for name, value in values.items()})
-
-
-def least(error: Callable[[], float], enough: float) -> float:
-    """Return the smallest of up to three errors, since a stall of the machine spoils one."""
-    found = error()
-    for _ in range(2):
-        found = found if found < enough else min(found, error())
-    return found
 
 
 REFUSED = BadInputError("netem cannot do delay_ms above 274000 (far); set link.mode=relay")
