@@ -1,7 +1,7 @@
 """Send numbered datagrams through a link, and compare what arrives with what the model draws.
 
-The kernel stamps each datagram when it leaves and when it arrives, so that late wakes of Python do
-not matter. Both stamps are of the wall clock.
+The kernel stamps each datagram when it leaves and when it arrives (wall clock), so that late wakes
+of Python do not matter.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +27,21 @@ Array: TypeAlias = NDArray[np.float64]
 
 SIZE = 172
 """Length of a datagram, about that of telemetry [bytes]."""
-EPOCH = 1
+EPOCH, SEED = 1, 1
 TIE_NS = 5_000
 """Difference of two due instants below which their order is chance [ns]."""
-_BUFFER = 4 << 20
 # Source: Linux, include/uapi/asm-generic/socket.h, linux/net_tstamp.h, linux/errqueue.h.
-_SO_TIMESTAMPNS = 35
-_SO_TIMESTAMPING = 37
+_SO_TIMESTAMPNS, _SO_TIMESTAMPING, _IP_RECVERR = 35, 37, 11
 _TX_SOFTWARE, _SOFTWARE, _ID, _STAMP_ONLY = 1 << 1, 1 << 4, 1 << 7, 1 << 11
-_IP_RECVERR = 11
+
+
+class Way(NamedTuple):
+    """Where one direction of a link takes in and delivers to; datagrams come from `source`."""
+
+    uplink: bool
+    target: Address
+    sink: Address
+    source: Address | None = None
 
 
 @dataclass
@@ -47,27 +53,24 @@ class Flow:
     arrived: list[tuple[int, int]] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class Way:
-    """Where one direction of a link takes in and delivers to; datagrams come from `source`."""
+class Judged(NamedTuple):
+    """A flow beside the model.
 
-    uplink: bool
-    target: Address
-    sink: Address
-    source: Address | None = None
+    `errors` are measured minus drawn delays of the datagrams that arrived, with copies [s].
+    """
+
+    errors: Array
+    wrongly_lost: int
+    wrongly_arrived: int
+    swapped: int
 
 
 def run_flow(
     ways: Sequence[Way], rate: float, duration: float, tail: float, begin: float = 0.0
 ) -> list[Flow]:
-    """Send on one or two ways in turns, and receive.
+    """Send on one or two ways in turns at `rate` [1/s] each for `duration` [s], and receive.
 
-    Args:
-        ways: One or two.
-        rate: On each way [1/s].
-        duration: Of the sending [s].
-        tail: How long to receive after that [s].
-        begin: When to begin [s], monotonic clock; soon if that has passed.
+    Receiving ends `tail` [s] later. Sending begins at `begin` [s], monotonic clock, or soon.
     """
     flows = [Flow(way.uplink) for way in ways]
     addresses = {address for way in ways for address in (way.source, way.sink)}
@@ -105,60 +108,23 @@ def since_first_ns(number: int, turn: int, turns: int, period_ns: int) -> int:
     return number * period_ns + turn * period_ns // turns + period_ns // 4
 
 
-def flood(way: Way, rate: float, duration: float, first: int = 0) -> int:
-    """Send bursts of 100, at most `rate` [1/s], for `duration` [s]; return how many were sent."""
-    sent, start, burst = 0, time.monotonic(), 100
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as source:
-        if way.source is not None:
-            source.bind(way.source)
-        source.connect(way.target)
-        while (now := time.monotonic()) < start + duration:
-            if now < start + sent / rate:
-                time.sleep(0.0002)
-                continue
-            for number in range(first + sent, first + sent + burst):
-                with suppress(ConnectionRefusedError):
-                    source.send(_datagram(True, number))
-            sent += burst
-    return sent
-
-
-@dataclass(frozen=True)
-class Judged:
-    """A flow beside the model: arrays [s] over the datagrams that arrived, and what was wrong.
-
-    `errors` is `measured` minus `drawn`; `sent` counts from the first datagram; copies count.
-    """
-
-    errors: Array
-    measured: Array
-    drawn: Array
-    sent: Array
-    wrongly_lost: int
-    wrongly_arrived: int
-    swapped: int
-
-
-def judge(flow: Flow, profile: DirectionProfile, seed: int, origin_ns: int) -> Judged:
+def judge(flow: Flow, profile: DirectionProfile, origin_ns: int) -> Judged:
     """Compare a flow with the model; the relay saw its first datagram at `origin_ns` [ns]."""
-    model = LinkDirection(profile, seed, flow.uplink, origin_ns)
+    model = LinkDirection(profile, SEED, flow.uplink, origin_ns)
     due: dict[int, list[int]] = {}
     for number in sorted(flow.sent):
         releases = model.send(EPOCH, _kind(flow.uplink), number, SIZE, flow.sent[number])
         due[number] = sorted(releases, reverse=True)
-    rows, order, too_many = [], [], 0
-    start_ns = min(flow.sent.values())
+    errors, order, too_many = [], [], 0
     for at_ns, number in flow.arrived:
-        if not due[number]:
+        if due[number]:
+            order.append(due[number].pop())
+            errors.append(at_ns - order[-1])
+        else:
             too_many += 1
-            continue
-        due_ns, sent_ns = due[number].pop(), flow.sent[number]
-        order.append(due_ns)
-        rows.append((at_ns - due_ns, at_ns - sent_ns, due_ns - sent_ns, sent_ns - start_ns))
-    errors, measured, drawn, sent = np.array(rows, dtype=float).reshape(-1, 4).T * 1e-9
     swapped = sum(a > b + TIE_NS for a, b in pairwise(order))
     missing = sum(map(len, due.values()))
-    return Judged(errors, measured, drawn, sent, missing, too_many, swapped)
+    return Judged(np.array(errors, dtype=float) * 1e-9, missing, too_many, swapped)
 
 
 def _kind(uplink: bool) -> Kind:
@@ -171,7 +137,7 @@ def _datagram(uplink: bool, number: int) -> bytes:
 
 def _open(address: Address | None) -> socket.socket:
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
     one.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
     flags = _TX_SOFTWARE | _SOFTWARE | _ID | _STAMP_ONLY
     one.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, flags)

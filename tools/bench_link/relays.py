@@ -1,62 +1,46 @@
-"""The relays that are measured, each a process: ours, one in C, one with asyncio.
-
-usage: python -m tools.bench_link.relays LISTEN_PORT TARGET_PORT DELAY   (the one with asyncio)
-"""
+"""The relays that are measured, each a process: `cloudrc relay`, and one in C."""
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
 import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from cloudrc.assembly import link_profile
+from cloudrc.config.load import load_experiment
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import MissingPrerequisiteError
-from tools.bench_link.flow import Address, Array, Way
+from cloudrc.link.profile import DirectionProfile
+from tools.bench_link.flow import SEED, Array, Flow, Judged, Way, judge, run_flow
 
-HERE = Path(__file__).parent
-EMPTY: dict[str, object] = {"mission": "hover", "world": {"scene": "empty"}}
-"""What an experiment of the bench flies, if it flew."""
+Links: TypeAlias = dict[str, dict[str, object]]
+"""Name -> the section `link` of an experiment file."""
 DELAY = 0.020
-"""Delay of the C relay and the asyncio relay, and of ours beside them [s]."""
-_TICKS = os.sysconf("SC_CLK_TCK")
+"""Delay of the C relay, and of ours beside it [s]."""
+LINK: dict[str, object] = {"profile": "ideal", "uplink": {"delay_ms": DELAY * 1e3}}
 
 
 class Process:
-    """A relay that runs.
-
-    Attributes:
-        ways: How to send through it.
-        said: What it wrote to standard error, once it has ended.
-    """
+    """A relay that runs; `ways` tells how to send through it."""
 
     def __init__(self, command: list[str], ways: list[Way]) -> None:
         """Start it and wait until it says that it is ready."""
-        self.ways, self.said = ways, ""
+        self.ways, self._said = ways, ""
         self._process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         assert self._process.stdout is not None
         self._process.stdout.readline()
-
-    def cpu(self) -> float:
-        """Return the processor time that it has taken [s]."""
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / _TICKS
-
-    def memory(self) -> int:
-        """Return the most memory that it has taken [bytes]."""
-        status = Path(f"/proc/{self._process.pid}/status").read_text()
-        found = re.search(r"VmHWM:\s+(\d+) kB", status)
-        return int(found[1]) * 1024 if found else 0
 
     def use_fifo(self) -> None:
         """Put it under SCHED_FIFO."""
@@ -65,24 +49,24 @@ class Process:
     def stop(self) -> None:
         """End it."""
         self._process.send_signal(signal.SIGTERM)
-        _, self.said = self._process.communicate(timeout=10)
+        _, self._said = self._process.communicate(timeout=10)
 
     def counts(self) -> dict[str, float]:
         """Read what our relay has counted, once it has ended."""
-        line = self.said.strip().splitlines()[-1].rpartition(": ")[2]
+        line = self._said.strip().splitlines()[-1].rpartition(": ")[2]
         return {name: float(n) for name, n in (one.split() for one in line.split(", "))}
 
 
-def ours(folder: Path, link: dict[str, object], *flags: str) -> Process:
+def ours(folder: Path, link: dict[str, object], *, fifo: bool = False) -> Process:
     """Start `cloudrc relay` on a link: the section `link` of an experiment file."""
-    config = folder / f"{link.get('profile', 'link')}-{len(list(folder.iterdir()))}.yaml"
-    config.write_text(json.dumps({"seed": 1, **EMPTY, "link": link}))
-    world_side, cloud_side, world, cloud = _free_addresses(4)
-    command = [sys.executable, "-m", "cloudrc", "relay", f"--config={config}", "--feed", *flags]
+    config = _write(folder, link)
+    world_side, cloud_side, world, cloud = (("127.0.0.1", port) for port in free_ports(4))
     addresses = {
         "world-side": world_side, "cloud-side": cloud_side, "world": world, "cloud": cloud
     }  # fmt: skip
+    command = [sys.executable, "-m", "cloudrc", "relay", f"--config={config}", "--feed"]
     command += [f"--{name}={host}:{port}" for name, (host, port) in addresses.items()]
+    command += ["--fifo"] if fifo else []
     return Process(
         command, [Way(True, world_side, cloud, world), Way(False, cloud_side, world, cloud)]
     )
@@ -90,35 +74,24 @@ def ours(folder: Path, link: dict[str, object], *flags: str) -> Process:
 
 def of_c(program: Path) -> Process:
     """Start the C relay."""
-    listen, target = _free_addresses(2)
-    command = [str(program), str(listen[1]), str(target[1]), str(round(DELAY * 1e6)), "1"]
-    return Process(command, [Way(True, listen, target)])
-
-
-def of_asyncio() -> Process:
-    """Start the asyncio relay."""
-    listen, target = _free_addresses(2)
-    command = [sys.executable, "-m", __name__, str(listen[1]), str(target[1]), str(DELAY)]
-    return Process(command, [Way(True, listen, target)])
+    listen, target = free_ports(2)
+    command = [str(program), str(listen), str(target), str(round(DELAY * 1e6)), "1"]
+    return Process(command, [Way(True, ("127.0.0.1", listen), ("127.0.0.1", target))])
 
 
 def compile_anchors(folder: Path) -> tuple[Path, Path]:
     """Compile the programs `wake_lateness` and `relay` into a folder.
 
     Raises:
-        MissingPrerequisiteError: If there is no C compiler, or it fails.
+        MissingPrerequisiteError: If there is no C compiler.
     """
-    compiler = shutil.which("cc")
-    if compiler is None:
+    if shutil.which("cc") is None:
         raise MissingPrerequisiteError(
             "bench-link compiles two anchors and finds no C compiler 'cc'; apt-get install gcc"
         )
     for name in ("wake_lateness", "relay"):
-        command = [compiler, "-O2", "-o", str(folder / name), str(HERE / "c" / f"{name}.c")]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            line = (done.stderr.strip().splitlines() or ["no message"])[0]
-            raise MissingPrerequisiteError(f"cc cannot compile {name}.c: {line}; see its packages")
+        source = Path(__file__).parent / "c" / f"{name}.c"
+        subprocess.run(["cc", "-O2", "-o", str(folder / name), str(source)], check=True)
     return folder / "wake_lateness", folder / "relay"
 
 
@@ -137,30 +110,50 @@ def fifo_allowed() -> bool:
     return done.returncode == 0
 
 
-def _free_addresses(count: int) -> list[Address]:
-    return [("127.0.0.1", port) for port in free_ports(count)]
+class Row(NamedTuple):
+    """One direction of one profile."""
+
+    name: str
+    direction: str
+    judged: Judged
 
 
-class _AsyncioRelay(asyncio.DatagramProtocol):
-    """A relay with `call_later`, whose clock epoll rounds up to 1 ms."""
+def measure_profiles(folder: Path, links: Links, duration: float, *, fifo: bool) -> list[Row]:
+    """Send through several links at the same time, both ways at 100 Hz, for `duration` [s].
 
-    def __init__(self, target: Address, delay: float) -> None:
-        self._target, self._delay = target, delay
+    Returns:
+        Two rows for each link.
+    """
+    relays = {name: ours(folder, link, fifo=fifo) for name, link in links.items()}
+    # Once all senders are up: to start one takes 0.6 s of processor time from the others.
+    begin = time.monotonic() + 0.6 * (len(links) + 1)
+    tasks = [(relay.ways, duration, begin) for relay in relays.values()]
+    with ProcessPoolExecutor(len(tasks), mp_context=get_context("spawn")) as pool:
+        flows = dict(zip(relays, pool.map(_send, tasks), strict=True))
+    rows: list[Row] = []
+    for name, relay in relays.items():
+        relay.stop()
+        origin_ns = min(min(flow.sent.values()) for flow in flows[name])
+        for flow, profile in zip(flows[name], profiles_of(folder, links[name]), strict=True):
+            direction = "uplink" if flow.uplink else "downlink"
+            rows.append(Row(name, direction, judge(flow, profile, origin_ns)))
+    return rows
 
-    def connection_made(self, transport: Any) -> None:
-        self._transport, self._loop = transport, asyncio.get_running_loop()
 
-    def datagram_received(self, data: bytes, addr: tuple[str | int, int]) -> None:
-        self._loop.call_later(self._delay, self._transport.sendto, data, self._target)
-
-
-async def _relay_with_asyncio(listen: int, target: int, delay: float) -> None:
-    await asyncio.get_running_loop().create_datagram_endpoint(
-        lambda: _AsyncioRelay(("127.0.0.1", target), delay), local_addr=("127.0.0.1", listen)
-    )
-    print("ready", flush=True)
-    await asyncio.Event().wait()
+def _send(task: tuple[list[Way], float, float]) -> list[Flow]:
+    ways, duration, begin = task
+    return run_flow(ways, 100.0, duration, 1.2, begin)
 
 
-if __name__ == "__main__":
-    asyncio.run(_relay_with_asyncio(int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])))
+def profiles_of(folder: Path, link: dict[str, object]) -> tuple[DirectionProfile, DirectionProfile]:
+    """Read what a link asks for: uplink, downlink."""
+    experiment = load_experiment(str(_write(folder, link)))
+    return link_profile(experiment.uplink), link_profile(experiment.downlink)
+
+
+def _write(folder: Path, link: dict[str, object]) -> Path:
+    """Write an experiment file with a link."""
+    path = folder / f"{link.get('profile', 'link')}-{len(list(folder.iterdir()))}.yaml"
+    world = {"mission": "hover", "world": {"scene": "empty"}}
+    path.write_text(json.dumps({"seed": SEED, **world, "link": link}))
+    return path
