@@ -7,73 +7,19 @@ shapers only store calls, on a clock that a test moves.
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded
-from cloudrc.link.model import LinkDirection
 from cloudrc.link.netem import Answer, Netem
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Machine, Mode, Settings, Sidecar
 from cloudrc.link.state import Change
 
-MS = 1_000_000
-PERIOD_NS = 10 * MS
-TELEMETRY = 3
 SIZE = 172
-
-
-def link(profile: DirectionProfile, seed: int = 1, uplink: bool = True) -> LinkDirection:
-    return LinkDirection(profile, seed, uplink)
-
-
-def flow(
-    profile: DirectionProfile, count: int, seed: int = 1, period_ns: int = PERIOD_NS
-) -> list[tuple[int, ...]]:
-    """Return the delays [ns] of each packet's copies, one packet per period."""
-    direction = link(profile, seed)
-    return [
-        tuple(release - n * period_ns for release in releases)
-        for n in range(count)
-        for releases in [direction.send(1, TELEMETRY, n, SIZE, n * period_ns)]
-    ]
-
-
-def delays(profile: DirectionProfile, count: int, seed: int = 1) -> NDArray[np.float64]:
-    """Return the delays [s] of `count` packets, none lost or duplicated."""
-    return np.array([delay * 1e-9 for (delay,) in flow(profile, count, seed)])
-
-
-def losses(profile: DirectionProfile, count: int, seed: int = 1) -> NDArray[np.bool_]:
-    """Return True for each lost packet."""
-    return np.array([not copies for copies in flow(profile, count, seed)])
-
-
-def bursts(lost: NDArray[np.bool_]) -> list[int]:
-    """Return the lengths of the runs of True."""
-    runs, length = [], 0
-    for one in [*lost.tolist(), False]:
-        if one:
-            length += 1
-        elif length:
-            runs.append(length)
-            length = 0
-    return runs
-
-
-def bind_loopback(port: int = 0) -> socket.socket:
-    """Open a UDP socket on 127.0.0.1; port 0 lets the kernel choose."""
-    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    bound.bind(("127.0.0.1", port))
-    return bound
-
-
+"""Length of a datagram, about that of telemetry [bytes]."""
 PEER = ("10.244.0.7", 7400)
 UNKNOWN = Answer(2, "", "Error: Specified qdisc kind is unknown.\n")
 NO_QDISC = Answer(2, "", "Error: No such file or directory.\n")

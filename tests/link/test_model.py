@@ -1,0 +1,419 @@
+"""One direction of the link: draws by counter, queue, order, time line, and their statistics."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from importlib.resources import files
+from math import asin, erf, isnan, pi, sqrt
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from cloudrc.config.schema import Direction, Profile
+from cloudrc.link.draws import (
+    BLOCK,
+    CHAIN_BLOCKS,
+    Purpose,
+    bad_states,
+    bit_flips,
+    normals,
+    stream_key,
+    uniforms,
+)
+from cloudrc.link.model import LinkDirection, Numbers, Stream, loss_runs, numbers, sample
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
+from tests.link.conftest import SIZE
+
+MS, SECOND = 1_000_000, 1_000_000_000
+PERIOD_NS = 10 * MS
+COUNT = 20_000
+KEY = stream_key(1, True, 1, 3)
+Array = NDArray[np.float64]
+Shape = Literal["uniform", "normal", "pareto"]
+BURSTS = GilbertElliott(0.02, 0.2)
+"""Loss 1/11, in bursts of 5 packets."""
+LIVELY = DirectionProfile(
+    0.045,
+    0.025,
+    "pareto",
+    0.5,
+    GilbertElliott(0.02, 0.2, 0.5, 0.01, 0.03),
+    duplicate=0.05,
+    reorder=0.05,
+)
+profiles = st.builds(
+    DirectionProfile,
+    delay=st.floats(0, 0.5),
+    jitter=st.floats(0, 0.5),
+    distribution=st.sampled_from(["uniform", "normal", "pareto"]),
+    correlation=st.sampled_from([0.0, 0.5, 1.0]),
+    loss=st.sampled_from([0.0, 0.3, GilbertElliott(0.1, 0.3, 0.5, 0.1, 0.1)]),
+    duplicate=st.sampled_from([0.0, 0.5]),
+    reorder=st.sampled_from([0.0, 0.5]),
+    keep_order=st.booleans(),
+    rate=st.sampled_from([None, 1e5]),
+    queue_packets=st.sampled_from([1, 10]),
+    changes=st.sampled_from([(), (Change(0.5, 0.01, 0.02, 0.1, 1e6), Change(1.0, loss=0.0))]),
+    blackouts=st.sampled_from([(), (Blackout(0.2, 0.1),)]),
+)
+
+
+def link(profile: DirectionProfile, seed: int = 1, uplink: bool = True) -> LinkDirection:
+    return LinkDirection(profile, seed, uplink)
+
+
+def flow(profile: DirectionProfile, count: int, seed: int = 1) -> list[tuple[int, ...]]:
+    """Return the delays [ns] of each packet's copies, one packet per 10 ms."""
+    direction = link(profile, seed)
+    return [
+        tuple(at - n * PERIOD_NS for at in direction.send(1, 3, n, SIZE, n * PERIOD_NS))
+        for n in range(count)
+    ]
+
+
+def delays(profile: DirectionProfile, count: int) -> Array:
+    """Return the delays [s] of `count` packets, none lost or duplicated."""
+    return np.array([delay * 1e-9 for (delay,) in flow(profile, count)])
+
+
+def measured(profile: DirectionProfile, count: int = COUNT) -> Numbers:
+    return numbers(sample(link(profile), 3, range(0, count * PERIOD_NS, PERIOD_NS), 191))
+
+
+def ask(direction: LinkDirection, counters: list[int]) -> dict[int, tuple[int, ...]]:
+    return {n: direction.send(1, 3, n, SIZE, n * PERIOD_NS) for n in counters}
+
+
+def test_the_first_draws_of_a_stream_are_these() -> None:
+    """A change of the draws changes every published flight; note it in the change log."""
+    first = [0.91781617987454, 0.51679997741454, 0.6141663944716]
+    assert uniforms(KEY, Purpose.DELAY, 0)[:3] == pytest.approx(first, abs=1e-12)
+    with pytest.raises(ValueError, match="read-only"):
+        uniforms(KEY, Purpose.DELAY, 0)[0] = 0.5
+
+
+def test_streams_purposes_and_blocks_do_not_overlap() -> None:
+    others = (2, True, 1, 3), (1, False, 1, 3), (1, True, 2, 3), (1, True, 1, 4)
+    keys = [KEY, *(stream_key(*other) for other in others)]
+    drawn = [uniforms(key, p, b) for key in keys for p in Purpose for b in range(10)]
+    values = np.concatenate(drawn)
+    assert np.unique(values).size == values.size
+
+
+@given(block=st.integers(0, 2**56 - 1), purpose=st.sampled_from(Purpose))
+@settings(max_examples=50, deadline=None)
+def test_uniforms_stay_inside_the_open_interval(block: int, purpose: Purpose) -> None:
+    values = uniforms(KEY, purpose, block)
+    assert values.shape == (BLOCK,)
+    assert 0.0 < values.min() < 0.1 < 0.9 < values.max() < 1.0
+
+
+@given(blocks=st.lists(st.integers(0, 2 * CHAIN_BLOCKS), min_size=1, max_size=4))
+@settings(max_examples=10, deadline=None)
+def test_chains_do_not_depend_on_what_was_asked_before(blocks: list[int]) -> None:
+    found = []
+    for order in (blocks, blocks[::-1]):
+        for function in (uniforms, normals, bad_states):
+            function.cache_clear()
+        found.append([(normals(KEY, 0, b, 0.9), bad_states(KEY, b, 0.02, 0.2)) for b in order])
+    assert found[0] == found[1][::-1]
+
+
+def test_chains_are_those_of_the_docstrings() -> None:
+    fresh, correlated = (normals(KEY, Purpose.DELAY, 0, c) for c in (0.0, 0.6))
+    assert correlated[0] == fresh[0]
+    assert correlated[1] == pytest.approx(0.6 * fresh[0] + 0.8 * fresh[1])
+    assert normals(KEY, Purpose.DELAY, 1, 0.6)[0] == pytest.approx(
+        0.6 * correlated[-1] + 0.8 * normals(KEY, Purpose.DELAY, 1, 0.0)[0]
+    )
+    state, draw = bad_states(KEY, 0, 0.3, 0.4), uniforms(KEY, Purpose.STATE, 0)
+    assert state[0] == (draw[0] < 0.3 / 0.7)
+    for n in range(1, BLOCK):
+        assert state[n] == ((draw[n] >= 0.4) if state[n - 1] else (draw[n] < 0.3))
+    assert not any(bad_states(KEY, 0, 0.0, 0.0))
+    assert all(bad_states(KEY, 0, 0.1, 0.0))
+
+
+def uniform(z: Array) -> Array:
+    return (z + 1) / 2
+
+
+def normal(z: Array) -> Array:
+    return np.array([0.5 * (1 + erf(one / sqrt(2))) for one in z])
+
+
+def pareto(z: Array) -> Array:
+    """Exponent 3, cut at its 99.9 % quantile; then mean 0 and standard deviation 1."""
+    cut = 1e-3
+    mean = 1.5 * (1 - cut ** (2 / 3)) / (1 - cut)
+    square = 3 * (1 - cut ** (1 / 3)) / (1 - cut)
+    raw = np.maximum(z * sqrt(square - mean**2) + mean, 1.0)
+    return (1 - raw**-3.0) / (1 - cut)
+
+
+@pytest.mark.parametrize("count", [100_000, pytest.param(1_000_000, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    ("shape", "cumulative", "deviation"),
+    [("uniform", uniform, 1 / sqrt(3)), ("normal", normal, 1.0), ("pareto", pareto, 1.0)],
+)
+def test_many_draws_match_their_distribution(
+    shape: Shape,
+    cumulative: Callable[[Any], Array],
+    deviation: float,
+    count: int,
+    figure: Callable[..., None],
+) -> None:
+    delay, jitter, loss, root = 0.060, 0.005, 0.02, sqrt(count)
+    fates = flow(DirectionProfile(delay, jitter, shape, loss=loss), count)
+    lost = np.array([not copies for copies in fates])
+    off, most = abs(lost.mean() - loss), 4 * sqrt(loss * (1 - loss)) / root
+    figure(f"{count:,} draws: loss off by", 100 * off, "<=", 100 * most, "%", count)
+    assert np.mean(loss_runs(stream_of(lost))) == pytest.approx(1 / (1 - loss), rel=10 / root)
+    drawn = np.sort((np.array([one[0] for one in fates if one]) * 1e-9 - delay) / jitter)
+    off, most = abs(drawn.mean()) * jitter * 1e6, 4.04 * jitter * 1e6 / root
+    figure(f"{count:,} draws: mean off by", off, "<=", most, "us", count)
+    assert drawn.std() == pytest.approx(deviation, rel=10 / root)
+    some = drawn[:: count // 2000]
+    share = np.linspace(0, 1, drawn.size)[:: count // 2000]
+    # Kolmogorov-Smirnov distance that one in a thousand seeds exceeds by chance.
+    distance = np.abs(cumulative(some) - share).max()
+    figure(f"{count:,} draws: from their distribution", distance, "<=", 1.97 / root, count=count)
+
+
+def stream_of(lost: NDArray[np.bool_]) -> Stream:
+    return Stream(np.arange(len(lost)), np.where(lost, np.nan, 0.1), (~lost).astype(int))
+
+
+@pytest.mark.parametrize(("shape", "c"), [("normal", 0.7), ("pareto", 0.5), ("uniform", 0.9)])
+def test_correlated_jitter_keeps_its_distribution(shape: Shape, c: float) -> None:
+    profile = DirectionProfile(0.045, 0.005, shape)
+    apart, alike = (delays(replace(profile, correlation=one), 3 * COUNT) for one in (0.0, c))
+    assert alike.mean() == pytest.approx(0.045, abs=0.0002)
+    assert alike.std() == pytest.approx(apart.std(), rel=0.04)
+    shares = np.linspace(0.05, 0.95, 19)
+    assert np.quantile(alike, shares) == pytest.approx(np.quantile(apart, shares), abs=0.0003)
+    lag_one = np.corrcoef(alike[:-1], alike[1:])[0, 1]
+    expected = {"normal": c, "uniform": 6 / pi * asin(c / 2), "pareto": 0.39}[shape]
+    assert lag_one == pytest.approx(expected, abs=0.03)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6])
+def test_a_table_is_drawn_from_about_its_mean(correlation: float) -> None:
+    """A quarter of the packets is late by 1.73 jitters; the others are early by 0.58."""
+    table = (-1 / sqrt(3),) * 3 + (sqrt(3),)
+    drawn = delays(DirectionProfile(0.045, 0.005, "table", correlation, table=table), COUNT)
+    assert set(np.round(drawn * 1e9)) == {round(45e6 + 5e6 * value) for value in set(table)}
+    assert drawn.mean() == pytest.approx(0.045, abs=0.0002)
+    assert drawn.std() == pytest.approx(0.005, rel=0.02)
+    lag_one = np.corrcoef(drawn[:-1], drawn[1:])[0, 1]
+    assert (lag_one > 0.3) if correlation else (abs(lag_one) < 0.03)
+
+
+def test_200000_packets_have_the_specified_bursts(figure: Callable[..., None]) -> None:
+    lost = np.array([not copies for copies in flow(DirectionProfile(loss=BURSTS), 200_000)])
+    length = np.mean(loss_runs(stream_of(lost)))
+    for name, found, asked in (("loss", lost.mean(), 1 / 11), ("burst", length, 5.0)):
+        off = 100 * abs(found / asked - 1)
+        figure(f"Gilbert-Elliott: {name} off by", off, "<=", 10.0, "%", lost.size)
+
+
+def test_the_bad_state_delays_what_it_does_not_lose() -> None:
+    loss = GilbertElliott(0.1, 0.1, loss_bad=0.5, loss_good=0.0, delay_bad=0.040)
+    fate = flow(DirectionProfile(0.030, loss=loss), COUNT)
+    assert set(fate) == {(), (30 * MS,), (70 * MS,)}
+    assert fate.count(()) / COUNT == pytest.approx(0.25, abs=0.02)
+    assert fate.count((70 * MS,)) / COUNT == pytest.approx(0.25, abs=0.02)
+    for certain in (1.0, GilbertElliott(1.0, 0.0)):
+        assert set(flow(DirectionProfile(duplicate=1.0, loss=certain), 1000)) == {()}
+
+
+def test_a_copy_has_a_delay_of_its_own() -> None:
+    fate = flow(DirectionProfile(0.045, 0.025, duplicate=0.2), COUNT)
+    pairs = np.array([copies for copies in fate if len(copies) == 2])
+    assert len(pairs) / COUNT == pytest.approx(0.2, abs=0.01)
+    assert pairs[:, 1].mean() * 1e-9 == pytest.approx(0.045, abs=0.001)
+    assert abs(np.corrcoef(pairs.T)[0, 1]) < 0.05
+
+
+def test_what_overtakes_has_no_delay_and_no_queue() -> None:
+    fate = flow(DirectionProfile(0.045, 0.005, reorder=0.1), COUNT)
+    assert fate.count((0,)) / COUNT == pytest.approx(0.1, abs=0.01)
+    assert min(copies[0] for copies in fate if copies != (0,)) >= 40 * MS
+    bad = GilbertElliott(1.0, 0.0, loss_bad=0.0, delay_bad=0.040)
+    slow = DirectionProfile(0.030, rate=1e3, queue_packets=1, reorder=1.0, loss=bad)
+    assert set(flow(slow, 100)) == {(0,)}
+
+
+def test_damage_flips_one_bit_anywhere_and_shifts_no_other_draw() -> None:
+    profile, data = replace(LIVELY, corrupt=0.2), bytes(SIZE)
+    one, other, seven = link(profile, 7), link(profile, 7), link(profile, 8)
+    damaged = [one.corrupted(1, 3, n, data) for n in range(COUNT)]
+    places = [np.flatnonzero(np.unpackbits(np.frombuffer(d, np.uint8))) for d in damaged]
+    hit = [int(place[0]) for place in places if place.size]
+    assert max(place.size for place in places) == 1
+    assert len(hit) / COUNT == pytest.approx(0.2, abs=5 * sqrt(0.2 * 0.8 / COUNT))
+    shares, _ = np.histogram(hit, bins=8, range=(0, 8 * SIZE))
+    assert shares.min() > 0.8 * len(hit) / 8
+    assert one.counts()["corrupted"] == len(hit)
+    assert damaged[:600] == [other.corrupted(1, 3, n, data) for n in reversed(range(600))][::-1]
+    assert damaged[:600] != [other.corrupted(2, 3, n, data) for n in range(600)]
+    assert damaged[:600] != [seven.corrupted(1, 3, n, data) for n in range(600)]
+    assert {one.corrupted(1, 3, n, b"") for n in range(50)} == {b""}
+    assert (len(bit_flips(KEY, 0, 1.0)), bit_flips(KEY, 0, 0.0)) == (256, {})
+    assert flow(profile, 600) == flow(LIVELY, 600)
+    assert (link(profile).corrupts, link(LIVELY).corrupts) == (True, False)
+
+
+@given(profile=profiles, seed=st.integers(0, 2**63 - 1))
+@settings(max_examples=40, deadline=None)
+def test_nothing_is_early_and_every_packet_is_counted_once(
+    profile: DirectionProfile, seed: int
+) -> None:
+    direction = link(profile, seed)
+    fates = [direction.send(1, 3, n, SIZE, n * 5 * MS) for n in range(400)]
+    for n, releases in enumerate(fates):
+        assert len(releases) <= 2
+        assert all(type(r) is int and r >= n * 5 * MS for r in releases)
+    counts = direction.counts()
+    assert counts.pop("duplicated") == sum(len(releases) == 2 for releases in fates)
+    assert sum(counts.values()) == 400
+    assert counts["passed"] == sum(bool(releases) for releases in fates)
+    if profile.keep_order:
+        arrivals = [r for releases in fates for r in releases]
+        assert arrivals == sorted(arrivals)
+
+
+@pytest.mark.promise("link-follows-the-seed")
+@pytest.mark.parametrize(
+    "profile", [LIVELY, DirectionProfile(0.01, 0.01, changes=(Change(10.0, 0.02, loss=0.2),))]
+)
+def test_order_other_kinds_and_epochs_shift_nothing(profile: DirectionProfile) -> None:
+    counters = [*range(3000), *range(100_000, 101_000), 10**12, 2**63, 2**64 - 1]
+    among, alone = link(profile), ask(link(profile), counters)
+    for n in random.Random(1).sample(counters, len(counters)):
+        for kind, epoch in ((1, 0), (1, 1), (3, 2)):
+            among.send(epoch, kind, n, 40, n * PERIOD_NS)
+        assert among.send(1, 3, n, SIZE, n * PERIOD_NS) == alone[n]
+    others = [ask(link(profile, seed, up), counters) for seed, up in ((2, True), (1, False))]
+    assert alone != others[0] != others[1] != alone
+
+
+def test_conditions_that_change_nothing_change_nothing() -> None:
+    """The fast and the general path also give the same impairments."""
+    pointless = (Change(1.0, delay=0.045), Change(1000.0, delay=9.0, rate=1e6))
+    for loss in (0.1, LIVELY.loss):
+        steady = DirectionProfile(0.045, 0.06, loss=loss, duplicate=0.1, reorder=0.1)
+        assert flow(steady, 1000) == flow(replace(steady, changes=pointless), 1000)
+
+
+def test_the_bottleneck_serialises_and_drops_from_the_tail() -> None:
+    """972 B + 28 B at 1 Mbit/s take 8 ms; the third finds two in the queue."""
+    direction = link(DirectionProfile(0.020, changes=(Change(1.0, rate=1e6),), queue_packets=2))
+    times = (0, 1000, 1000, 1000, 1009, 1040)
+    arrivals = [direction.send(1, 3, n, 972, now * MS) for n, now in enumerate(times)]
+    at = (20,), (1028,), (1036,), (), (1044,), (1068,)
+    assert arrivals == [tuple(one * MS for one in copies) for copies in at]
+    assert direction.counts()["queue"] == 1
+
+
+def test_the_time_line_counts_from_the_origin() -> None:
+    changes = (Change(1.0, delay=0.050), Change(2.0, jitter=0.0, loss=1.0), Change(3.0, loss=0.0))
+    profile = DirectionProfile(
+        0.020, changes=changes, blackouts=(Blackout(4.0, 0.5), Blackout(4.2, 1.0))
+    )
+    direction = LinkDirection(profile, 1, True, 7 * SECOND)
+    expected = {-1.0: 20, 0.0: 20, 0.999: 20, 1.0: 50, 2.5: None, 3.0: 50, 4.0: None, 5.1: None}
+    for elapsed, delay in (expected | {5.2: 50}).items():
+        now_ns = 7 * SECOND + round(elapsed * 1e9)
+        at = () if delay is None else (now_ns + delay * MS,)
+        assert direction.send(1, 3, 0, SIZE, now_ns) == at
+    assert direction.counts()["blackout"] == 2
+
+
+@pytest.mark.parametrize("loop", [False, True])
+def test_a_trace_holds_each_row_until_the_next(loop: bool) -> None:
+    """If it loops, its last row lasts as long as a mean row: the period is 4 s."""
+    trace = Trace((1.0, 2.0, 3.0), (0.010, 0.020, 0.030), (0.0, 1.0, 0.0), loop)
+    direction = link(DirectionProfile(9.0, loss=1.0, trace=trace))
+    hours = 3 * 3600 + 1 if loop else 100
+    for t, delay in ((0, 10), (1, 10), (2, None), (3, 30), (hours, 10 if loop else 30)):
+        at = () if delay is None else (t * SECOND + delay * MS,)
+        assert direction.send(1, 3, 0, SIZE, t * SECOND) == at
+
+
+def test_a_trace_without_losses_keeps_loss_and_adds_jitter() -> None:
+    fate = flow(DirectionProfile(9.0, 0.005, loss=0.5, trace=Trace((0.0,), (0.030,))), 2000)
+    arrived = [copies[0] for copies in fate if copies]
+    assert 800 < len(arrived) < 1200
+    assert 25 * MS <= min(arrived) < 26 * MS < 34 * MS < max(arrived) <= 35 * MS
+
+
+def test_a_new_profile_keeps_seed_origin_and_counts() -> None:
+    changes = (Change(5.0, delay=0.2),)
+    after = DirectionProfile(0.02, 0.01, distribution="normal", loss=0.1, changes=changes)
+    direction, always = LinkDirection(LIVELY, 1, True, 100), LinkDirection(after, 1, True, 100)
+    for n in range(300):
+        direction.send(1, 3, n, 172, n)
+    direction.replace_profile(after)
+    for n, now_ns in ((299, 400), (300, 500), (900, 5_000_000_200)):
+        assert direction.send(1, 3, n, 172, now_ns) == always.send(1, 3, n, 172, now_ns)
+    assert sum(direction.counts().values()) >= 300
+    direction.replace_profile(DirectionProfile(0.02, changes=changes), restart=True)
+    for now, delay in ((7.0, 0.02), (11.9, 0.02), (12.1, 0.2)):
+        (arrival_ns,) = direction.send(1, 3, 0, 172, round(now * 1e9))
+        assert arrival_ns == round(now * 1e9) + round(delay * 1e9)
+
+
+@pytest.mark.parametrize(
+    ("jitter", "overtaken", "mean", "deviation"),
+    [(0.010, 0.12, 0.0704, 0.0054), (0.025, 0.41, 0.0753, 0.0109), (0.040, 0.54, 0.0829, 0.0150)],
+)
+def test_more_jitter_reorders_more_or_costs_more_delay_in_order(
+    jitter: float, overtaken: float, mean: float, deviation: float
+) -> None:
+    found = measured(DirectionProfile(0.07, jitter))
+    assert found.overtaken == pytest.approx(overtaken, abs=0.02)
+    assert (found.least, found.most) == pytest.approx((0.07 - jitter, 0.07 + jitter), abs=0.0001)
+    in_order = measured(DirectionProfile(0.07, jitter, keep_order=True))
+    assert (in_order.mean, in_order.deviation) == pytest.approx((mean, deviation), abs=0.0005)
+    assert in_order.overtaken == 0.0
+
+
+def test_statistics_of_losses_copies_and_of_nothing() -> None:
+    stream = stream_of(np.array([0, 1, 1, 0, 1, 0, 0, 1, 1, 1], dtype=bool))
+    assert (loss_runs(stream), numbers(stream).loss) == ((2, 1, 3), pytest.approx(0.6))
+    found = measured(DirectionProfile(0.010, 0.020, duplicate=0.1, loss=0.5))
+    assert (found.least, found.duplicated) == (0.0, pytest.approx(0.05, rel=0.1))
+    nothing = measured(DirectionProfile(loss=1.0), 10)
+    assert (nothing.loss, nothing.runs) == (1.0, (10,))
+    assert all(isnan(value) for value in (nothing.mean, nothing.p99, nothing.correlation))
+    assert isnan(measured(DirectionProfile(0.045), 10).correlation)
+
+
+SHIPPED = {
+    file.name.removesuffix(".yaml"): Profile.model_validate_json(
+        json.dumps(yaml.safe_load(file.read_text()))
+    )
+    for file in (files("cloudrc.link") / "profiles").iterdir()
+}
+PAPERS = {"ideal": (0, 0), "paper-p1": (20, 10), "paper-p2": (45, 25), "paper-p3": (70, 40)}
+
+
+def test_the_shipped_profiles_leave_time_for_a_command_to_come_back() -> None:
+    """Mean round trip plus a period of odometry and of commands is below the command age limit."""
+    assert set(SHIPPED) >= {*PAPERS, "wifi", "lte", "5g", "satellite", "handover", "lossy"}
+    for profile in SHIPPED.values():
+        assert 10 < len(profile.description) <= 90
+        round_trip = profile.uplink.delay_ms + profile.downlink.delay_ms
+        assert round_trip + 20 < (profile.command_age_max_ms or 250)
+    for name, (delay, jitter) in PAPERS.items():
+        both = SHIPPED[name].uplink, SHIPPED[name].downlink
+        assert both == (Direction(delay_ms=delay, jitter_ms=jitter),) * 2
