@@ -6,8 +6,7 @@ with a cache for speed, and draw for blocks of 256 packets, with one column of n
 So a purpose that a profile does not use does not change the numbers of other purposes.
 
 A state that carries over from packet to packet (burst, correlation) restarts from its stationary
-distribution every 64 blocks (16,384 packets, 164 s at 100 Hz). The restart bounds the work for any
-counter, even a forged one.
+distribution every 64 blocks (16,384 packets), which bounds the work for any counter.
 
 The impairment of a packet is a tuple with one entry per copy that arrives: no entry if the packet
 is lost, two entries if it is duplicated. An entry is OVERTAKES or the sum that jitter and the bad
@@ -132,19 +131,12 @@ def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> 
 def impairments(
     key: StreamKey, block: int, profile: DirectionProfile, jitter: float, loss: Loss
 ) -> list[Fate]:
-    """Draw the impairments of the 256 packets of a block.
+    """Draw the impairments of the 256 packets of a block, with the jitter [s] and loss in force.
 
     A lost packet is neither duplicated nor reordered. The copy of a packet has an independent
     delay with the same distribution.
 
     Deviation: tc-netem delivers one copy of a packet that is both duplicated and lost.
-
-    Args:
-        key: Stream.
-        block: Number of the block.
-        profile: Supplies distribution, correlation, duplicate and reorder.
-        jitter: Jitter in force [s].
-        loss: Loss in force.
     """
     offsets = _offsets(key, Purpose.DELAY, block, profile, jitter)
     table: list[Fate] = [(offset,) for offset in offsets]
@@ -164,11 +156,7 @@ def impairments(
 
 @lru_cache(maxsize=_CACHED)
 def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
-    """Draw which packets of a block are damaged, with probability `corrupt` per packet.
-
-    Returns:
-        Index in the block -> place of the flipped bit, as a share of the datagram in (0, 1).
-    """
+    """Draw the damaged packets: index in the block -> flipped bit, as a share of the datagram."""
     places = uniforms(key, Purpose.CORRUPT_BIT, block)
     return {n: float(places[n]) for n in _packets_hit(key, Purpose.CORRUPT, block, corrupt)}
 
@@ -176,22 +164,15 @@ def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
 def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfile) -> list[float]:
     """Draw the jitter of a block in units of `jitter`, with mean 0, shape (256,).
 
-    The distributions:
-
-    - uniform: in (-1, 1).
-    - normal: standard deviation 1.
-    - pareto: exponent 3, cut off at the 99.9 % quantile, then shifted and scaled to mean 0 and
-      standard deviation 1. It ranges from -0.69 to 12.1, with median -0.32 and 99 % quantile 4.3.
-      Without the cut, jitter would sometimes delay a packet by seconds.
-    - table: the profile's values, with mean 0 and standard deviation 1.
+    Uniform jitter is in (-1, 1); other jitter has standard deviation 1. Pareto jitter has exponent
+    3 and is cut off at the 99.9 % quantile: it ranges from -0.69 to 12.1, with median -0.32.
 
     With a correlation c, the function transforms normal variates that have correlation c. So the
     distribution stays exact, but the correlation of the result differs from c: uniform
     (6/π) · asin(c/2), at most 0.018 below c; pareto 0.39 for c = 0.5 and 0.86 for c = 0.9.
 
     Source: tc-netem(8) for the meaning of jitter, iproute2 netem/pareto.c for the exponent.
-    Deviation: netem cuts its normal table off at ±4 and its Pareto table at 4. So netem's Pareto
-    jitter has only 0.82 of the specified standard deviation; cloudrc's jitter has the full
+    Deviation: netem cuts its Pareto table at 4, so its jitter has only 0.82 of the specified
     standard deviation.
     """
     correlation = 0.0 if purpose is Purpose.COPY_DELAY else profile.correlation

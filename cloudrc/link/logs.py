@@ -5,9 +5,8 @@
 
 A telemetry datagram has 203 bytes, a command datagram 88 bytes. irtt measures both directions if
 the clocks of the two hosts agree; ping measures round trips. The columns of a CSV log name their
-units: `time_ms,delay_us,loss` are the time of sending, the one-way delay and the loss (0 or 1);
-`timestamp_ns,rtt_ms` has round trips. The readers take half of each round trip if the user asks for
-that.
+units, such as `time_ms,delay_us,loss` or `timestamp_ns,rtt_ms`. The readers take half of each round
+trip if the user asks for that (`halve`).
 
 Every reader fills a `Log`, and `Log.packets` makes the same checks for all logs. `Packets.notes`
 counts the rows that are left out, merged or sorted. A log is refused if more than 1 % of its rows
@@ -51,9 +50,6 @@ STEPS_MAX = 3
 jumps mean that the rows are shuffled."""
 PACKETS_MAX = 10_000_000
 """Limit of packets in a log of ping, since a number may be forged: three weeks at five a second."""
-STEP_BACK = 0.02
-"""Limit of the time [s] by which a packet may seem to be sent before the packet with the number
-before its own."""
 HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
@@ -102,7 +98,6 @@ class Log:
         entries: The packets in the order of the source.
         counts: What was left out, merged or changed -> how often.
         unusable: One reason for each row that cannot be used.
-        facts: Further notes.
         halved: Whether the delays are halves of round trips.
         clocks: What the user should do if the two clocks differ.
     """
@@ -111,17 +106,14 @@ class Log:
     entries: list[Entry] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)
     unusable: list[str] = field(default_factory=list)
-    facts: list[str] = field(default_factory=list)
     halved: bool = False
     clocks: str = _CLOCKS
 
     def packets(self) -> Packets:
         """Check the packets, sort them by the time of sending, and note what was changed.
 
-        Raises:
-            BadInputError: If more than 1 % of the rows cannot be used, if more than 1 % repeat the
-                time of an earlier row, if no packet arrived, if a delay is negative, or if the
-                times jump back one to three times.
+        Raises a BadInputError if more than 1 % of the rows cannot be used or repeat the time of an
+        earlier row, if no packet arrived, if a delay is negative, or if the times jump back.
         """
         self._refuse_beyond_limit(len(self.unusable), self.unusable[0] if self.unusable else "")
         arrived = [delay for _, delay in self.entries if delay is not None]
@@ -144,7 +136,7 @@ class Log:
         self.counts["left out, unreadable"] += len(self.unusable)
         notes = [f"{count} {what}" for what, count in self.counts.items() if count]
         sent, delays = zip(*sorted(unique.items(), key=itemgetter(0)), strict=True)
-        return Packets(sent, delays, (*notes, *self.facts, *_gaps(sent)), self.halved)
+        return Packets(sent, delays, (*notes, *_gaps(sent)), self.halved)
 
     def refuse_early(self, least: float) -> None:
         """Refuse a log whose shortest delay, `least` [s], is negative."""
@@ -188,9 +180,6 @@ def trace_of(packets: Packets) -> Trace:
 
     Each row begins halfway between its packet and the packet before. So a replayed packet may be
     late or early by half a period and still meets its own row. Time begins at the first packet.
-
-    Returns:
-        One row per packet; the losses are None if nothing was lost.
     """
     sent = packets.sent
     halfway = [(before + after) / 2 - sent[0] for before, after in pairwise(sent)]
@@ -236,11 +225,7 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
     direction a packet was lost, the packet counts as lost in both directions. Times of sending are
     on the client's monotonic clock, so steps of its wall clock do not matter.
 
-    Args:
-        text: Content of the file.
-        name: Name of the file, for messages.
-        direction: Direction to read; None only with `halve`.
-        halve: True: use half of each round trip. False: use the one-way delay.
+    `direction` may be None with `halve` alone. `name` is that of the file, for messages.
 
     Raises:
         BadInputError: If the file is not such an output, if it contradicts its own counts, or if
@@ -364,11 +349,8 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     if its delay is -1, -999 or -9999, and the column has no other negative number; or if its delay
     is 0, all other delays are far from 0, and there is no column `loss`.
 
-    Args:
-        lines: Lines of the file.
-        name: Name of the file, for messages.
-        halve: True: use half of each round trip. False: reject round trips.
-        trust_units: Whether to accept values that seem to be in another unit.
+    `trust_units` accepts values that seem to be in another unit. Without `halve`, round trips are
+    rejected. `name` is that of the file, for messages.
 
     Raises:
         BadInputError: If the log cannot be used; the text names line, value and remedy.
@@ -526,14 +508,9 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     line such as "no answer yet", and packets that only the summary counts. Without a summary,
     packets after the last line are unknown, because their replies may have been under way.
 
-    Args:
-        lines: Lines of the log.
-        name: Name of the file, for messages.
-        halve: Must be true: the user accepts half of each round trip as the one-way delay.
-
     Raises:
-        BadInputError: If `halve` is false, if the log has no replies, no time stamps, too many
-            packets or several sessions, or if it contradicts its summary.
+        BadInputError: If `halve` is false, if the log `name` has no replies, no time stamps, too
+            many packets or several sessions, or if it contradicts its summary.
     """
     if not halve:
         raise BadInputError(f"{name}: ping measures round trips; {HALVE}")
@@ -543,7 +520,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
         nothing = f"{name}: has no replies; give the output of: ping -D -O HOST"
         raise BadInputError([*log.unusable, nothing][0])
     first, last = ping.check_range()
-    period = ping.check_clock()
+    period = ping.period()
     known = np.array(sorted(ping.replies))
     sent = np.array([ping.replies[number][0] for number in known])
     numbers = np.arange(first, last + 1)
@@ -664,26 +641,12 @@ class _Ping:
             )
         return first, last
 
-    def check_clock(self) -> float:
-        """Check the times of sending by the numbers; return the median time between packets [s]."""
-        sent = {number: at for number, (at, _) in sorted(self.replies.items())}
-        times = sent if len(sent) > 1 else {n: at for n, at in sorted(self._told.items()) if at}
-        pairs = list(pairwise(times.items()))
-        period = median([(b - a) / (m - n) for (n, a), (m, b) in pairs] or [1.0])
-        for (before, at), (after, later) in pairwise(sent.items()):
-            usual = (after - before) * period
-            step = later - at - usual
-            if later - at < -STEP_BACK or step < -max(2.0, 5 * period):
-                raise BadInputError(
-                    f"{self._log.name}: after number {before} the times go back by {-step:.3g} s: a"
-                    " step of the clock, or two sessions in one log; give the lines before or after"
-                    " it"
-                )
-            if step > max(2.0, 5 * period, 0.2 * usual):
-                self._log.facts.append(
-                    f"after number {before} the clock stepped by {step:.4g} s, or ping stood still"
-                )
-        return max(period, 1e-6)
+    def period(self) -> float:
+        """Return the median time between two packets [s]."""
+        sent = {number: at for number, (at, _) in self.replies.items()}
+        times = sent if len(sent) > 1 else {number: at for number, at in self._told.items() if at}
+        pairs = pairwise(sorted(times.items()))
+        return max(median([(b - a) / (m - n) for (n, a), (m, b) in pairs] or [1.0]), 1e-6)
 
     def _refuse_sessions(self, sign: str) -> None:
         raise BadInputError(

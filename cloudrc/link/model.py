@@ -1,8 +1,7 @@
-"""Model a link direction: compute when each packet arrives.
+"""Model a link direction: compute when each packet arrives, and statistics of many packets.
 
 The model has no clock, no socket and no stateful random generator. The virtual driver and the relay
-use the same model, so both get the same delays and losses. `sample` sends packets through the
-model, and `numbers` computes statistics of the delays and losses.
+use the same model, so both get the same delays and losses.
 """
 
 from __future__ import annotations
@@ -42,14 +41,9 @@ class LinkDirection:
     def __init__(
         self, profile: DirectionProfile, seed: int, uplink: bool, origin_ns: int = 0
     ) -> None:
-        """Create the direction.
+        """Create the direction; `uplink` is True for world to cloud.
 
-        Args:
-            profile: Conditions of the direction.
-            seed: Seed of the experiment.
-            uplink: True for world to cloud.
-            origin_ns: When the link came up [ns], on the clock of `send`. The times of time line,
-                trace and blackouts count from this instant.
+        The time line counts from `origin_ns`, when the link came up, on the clock of `send`.
         """
         self._seed, self._uplink = seed, uplink
         self._origin_ns: int | None = origin_ns
@@ -63,12 +57,8 @@ class LinkDirection:
         """Replace the conditions from the next packet on.
 
         Seed, counts and the bottleneck's queue stay. The random draws are the same as if the link
-        had used this profile from the start.
-
-        Args:
-            profile: New conditions.
-            restart: True: the new time line begins at the next packet. False: the new time line
-                has the same start as the present time line.
+        had used this profile from the start. The new time line begins at the next packet
+        (`restart`), or began when the present one did.
         """
         if restart:
             self._origin_ns = None
@@ -80,17 +70,10 @@ class LinkDirection:
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
-        """Send one packet.
+        """Send one packet of `size` bytes of UDP payload at `now_ns` [ns].
 
         As in tc-netem, a packet is lost before the bottleneck, and a reordered packet skips the
         bottleneck.
-
-        Args:
-            epoch: Epoch in the packet's header.
-            kind: Message type in the packet's header.
-            counter: Counter in the packet's header, >= 0.
-            size: UDP payload [bytes].
-            now_ns: Time of sending [ns].
 
         Returns:
             Times of arrival [ns], never before `now_ns`: no time for a lost packet, two times for a
@@ -139,9 +122,8 @@ class LinkDirection:
     def counts(self) -> dict[str, int]:
         """Return the number of packets by outcome so far.
 
-        Returns:
-            `passed`: at least one copy arrives; `duplicated`: two copies arrive; `lost`,
-            `blackout` and `queue`: no copy arrives, by cause; `corrupted`: damaged.
+        At least one copy arrives (`passed`) or two (`duplicated`); no copy arrives, by cause
+        (`lost`, `blackout`, `queue`); the packet is damaged (`corrupted`).
         """
         return dict(self._counts)
 
@@ -202,12 +184,7 @@ class Numbers:
     """Statistics of a stream; an unknown value is NaN.
 
     Attributes:
-        mean: Mean delay [s].
-        deviation: Standard deviation of the delay [s].
-        least: Shortest delay [s].
-        median: Median delay [s].
-        p99: 99 % quantile of the delay [s].
-        most: Longest delay [s].
+        mean: Mean delay [s]; likewise standard deviation, shortest, median, 99 % quantile, longest.
         correlation: Correlation of the delays of successive packets [1].
         loss: Share of packets that did not arrive, in [0, 1].
         runs: Length of each run of successive losses.
@@ -230,14 +207,7 @@ class Numbers:
 
 
 def sample(link: LinkDirection, kind: int, sent_ns: Sequence[int], size: int) -> Stream:
-    """Send packets through a link.
-
-    Args:
-        link: A new direction with origin 0.
-        kind: Message type in the header.
-        sent_ns: Times of sending, rising [ns], shape (n,).
-        size: UDP payload of each packet [bytes].
-    """
+    """Send packets of `size` bytes at rising times [ns] through a new direction with origin 0."""
     delays = np.full(len(sent_ns), np.nan)
     copies = np.zeros(len(sent_ns), dtype=np.int64)
     for n, now_ns in enumerate(sent_ns):

@@ -50,12 +50,7 @@ def mean_loss(loss: Loss) -> float:
 class Change:
     """A change of the conditions at one instant; None leaves a value unchanged.
 
-    Attributes:
-        at: Time since the link came up [s].
-        delay: Mean delay, one way [s].
-        jitter: As in `DirectionProfile` [s].
-        loss: Probability of an independent loss, or loss in bursts.
-        rate: Rate of the bottleneck [bit/s].
+    The instant `at` is the time since the link came up [s]; for the others see `DirectionProfile`.
     """
 
     at: float
@@ -67,12 +62,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Blackout:
-    """An interval, from `start` [s] since the link came up, in which all packets are lost.
-
-    Attributes:
-        start: Time since the link came up [s].
-        duration: Length of the interval [s].
-    """
+    """An interval in which all packets are lost; `start` counts since the link came up [s]."""
 
     start: float
     duration: float

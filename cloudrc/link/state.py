@@ -20,11 +20,11 @@ STATE_FILE = "link.json"
 PROFILE_FILE = "profile.json"
 """Name of the profile file that a local run's relay follows, in the folder of its state files."""
 STATE_MAX = 1 << 16
-"""Size limit of a state file that an end of the tunnel reads [bytes]: room for a time line with
-about 800 changes. A file of 1 MiB could block the loop for 2 s."""
+"""Size limit of a state file that an end of the tunnel reads [bytes]: room for about 800 changes. A
+file of 1 MiB could block the loop for 2 s."""
 RELEASED_SUFFIX = ".released"
-"""Suffix of the file that contains how late a relay's datagrams left so far: names and integers as
-JSON. This is a separate file, since the state file is read only when the link changes."""
+"""Suffix of the file that tells how late a relay's datagrams left so far: names and integers as
+JSON."""
 RELEASED = frozenset(
     {"released", "released_early", "overflow", "stalled"}
     | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}
