@@ -23,7 +23,7 @@ import socket
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import count
 from time import monotonic_ns
 from typing import TypeAlias
@@ -57,6 +57,8 @@ QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 
 _BITS = 7
 """How many significant bits of a lateness select its bucket [1]: buckets are 1.6 % wide."""
+_EARLY = -1
+"""Bucket of the datagrams that left before they were due."""
 _RECENT = 10
 """Number of calls of `Recent.counts` that its percentiles cover [1]."""
 _STEP_MIN_NS = 1_000_000
@@ -72,51 +74,28 @@ objects are mostly datagrams in flight, which are not garbage."""
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 
 
-class ReleaseErrors:
-    """Histogram of the lateness: the time from when a datagram was due until it left.
-
-    Attributes:
-        early: Number of datagrams that left before they were due; above 0 is a fault.
-    """
-
-    def __init__(self, early: int = 0, counts: Counter[int] | None = None) -> None:
-        self.early, self._counts = early, Counter[int]() if counts is None else counts
+class ReleaseErrors(Counter[int]):
+    """Histogram of the lateness: bucket -> number of datagrams that left this long after due."""
 
     def observe(self, error_ns: int) -> None:
         """Count one datagram that left `error_ns` [ns] after it was due."""
-        if error_ns < 0:
-            self.early += 1
-            error_ns = 0
         shift = max(0, error_ns.bit_length() - _BITS)
-        self._counts[(shift << _BITS) + (error_ns >> shift)] += 1
-
-    @classmethod
-    def together(cls, parts: Iterable[ReleaseErrors]) -> ReleaseErrors:
-        """Add up the counts of several directions; other threads may count meanwhile."""
-        whole = cls()
-        for part in parts:
-            whole.early += part.early
-            whole._counts += part._counts.copy()
-        return whole
-
-    def since(self, before: ReleaseErrors) -> ReleaseErrors:
-        """Return the counts since an earlier copy: these counts minus `before`."""
-        return ReleaseErrors(self.early - before.early, self._counts - before._counts)
+        self[_EARLY if error_ns < 0 else (shift << _BITS) + (error_ns >> shift)] += 1
 
     def in_ns(self) -> dict[str, int]:
-        """Return the lateness in whole nanoseconds.
+        """Return the lateness in whole nanoseconds; another thread may count meanwhile.
 
         Returns:
-            `released`, `released_early`, and `release_error_p50_ns`, `_p99_ns` and `_p999_ns` [ns];
-            empty before the first datagram.
+            `released`; `released_early`: left before they were due, which is a fault; and
+            `release_error_p50_ns`, `_p99_ns` and `_p999_ns` [ns]. Empty before the first datagram.
         """
-        counts, below = sorted(self._counts.copy().items()), 0
+        counts, below = sorted(self.copy().items()), 0
         whole = sum(number for _, number in counts)
         wanted = [(f"release_error_{name}_ns", share) for name, share in QUANTILES.items()]
-        found = {"released": whole, "released_early": self.early} if whole else {}
+        found = {"released": whole, "released_early": self[_EARLY]} if whole else {}
         for bucket, number in counts:
             below += number
-            shift, start = divmod(bucket, 1 << _BITS)
+            shift, start = divmod(max(bucket, 0), 1 << _BITS)
             while wanted and below >= wanted[0][1] * whole:
                 found[wanted.pop(0)[0]] = (start + 1) << shift
         return found
@@ -134,10 +113,10 @@ class Recent:
 
         `errors` are the counts since the beginning, as a copy that no thread changes any more.
         """
-        recent = errors.since(self._past[0]).in_ns()
+        recent = ReleaseErrors(errors - self._past[0]).in_ns()
         self._past.append(errors)
         recent.pop("released", None)
-        return {**recent, "released_early": errors.early}
+        return {**recent, "released_early": errors[_EARLY]}
 
 
 def ask_for_stamps(one: socket.socket) -> bool:
@@ -384,7 +363,14 @@ class Lanes:
 
     def recent(self) -> dict[str, int]:
         """Return the recent lateness as from `Recent.counts`; call this method once a second."""
-        return self._recent.counts(ReleaseErrors.together(lane.errors for lane in self._lanes))
+        return self._recent.counts(self.errors())
+
+    def errors(self) -> ReleaseErrors:
+        """Add up how late the datagrams of all lanes have left."""
+        whole = ReleaseErrors()
+        for lane in self._lanes:
+            whole.update(lane.errors.copy())
+        return whole
 
 
 class Relay(Lanes):
@@ -424,8 +410,7 @@ class Relay(Lanes):
 
     def counts(self) -> dict[str, int]:
         """Return `outcomes`, and the lateness since the beginning as from `ReleaseErrors.in_ns`."""
-        errors = ReleaseErrors.together(lane.errors for lane in self._lanes)
-        return {**self.outcomes(), **errors.in_ns()}
+        return {**self.outcomes(), **self.errors().in_ns()}
 
     def released(self, way: str) -> dict[str, int]:
         """Return how late datagrams of "uplink" or "downlink" left, as from `Lane.released`."""
@@ -440,14 +425,13 @@ class RelayShaper(Lanes):
     def __init__(
         self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
     ) -> None:
-        """Open the two sockets.
+        """Open the two sockets; the origin of the model is on the machine's monotonic clock.
 
         Args:
             listen: Address to which this pod's tunnel end sends; port 0 lets the kernel choose.
-            direction: Model of the link; its origin is on the machine's monotonic clock.
+            direction: Model of the link.
             peek: Reads kind, epoch and counter of a datagram.
-            end: Address from which this pod's tunnel end sends; the kernel drops datagrams from
-                other addresses. None accepts any sender.
+            end: Address from which this pod's tunnel end sends. None accepts any sender.
 
         Raises:
             OSError: If `listen` is in use, or cannot be reached from `end`.
