@@ -30,10 +30,9 @@ from cloudrc.link.draws import (
 )
 from cloudrc.link.model import LinkDirection, Numbers, Stream, loss_runs, numbers, sample
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
-from tests.link.conftest import SIZE
 
 MS, SECOND = 1_000_000, 1_000_000_000
-PERIOD_NS = 10 * MS
+PERIOD_NS, SIZE = 10 * MS, 172
 COUNT = 20_000
 KEY = stream_key(1, True, 1, 3)
 Array = NDArray[np.float64]

@@ -32,7 +32,6 @@ from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
 from cloudrc.link.netem import STRETCH, Netem, table, write_tables
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, Trace
 from cloudrc.tunnel.codec import Kind
-from tests.link.conftest import SIZE
 
 SHAPED = [name for name in names("profile") if name != "lossy"]
 """netem refuses that one."""
@@ -61,6 +60,7 @@ PATIENCE = 180.0
 LATE = 0.1
 """Lateness of a step where the machine now and then stands still [s]."""
 ROOT = Path(__file__).resolve().parents[2]
+SIZE = 172
 _CLONE_NEWNET = 0x40000000
 _SO_TIMESTAMPNS = 35  # include/uapi/asm-generic/socket.h
 

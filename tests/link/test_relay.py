@@ -41,8 +41,7 @@ from cloudrc.link.relay import (
     tighten_slack,
 )
 from cloudrc.tunnel.codec import Kind, encode_header
-from tests.link.conftest import SIZE
-from tools.bench_link.flow import EPOCH, SEED, Flow, judge, run_flow, since_first_ns
+from tools.bench_link.flow import EPOCH, SEED, SIZE, Flow, judge, run_flow, since_first_ns
 from tools.bench_link.relays import LINK, fifo_allowed, measure_profiles, ours, profiles_of
 
 ROOT = Path(__file__).resolve().parents[2]
