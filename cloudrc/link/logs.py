@@ -43,11 +43,10 @@ LONGEST = 5.0
 UNUSABLE_MAX = 0.01
 """Largest share of rows that may be left out [1]; above this share the log is refused."""
 GAP, GAP_MIN = 20, 1.0
-"""Shortest gap that a note reports: as a multiple of the median time between packets [1], and
-[s]."""
+"""Shortest gap that a note reports, in median times between packets [1] and in [s]."""
 STEPS_MAX = 3
-"""Up to this number of jumps back in time, a jump is a step of the clock or a new session [1]. More
-jumps mean that the rows are shuffled."""
+"""Up to this number of jumps back in time, a jump is a step of the clock or a new session; more
+jumps mean that the rows are shuffled [1]."""
 PACKETS_MAX = 10_000_000
 """Limit of packets in a log of ping, since a number may be forged: three weeks at five a second."""
 HALVE = (
@@ -94,11 +93,9 @@ class Log:
     """The rows that a reader finds in a source.
 
     Attributes:
-        name: Name of the source, for messages.
         entries: The packets in the order of the source.
         counts: What was left out, merged or changed -> how often.
         unusable: One reason for each row that cannot be used.
-        halved: Whether the delays are halves of round trips.
         clocks: What the user should do if the two clocks differ.
     """
 

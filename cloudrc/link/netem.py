@@ -250,10 +250,7 @@ def notes(profile: DirectionProfile) -> list[str]:
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
     """Translate the conditions at one instant into arguments of `tc qdisc add|change ... netem`.
 
-    Args:
-        profile: A profile that has passed `check`.
-        conditions: Conditions at this instant.
-        room: Limit of the qdisc [packets].
+    The profile has passed `check`; `room` is the limit of the qdisc [packets].
     """
     words = ["limit", str(room), "delay", _microseconds(conditions.delay_ns)]
     if conditions.jitter:
@@ -274,8 +271,8 @@ def options(profile: DirectionProfile, conditions: Conditions, room: int) -> lis
 def limit(profile: DirectionProfile) -> int:
     """Return the limit of the qdisc: packets under way plus the queue of a bottleneck [packets].
 
-    The limit is the same along the whole time line. Otherwise a step to a shorter delay would drop
-    packets, because packets with the longer delay are still under way.
+    The limit is the same along the whole time line, since a step to a shorter delay must not drop
+    packets that are under way with the longer one.
     """
     pieces = Timeline(profile).pieces
     if all(piece.rate is None for piece in pieces):
@@ -319,11 +316,10 @@ def _is_ours(root: dict[str, Any]) -> bool:
 
 
 def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
-    """Read netem's counts from the objects of `tc -s -j qdisc show`.
+    """Read netem's counts from the objects of `tc -s -j qdisc show`; empty without `Netem`'s qdisc.
 
-    Returns:
-        `forwarded`: datagrams sent on, copies included; `lost`: datagrams dropped at random or
-        because the queue was full; `held`: datagrams queued now. Empty without a netem qdisc.
+    Datagrams are sent on (`forwarded`, copies included), dropped at random or by a full queue
+    (`lost`), or queued now (`held`).
     """
     leaf = leaf_of(qdiscs)
     if leaf is None:

@@ -21,11 +21,11 @@ import os
 import select
 import socket
 import sys
-import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from itertools import count
-from time import monotonic_ns
+from time import monotonic_ns, time_ns
 from typing import TypeAlias
 
 from cloudrc.link.model import LinkDirection
@@ -33,8 +33,7 @@ from cloudrc.link.profile import DirectionProfile
 
 Address: TypeAlias = tuple[str, int]
 Peek: TypeAlias = Callable[[bytes], tuple[int, int, int]]
-"""Function that returns kind, epoch and counter of a datagram; it raises a ValueError if the
-datagram is not from the tunnel."""
+"""Function that returns kind, epoch and counter of a datagram; else it raises a ValueError."""
 Send: TypeAlias = Callable[[bytes], object]
 """Function that sends a datagram; it raises an OSError if the kernel refuses."""
 
@@ -61,15 +60,12 @@ _EARLY = -1
 """Bucket of the datagrams that left before they were due."""
 _RECENT = 10
 """Number of calls of `Recent.counts` that its percentiles cover [1]."""
-_STEP_MIN_NS = 1_000_000
-"""If the clock offset changes by more than this between two checks, the wall clock was set [ns]."""
 _FIFO_PRIORITY = 10
 """Real-time priority [1]: above ordinary processes, below the kernel's own threads (50)."""
 _SWITCH_INTERVAL = 0.0002
 """Longest time for which another thread of this process keeps the interpreter [s]."""
 _COLLECT_AFTER = 50_000
-"""Number of new objects that triggers a garbage collection [1]. The number is high, because new
-objects are mostly datagrams in flight, which are not garbage."""
+"""Number of new objects that triggers a garbage collection [1]: most are datagrams in flight."""
 # Source: Linux, include/uapi/asm-generic/socket.h, prctl.h; Python has no names for them.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 
@@ -119,23 +115,15 @@ class Recent:
         return {**recent, "released_early": errors[_EARLY]}
 
 
-def ask_for_stamps(one: socket.socket) -> bool:
-    """Ask the kernel to count dropped datagrams and to stamp arriving ones; return if it stamps."""
-    granted = False
+def ask_for_stamps(one: socket.socket) -> None:
+    """Ask the kernel to stamp arriving datagrams and to count dropped ones, if it can."""
     for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():
-        try:
+        with suppress(OSError):  # without stamps a datagram arrives when it is read
             one.setsockopt(socket.SOL_SOCKET, option, 1)
-            granted = True
-        except OSError:  # without stamps a datagram arrives when it is read
-            granted = False
-    return granted
 
 
 class Stamps:
     """Reads the kernel's time stamps and drop counts for the datagrams of one socket.
-
-    The kernel stamps arrivals (SO_TIMESTAMPNS) by the wall clock, which people and NTP may set. So
-    the relay converts a stamp at once to the monotonic clock.
 
     Attributes:
         dropped: Number of datagrams that found the socket's buffer full, as last reported by the
@@ -145,20 +133,6 @@ class Stamps:
     def __init__(self) -> None:
         """Start before the first datagram."""
         self.dropped = 0
-        self._offset_ns: int | None = None
-
-    def look_at_clocks(self) -> int | None:
-        """Compare the clocks before a batch of datagrams is read.
-
-        Returns:
-            Monotonic minus wall clock [ns]; None if the wall clock was set since the last call, so
-            that stamps cannot be converted.
-        """
-        # The wall clock first: a pause between the readings makes a datagram later, never earlier.
-        before, wall_ns = self._offset_ns, time.time_ns()
-        offset_ns = self._offset_ns = time.monotonic_ns() - wall_ns
-        stepped = before is not None and abs(offset_ns - before) > _STEP_MIN_NS
-        return None if stepped else offset_ns
 
     def wall_ns(self, ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
         """Return a datagram's arrival by the wall clock [ns], if stamped; update `dropped`.
@@ -175,15 +149,13 @@ class Stamps:
                 self.dropped += (told - self.dropped) & 0xFFFF_FFFF
         return wall_ns
 
+    def age_ns(self, ancillary: Sequence[tuple[int, int, bytes]], now_ns: int) -> int:
+        """Return how long ago a datagram arrived, in [0, AGE_MAX_NS]; 0 without a stamp.
 
-def instant_ns(wall_ns: int | None, offset_ns: int | None, now_ns: int) -> int:
-    """Convert a stamp [ns] by an offset of `Stamps` [ns] to the monotonic clock [ns].
-
-    The result is at most `AGE_MAX_NS` before `now_ns`, the time at which the datagram was read.
-    """
-    if wall_ns is None or offset_ns is None:
-        return now_ns
-    return max(now_ns - AGE_MAX_NS, min(now_ns, wall_ns + offset_ns))
+        `now_ns` is the wall clock [ns]. People and NTP may set this clock, hence the limits.
+        """
+        wall_ns = self.wall_ns(ancillary)
+        return 0 if wall_ns is None else min(max(0, now_ns - wall_ns), AGE_MAX_NS)
 
 
 class Lane:
@@ -219,7 +191,6 @@ class Lane:
 
     def take_in(self) -> None:
         """Read waiting datagrams from the socket into the model, at most `BATCH`."""
-        offset_ns, read = self._stamps.look_at_clocks(), self._stamps.wall_ns
         for _ in range(BATCH):
             try:
                 data, beside, flags, _ = self.source.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
@@ -228,9 +199,10 @@ class Lane:
             except OSError:  # nothing waits
                 return
             self._counts["received"] += 1
-            now_ns = monotonic_ns()
-            received_ns = instant_ns(read(beside), offset_ns, now_ns)
-            self._stalled += now_ns - received_ns >= AGE_MAX_NS
+            age_ns = self._stamps.age_ns(beside, time_ns())
+            # The wall clock first: a pause between both makes a datagram later, never earlier.
+            received_ns = monotonic_ns() - age_ns
+            self._stalled += age_ns >= AGE_MAX_NS
             try:
                 if flags & socket.MSG_TRUNC:
                     raise ValueError("too long")

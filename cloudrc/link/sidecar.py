@@ -125,13 +125,9 @@ def read_told(text: str) -> Told:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings of a sidecar.
+    """Settings of a sidecar: `link.mode`, "uplink" or "downlink", route file and state file.
 
-    Attributes:
-        mode: The setting `link.mode`.
-        direction: "uplink" or "downlink", for reports.
-        route: File with the address to which this pod's tunnel end has to send.
-        state: State file in the same folder, for reports.
+    The route file holds the address to which this pod's tunnel end has to send.
     """
 
     mode: Mode
@@ -150,8 +146,6 @@ class Machine:
         may_shape: Whether this process is root with NET_ADMIN.
         clock: Returns the time on the monotonic clock [ns].
         today: Returns date and time in UTC as text, for reports.
-        wait: Sleeps for a time [s].
-        log: Receives lines for people.
     """
 
     relay: Make

@@ -28,8 +28,7 @@ UNIX_TIME = 1e8
 the first time is subtracted."""
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _ROWS_TO_JUDGE = 10
-"""A delay of 0 may mark a lost packet only in traces with at least this number of rows [1]; shorter
-traces are typed by hand."""
+"""Only in traces of at least this many rows a delay of 0 may mark a loss; others are typed [1]."""
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
@@ -69,13 +68,10 @@ def decode(data: bytes) -> list[str]:
 
 
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
-    """Read the distribution of a trace's delays; ignore lost packets.
+    """Read the distribution of a trace's delays; ignore lost packets; raise as `read_trace`.
 
     Returns:
         The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,) [1].
-
-    Raises:
-        BadInputError: In the cases of `read_trace`, and if all delays are equal.
     """
     trace = read_trace(path, size_max)
     losses = trace.losses or (0.0,) * len(trace.delays)
@@ -142,7 +138,7 @@ class Row(NamedTuple):
     Attributes:
         where: File and line of the row, for messages.
         cells: Column -> text, stripped; the last columns may be missing.
-        decimal: Decimal point of the file: "." or ",".
+        decimal: "." or ",", between semicolons or tabs.
     """
 
     where: str
@@ -167,19 +163,13 @@ class Row(NamedTuple):
 
 
 def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]]:
-    """Read a CSV file with a header, separated by commas, semicolons or tabs.
+    """Read a CSV file with a header, separated by commas, or by semicolons or tabs.
 
-    Semicolons and tabs allow decimal commas. Blank lines and comments are skipped.
-
-    Args:
-        lines: Lines of the file.
-        name: Name of the file, for messages.
+    Blank lines and comments are skipped. A file with numbers alone is refused, and a row with more
+    cells than the header.
 
     Returns:
         Names of the columns in lower case ("RTT (ms)" becomes rtt_ms), and the rows.
-
-    Raises:
-        BadInputError: If the file has only numbers, or a row has more cells than the header.
     """
     data = ((n, one) for n, one in enumerate(lines, 1) if one.strip() and one[:1] != "#")
     kept = ((n, line) for n, line in data if not line.startswith("sep="))
