@@ -405,7 +405,7 @@ class Netem:
     def _take(self, profile: DirectionProfile, origin_ns: int) -> None:
         self._profile, self._timeline = profile, Timeline(profile)
         self._origin_ns, self._piece = origin_ns, -1
-        self._room = limit(profile)
+        self._room = self._least_room = limit(profile)
         if self._tables is not None:
             write_measured(self._tables, profile)
 
@@ -447,8 +447,8 @@ class Netem:
         until_ns = self._clock() + round(timeout * 1e9)
         if self._clock() - self._looked_ns >= PERIOD_NS:
             # The limit is as asked again once what was under way at a change has left.
-            if counters(self._look()).get("held", 0) < limit(self._profile):
-                self._room = limit(self._profile)
+            if counters(self._look()).get("held", 0) < self._least_room:
+                self._room = self._least_room
         while True:
             self._step()
             wake_ns = min(until_ns, self._next_ns())

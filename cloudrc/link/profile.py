@@ -204,15 +204,17 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
     """Compute the conditions from `instant` [s] until the next instant of the time line."""
-    found = {name: getattr(profile, name) for name in ("delay", "jitter", "loss", "rate")}
+    delay, jitter, loss, rate = profile.delay, profile.jitter, profile.loss, profile.rate
     for change in profile.changes:
-        if change.at <= instant:
-            given = {name: getattr(change, name) for name in found}
-            found |= {name: value for name, value in given.items() if value is not None}
+        if change.at > instant:
+            break
+        delay = delay if change.delay is None else change.delay
+        jitter = jitter if change.jitter is None else change.jitter
+        loss = loss if change.loss is None else change.loss
+        rate = rate if change.rate is None else change.rate
     if (trace := profile.trace) is not None:
         row = max(bisect_right(trace.times, instant) - 1, 0)
-        found["delay"] = trace.delays[row]
-        found["loss"] = found["loss"] if trace.losses is None else trace.losses[row]
+        delay = trace.delays[row]
+        loss = loss if trace.losses is None else trace.losses[row]
     blackout = any(b.start <= instant < b.start + b.duration for b in profile.blackouts)
-    delay_ns = round(found["delay"] * 1e9)
-    return Conditions(delay_ns, found["jitter"], found["loss"], found["rate"], blackout)
+    return Conditions(round(delay * 1e9), jitter, loss, rate, blackout)
