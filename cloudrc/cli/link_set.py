@@ -20,7 +20,7 @@ from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 
 if TYPE_CHECKING:
     from cloudrc.cluster.link import LinkParts, ReleasePlace, Sent
-    from cloudrc.config.profile_edit import Edit
+    from cloudrc.config.load import Edit
     from cloudrc.link.state import LinkState
 
 EPILOG = """\
@@ -93,7 +93,7 @@ def _set_here(
         TimedOutError: If the relay does not apply the profile in time.
     """
     from cloudrc.config.document import Document
-    from cloudrc.config.profile_edit import DIRECTIONS, edit_profile
+    from cloudrc.config.load import DIRECTIONS, edit_profile
     from cloudrc.link.state import CHANGE_FILE, PROFILE_FILE, from_text, publish
 
     def look() -> list[LinkState]:
@@ -125,17 +125,9 @@ def _set_in_cluster(
     options: argparse.Namespace, place: ReleasePlace, number: str
 ) -> tuple[LinkParts, Sent]:
     """Send a new profile to both link containers."""
-    from concurrent.futures import ThreadPoolExecutor
+    from cloudrc.cluster.link import send
 
-    with ThreadPoolExecutor(1) as pool:
-        looking = pool.submit(_link_of, options, place)
-        # Import while the cluster answers: a change should be in force within a second.
-        from cloudrc.cluster.link import send
-        from cloudrc.config.profile_edit import check_edit
-
-        if looking.exception() is not None:
-            check_edit(options.profile, options.settings)  # report a wrong command line first
-        link = looking.result()
+    link = _link_of(options, place)
     note = partial(_note, number=number)
     return link, send(place, link, options.profile, options.settings, note)
 

@@ -15,7 +15,7 @@ from cloudrc.cli import link_set, relay
 from cloudrc.cli.main import main
 from cloudrc.cli.relay import RelayControl
 from cloudrc.config.document import Document
-from cloudrc.config.profile_edit import edit_profile
+from cloudrc.config.load import edit_profile
 from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded
@@ -182,24 +182,6 @@ def test_a_named_run_that_does_not_fly_is_an_error(
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
     assert main(["link", "set", "uplink.delay_ms=1", "--run", "nowhere"]) == 2
     assert "--run nowhere: no run flies there" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["downlink.dely_ms=3"],
-        ["downlink.loss=2"],
-        ["sideways.loss=0.1"],
-        ["--profile", "nosuch"],
-        [],
-    ],
-)
-def test_without_a_flight_a_wrong_line_is_reported_first(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
-    assert main(["link", "set", *words]) == 2
 
 
 def test_the_table_names_all_settings(capsys: pytest.CaptureFixture[str]) -> None:
