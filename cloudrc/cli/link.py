@@ -1,4 +1,7 @@
-"""Parse and run `cloudrc link ACTION`: here `show`, the others in `cli/link_<name>.py`."""
+"""Parse `cloudrc link ACTION` and run the action, which is in `cli/link_<name>.py`; `show` is here.
+
+`cli/link_verify.py` imports much, so it is imported when it runs, and its arguments are here, too.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING
 
+from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import escape, print_line, table
+from cloudrc.cli.output import escape, output_argument, print_line, table
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -50,6 +54,24 @@ examples:
 The delays come from the same link model as in a flight, packet by packet: a
 flight with the same seed has exactly these delays. All delays are one way.
 Of a trace every row counts the same, however long it holds."""
+VERIFY_EPILOG = """\
+examples:
+  cloudrc link verify                       the link of the paper's experiment
+  cloudrc link verify satellite
+  cloudrc link verify paper --set link.uplink.loss=0.05 -o json
+
+The command starts the link's processes on this machine, one per direction, and
+sends numbered probes through each. A relay's draws are known, so each probe has
+a predicted delay; netem is compared with 200 simulated links. Tolerances:
+max(2 ms, 5 %) of the mean delay, 10 % of the jitter, max(2 percentage points,
+25 %) of the loss. What is off is measured again before it is reported.
+
+With --mode cluster the command judges the link of a release in flight by the
+tunnel's own datagrams, within a minute. It reports what it cannot judge.
+
+exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
+3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
+VERIFY_DEFAULT = "paper"
 PACKETS_MAX = 10_000_000
 RANGES: dict[str, tuple[float, float]] = {
     "seconds": (0.001, 86_400),
@@ -68,9 +90,14 @@ KINDS = ("png", "svg", "pdf")
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
+    here = {
+        "show": (SHOW_EPILOG, show_arguments, show),
+        "verify": (VERIFY_EPILOG, verify_arguments, _verify),
+    }
     for name, line in ACTIONS.items():
-        epilog, declare, act = SHOW_EPILOG, show_arguments, show
-        if name != "show":
+        if name in here:
+            epilog, declare, act = here[name]
+        else:
             module = importlib.import_module(f"cloudrc.cli.link_{name}")
             epilog, declare, act = module.EPILOG, module.arguments, module.execute
         action = actions.add_parser(
@@ -93,6 +120,34 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError("an action is missing; see 'cloudrc link --help'")
     code: int = options.act(options)
     return code
+
+
+def verify_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `verify`."""
+    add = parser.add_argument
+    target = f"name of a shipped one, or a file (default: {VERIFY_DEFAULT})"
+    add("target", nargs="?", default=VERIFY_DEFAULT, metavar="PROFILE|EXPERIMENT", help=target)
+    setting = "override one value of the experiment, for example link.uplink.loss=0.1"
+    add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
+    seconds = (
+        "time to send probes (default: as long as needed, at most 120); with --mode cluster: "
+        "time to wait for a verdict (default: 270)"
+    )
+    add("--seconds", type=float, metavar="S", help=seconds)
+    shaper = "relay (default), or netem between two network namespaces (needs root)"
+    add("--shaper", choices=("relay", "netem"), default="relay", help=shaper)
+    mode = "a link started on this machine (default), or the link of a release"
+    add("--mode", choices=("local", "cluster"), default="local", help=mode)
+    ends = "hosts of a release's two pods, from inside its cluster; used by 'helm test'"
+    add("--ends", metavar="WORLD,CLOUD", help=ends)
+    release_arguments(parser)
+    output_argument(parser)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from cloudrc.cli.link_verify import execute as verify
+
+    return verify(options)
 
 
 def show_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli import link_verify_report
-from cloudrc.cli.link_verify_report import Report, as_text, fetch, verify
+from cloudrc.cli import link_verify
+from cloudrc.cli.link_verify import Report, as_text, fetch, verify_release
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.errors import TimedOutError
 from cloudrc.link.profile import DirectionProfile
@@ -64,7 +64,7 @@ def release(monkeypatch: pytest.MonkeyPatch) -> Iterator[Release]:
             link.tells(lambda: write_told(Told("relay", "", APPLIED, Near("eth0", {}))))
         pods = {"world": (at_world, at_up), "cloud": (at_cloud, at_down)}
         made = Release(world, cloud, {"uplink": up, "downlink": down}, pods)
-        monkeypatch.setattr(link_verify_report.time, "sleep", made.count)
+        monkeypatch.setattr(link_verify.time, "sleep", made.count)
         monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)  # as no time passes
         yield made
 
@@ -82,7 +82,7 @@ def test_a_proxy_of_the_environment_is_not_used(release: Release, proxy: None) -
 
 
 def ask(release: Release, limit: float = 30.0) -> Report:
-    return verify("demo", release.pods, limit, lambda line: None)
+    return verify_release("demo", release.pods, limit, lambda line: None)
 
 
 def causes(report: Report) -> list[tuple[str, str]]:
@@ -146,7 +146,7 @@ def test_a_wrong_setting_differs_from_a_wrong_shaper(
 def test_once_one_direction_is_off_the_wait_is_short(
     release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link_verify_report, "OFF_TIMEOUT", 0.0)
+    monkeypatch.setattr(link_verify, "OFF_TIMEOUT", 0.0)
     release.hears("world", "off")
     release.hears("cloud", "open")
     assert ask(release, limit=5.0)["verdict"] == "not believed"
@@ -156,7 +156,7 @@ def test_once_one_direction_is_off_the_wait_is_short(
 def test_a_verdict_off_for_a_moment_does_not_end_the_wait(
     release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link_verify_report, "OFF_TIMEOUT", 0.05)
+    monkeypatch.setattr(link_verify, "OFF_TIMEOUT", 0.05)
     release.hears("world", "off")
     release.hears("cloud", "open")
     began = time.monotonic()
@@ -168,7 +168,7 @@ def test_a_verdict_off_for_a_moment_does_not_end_the_wait(
         if time.monotonic() - began > 0.2:
             release.hears("cloud", "ok", stamp_ns=6)
 
-    monkeypatch.setattr(link_verify_report.time, "sleep", recover)
+    monkeypatch.setattr(link_verify.time, "sleep", recover)
     assert ask(release)["verdict"] == "believed"
 
 

@@ -12,8 +12,7 @@ from cloudrc.config.shipped import names
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.tc import check
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
-from cloudrc.link.verify.expect import Flow, netem_makes
-from cloudrc.link.verify.judge import Row, look_twice, verdict_of
+from cloudrc.link.verify.judge import Flow, Row, look_twice, netem_makes, verdict_of
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from tests.link.verify.conftest import (
     VirtualNetem,

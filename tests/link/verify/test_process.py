@@ -14,10 +14,8 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli import link_verify_local
-from cloudrc.cli.link_verify import find_experiment
-from cloudrc.cli.link_verify_local import Way, run_link, verify
-from cloudrc.cli.link_verify_report import Report
+from cloudrc.cli import link_verify
+from cloudrc.cli.link_verify import Report, Way, find_experiment, run_link, verify
 from cloudrc.cli.main import main
 from cloudrc.config.schema import Profile
 from cloudrc.errors import CloudrcError
@@ -69,8 +67,8 @@ def test_a_doubled_delay_is_named_on_the_command_line(
         uplink=asked().uplink.model_copy(update={"delay_ms": 200.0}),
         downlink=asked().downlink.model_copy(update={"delay_ms": 160.0}),
     )
-    true = link_verify_local.verify
-    monkeypatch.setattr(link_verify_local, "verify", lambda *given: true(*given, applied=wrong))
+    true = link_verify.verify
+    monkeypatch.setattr(link_verify, "verify", lambda *given: true(*given, applied=wrong))
     words = ["link", "verify", "paper-p1", "--seconds", "4", "-o", "json"]
     assert main([*words, *[word for value in LINK for word in ("--set", value)]]) == 1
     report = json.loads(capsys.readouterr().out)
@@ -106,14 +104,14 @@ def stopped_now_and_then(ways: Mapping[str, Way]) -> Iterator[None]:
 @pytest.mark.process
 @pytest.mark.full
 def test_a_relay_without_its_cpu_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = link_verify_local.send_probes
+    true = link_verify.send_probes
     running: dict[str, Way] = {}
 
     def held_up(ends: Any) -> Any:
         with stopped_now_and_then(running):
             return true(ends)
 
-    monkeypatch.setattr(link_verify_local, "send_probes", held_up)
+    monkeypatch.setattr(link_verify, "send_probes", held_up)
     assert codes(probe(asked(), meddle=running.update)) == {"throttled"}
 
 
@@ -198,7 +196,7 @@ def test_an_early_end_has_the_exit_code_of_the_process(
         (way.folder / "log").write_text(f"before\n{words}\n" if words else "")
         return subprocess.Popen(["sh", "-c", f"exit {code}" if name == "uplink" else "sleep 9"])
 
-    monkeypatch.setattr(link_verify_local, "_start", start)
+    monkeypatch.setattr(link_verify, "_start", start)
     with pytest.raises(CloudrcError) as ended, run_link(asked(), "relay"):
         pass
     assert ended.value.exit_code == exit_code
