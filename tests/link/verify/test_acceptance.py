@@ -117,7 +117,9 @@ def test_an_honest_netem_is_believed(name: str) -> None:
     for way in ("uplink", "downlink"):
         profile = asked(name, way)
         if can(profile):
-            assert doubts(rows_of(profile, VirtualNetem(profile, 7))) == []
+            found = doubts(rows_of(profile, VirtualNetem(profile, 7)))
+            # Two minutes of probes leave the jitter of lte, whose netem draws chance, undecided.
+            assert found in ([], [("deviation", "open")] if name == "lte" else [])
 
 
 @pytest.mark.parametrize(
