@@ -1,13 +1,29 @@
-"""Parse `cloudrc link ACTION` and run the action; each action is in `cli/link_<name>.py`."""
+"""Parse `cloudrc link ACTION` and run the action, which is in `cli/link_<name>.py`; `show` is here.
+
+`cli/link_verify.py` imports much, so it is imported when it runs, and its arguments are here, too.
+"""
 
 from __future__ import annotations
 
 import argparse
 import importlib
+from collections.abc import Callable, Sequence
+from functools import partial
+from math import isnan, nan
 from pathlib import Path
+from statistics import fmean
+from typing import TYPE_CHECKING
 
-from cloudrc.cli.runtime import process_arguments, read_address
+from cloudrc.cli.cluster_flags import release_arguments
+from cloudrc.cli.extras import require
+from cloudrc.cli.output import escape, output_argument, print_line, table
 from cloudrc.errors import BadInputError
+
+if TYPE_CHECKING:
+    from cloudrc.config.schema import Direction, Profile
+    from cloudrc.link.model import Numbers, Stream
+    from cloudrc.link.profile import DirectionProfile
+    from cloudrc.report.figures.link import DirectionSample
 
 EPILOG = """\
 examples:
@@ -28,26 +44,74 @@ ACTIONS = {
     "run": "shape one direction of the link until SIGTERM",
 }
 """Help line of each action, in the order of the help."""
-DEBUG = "show the traceback of an error"
-MODES = ("auto", "netem", "relay")
+SHOW_EPILOG = """\
+examples:
+  cloudrc link show lossy
+  cloudrc link show my.yaml --seconds 120 -o my.svg
+  cloudrc link show trace.csv
+  cloudrc link show ./my.yaml --packets 300000 --rate 200
+
+The delays come from the same link model as in a flight, packet by packet: a
+flight with the same seed has exactly these delays. All delays are one way.
+Of a trace every row counts the same, however long it holds."""
+VERIFY_EPILOG = """\
+examples:
+  cloudrc link verify                       the link of the paper's experiment
+  cloudrc link verify satellite
+  cloudrc link verify paper --set link.uplink.loss=0.05 -o json
+
+The command starts the link's processes on this machine, one per direction, and
+sends numbered probes through each. A relay's draws are known, so each probe has
+a predicted delay; netem is compared with 200 simulated links. Tolerances:
+max(2 ms, 5 %) of the mean delay, 10 % of the jitter, max(2 percentage points,
+25 %) of the loss. What is off is measured again before it is reported.
+
+With --mode cluster the command judges the link of a release in flight by the
+tunnel's own datagrams, within a minute. It reports what it cannot judge.
+
+exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
+3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
+VERIFY_DEFAULT = "paper"
+PACKETS_MAX = 10_000_000
+RANGES: dict[str, tuple[float, float]] = {
+    "seconds": (0.001, 86_400),
+    "seed": (0, 2**53 - 1),
+    "rate": (1, 10_000),
+    "packets": (1, PACKETS_MAX),
+}
+"""Option of `show` -> its least and largest value."""
+ROWS = 1000
+"""Least number of packets for the picture of a trace; a short trace gets several per row."""
+SECONDS = 30.0
+"""Default time that the picture shows [s]; longer if the profile's time line is longer."""
+KINDS = ("png", "svg", "pdf")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
+    here = {
+        "show": (SHOW_EPILOG, show_arguments, show),
+        "verify": (VERIFY_EPILOG, verify_arguments, _verify),
+    }
     for name, line in ACTIONS.items():
-        module = None if name == "run" else importlib.import_module(f"cloudrc.cli.link_{name}")
+        if name in here:
+            epilog, declare, act = here[name]
+        else:
+            module = importlib.import_module(f"cloudrc.cli.link_{name}")
+            epilog, declare, act = module.EPILOG, module.arguments, module.execute
         action = actions.add_parser(
             name,
             help=line,
             description=line[0].upper() + line[1:] + ".",
-            epilog=getattr(module, "EPILOG", None),
+            epilog=epilog,
             formatter_class=parser.formatter_class,
             allow_abbrev=False,
         )
-        action.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=DEBUG)
-        (module.arguments if module else _run_arguments)(action)
-        action.set_defaults(act=module.execute if module else _run)
+        debug = "show the traceback of an error"
+        action.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=debug)
+        declare(action)
+        action.set_defaults(act=act)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -58,58 +122,158 @@ def execute(options: argparse.Namespace) -> int:
     return code
 
 
-def _run(options: argparse.Namespace) -> int:
-    from cloudrc.cli.link_run import run
+def verify_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `verify`."""
+    add = parser.add_argument
+    target = f"name of a shipped one, or a file (default: {VERIFY_DEFAULT})"
+    add("target", nargs="?", default=VERIFY_DEFAULT, metavar="PROFILE|EXPERIMENT", help=target)
+    setting = "override one value of the experiment, for example link.uplink.loss=0.1"
+    add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
+    seconds = (
+        "time to send probes (default: as long as needed, at most 120); with --mode cluster: "
+        "time to wait for a verdict (default: 270)"
+    )
+    add("--seconds", type=float, metavar="S", help=seconds)
+    shaper = "relay (default), or netem between two network namespaces (needs root)"
+    add("--shaper", choices=("relay", "netem"), default="relay", help=shaper)
+    mode = "a link started on this machine (default), or the link of a release"
+    add("--mode", choices=("local", "cluster"), default="local", help=mode)
+    ends = "hosts of a release's two pods, from inside its cluster; used by 'helm test'"
+    add("--ends", metavar="WORLD,CLOUD", help=ends)
+    release_arguments(parser)
+    output_argument(parser)
 
-    return run(options)
+
+def _verify(options: argparse.Namespace) -> int:
+    from cloudrc.cli.link_verify import execute as verify
+
+    return verify(options)
 
 
-def _run_arguments(parser: argparse.ArgumentParser) -> None:
-    process_arguments(parser)
-    parser.add_argument(
-        "--profile",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="profile of the link; watched for changes",
-    )
-    parser.add_argument(
-        "--direction",
-        choices=("uplink", "downlink"),
-        required=True,
-        help="direction of the profile to shape",
-    )
-    parser.add_argument(
-        "--mode",
-        choices=MODES,
-        default="auto",
-        help="auto (default) takes netem if permissions and kernel allow it, else relay",
-    )
-    parser.add_argument(
-        "--peer",
-        type=read_address,
-        required=True,
-        metavar="HOST:PORT",
-        help="address of the other tunnel end",
-    )
-    parser.add_argument(
-        "--end",
-        type=read_address,
-        metavar="HOST:PORT",
-        help="address from which this pod's tunnel end sends; the relay takes datagrams from no"
-        " other (default: from any that reaches --listen)",
-    )
-    parser.add_argument(
-        "--listen",
-        type=read_address,
-        default=("127.0.0.1", 7401),
-        metavar="HOST:PORT",
-        help="where the relay receives datagrams (default: 127.0.0.1:7401)",
-    )
-    parser.add_argument(
-        "--route",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="write the address to which this pod's tunnel end must send, once ready",
-    )
+def show_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `show`."""
+    add = parser.add_argument
+    add("profile", metavar="PROFILE", help="shipped profile, a file, or a trace in CSV")
+    picture = "the picture: .png, .svg or .pdf (default: NAME.png)"
+    add("-o", "--output", type=Path, metavar="FILE", help=picture)
+    seconds = "time to show (default: 30, or the whole time line)"
+    add("--seconds", type=float, metavar="S", help=seconds)
+    seed = "seed of the random draws (default: 1)"
+    add("--seed", type=int, default=1, metavar="S", help=seed)
+    rate = "packets per second (default: 100)"
+    add("--rate", type=float, default=100.0, metavar="HZ", help=rate)
+    packets = "packets for the statistics of an unchanging link (default: 100000)"
+    add("--packets", type=int, default=100_000, metavar="N", help=packets)
+
+
+def show(options: argparse.Namespace) -> int:
+    """Draw a profile and print its statistics; the last line is the picture's path."""
+    require("a picture of a link", ("report",))
+    output = options.output or Path(f"{Path(options.profile).stem}.png")
+    if output.suffix[1:] not in KINDS:
+        raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
+    for name, (least, most) in RANGES.items():
+        value = getattr(options, name)
+        if value is not None and not least <= value <= most:
+            raise BadInputError(f"--{name} {value:g}: give a number from {least} to {most}")
+    from cloudrc.report.figures.link import render_link
+
+    profile, is_trace = _profile(options.profile)
+    names = ("uplink",) if is_trace else ("uplink", "downlink")
+    ways = {name: _way(getattr(profile, name), name, options) for name in names}
+    title = escape(": ".join(filter(None, (Path(options.profile).stem, profile.description))))
+    samples = [sample for sample, _ in ways.values()]
+    picture = render_link(title, samples[0], samples[1] if samples[1:] else None, output.suffix[1:])
+    output.write_bytes(picture)
+    print(title)
+    print(_table({name: numbers for name, (_, numbers) in ways.items()}))
+    print_line(str(output))
+    return 0
+
+
+def _profile(name: str) -> tuple[Profile, bool]:
+    """Load a profile, or make one of a trace; return also whether it is a trace."""
+    from cloudrc.config.load import load_profile
+    from cloudrc.config.schema import Direction, Profile
+    from cloudrc.link.traces import read_trace
+
+    if not name.endswith(".csv"):
+        return load_profile(name), False
+    path = Path(name).absolute()
+    times = read_trace(path).times
+    about = f"a trace of {len(times)} rows in {times[-1] - times[0]:.4g} s"
+    return Profile(description=about, uplink=Direction(trace=str(path))), True
+
+
+def _way(
+    asked: Direction, name: str, options: argparse.Namespace
+) -> tuple[DirectionSample, Numbers]:
+    """Simulate one direction; if it never changes, the statistics come from a longer stream."""
+    from cloudrc.assembly import link_profile
+    from cloudrc.link.model import numbers
+    from cloudrc.link.profile import Timeline
+    from cloudrc.report.figures.link import DirectionSample
+
+    profile = link_profile(asked)
+    timeline, send = Timeline(profile), partial(_send, profile, name == "uplink", options.seed)
+    period_ns = round(1e9 / options.rate)
+    if profile.trace is not None and options.seconds is None:
+        shown = send(_row_times(profile.trace.times))
+    else:
+        seconds = options.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
+        if seconds * options.rate > PACKETS_MAX:
+            raise BadInputError(
+                f"{seconds:g} s at {options.rate:g} packets a second are more than {PACKETS_MAX} "
+                "packets; give less with --seconds or --rate"
+            )
+        shown = send(range(0, max(1, round(seconds * options.rate)) * period_ns, period_ns))
+    many = shown
+    if timeline.only() is not None:
+        many = send(range(0, options.packets * period_ns, period_ns))
+    counted = numbers(many)
+    return DirectionSample(asked, shown.sent, shown.delays, many.delays, counted.runs), counted
+
+
+def _row_times(times: Sequence[float]) -> list[int]:
+    """Return when to send [ns]: once per row of a trace, or more often if it has few rows."""
+    rows = [round(time * 1e9) for time in times]
+    share = -(-ROWS // len(rows))
+    if len(rows) == 1 or share == 1:
+        return rows
+    ends = [*rows[1:], 2 * rows[-1] - rows[-2]]
+    return [a + n * (b - a) // share for a, b in zip(rows, ends, strict=True) for n in range(share)]
+
+
+def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[int]) -> Stream:
+    """Simulate packets with the kind and size of a flight's datagrams."""
+    from cloudrc.link.model import LinkDirection, sample
+    from cloudrc.tunnel.codec import SIZES, Kind
+
+    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
+    return sample(LinkDirection(profile, seed, uplink), kind, sent_ns, SIZES[kind])
+
+
+_STATISTICS: tuple[tuple[str, str, float, Callable[[Numbers], float]], ...] = (
+    ("mean", "ms", 1e3, lambda one: one.mean),
+    ("standard deviation", "ms", 1e3, lambda one: one.deviation),
+    ("least", "ms", 1e3, lambda one: one.least),
+    ("median", "ms", 1e3, lambda one: one.median),
+    ("99 %", "ms", 1e3, lambda one: one.p99),
+    ("most", "ms", 1e3, lambda one: one.most),
+    ("correlation with the next", "", 1.0, lambda one: one.correlation),
+    ("overtaken by a later one", "%", 1e2, lambda one: one.overtaken),
+    ("duplicated", "%", 1e2, lambda one: one.duplicated),
+    ("lost", "%", 1e2, lambda one: one.loss),
+    ("lost in a row, mean", "", 1.0, lambda one: fmean(one.runs) if one.runs else nan),
+    ("lost in a row, most", "", 1.0, lambda one: max(one.runs, default=0)),
+)
+"""Name, unit, scale and value of each line."""
+
+
+def _table(counted: dict[str, Numbers]) -> str:
+    rows = [["one way", *(counted if len(counted) > 1 else ("",)), ""]]
+    for name, unit, scale, value in _STATISTICS:
+        values = [value(one) for one in counted.values()]
+        cells = ["-" if isnan(number) else f"{number * scale:.4g}" for number in values]
+        rows.append([name, *cells, unit])
+    return table(rows, right=range(1, len(counted) + 1))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,6 @@ from cloudrc.errors import BadInputError
 if TYPE_CHECKING:
     from cloudrc.link.logs import Direction, Packets
     from cloudrc.record.columns import Recording, Table
-
 
 EPILOG = """\
 sources:
@@ -37,45 +37,50 @@ examples:
 A trace describes one direction. A run has two: without --direction the command
 writes both, and adds the direction to each file name."""
 DIRECTIONS: tuple[Direction, ...] = ("uplink", "downlink")
+UNPACKED_MAX = 64 << 20
+"""Longest log that is unpacked [bytes]: 10 min of irtt at 100 Hz."""
+SETTLING_NS = 2_000_000_000
+"""Time before a session's last datagram in which no datagram counts as lost [ns], because a missing
+datagram may still be under way."""
+TOPICS = {
+    "uplink": ("/telemetry", "/uplink_delay"),
+    "downlink": ("/delay_estimate", "/downlink_delay"),
+}
+"""Direction -> topic with a row per sent datagram, topic with a row per arrived datagram."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the action's arguments."""
-    parser.add_argument("source", type=Path, metavar="SOURCE", help="a run, a log or a CSV file")
-    parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="FILE", help="the trace to write"
-    )
-    parser.add_argument("--direction", choices=DIRECTIONS, help="take this direction only")
-    parser.add_argument(
-        "--halve-rtt",
-        action="store_true",
-        help="take half of each round trip; correct only if both directions are equal",
-    )
-    parser.add_argument(
-        "--trust-units",
-        action="store_true",
-        help="accept values that look as if they had another unit",
-    )
+    add = parser.add_argument
+    add("source", type=Path, metavar="SOURCE", help="a run, a log or a CSV file")
+    add("-o", "--output", type=Path, required=True, metavar="FILE", help="the trace to write")
+    add("--direction", choices=DIRECTIONS, help="take this direction only")
+    halve = "take half of each round trip; correct only if both directions are equal"
+    add("--halve-rtt", action="store_true", help=halve)
+    trust = "accept values that look as if they had another unit"
+    add("--trust-units", action="store_true", help=trust)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Read the source, write the traces, and print a summary of each."""
-    source: Path = options.source
+    source, output, only = options.source, options.output, options.direction
     if not (source.is_dir() or source.is_file()):
         raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")
-    halve: bool = options.halve_rtt
-    if not is_run(source):
-        packets = from_log(source, options.direction, halve=halve, trust_units=options.trust_units)
-        _write(packets, options.output, options.direction or "uplink")
+    if not _is_run(source):
+        packets = _from_log(source, only, halve=options.halve_rtt, trust_units=options.trust_units)
+        _write(packets, output, only or "uplink")
         return 0
-    both = options.direction is None and not halve
-    only: Direction = options.direction or "uplink"
-    chosen = DIRECTIONS if both else (only,)
-    read = [(name, from_run(source, name, halve=halve)) for name in chosen]
-    for name, packets in read:
-        file = options.output
-        file = file.with_stem(f"{file.stem}-{name}") if both else file
-        _write(packets, file, name)
+    require("a trace of a run", ("record",))
+    recording = _recording(source)
+    if only is not None or options.halve_rtt:
+        packets = (
+            _halves(recording, source) if options.halve_rtt else one_way(recording, source, only)
+        )
+        _write(packets, output, only or "uplink")
+        return 0
+    both = {way: one_way(recording, source, way) for way in DIRECTIONS}
+    for way, packets in both.items():
+        _write(packets, output.with_stem(f"{output.stem}-{way}"), way)
     return 0
 
 
@@ -102,56 +107,24 @@ def _write(packets: Packets, path: Path, direction: str) -> None:
         print(f"distribution: table, table: {path.name}}}")
 
 
-MCAP_MAGIC = b"\x89MCAP0\r\n"
-UNPACKED_MAX = 64 << 20
-"""Longest log that is unpacked [bytes]: 10 min of irtt at 100 Hz."""
-SETTLING_NS = 2_000_000_000
-"""Time before a session's last datagram in which no datagram counts as lost [ns], because a missing
-datagram may still be under way."""
-TOPICS = {
-    "uplink": ("/telemetry", "/uplink_delay"),
-    "downlink": ("/delay_estimate", "/downlink_delay"),
-}
-"""Direction -> topic with a row per sent datagram, topic with a row per arrived datagram."""
-
-
-def is_run(path: Path) -> bool:
+def _is_run(path: Path) -> bool:
     """Return whether a path is a run's folder or an MCAP file; both hold both directions."""
     if path.is_dir():
         return True
     with path.open("rb") as file:
-        return file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+        return file.read(8) == b"\x89MCAP0\r\n"
 
 
-def from_run(path: Path, direction: Direction, *, halve: bool) -> Packets:
-    """Read one direction of a run's folder or of its mission.mcap.
-
-    Args:
-        path: Folder or file.
-        direction: Direction of the link.
-        halve: True: use half of each round trip that cloud has measured. False: use one-way delays,
-            which are known only if both ends share a clock.
-
-    Raises:
-        BadInputError: If the run holds no such delays.
-    """
-    require("a trace of a run", ("record",))
-    recording = _recording(path)
-    return _halves(recording, path) if halve else one_way(recording, path, direction)
-
-
-def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_units: bool) -> Packets:
-    """Read a log of ping or irtt, or a CSV file; recognise the kind by the content.
-
-    Raises:
-        BadInputError: If the file is none of these, or cannot be used.
-    """
+def _from_log(
+    path: Path, direction: Direction | None, *, halve: bool, trust_units: bool
+) -> Packets:
+    """Read a log of ping or irtt, or a CSV file; recognise the kind by the content."""
     from cloudrc.link.logs import is_ping, read_csv, read_irtt, read_ping, refuse_others
     from cloudrc.link.traces import read_lines
 
     name = str(path)
     remedy = "give a run, a log of ping or irtt, or a CSV file"
-    lines = _unpack(path) or read_lines(path, name, remedy)
+    lines = _unpack(path) if path.suffix == ".gz" else read_lines(path, name, remedy)
     refuse_others(lines, name)
     if lines and lines[0].lstrip().startswith(("{", "[{")):
         return read_irtt("\n".join(lines), name, direction, halve=halve)
@@ -161,14 +134,12 @@ def from_log(path: Path, direction: Direction | None, *, halve: bool, trust_unit
 
 
 def _unpack(path: Path) -> list[str]:
-    """Unpack a file that irtt has compressed; return empty bytes if it is not compressed."""
+    """Unpack a file that irtt has compressed."""
     import gzip
     import zlib
 
     from cloudrc.link.traces import decode
 
-    if path.suffix != ".gz":
-        return []
     try:
         with gzip.open(path) as file:
             data = file.read(UNPACKED_MAX + 1)
@@ -201,8 +172,6 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     Raises:
         BadInputError: If the recording holds no one-way delays.
     """
-    from math import isnan
-
     from cloudrc.link.logs import Log
 
     sent_topic, topic = TOPICS[direction]
@@ -246,13 +215,12 @@ def _halves(recording: Recording, path: Path) -> Packets:
     Lost packets are not visible in this estimate. Telemetry repeats an echo until the next command
     arrives; the repeated echoes count once.
     """
-    from math import isnan
-
     from cloudrc.link.logs import Log
 
-    estimates = recording["/delay_estimate"]
     log, previous, start_ns = Log(str(path), halved=True), None, None
-    for stamp_ns, rtt, loop in _columns(estimates, "stamp_ns", "rtt", "loop_delay"):
+    for stamp_ns, rtt, loop in _columns(
+        recording["/delay_estimate"], "stamp_ns", "rtt", "loop_delay"
+    ):
         if isnan(rtt):
             continue
         if (rtt, loop) == previous:

@@ -19,26 +19,54 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import print_line
-from cloudrc.cli.runtime import ipv4_addresses, open_exporter, warn_if_exposed
-from cloudrc.drivers.process import StopSignal
-from cloudrc.link.follow import Load
-from cloudrc.link.sidecar import Near, look_near, write_told
-from cloudrc.records import Counted
+from cloudrc.cli.runtime import (
+    ipv4_addresses,
+    open_exporter,
+    process_arguments,
+    read_address,
+    warn_if_exposed,
+)
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.iproute2 import Programs
-    from cloudrc.link.follow import Profiles
-    from cloudrc.link.sidecar import Machine, Sidecar
+    from cloudrc.link.follow import Load, Profiles
+    from cloudrc.link.sidecar import Machine, Near, Sidecar
 
+EPILOG = ""
 STATUS_PERIOD = 1.0
 """How long an answer of /link.json is cached [s]."""
 EMPTY_STATUS = "{}\n"
 """Answer of /link.json before the shaper works."""
 
 
-def run(options: argparse.Namespace) -> int:
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the action's arguments."""
+    process_arguments(parser)
+    add = parser.add_argument
+    file = "profile of the link; watched for changes"
+    add("--profile", type=Path, required=True, metavar="FILE", help=file)
+    way = "direction of the profile to shape"
+    add("--direction", choices=("uplink", "downlink"), required=True, help=way)
+    mode = "auto (default) takes netem if permissions and kernel allow it, else relay"
+    add("--mode", choices=("auto", "netem", "relay"), default="auto", help=mode)
+    peer = "address of the other tunnel end"
+    add("--peer", type=read_address, required=True, metavar="HOST:PORT", help=peer)
+    end = (
+        "address from which this pod's tunnel end sends; the relay takes datagrams from no"
+        " other (default: from any that reaches --listen)"
+    )
+    add("--end", type=read_address, metavar="HOST:PORT", help=end)
+    listen, here = "where the relay receives datagrams (default: 127.0.0.1:7401)", "127.0.0.1"
+    add("--listen", type=read_address, default=(here, 7401), metavar="HOST:PORT", help=listen)
+    route = "write the address to which this pod's tunnel end must send, once ready"
+    add("--route", type=Path, required=True, metavar="FILE", help=route)
+
+
+def execute(options: argparse.Namespace) -> int:
     """Shape one direction of the link until SIGTERM."""
+    from cloudrc.drivers.process import StopSignal
+
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
     from cloudrc.drivers.iproute2 import Programs
     from cloudrc.link.follow import HANDED_FILE, Profiles
@@ -95,7 +123,7 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
     from cloudrc.link.sidecar import Machine
     from cloudrc.tunnel.codec import peek
 
-    seed, clock = read_experiment(str(options.config)).seed, time.monotonic_ns
+    seed, clock, wait = read_experiment(str(options.config)).seed, time.monotonic_ns, time.sleep
 
     def relay(profile: DirectionProfile, origin_ns: int) -> RelayShaper:
         settle()
@@ -106,11 +134,10 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
 
     def netem(profile: DirectionProfile, origin_ns: int) -> Netem:
         return Netem(
-            programs,
-            profile,
+            *(programs, profile),
             origin_ns=origin_ns,
             clock=clock,
-            wait=time.sleep,
+            wait=wait,
             tables=tables,
             log=log,
         )
@@ -121,7 +148,7 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
         may_shape=may_shape(Path("/proc/self/status").read_text(encoding="ascii")),
         clock=clock,
         today=lambda: datetime.now(UTC).isoformat(timespec="seconds"),
-        wait=time.sleep,
+        wait=wait,
         log=log,
     )
 
@@ -147,10 +174,8 @@ def _start_watching(
             action()
             time.sleep(random.uniform(shortest, longest))
 
-    for action, pause in (
-        (poll_profile, (PROFILE_PERIOD, PROFILE_PERIOD)),
-        (resolve_peer, PEER_PAUSE),
-    ):
+    steady = (PROFILE_PERIOD, PROFILE_PERIOD)
+    for action, pause in ((poll_profile, steady), (resolve_peer, PEER_PAUSE)):
         threading.Thread(target=repeat, args=(action, *pause), daemon=True).start()
 
 
@@ -159,6 +184,7 @@ class Metrics:
 
     def __init__(self, exporter: Exporter, direction: str, mode: str) -> None:
         self._exporter, self._direction, self._mode = exporter, direction, mode
+        self.unresolved = exporter.unresolved
 
     def shapes(self, shaper: str) -> None:
         """Export which shaper is in use, and report ready."""
@@ -169,26 +195,19 @@ class Metrics:
         """Export the mean `delay` [s] that the profile requests."""
         self._exporter.asked(self._direction, delay)
 
-    def unresolved(self, count: int) -> None:
-        """Export how often the peer's name could not be resolved."""
-        self._exporter.unresolved(count)
-
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
         """Export the counters of datagrams."""
+        from cloudrc.records import Counted
+
         self._exporter.see([Counted(stamp_ns, "link", name, n) for name, n in counts.items()])
 
 
-def inspect_network(host: str, inside: tuple[str, ...] = ()) -> Near | None:
-    """Find the netem qdiscs of a network namespace and its route to a host.
-
-    Args:
-        host: IPv4 address.
-        inside: Prefix of commands for another namespace, such as "ip netns exec NAME"; empty for
-            the namespace of this process.
-    """
+def inspect_network(host: str) -> Near | None:
+    """Find the netem qdiscs of this thread's network namespace and its route to an IPv4 address."""
     from cloudrc.drivers.iproute2 import Programs
+    from cloudrc.link.sidecar import look_near
 
-    programs = Programs(prefix=inside)
+    programs = Programs()
     try:
         return look_near(programs, host)
     finally:
@@ -209,6 +228,8 @@ class LinkStatusSource:
 
     def text(self) -> str:
         """Return the state as JSON; return the previous answer if tc or ip hangs."""
+        from cloudrc.link.sidecar import write_told
+
         if not self._lock.acquire(timeout=STATUS_PERIOD):
             return self._text
         try:

@@ -1,87 +1,104 @@
-"""Run `cloudrc link verify`: compare a link with its profile, with probes or in flight."""
+"""Run `cloudrc link verify`: compare a link with its profile, by probes or in flight.
+
+On this machine the link runs as one process per direction, and probes go both ways. netem is
+verified between two network namespaces, joined by a veth pair, as between two pods. This needs
+root, changes nothing outside the namespaces, and deletes them at the end.
+
+Of a release the tunnel's own datagrams are the probes. Each end judges the direction that it
+receives and serves the result at /link.json of its metrics port; there each link container shows
+what it shapes.
+"""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import ctypes
+import json
+import os
+import socket
+import subprocess
 import sys
-from contextlib import ExitStack
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from math import inf, isfinite, nan
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, TypeAlias
 
-from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
-from cloudrc.cli.output import escape, format_document, output_argument
+import numpy as np
+
+from cloudrc.assembly import link_profile
+from cloudrc.cli.cluster_flags import release_from_flags
+from cloudrc.cli.link import VERIFY_DEFAULT
+from cloudrc.cli.link_run import inspect_network
+from cloudrc.cli.output import escape, format_document, paint, table
 from cloudrc.cli.pool import interrupt_on_signals
-from cloudrc.errors import BadInputError
+from cloudrc.cluster.pods import METRICS, NO_PROXY
+from cloudrc.config import shipped
+from cloudrc.config.document import write_yaml
+from cloudrc.config.load import ResolvedExperiment, dump, read_experiment
+from cloudrc.config.schema import Experiment, Profile
+from cloudrc.drivers.machine import interpreter
+from cloudrc.drivers.process import PARENT
+from cloudrc.drivers.realtime import bind, free_ports, parse
+from cloudrc.errors import (
+    BadInputError,
+    CloudrcError,
+    InvalidRunError,
+    MissingPrerequisiteError,
+    TimedOutError,
+)
+from cloudrc.link.netem import check
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.sidecar import Told, read_told
+from cloudrc.link.state import STATE_FILE, from_text
+from cloudrc.link.verify.causes import Findings, find_causes, read_evidence, read_metrics
+from cloudrc.link.verify.judge import (
+    RUN_LENGTH,
+    UNITS,
+    Flow,
+    Plan,
+    Row,
+    judge,
+    look_twice,
+    tolerance,
+    verdict_of,
+)
+from cloudrc.link.verify.monitor import PERIOD
+from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
+from cloudrc.tunnel.codec import SIZES, Kind
 
-if TYPE_CHECKING:
-    from cloudrc.cli.link_verify_report import Report
-    from cloudrc.config.load import ResolvedExperiment
-
-EPILOG = """\
-examples:
-  cloudrc link verify                       the link of the paper's experiment
-  cloudrc link verify satellite
-  cloudrc link verify paper --set link.uplink.loss=0.05 -o json
-
-The command starts the link's processes on this machine, one per direction, and
-sends numbered probes through each. A relay's draws are known, so each probe has
-a predicted delay; netem is compared with 200 simulated links. Tolerances:
-max(2 ms, 5 %) of the mean delay, 10 % of the jitter, max(2 percentage points,
-25 %) of the loss. What is off is measured again before it is reported.
-
-With --mode cluster the command judges the link of a release in flight by the
-tunnel's own datagrams, within a minute. It reports what it cannot judge.
-
-exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
-3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
-DEFAULT = "paper"
 RELEASE_TIMEOUT = 270.0
 """Default time limit for the verdict on a release [s]."""
+START_LIMIT, STOP_LIMIT = 90.0, 2.0
+"""Longest time for both processes to start, which a slow disk needs, and to stop [s]."""
+COUNTS_WAIT = 1.3
+"""Time until the processes have counted the last probe [s]; they do so once a second."""
+POLL_PERIOD, OFF_TIMEOUT, HTTP_TIMEOUT = 2.0, 30.0, 3.0
+"""Pause between two polls, longest wait for a verdict once the other is "off", for a page [s]."""
+PORTS = END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]
+LOOPBACK, DEVICE, PORT = "127.0.0.1", "tunnel", 7400
+HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}
+"""Direction -> address of its sending end, in that end's namespace."""
+WAYS = {
+    "uplink": ("world", "cloud", Kind.TELEMETRY),
+    "downlink": ("cloud", "world", Kind.COMMAND),
+}
+"""Direction -> the end that sends in it, the end that receives, and what."""
+COLOURS = {"ok": "green", "off": "red", "open": "yellow"}
+NAMES = {"mean": "delay, mean", "deviation": "standard deviation", "loss": "lost"}
+SCALES = {"s": (1e3, "ms"), "1": (1e2, "%"), "bit/s": (1e-3, "kbit/s")}
+NOT_JUDGED = "NOT JUDGED"
+"""Mark in a note: something that the profile asks for was not verified."""
+VERDICTS = {"off": "not believed", "open": "undecided", "ok": "believed"}
+_CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
-
-def arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the action's arguments."""
-    parser.add_argument(
-        "target",
-        nargs="?",
-        default=DEFAULT,
-        metavar="PROFILE|EXPERIMENT",
-        help=f"name of a shipped one, or a file (default: {DEFAULT})",
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="settings",
-        help="override one value of the experiment, for example link.uplink.loss=0.1",
-    )
-    parser.add_argument(
-        "--seconds",
-        type=float,
-        metavar="S",
-        help="time to send probes (default: as long as needed, at most 120); with --mode cluster: "
-        "time to wait for a verdict (default: 270)",
-    )
-    parser.add_argument(
-        "--shaper",
-        choices=("relay", "netem"),
-        default="relay",
-        help="relay (default), or netem between two network namespaces (needs root)",
-    )
-    parser.add_argument(
-        "--mode",
-        choices=("local", "cluster"),
-        default="local",
-        help="a link started on this machine (default), or the link of a release",
-    )
-    parser.add_argument(
-        "--ends",
-        metavar="WORLD,CLOUD",
-        help="hosts of a release's two pods, from inside its cluster; used by 'helm test'",
-    )
-    release_arguments(parser)
-    output_argument(parser)
+Report: TypeAlias = dict[str, Any]
+Tell: TypeAlias = Callable[[str], None]
+Pods: TypeAlias = Mapping[str, Sequence[str]]
+"""End -> URLs of its own pages and of those of its link container."""
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -90,65 +107,464 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seconds {options.seconds:g}: give a number from 1 to 3600")
     interrupt_on_signals()  # on a signal, remove namespaces and processes
     if options.ends or options.mode == "cluster":
-        report = _verify_release(options)
+        limit = options.seconds or RELEASE_TIMEOUT
+        with _pods(options) as pods:
+            report = verify_release(options.release or "cloudrc", pods, limit, _tell)
     else:
-        from cloudrc.cli.link_verify_local import verify
-
         experiment = find_experiment(options.target, options.settings)
         report = verify(options.target, experiment, options.shaper, options.seconds, _tell)
-    from cloudrc.cli.link_verify_report import as_text
-
-    table = options.output == "table"
-    print(as_text(report) if table else format_document(report, options.output))
+    is_table = options.output == "table"
+    print(as_text(report) if is_table else format_document(report, options.output))
     return 0 if report["verdict"] == "believed" else 1
-
-
-def _verify_release(options: argparse.Namespace) -> Report:
-    """Query the ends of a release, at given hosts or through the cluster's API."""
-    from cloudrc.cli.link_verify_report import END_PORT, LINK_PORT, verify
-
-    name, ports = options.release or "cloudrc", (END_PORT, LINK_PORT)
-    with ExitStack() as stack:
-        if options.ends:
-            hosts = options.ends.split(",")
-            if len(hosts) != 2 or not all(hosts):
-                raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
-            urls = [[f"http://{host}:{port}" for port in ports] for host in hosts]
-        else:
-            from cloudrc.cluster.pods import find_pod, forwarded
-
-            release, urls = release_from_flags(options), []
-            name = release.name
-            for end in ("world", "cloud"):
-                pod = find_pod(release, end).metadata.name
-                local = stack.enter_context(forwarded(release, pod, ports))
-                urls.append([f"http://127.0.0.1:{local[port]}" for port in ports])
-        pods = dict(zip(("world", "cloud"), urls, strict=True))
-        return verify(name, pods, options.seconds or RELEASE_TIMEOUT, _tell)
-
-
-def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
-    """Find the experiment; a profile replaces the link of the default experiment."""
-    from cloudrc.config import shipped
-    from cloudrc.config.load import read_experiment
-    from cloudrc.config.schema import Experiment, Profile
-
-    names = [*shipped.names("profile"), *shipped.names("experiment")]
-    is_profile = target not in shipped.names("experiment")
-    if shipped.is_path(target):
-        tree = shipped.read("profile", target, Path.cwd()).tree
-        is_profile = set(tree).isdisjoint(set(Experiment.model_fields) - set(Profile.model_fields))
-    elif target not in names:
-        raise BadInputError(
-            f"no profile or experiment named '{target}'; available: {', '.join(names)}"
-        )
-    if not is_profile:
-        return read_experiment(target, settings)
-    name = str(Path.cwd() / target) if shipped.is_path(target) else target
-    return read_experiment(DEFAULT, [f"link.profile={name}", *settings])
 
 
 def _tell(line: str) -> None:
     """Show progress in one line, on a terminal only."""
     if sys.stderr.isatty():
         print(f"\r\x1b[K{escape(line)}", end="", file=sys.stderr, flush=True)
+
+
+def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
+    """Find the experiment; a profile replaces the link of the default experiment."""
+    experiments, profiles = shipped.names("experiment"), shipped.names("profile")
+    if shipped.is_path(target):
+        keys = set(shipped.read("profile", target, Path.cwd()).tree)
+        is_profile = keys.isdisjoint(Experiment.model_fields.keys() - Profile.model_fields.keys())
+        target = str(Path.cwd() / target)
+    elif target in (*experiments, *profiles):
+        is_profile = target not in experiments
+    else:
+        names = ", ".join([*profiles, *experiments])
+        raise BadInputError(f"no profile or experiment named '{target}'; available: {names}")
+    if not is_profile:
+        return read_experiment(target, settings)
+    return read_experiment(VERIFY_DEFAULT, [f"link.profile={target}", *settings])
+
+
+@dataclass(slots=True)
+class Way:
+    """One direction of a link under test: its probes' socket, the shaper's files and process."""
+
+    own: socket.socket
+    peer: tuple[str, int]
+    ports: Sequence[int]  # where a relay receives, and where the process serves its pages
+    namespace: str = ""  # of the network; "" for this process's
+    folder: Path = Path()
+    process: subprocess.Popen[bytes] | None = None
+
+    def get(self, page: str) -> str:
+        """Fetch a page of the process; "" without an answer."""
+        with inside(self.namespace):
+            return fetch(f"http://{LOOPBACK}:{self.ports[1]}/{page}")
+
+
+def verify(
+    title: str,
+    experiment: ResolvedExperiment,
+    shaper: str,
+    seconds: float | None,
+    tell: Tell,
+    applied: Profile | None = None,
+    meddle: Callable[[Mapping[str, Way]], None] = lambda ways: None,
+) -> Report:
+    """Probe a link for `seconds` [s], None for as long as needed; look twice at what is off.
+
+    Tests inject faults: by another profile `applied`, and by a function that gets the running link.
+    """
+    tell("planning the probes")
+    plans, found, notes = make_plans(experiment, seconds, shaper), dict[str, Findings](), []
+    for look in ("sending probes", "looking again at what is off"):
+        tell(f"{look}: {max(plan.sent[-1] for plan in plans.values()):.0f} s")
+        with run_link(experiment, shaper, applied) as ways:
+            meddle(ways)
+            now = probe_link(ways, plans)
+        rows = {way: look_twice(found.get(way, now[way]).rows, now[way].rows) for way in now}
+        found = {way: now[way]._replace(rows=rows[way]) for way in now}
+        if "off" not in {verdict_of(one.rows) for one in found.values()}:
+            break
+    tell("")
+    for way, plan in plans.items():
+        if shaper == "netem" and plan.profile.correlation and plan.profile.jitter:
+            notes.append(_on_correlation(way, plan.profile.correlation))
+        if plan.profile.rate and not plan.train:
+            notes.append(f"{way}: rate {NOT_JUDGED}: this machine itself is hardly faster")
+    probes = {
+        way: f"{len(plan.sent)} probes of {plan.flow.size} bytes" for way, plan in plans.items()
+    }
+    return make_report(title, found, probes, notes)
+
+
+def make_plans(
+    experiment: ResolvedExperiment, seconds: float | None, shaper: str
+) -> dict[str, Plan]:
+    """Plan probes of the size of datagrams for `seconds` [s]; None: as long as needed.
+
+    Raises:
+        BadInputError: If netem cannot realise the profile; names the direction.
+    """
+    plans, netem = {}, shaper == "netem"
+    for way, (_, _, kind) in WAYS.items():
+        flow = Flow(experiment.seed, way == "uplink", PROBE, SIZES[kind])
+        profile = link_profile(getattr(experiment, way))
+        try:
+            if netem:
+                check(profile)
+        except BadInputError as error:
+            raise BadInputError(_advise(f"{way}: {error}")) from None
+        plans[way] = plan_probes(profile, flow, seconds, drawn=netem)
+    return plans
+
+
+def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
+    """Send all probes over a running link and judge them."""
+    since_wall_ns, found = time.time_ns() - time.monotonic_ns(), {}
+    states = {name: from_text((way.folder / STATE_FILE).read_text()) for name, way in ways.items()}
+    ends = [
+        ProbeEnd(
+            *(way.own, parse((way.folder / "route").read_text()), plans[name]),
+            (states[name].origin_ns or 0) + since_wall_ns,
+        )
+        for name, way in ways.items()
+    ]
+    streams = send_probes(ends)
+    time.sleep(COUNTS_WAIT)
+    for (name, way), stream in zip(ways.items(), streams, strict=True):
+        plan, page, metrics = plans[name], way.get("link.json"), read_metrics(way.get("metrics"))
+        with inside(way.namespace):  # a process that hangs says nothing, the kernel does
+            near = inspect_network(way.peer[0])
+        told = read_told(page) if page else Told(states[name].shaper, states[name].reason, None)
+        known = read_evidence(replace(told, near=near), metrics, len(stream.sent))
+        rows = judge(plan, stream, plan.expected(stream), plan.applied(known.applied))
+        found[name] = Findings(rows, known)
+    return found
+
+
+@contextlib.contextmanager
+def run_link(
+    experiment: ResolvedExperiment, shaper: str, applied: Profile | None = None
+) -> Iterator[dict[str, Way]]:
+    """Run both directions of a link: on loopback, or for netem in two namespaces.
+
+    Raises:
+        CloudrcError: If a process ends early, with its message and exit code, or starts too slowly.
+    """
+    profile = applied or Profile(uplink=experiment.uplink, downlink=experiment.downlink)
+    text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
+    with contextlib.ExitStack() as stack:
+        ways = stack.enter_context(_open_namespaces() if shaper == "netem" else _open_loopback())
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cloudrc-verify-")))
+        (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+        (folder / "profile.yaml").write_text(text, encoding="utf-8")
+        for name, way in ways.items():
+            way.folder = folder / name
+            way.folder.mkdir()
+            way.process = _start(name, way, shaper)
+            stack.callback(_stop, way.process)
+        deadline = time.monotonic() + START_LIMIT
+        while not all((way.folder / "route").exists() for way in ways.values()):
+            for name, way in ways.items():
+                if way.process and (code := way.process.poll()) is not None:
+                    raise _ended(name, code, (way.folder / "log").read_text(errors="replace"))
+            if time.monotonic() > deadline:
+                raise TimedOutError(f"the link was not up within {START_LIMIT:g} s; try again")
+            time.sleep(0.02)
+        yield ways
+
+
+def _start(name: str, way: Way, shaper: str) -> subprocess.Popen[bytes]:
+    relay, pages = (f"{LOOPBACK}:{port}" for port in way.ports)
+    words = [f"--peer={way.peer[0]}:{way.peer[1]}", f"--listen={relay}", f"--metrics={pages}"]
+    words += [f"--{file}={way.folder.parent / file}.yaml" for file in ("config", "profile")]
+    words += [f"--direction={name}", f"--mode={shaper}", f"--route={way.folder / 'route'}"]
+    with (way.folder / "log").open("wb") as log, inside(way.namespace):
+        return subprocess.Popen(
+            interpreter("-m", "cloudrc", "link", "run", *words),
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env={**os.environ, PARENT: str(os.getpid())},
+            start_new_session=True,  # Ctrl-C reaches this process alone, which stops them
+        )
+
+
+def _advise(text: str) -> str:
+    """Replace the advice for a chart by the one for this command."""
+    return text.replace("set link.mode=", "use --shaper ")
+
+
+def _ended(name: str, code: int, log: str) -> CloudrcError:
+    last = (log.strip().splitlines() or ["it left no message"])[-1]
+    words = _advise(last.removeprefix("cloudrc: error: "))
+    for kind in (BadInputError, MissingPrerequisiteError, TimedOutError):
+        if code == kind.exit_code:
+            return kind(f"the {name} is not shaped: {words}")
+    return InvalidRunError(f"the {name} is not shaped: its process ended with {code}: {words}")
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(STOP_LIMIT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+@contextlib.contextmanager
+def _open_loopback() -> Iterator[dict[str, Way]]:
+    with bind((LOOPBACK, 0)) as up, bind((LOOPBACK, 0)) as down:
+        ports = zip(free_ports(2), free_ports(2, socket.SOCK_STREAM), strict=True)
+        yield {
+            "uplink": Way(up, down.getsockname(), next(ports)),
+            "downlink": Way(down, up.getsockname(), next(ports)),
+        }
+
+
+@contextlib.contextmanager
+def _open_namespaces() -> Iterator[dict[str, Way]]:
+    if os.geteuid() != 0:
+        raise MissingPrerequisiteError(
+            "netem is verified between two network namespaces, which needs root; run this as root,"
+            " or verify the relay (--shaper relay)"
+        )
+    names, ways = {way: f"cloudrc-{way}-{os.getpid()}" for way in HOSTS}, {}
+    near, far = names.values()
+    with contextlib.ExitStack() as stack:
+        for name in names.values():
+            _ip("netns", "add", name)
+            stack.callback(_ip, "netns", "del", name)
+        _ip("-n", near, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", far)
+        for (way, name), peer in zip(names.items(), reversed(HOSTS.values()), strict=True):
+            _ip("-n", name, "addr", "add", f"{HOSTS[way]}/24", "dev", DEVICE)
+            for device in ("lo", DEVICE):
+                _ip("-n", name, "link", "set", device, "up")
+            with inside(name):
+                own = stack.enter_context(bind((HOSTS[way], PORT)))
+            ways[way] = Way(own, (peer, PORT), (PORT + 1, PORT + 2), name)
+        yield ways
+
+
+def _ip(*words: str) -> None:
+    try:
+        done = subprocess.run(("ip", *words), capture_output=True, text=True, timeout=10.0)
+        failure = " ".join(done.stderr.split()) if done.returncode else ""
+    except FileNotFoundError:
+        failure = "no program ip (package iproute2)"
+    if failure:
+        raise MissingPrerequisiteError(f"ip {' '.join(words)}: {failure}; use --shaper relay")
+
+
+@contextlib.contextmanager
+def inside(namespace: str) -> Iterator[None]:
+    """Move this thread into a network namespace, if one is named.
+
+    Sockets that are opened inside and processes that are started inside stay there.
+    """
+    if not namespace:
+        yield
+        return
+    library = ctypes.CDLL(None, use_errno=True)  # os.setns exists from Python 3.12 only
+    with open("/proc/thread-self/ns/net") as home, open(f"/run/netns/{namespace}") as target:
+        if library.setns(target.fileno(), _CLONE_NEWNET):
+            raise MissingPrerequisiteError(f"cannot enter {namespace}; use --shaper relay")
+        try:
+            yield
+        finally:
+            library.setns(home.fileno(), _CLONE_NEWNET)
+
+
+@contextlib.contextmanager
+def _pods(options: argparse.Namespace) -> Iterator[Pods]:
+    """Find the pages of a release's ends, at given hosts or through the cluster's API."""
+    hosts = options.ends.split(",") if options.ends else []
+    if hosts and (len(hosts) != 2 or not all(hosts)):
+        raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
+    with contextlib.ExitStack() as stack:
+        bases = [[f"{host}:{port}" for port in PORTS] for host in hosts]
+        if not hosts:
+            from cloudrc.cluster.pods import find_pod, forwarded
+
+            release = release_from_flags(options)
+            for end in ("world", "cloud"):
+                pod = find_pod(release, end).metadata.name
+                local = stack.enter_context(forwarded(release, pod, PORTS))
+                bases.append([f"{LOOPBACK}:{local[port]}" for port in PORTS])
+        urls = [[f"http://{base}" for base in pair] for pair in bases]
+        yield dict(zip(("world", "cloud"), urls, strict=True))
+
+
+def verify_release(title: str, pods: Pods, limit: float, tell: Tell) -> Report:
+    """Wait at most `limit` [s] for the verdicts of both ends.
+
+    Raises:
+        TimedOutError: If an end does not answer in time.
+    """
+    deadline, off_deadline = time.monotonic() + limit, inf
+    seen = dict[str, Any]()
+    while True:
+        tell(", ".join(note for way, found in seen.items() for note in _patience(way, found)))
+        time.sleep(POLL_PERIOD)
+        for way, (_, receiver, _) in WAYS.items():
+            if page := fetch(f"{pods[receiver][0]}/link.json"):
+                seen[way] = json.loads(page)
+        verdicts, now = [found["verdict"] for found in seen.values()], time.monotonic()
+        off_deadline = min(off_deadline, now + OFF_TIMEOUT) if "off" in verdicts else inf
+        waits = [way for way in WAYS if way not in seen or _may_change(seen[way])]
+        if not waits or now >= min(deadline, off_deadline):
+            break
+    tell("")
+    if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
+        text = f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
+        raise TimedOutError(text)
+    findings = {way: _findings(way, seen[way], pods[WAYS[way][0]][1]) for way in WAYS}
+    counts = {way: max([row["datagrams"] for row in seen[way]["rows"]], default=0) for way in WAYS}
+    probes = {way: f"{count} of the tunnel's own datagrams" for way, count in counts.items()}
+    notes = [note for way in WAYS for note in _notes(way, seen[way], findings[way])]
+    return make_report(title, findings, probes, notes)
+
+
+def fetch(url: str) -> str:
+    """Fetch a page without a proxy; "" without an answer."""
+    try:
+        with NO_PROXY.open(url, timeout=HTTP_TIMEOUT) as page:
+            return str(page.read().decode())
+    except OSError:
+        return ""
+
+
+def _may_change(found: Mapping[str, Any]) -> bool:
+    """Whether waiting helps: a time line that loops is never judged in flight."""
+    loops = any(row["quantity"] == "time_line" and row.get("measured") for row in found["rows"])
+    return bool(found["verdict"] == "open") and not loops
+
+
+def _findings(way: str, found: Mapping[str, Any], link: str) -> Findings:
+    """Combine the receiver's verdict with what the sender's link reports at a URL."""
+    kind = WAYS[way][2]
+    try:
+        told = read_told(fetch(f"{link}/link.json"))
+    except ValueError:
+        told = Told("", "", None)
+    known = read_evidence(told, read_metrics(fetch(f"{link}/metrics")))
+    flow = Flow(0, way == "uplink", kind, SIZES[kind])
+    plan = Plan(DirectionProfile(), flow, np.arange(float(RUN_LENGTH)) * PERIOD)
+    applied, rows = plan.applied(known.applied), []
+    for row in found["rows"]:
+        name, verdict = row["quantity"], row["verdict"]
+        values = (row.get(key, nan) for key in ("asked", "measured", "low", "high"))
+        asked, measured, low, high = map(float, values)
+        in_force = applied.get(name, nan)
+        if name == "rate" and known.applied:  # single datagrams do not measure it
+            in_force, slack = known.applied.rate or inf, tolerance("rate", asked)
+            if abs(in_force - asked) > slack:
+                verdict, low, high = "off", asked - slack, asked + slack
+        if verdict != "told":
+            unit = UNITS.get(name, "1")
+            rows.append(Row(name, unit, asked, in_force, measured, low, high, verdict))
+    return Findings(rows, known)
+
+
+def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> Iterator[str]:
+    """Note what was not judged, and how much longer it takes."""
+    rows = {row["quantity"]: row for row in found["rows"]}
+    judged = {row.name for row in finding.rows}
+    if not judged and "time_line" not in rows:
+        hint = "fly a mission first" if way == "downlink" else "is the other end ready?"
+        yield f"{way}: no datagrams to measure; {hint}"
+    elif "round_trip" in judged:
+        yield f"{way}: the ends do not share a clock: judged by round trips, not one-way delays"
+    elif judged and "mean" not in judged:
+        yield f"{way}: delays {NOT_JUDGED}: the ends do not share a clock"
+    if "rate" in rows and "rate" not in judged:
+        yield f"{way}: rate {NOT_JUDGED}: single datagrams do not measure it"
+    if "correlation" in rows:
+        yield _on_correlation(way, rows["correlation"]["asked"])
+    if rows.get("time_line", {}).get("measured"):
+        yield f"{way}: {NOT_JUDGED} in flight: a time line loops; probe it without --mode cluster"
+    elif "time_line" in rows:
+        yield f"{way}: its time line {NOT_JUDGED} in flight, only what follows it"
+    yield from _patience(way, found)
+
+
+def _patience(way: str, found: Mapping[str, Any]) -> Iterator[str]:
+    for row in found["rows"]:
+        if _may_change(found) and row["quantity"] == "datagrams":
+            needs, count = round(row["asked"]), round(row["measured"])
+            seconds = max(0, needs - count) * PERIOD
+            yield f"{way}: {count} of {needs} datagrams, {seconds:.0f} s more"
+
+
+def _on_correlation(way: str, asked: float) -> str:
+    return f"{way}: correlation {asked:g} {NOT_JUDGED}: netem realises almost none of it"
+
+
+def make_report(
+    title: str, findings: Mapping[str, Findings], probes: Mapping[str, str], notes: Sequence[str]
+) -> Report:
+    """Make plain values in SI units, shares in [0, 1]; unknown values are left out."""
+    shapers = {one.evidence.shaper or "an unknown shaper" for one in findings.values()}
+    verdicts = {verdict_of(one.rows) for one in findings.values()}
+    return {
+        "schemaVersion": 1,
+        "verdict": next(word for verdict, word in VERDICTS.items() if verdict in verdicts),
+        "link": title,
+        "shaper": f"shaped by {' and '.join(sorted(shapers))}",
+        "causes": [cause._asdict() for cause in find_causes(findings)],
+        "notes": list(notes),
+        "directions": {
+            way: {
+                "probes": probes[way],
+                "rows": [_known(row._asdict()) for row in found.rows],
+                "evidence": _known(asdict(found.evidence) | {"applied": None}),
+            }
+            for way, found in findings.items()
+        },
+    }
+
+
+def _known(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        key: value
+        for key, value in values.items()
+        if value not in (None, "", ()) and not (isinstance(value, float) and not isfinite(value))
+    }
+
+
+def as_text(report: Report) -> str:
+    """Format a table per direction, notes, causes, and the verdict in the last line."""
+    lines = [escape(f"{report['link']}: {report['shaper']}")]
+    for way, found in report["directions"].items():
+        rows = [[way, "asked", "applied", "measured", "allowed", "verdict"]]
+        rows += [_cells(row) for row in found["rows"]]
+        head, *body = table(rows, [1, 2, 3, 4]).splitlines()
+        lines += ["", paint(head, "bold"), paint(escape(f"  {found['probes']}"), "dim")]
+        for line, verdict in zip(body, (row["verdict"] for row in found["rows"]), strict=True):
+            lines.append(line.removesuffix(verdict) + paint(verdict, COLOURS[verdict]))
+    causes = [f"  {one['way']}: {one['text']}  [{one['code']}]" for one in report["causes"]]
+    lines += ["", *map(escape, [*report["notes"], *causes])]
+    partly = any(NOT_JUDGED in note for note in report["notes"])
+    colour, words = {
+        "believed": (
+            "green",
+            f"matches its profile{f', except what is {NOT_JUDGED} (above)' * partly}",
+        ),
+        "not believed": ("red", "does not match its profile"),
+        "undecided": (
+            "yellow",
+            "was not measured for long enough: give more --seconds, or ask again",
+        ),
+    }[report["verdict"]]
+    return "\n".join([*lines, paint(f"{report['verdict'].upper()}: the link {words}", colour)])
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    scale, unit = SCALES[row["unit"]]
+    names = ("asked", "applied", "measured", "low", "high")
+    asked, applied, measured, low, high = (_number(row.get(name, nan) * scale) for name in names)
+    allowed = f"{low} .. {high}" if row.get("low") else f"<= {high}"
+    name = NAMES.get(row["name"], row["name"].replace("_", " "))
+    return [f"  {name} [{unit}]", asked, applied, measured, allowed, row["verdict"]]
+
+
+def _number(value: float) -> str:
+    return "-" if not isfinite(value) else f"{value:.2f}" if value < 1e4 else f"{value:.0f}"

@@ -14,7 +14,7 @@ from cloudrc.cli.parser import input_file
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.record.recover import Recovery
+    from cloudrc.record.reader import Recovery
 
 LOSSY = 1
 """Exit code if data is lost."""
@@ -42,7 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Recover a recording; print what the copy keeps and what is lost."""
     require("a recovery", ("record",))
-    from cloudrc.record.recover import recover
+    from cloudrc.record.reader import recover
 
     source: Path = options.file
     target = options.to or source.with_name(f"{source.stem}.recovered{source.suffix}")

@@ -405,7 +405,7 @@ def _link_monitor(
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
     from cloudrc.link.traces import SIZE_MAX
-    from cloudrc.link.verify.expect import Flow
+    from cloudrc.link.verify.judge import Flow
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.tunnel.codec import SIZES, Kind
 

@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 
 from cloudrc.cluster.tools import ClusterError, run
 from cloudrc.config.document import read_document, write_yaml
-from cloudrc.config.load import FILE_READERS
-from cloudrc.config.profile_edit import DIRECTIONS, Edit, edit_profile
+from cloudrc.config.load import DIRECTIONS, FILE_READERS, Edit, edit_profile
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 from cloudrc.link.follow import HANDED_FILE, Handed, write_handed
 from cloudrc.link.state import CHANGE_FILE, STATE_FILE, LinkState, from_text, read_change
@@ -194,7 +193,7 @@ def send(
     Args:
         place: The release.
         link: The present link of the release.
-        profile: New profile, as in `cloudrc.config.profile_edit.edit_profile`.
+        profile: New profile, as in `cloudrc.config.load.edit_profile`.
         settings: Values to set, also as in `edit_profile`.
         note: Returns the text of a file beside the profile: who changed the profile, and why.
 

@@ -6,48 +6,40 @@ and `12:30` are text. Duplicate keys are refused.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 from cloudrc import files
-from cloudrc.config.schema import MAX_WAYPOINTS
 from cloudrc.errors import BadInputError
 
 KeyPath = tuple[str, ...]
 """Keys from the top of a document down to a value; the indices of lists are text, too."""
 
 SIZE_MAX = 8 << 20
-"""Largest file that is read [bytes]: four times the size of a mission of MAX_WAYPOINTS points."""
+"""Largest file that is read [bytes]: more than any mission needs."""
 SET_LABEL = "--set"
 """Label of a value that was set on the command line."""
+_VALUES_MAX = 300_000
+"""Largest number of values in a document; nested aliases multiply values."""
 
 _SCALARS = (
-    ("null", r"~|null|Null|NULL|", "~nN\0"),
-    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
-    ("int", r"[-+]?[0-9]+", "-+0123456789"),
+    ("null", r"~|null|Null|NULL|", [*"~nN", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
+    ("int", r"[-+]?[0-9]+", [*"-+0123456789"]),
     (
         "float",
         r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
         r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
-        "-+.0123456789",
+        [*"-+.0123456789"],
     ),
 )
-"""Tag, pattern and possible first characters of each kind of scalar. The first character "\\0"
-stands for an empty scalar.
+"""Tag, pattern and possible first characters of each kind of scalar.
 Source: YAML 1.2.2, section 10.3.2."""
-
-_MAX_DEPTH = 50
-"""Deepest nesting of lists and mappings."""
-_MAX_VALUES = 300_000
-"""Largest number of values in a document."""
-_MAX_EVENTS = 3 * _MAX_VALUES
-"""Largest number of parser events: a value has at most two events, and its key has one."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -58,26 +50,20 @@ class _Dumper(yaml.SafeDumper):
     yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write no YAML aliases but every value in full, because people read resolved files."""
+        """Write every value in full, because people read resolved files."""
         return True
 
 
 for _tag, _pattern, _first in _SCALARS:
     for _class in (_Loader, _Dumper):
         _class.add_implicit_resolver(
-            f"tag:yaml.org,2002:{_tag}",
-            re.compile(f"(?:{_pattern})$"),
-            ["" if character == "\0" else character for character in _first],
+            f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first
         )
 _Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
 
 
 def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
-    """Parse one YAML document.
-
-    Args:
-        text: The document.
-        name: Its name in messages.
+    """Parse one YAML document; `name` stands for it in messages.
 
     Returns:
         The document as dictionaries with text keys, lists and scalars; and the line of each value,
@@ -86,11 +72,10 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
     Raises:
         BadInputError: If the text is not YAML, repeats a key or has an object that is not plain.
     """
+    lines: dict[KeyPath, int] = {}
     try:
         loader = _Loader(text)
-        _check_bounds(text)
-        lines: dict[KeyPath, int] = {}
-        return _value(loader, loader.get_single_node(), (), lines, ()), lines
+        return _value(loader, loader.get_single_node(), (), lines), lines
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{name}:{mark.line + 1}" if mark else name
@@ -98,39 +83,32 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
     except (yaml.YAMLError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise BadInputError(f"{name}: not readable as YAML: {reason}") from error
+    except RecursionError:
+        line = max(lines.values(), default=1)
+        raise BadInputError(f"{name}:{line}: nested too deep; fix the YAML there") from None
 
 
 def parse_value(text: str, name: str) -> Any:
-    """Parse a value of the command line.
+    """Parse a value of the command line; `name` stands for it in messages.
 
     In a scalar without quotes, ` #` starts no comment and `: ` starts no mapping.
 
-    Args:
-        text: A list or mapping in YAML's brackets, quoted text, several lines of YAML, or a scalar.
-        name: Its name in messages.
-
     Raises:
-        BadInputError: If brackets hold no YAML, or if text follows the closing bracket.
+        BadInputError: If brackets or quotes hold no YAML, or if text follows them.
     """
     stripped = text.strip()
     if "\n" in stripped:
         return parse_yaml(text, name)[0]
     quoted = len(stripped) > 1 and stripped[0] in "'\"" and stripped[0] == stripped[-1]
     if quoted or stripped.startswith(("[", "{")):
-        # A comment would swallow the outer bracket, and what follows the value adds an element.
-        with contextlib.suppress(BadInputError):
-            values = parse_yaml(f"[{stripped}, null]", name)[0]
-            if len(values) == 2:
-                return values[0]
-        parse_yaml(stripped, name)  # raises if that is no YAML either
-        raise BadInputError(f"{name}: {stripped}: text behind the value; delete or quote it")
+        # A comment would swallow the outer bracket; what follows the value adds an element.
+        value, *rest = parse_yaml(f"[{stripped}, ]", name)[0]
+        if rest:
+            raise BadInputError(f"{name}: {stripped}: text behind the value; delete or quote it")
+        return value
     loader = _Loader("")
-    tag = loader.resolve(yaml.ScalarNode, stripped, (True, False))
-    if tag != "tag:yaml.org,2002:str":
-        return loader.construct_object(yaml.ScalarNode(tag, stripped))
-    if "\0" in text:
-        raise BadInputError(f"{name}: text with the character NUL, which no path can contain")
-    return text
+    node = yaml.ScalarNode(loader.resolve(yaml.ScalarNode, stripped, (True, False)), stripped)
+    return text if node.tag.endswith(":str") else loader.construct_object(node)
 
 
 def write_yaml(value: Any) -> str:
@@ -141,37 +119,16 @@ def write_yaml(value: Any) -> str:
     )  # fmt: skip
 
 
-def _check_bounds(text: str) -> None:
-    """Refuse a document that would exhaust memory or, as libyaml's composer recurses, the stack."""
-    depth = 0
-    for count, event in enumerate(yaml.parse(text, Loader=_Loader)):
-        if count > _MAX_EVENTS:
-            raise _refuse(event, f"more than {_MAX_VALUES} values")
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > _MAX_DEPTH:
-                raise _refuse(event, f"nested more than {_MAX_DEPTH} deep")
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-
-
-def _value(
-    loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int], parents: tuple[Any, ...]
-) -> Any:
+def _value(loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int]) -> Any:
     if node is None:
         return None
     lines[path] = node.start_mark.line + 1
-    if len(lines) > _MAX_VALUES:  # nested aliases multiply values
-        raise _refuse(node, f"more than {_MAX_VALUES} values")
-    if node in parents:
-        raise _refuse(node, "a value contains itself")
+    if len(lines) > _VALUES_MAX:
+        raise _refuse(node, f"more than {_VALUES_MAX} values")
     if isinstance(node, yaml.MappingNode):
-        return _mapping(loader, node, path, lines, (*parents, node))
+        return _mapping(loader, node, path, lines)
     if isinstance(node, yaml.SequenceNode):
-        return [
-            _value(loader, item, (*path, str(index)), lines, (*parents, node))
-            for index, item in enumerate(node.value)
-        ]
+        return [_value(loader, item, (*path, str(n)), lines) for n, item in enumerate(node.value)]
     value = loader.construct_object(node)
     if value is not None and not isinstance(value, bool | int | float | str):
         raise _refuse(node, f"{node.tag} is not a plain value")
@@ -180,9 +137,7 @@ def _value(
     return value
 
 
-def _mapping(
-    loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int], parents: tuple[Any, ...]
-) -> dict[str, Any]:
+def _mapping(loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key_node, value_node in node.value:
         if not isinstance(key_node, yaml.ScalarNode):
@@ -192,7 +147,7 @@ def _mapping(
             raise _refuse(key_node, "merge keys are not supported; write the keys out")
         if key in result:
             raise _refuse(key_node, f"the key {key!r} is given twice; keep one of them")
-        result[key] = _value(loader, value_node, (*path, key), lines, parents)
+        result[key] = _value(loader, value_node, (*path, key), lines)
         lines[(*path, key)] = key_node.start_mark.line + 1
     return result
 
@@ -201,17 +156,11 @@ def _refuse(node: Any, problem: str) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
 
-@dataclass(frozen=True, slots=True)
-class Source:
-    """The place where a value is written.
+class Source(NamedTuple):
+    """The place where a value is written."""
 
-    Attributes:
-        label: The place in messages: "paper.yaml:12", "--set".
-        folder: Folder at which a relative path in the value starts.
-    """
-
-    label: str
-    folder: Path
+    label: str  # "paper.yaml:12", "--set"
+    folder: Path  # where a relative path in the value starts
 
     def absolute(self, path: str) -> Path:
         """Resolve a path that is written at this place; no path raises an exception."""
@@ -235,73 +184,51 @@ class Document:
         for key, source in self.sources.items():
             if source.label == SET_LABEL and key[: len(path)] == path:
                 return source
-        for length in range(len(path), -1, -1):
-            if path[:length] in self.sources:
-                return self.sources[path[:length]]
-        return Source("default", Path())
+        above = (path[:length] for length in range(len(path), -1, -1))
+        return next(
+            (self.sources[key] for key in above if key in self.sources), Source("default", Path())
+        )
 
     def get(self, *path: str) -> Any:
         """Return the value at `path`; None if it or one of its parents is missing."""
         value: Any = self.tree
         for key in path:
-            if not isinstance(value, dict):
-                return None
-            value = value.get(key)
+            value = child(value, key)
         return value
 
-    def set_value(self, path: KeyPath, value: Any, origin: Document | Source) -> None:
-        """Set the value at `path`; its parents must exist.
-
-        Args:
-            path: At least one key.
-            value: A scalar or a tree.
-            origin: Place of the value, or the document whose tree it is.
-        """
-        parent: Any = self.tree
-        for key in path[:-1]:
-            parent = parent[int(key)] if isinstance(parent, list) else parent[key]
+    def set_value(self, path: KeyPath, value: Any, source: Source) -> None:
+        """Set the value at `path`; its parents exist, and an index may be a list's length."""
+        parent = self.get(*path[:-1])
         if isinstance(parent, list):
-            parent[int(path[-1])] = value
+            parent[int(path[-1]) : int(path[-1]) + 1] = [value]
         else:
             parent[path[-1]] = value
-        self.forget_sources(path)
-        if isinstance(origin, Source):
-            self.sources[path] = origin
-        else:
-            self.sources |= {(*path, *key): source for key, source in origin.sources.items()}
+        below = {key: place for key, place in self.sources.items() if key[: len(path)] != path}
+        self.sources = below | {path: source}
 
-    def forget_sources(self, path: KeyPath) -> None:
-        """Delete the places of the value at `path` and of all values below it."""
-        for key in [key for key in self.sources if key[: len(path)] == path]:
-            del self.sources[key]
+
+def child(node: Any, key: str) -> Any:
+    """Return the value at a key of a mapping or an index of a list; None if there is none."""
+    if isinstance(node, dict):
+        return node.get(key)
+    if isinstance(node, list) and key.isdecimal() and int(key) < len(node):
+        return node[int(key)]
+    return None
 
 
 def read_document(path: Path, name: str) -> Document:
-    """Read a YAML file whose top level is a mapping.
-
-    Args:
-        path: The file.
-        name: Its name in messages.
+    """Read a YAML file whose top level is a mapping; `name` stands for it in messages.
 
     Raises:
-        BadInputError: If the file cannot be read, is too large, is not YAML, or has no mapping at
-            its top level.
+        BadInputError: If the file cannot be read, is too large, or is no such YAML.
     """
     try:
         text = files.read(path, SIZE_MAX).decode("utf-8")
-    except OSError as error:
-        raise BadInputError(f"{name}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise BadInputError(f"{name}: is not UTF-8 text") from error
-    except ValueError as error:
-        reason = str(error).removeprefix(f"{path}: ")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
         raise BadInputError(f"{name}: cannot be read: {reason}; name a YAML file") from error
-    # Counted in the text, because parsing and checking 100,000 waypoints takes half a minute.
-    points = text.count("position_m")
-    if points > MAX_WAYPOINTS:
-        raise BadInputError(
-            f"{name}: waypoints: {points}: at most {MAX_WAYPOINTS}; split the mission"
-        )
     tree, lines = parse_yaml(text, name)
     if not isinstance(tree, dict):
         raise BadInputError(f"{name}: must be a mapping of keys to values")

@@ -1,13 +1,8 @@
 """Load an experiment and resolve it: replace names and defaults by values.
 
-The steps:
-
-1. Read the file.
-2. Apply `--set`.
-3. Insert mission and link profile; the experiment's own values have priority.
-4. Add the missing parameters of plug-ins.
-5. Check everything against the schema, the scene and the disk. One error lists all problems, each
-   with its line.
+The steps: read the file; apply `--set`; insert mission and link profile, below the experiment's own
+values; complete the plug-ins; check everything against the schema, the scene and the disk. One
+error lists all problems, each with its line.
 
 A resolved experiment contains its mission, both directions of the link, all parameters of the
 plug-ins and all limits. Written to a file, it is an experiment file that gives the same run.
@@ -17,19 +12,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from math import sqrt
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
+from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config.document import Document, KeyPath, write_yaml
+from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, write_yaml
 from cloudrc.config.mission_check import check_mission
+from cloudrc.config.overrides import Override
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import (
-    COMMAND_AGE_MS,
+    Change,
     Cloud,
     CommandAge,
     Direction,
@@ -47,6 +44,10 @@ from cloudrc.link.traces import read_table, read_trace
 COMMAND_AGE_MAX_MS = 250.0
 """Value of guard.command_age_max_ms if neither experiment nor profile gives one [ms].
 Source: docs/reference/plant.md, "Command age"."""
+DIRECTIONS = ("uplink", "downlink")
+FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
+"""Key of a direction whose value is a path -> function that reads the file."""
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 def speed_cap(command_age_max_ms: float) -> float:
@@ -63,23 +64,28 @@ def speed_cap(command_age_max_ms: float) -> float:
 class ResolvedGuard(Guard):
     """A guard with a value for each limit."""
 
-    command_age_max_ms: CommandAge = Field(
-        COMMAND_AGE_MAX_MS, description="Age limit of a command [ms]"
-    )
-    speed_max_mps: Speed = Field(
-        speed_cap(COMMAND_AGE_MAX_MS), description="Cap on the commanded speed [m/s]"
-    )
+    command_age_max_ms: CommandAge = COMMAND_AGE_MAX_MS
+    speed_max_mps: Speed = Field(None, validate_default=True)
+
+    @field_validator("speed_max_mps", mode="before")
+    @classmethod
+    def _default_speed(cls, speed_max: Any, info: ValidationInfo) -> Any:
+        return speed_cap(_age_max(info)) if speed_max is None else speed_max
 
     @field_validator("speed_max_mps")
     @classmethod
     def _check_stopping(cls, speed_max: float, info: ValidationInfo) -> float:
-        age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
-        if speed_max > speed_cap(age_max) + 1e-6:
+        if speed_max > (cap := speed_cap(age_max := _age_max(info))) + 1e-6:
             raise ValueError(
-                f"must be at most {speed_cap(age_max):g} m/s: above it the robot does not stop in "
-                f"time with commands {age_max:g} ms old; lower it, or guard.command_age_max_ms"
+                f"must be at most {cap:g} m/s: above it the robot does not stop in time with "
+                f"commands {age_max:g} ms old; lower it, or guard.command_age_max_ms"
             )
         return speed_max
+
+
+def _age_max(info: ValidationInfo) -> float:
+    age_max: float = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
+    return age_max
 
 
 class ResolvedCloud(Cloud):
@@ -108,12 +114,6 @@ class ResolvedExperiment(Experiment):
         return self.link.downlink
 
 
-_Model = TypeVar("_Model", bound=BaseModel)
-_DIRECTIONS = ("uplink", "downlink")
-FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
-"""Key of a direction whose value is a path -> function that reads the file."""
-
-
 def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
     """Load an experiment for a flight, and import the plug-ins that it names.
 
@@ -128,7 +128,7 @@ def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedE
         BadInputError: If the experiment has problems. The message is one line, or a summary and one
             line for each problem.
     """
-    return _load_experiment(str(name), settings, overrides.resolve_plugins)
+    return _load_experiment(str(name), settings, build=True)
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
@@ -137,12 +137,12 @@ def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedE
     This differs from `load_experiment`: plug-ins are neither imported nor checked, and have only
     the parameters that the file gives. The config.yaml of a run gives all parameters.
     """
-    return _load_experiment(str(name), settings, overrides.name_plugins)
+    return _load_experiment(str(name), settings, build=False)
 
 
 def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
     """Load a link profile by name or path (relative to `folder`); raises BadInputError."""
-    return _load_profile(str(name), folder or Path())[1]
+    return check_profile(shipped.read("profile", str(name), folder or Path()), str(name))
 
 
 def check_profile(document: Document, name: str) -> Profile:
@@ -155,8 +155,7 @@ def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
 
     `config.mission_check.check_mission` checks a mission against a scene.
     """
-    document = shipped.read("mission", str(name), folder or Path())
-    return _validate(document, Mission, str(name), [])
+    return _validate(shipped.read("mission", str(name), folder or Path()), Mission, str(name))
 
 
 def dump(experiment: ResolvedExperiment) -> str:
@@ -168,69 +167,53 @@ def dump(experiment: ResolvedExperiment) -> str:
 
 
 def fingerprint(experiment: ResolvedExperiment) -> str:
-    """Compute the hash of an experiment; experiments with equal hashes give equal flights.
-
-    Returns:
-        SHA-256 of the text from `dump`, in hexadecimal digits.
-    """
+    """Return the SHA-256 of the text from `dump`; equal ones give equal flights."""
     return hashlib.sha256(dump(experiment).encode()).hexdigest()
 
 
-def _load_experiment(
-    name: str, settings: Iterable[str], plug_ins: Callable[[Document], list[Problem]]
-) -> ResolvedExperiment:
+def _load_experiment(name: str, settings: Iterable[str], *, build: bool) -> ResolvedExperiment:
     document = shipped.read("experiment", name, Path())
     changes = overrides.parse_settings(settings)
+    inner = [change for change in changes if _is_inside_name(change.path)]
     _default(document, ("name",), Path(name).stem)
-    outer = [change for change in changes if not change.inside_name]
-    if any(change.path in (("link",), ("link", "profile")) for change in outer):
+    if any(change.path in (("link",), ("link", "profile")) for change in changes):
         _remove_profile_values(document)
-    overrides.apply_overrides(document, outer)
+    overrides.apply_overrides(document, [change for change in changes if change not in inner])
     for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found = [*_inline_mission(document), *_inline_profile(document)]
-    overrides.apply_overrides(document, [change for change in changes if change.inside_name])
+    overrides.apply_overrides(document, inner)
     for key in overrides.KINDS:
-        _default(document, ("cloud", key), Experiment().cloud.model_dump()[key])
-    overrides.locate_metrics(document)
-    found += [*plug_ins(document), *_resolve_traces(document, ("link",))]
-    found += _check_files(document)
+        _default(document, ("cloud", key), getattr(Cloud(), key))
+    found += overrides.resolve_plugins(document, build=build)
+    found += _resolve_traces(document, ("link",)) + _resolve_files(document)
     experiment = _validate(document, ResolvedExperiment, name, found)
-    scene = load_scene(experiment.world.scene)
-    wrong = [
-        Problem(("mission", *problem.path), problem.value, problem.reason)
-        for problem in check_mission(experiment.mission, scene)
-    ]
-    problems.raise_problems(document, wrong, name)
+    wrong = check_mission(experiment.mission, load_scene(experiment.world.scene))
+    below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
+    problems.raise_problems(document, below, name)
     return experiment
 
 
-def _load_profile(name: str, folder: Path) -> tuple[Document, Profile]:
-    document = shipped.read("profile", name, folder)
-    return document, check_profile(document, name)
+def _is_inside_name(path: KeyPath) -> bool:
+    """Whether a key is inside the mission or the profile, which a file may give by name."""
+    is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
+    return is_direction or (path[0] == "mission" and len(path) > 1)
 
 
-def _validate(document: Document, model: type[_Model], name: str, found: list[Problem]) -> _Model:
-    """Check a document against its model.
-
-    Raises:
-        BadInputError: If `found` contains problems or the check finds more; lists all of them.
-    """
-    result = None
+def _validate(
+    document: Document, model: type[_Model], name: str, found: Sequence[Problem] = ()
+) -> _Model:
+    """Check a document against its model, and raise an error if it or `found` has problems."""
+    known = {problem.path for problem in found}
     # Messages describe what a file may contain: in a file, a mission may be a name, too.
     file_model = Experiment if model is ResolvedExperiment else model
     try:
         # In JSON mode pydantic accepts lists for tuples and is still strict.
         result = model.model_validate_json(json.dumps(document.tree))
     except ValidationError as error:
-        known = {problem.path for problem in found}
-        found = found + [
-            problem
-            for problem in problems.from_pydantic(error, file_model)
-            if problem.path not in known
-        ]
+        more = problems.from_pydantic(error, file_model)
+        found = [*found, *(problem for problem in more if problem.path not in known)]
     problems.raise_problems(document, found, name)
-    assert result is not None
     return result
 
 
@@ -245,14 +228,15 @@ def _inline_mission(document: Document) -> list[Problem]:
     name = document.tree["mission"]
     if not isinstance(name, str):
         return []
-    source = document.source(("mission",))
+    folder = document.source(("mission",)).folder
     document.tree["mission"] = {}
     try:
-        mission = shipped.read("mission", name, source.folder)
-        _validate(mission, Mission, name, [])
+        file = shipped.read("mission", name, folder)
+        _validate(file, Mission, name)
     except BadInputError as error:
         return [Problem(("mission",), "", str(error))]
-    document.set_value(("mission",), mission.tree, mission)
+    document.tree["mission"] = file.tree
+    document.sources |= {("mission", *key): source for key, source in file.sources.items()}
     return []
 
 
@@ -260,96 +244,166 @@ def _inline_profile(document: Document) -> list[Problem]:
     """Insert the profile's values where the experiment gives none for a direction."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
-    given = {key: document.get("link", key) for key in _DIRECTIONS}
-    if not isinstance(name, str) or all(map(overrides.is_spelled_out, given.values())):
+    if not isinstance(name, str) or _has_all_values(document):
         return []
     source = document.source(("link", "profile"))
     try:
-        file, profile = _load_profile(name, source.folder)
+        file = shipped.read("profile", name, source.folder)
+        profile = _validate(file, Profile, name)
     except BadInputError as error:
         return [Problem(("link", "profile"), "", str(error))]
     if shipped.is_path(name):
         document.set_value(("link", "profile"), str(source.absolute(name)), source)
-    for key in _DIRECTIONS:
-        if isinstance(given[key], dict | None):
-            _fill_from(document, ("link", key), file, key)
+    for way in DIRECTIONS:
+        own = document.get("link", way)
+        if isinstance(own, dict | None):
+            document.tree["link"][way] = (file.get(way) or {}) | (own or {})
+            inserted = {
+                ("link", *key): place
+                for key, place in file.sources.items()
+                if key[:1] == (way,) and not (own and key[1:2] and key[1] in own)
+            }
+            document.sources = inserted | document.sources
     age_max = profile.command_age_max_ms or COMMAND_AGE_MAX_MS
     _default(document, ("guard", "command_age_max_ms"), age_max)
-    _default(document, ("guard", "speed_max_mps"), speed_cap(_age_max(document)))
     return []
 
 
-def _age_max(document: Document) -> float:
-    """Return the guard's age limit [ms], or the default if a later check will refuse the value."""
-    age_max = document.get("guard", "command_age_max_ms")
-    least, largest = COMMAND_AGE_MS
-    usable = type(age_max) in (int, float) and least <= age_max <= largest  # excludes true
-    return age_max if usable else COMMAND_AGE_MAX_MS
-
-
-def _fill_from(document: Document, path: KeyPath, file: Document, key: str) -> None:
-    """Fill missing keys at `path` from `key` of another file."""
-    _default(document, path, {})
-    given = document.get(*path)
-    for name, value in (file.get(key) or {}).items():
-        if name not in given:
-            given[name] = value
-            document.sources |= {
-                (*path, *source_path[1:]): source
-                for source_path, source in file.sources.items()
-                if source_path[:2] == (key, name)
-            }
+def _has_all_values(document: Document) -> bool:
+    """Whether both directions have every key, as in a resolved file; old files have no `loop`."""
+    wanted = Direction.model_fields.keys() - {"loop"}
+    given = [document.get("link", way) for way in DIRECTIONS]
+    return all(isinstance(one, dict) and one.keys() >= wanted for one in given)
 
 
 def _remove_profile_values(document: Document) -> None:
     """Remove the profile's values from a resolved file, before another profile replaces it."""
-    link, guard = document.get("link"), document.get("guard")
-    if not isinstance(link, dict):
+    if not _has_all_values(document):
         return
-    if not all(overrides.is_spelled_out(link.get(key)) for key in _DIRECTIONS):
-        return
-    for key in _DIRECTIONS:
-        del link[key]
+    for way in DIRECTIONS:
+        del document.tree["link"][way]
     try:
-        age_max = load_profile(str(link.get("profile"))).command_age_max_ms
+        age_max = load_profile(str(document.get("link", "profile"))).command_age_max_ms
     except BadInputError:
         age_max = None  # the profile's file no longer exists
     age_max = age_max or COMMAND_AGE_MAX_MS
-    if isinstance(guard, dict):
-        for key, implied in (
-            ("command_age_max_ms", age_max),
-            ("speed_max_mps", speed_cap(age_max)),
-        ):
-            if guard.get(key) == implied:
-                del guard[key]
+    implied = {"command_age_max_ms": age_max, "speed_max_mps": speed_cap(age_max)}
+    for key, value in implied.items():
+        if document.get("guard", key) == value:
+            del document.tree["guard"][key]
 
 
 def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
     """Make the paths of traces and tables absolute; check that the files can be read."""
     found = []
-    for path in ((*above, key, name) for key in _DIRECTIONS for name in FILE_READERS):
-        given = document.get(*path)
-        if not isinstance(given, str):
-            continue
-        source = document.source(path)
-        absolute = source.absolute(given)
-        document.set_value(path, str(absolute), source)
-        try:
-            FILE_READERS[path[-1]](absolute)
-        except BadInputError as error:
-            found.append(Problem(path, "", str(error)))
+    for path in ((*above, way, key) for way in DIRECTIONS for key in FILE_READERS):
+        given, source = document.get(*path), document.source(path)
+        if isinstance(given, str):
+            absolute = source.absolute(given)
+            document.set_value(path, str(absolute), source)
+            try:
+                FILE_READERS[path[-1]](absolute)
+            except BadInputError as error:
+                found.append(Problem(path, "", str(error)))
     return found
 
 
-def _check_files(document: Document) -> list[Problem]:
-    """Check that robot and scene are shipped or exist; make their paths absolute."""
+def _resolve_files(document: Document) -> list[Problem]:
+    """Make the paths of robot, scene and the user's metrics absolute; metrics are not imported."""
     found = []
     for key in ("robot", "scene"):
         name = document.get("world", key)
         if isinstance(name, str):
             try:
-                source = document.source(("world", key))
-                document.tree["world"][key] = shipped.model_path(key, name, source.folder)
+                folder = document.source(("world", key)).folder
+                document.tree["world"][key] = shipped.model_path(key, name, folder)
             except BadInputError as error:
                 found.append(Problem(("world", key), "", str(error)))
+    names = document.get("report", "metrics")
+    if isinstance(names, str):  # a single one
+        names = document.tree["report"]["metrics"] = [names]
+    for index, name in enumerate(names if isinstance(names, list) else ()):
+        if isinstance(name, str) and plugins.is_path(name):
+            source = document.source(("report", "metrics", str(index)))
+            names[index] = str(source.absolute(name))
     return found
+
+
+CHANGEABLE_KEYS = Change.model_fields.keys() - {"at_s"}
+"""Keys of a direction that an entry of `changes` may set."""
+TIME_LINE_KEYS = ("changes", "trace", "blackouts")
+"""Keys of a direction that make its conditions depend on time."""
+_HERE = "link set"
+_EXAMPLE = "for example downlink.delay_ms=120, or --profile handover"
+
+
+class Edit(NamedTuple):
+    """A profile that `cloudrc link set` has edited."""
+
+    values: dict[str, Any]  # as in a profile file, without defaults; paths are absolute
+    cause: str  # the request in words
+    restart: bool  # whether the time line starts again when the profile takes effect
+    notes: list[str]  # sentences for the user about side effects
+
+
+def edit_profile(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
+    """Change a link profile.
+
+    A value that the user sets stays in force: it is removed from the time line (changes, trace).
+    The rest of the time line continues.
+
+    Args:
+        before: The present profile.
+        profile: Name or path of a profile that replaces it; None to edit the present one.
+        settings: Values to set, such as "downlink.delay_ms=120".
+
+    Raises:
+        BadInputError: If the request is empty or not valid.
+    """
+    if profile is None and not settings:
+        raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")
+    document, notes, restart = before, list[str](), profile is not None
+    if profile is not None:
+        new = load_profile(profile)
+        document = shipped.read("profile", profile, Path())
+        document.tree = new.model_dump(mode="json", exclude_defaults=True)
+        if new.command_age_max_ms is not None:
+            notes.append(
+                f"profile {profile} needs guard.command_age_max_ms={new.command_age_max_ms:g}; the "
+                "guard keeps the limit that it started with, so the robot may hold"
+            )
+    changes = [_without_prefix(change) for change in overrides.parse_settings(settings)]
+    for path, _ in changes:
+        restart |= path[1] in TIME_LINE_KEYS
+        notes += _drop_from_time_line(document, *path[:2])
+    overrides.apply_overrides(document, changes)
+    document.sources = {
+        path: Source(_HERE, source.folder) if source.label == SET_LABEL else source
+        for path, source in document.sources.items()
+    }
+    values = check_profile(document, _HERE).model_dump(mode="json", exclude_defaults=True)
+    words = [f"profile {profile}"] if profile else []
+    return Edit(values, ", ".join([*words, *settings]), restart, notes)
+
+
+def _without_prefix(change: Override) -> Override:
+    """Remove a leading "link."; refuse a key that belongs to no direction."""
+    path = change.path[1:] if change.path[0] == "link" else change.path
+    if len(path) < 2 or path[0] not in DIRECTIONS:
+        raise BadInputError(f"{'.'.join(change.path)}: set a key of uplink or downlink, {_EXAMPLE}")
+    return Override(path, change.value)
+
+
+def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:
+    """Remove the key that the user sets from a direction's time line; return notes about it."""
+    direction = document.get(way)
+    if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:
+        return []
+    notes = []
+    if [entry for entry in direction.get("changes") or () if entry.pop(key, None) is not None]:
+        notes.append(f"the time line of the {way} no longer changes {key}")
+    if key == "delay_ms" and direction.pop("trace", None) is not None:
+        notes.append(f"the {way} no longer follows its trace")
+    elif key == "loss" and direction.get("trace"):
+        notes.append(f"if the trace of the {way} has a column loss, it still sets the loss")
+    return notes

@@ -7,11 +7,12 @@ The board is not checked: the paper's last waypoint is behind the board.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
-from numpy.typing import NDArray
 
 from cloudrc.config.problems import Problem
-from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Steps
+from cloudrc.config.schema import Mission, Steps
 from cloudrc.geometry import fence
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
@@ -22,127 +23,100 @@ from cloudrc.geometry.placement import (
 )
 from cloudrc.geometry.robot import Array
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import Vector
 
 _YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"
 _REPORTED = 20
 """Largest number of problems of one kind that are listed."""
+_SPANS = zip("xyz", fence.INNER_LOW, fence.INNER_HIGH, strict=True)
+_INNER = ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in _SPANS) + " [m]"
+"""Where the guard lets the robot fly, in words."""
 
 
 def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
-    """List the problems of a mission in a scene.
-
-    Args:
-        mission: Waypoints or steps.
-        scene: The scene to fly in.
-
-    Returns:
-        Problems with paths relative to the mission; empty if the mission can be flown.
-    """
-    count = len(mission.waypoints)
+    """List the problems of a mission in a scene, with paths relative to the mission."""
     if mission.steps is not None:
-        if count:
+        if mission.waypoints:
             reason = "a mission has waypoints or steps, not both; delete one"
             return [Problem(("steps",), "", reason)]
-        return _check_steps(mission.steps, scene)
-    if count == 0:
+        reason = _check_steps(mission.steps, scene)
+        return [Problem(("steps",), "", reason)] if reason else []
+    if not mission.waypoints:
         return [Problem(("waypoints",), "", "none given; give at least one, or steps")]
-    if count > MAX_WAYPOINTS:
-        reason = f"must be at most {MAX_WAYPOINTS}; split the mission"
-        return [Problem(("waypoints",), str(count), reason)]
-    return _check_waypoints(mission, scene)
+    return list(_check_waypoints(mission, scene))
 
 
-def _check_waypoints(mission: Mission, scene: Scene) -> list[Problem]:
+def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
     # A waypoint counts as reached within its tolerance; half of it is left for the flight's errors.
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
-    outside = outside_fence(positions, slack) | ~_in_fence(positions)
+    in_fence = np.all((positions >= fence.LOW) & (positions <= fence.HIGH), axis=1)
+    outside = outside_fence(positions, slack) | ~in_fence
     hit = find_overlapped_pipe(scene, positions, yaws)
     wrong = np.flatnonzero(outside | (hit >= 0))
-    problems = [
-        Problem(("waypoints", str(index), "yaw_deg"), f"{mission.waypoints[index].yaw_deg:g}", _YAW)
-        for index in np.flatnonzero(yaws)[:_REPORTED]
-    ]
+    for index in np.flatnonzero(yaws)[:_REPORTED]:
+        path = ("waypoints", str(index), "yaw_deg")
+        yield Problem(path, f"{mission.waypoints[index].yaw_deg:g}", _YAW)
+    start = scene.spawn if mission.start == "spawn" else None
     for index in wrong[:_REPORTED]:
-        point = mission.waypoints[index].position_m
         if outside[index]:
-            reason = f"beyond the fence, or nearer than the guard flies: {_fence_in_words()}"
+            reason = f"beyond the fence, or nearer than the guard flies: {_INNER}"
         else:
             name = scene.pipes[hit[index]].name
             reason = f"the robot would be within {CLEARANCE_MIN:g} m of the wall of {name}"
-        before = mission.waypoints[index - 1].position_m if index else None
-        if index == 0 and mission.start == "spawn":
-            before = scene.spawn
-        before = None if index - 1 in wrong else before
-        near = find_nearest_legal(scene, point, float(yaws[index]), before)
+        before = mission.waypoints[index - 1].position_m if index else start
+        if index - 1 in wrong:
+            before = None
+        near = find_nearest_legal(
+            scene, mission.waypoints[index].position_m, float(yaws[index]), before
+        )
         if near is not None:
-            reason += f"; nearest legal point found: {_point(near)}"
-        path = ("waypoints", str(index), "position_m")
-        problems.append(Problem(path, _point(point), reason))
+            reason += f"; nearest legal point found: {_point(np.array(near))}"
+        yield _at_point(index, positions[index], reason)
     if len(wrong) > _REPORTED:
         rest = f"{len(wrong) - _REPORTED} more waypoints are beyond the fence or at a pipe's wall"
-        problems.append(Problem(("waypoints",), "", rest))
-    if len(wrong):
-        return problems
-    starts = [scene.spawn] if mission.start == "spawn" else [mission.waypoints[0].position_m]
-    return problems + _check_ways(np.concatenate([starts, positions]), scene)
+        yield Problem(("waypoints",), "", rest)
+    if not len(wrong):
+        yield from _check_ways(
+            np.vstack([positions[0] if start is None else start, positions]), scene
+        )
 
 
-def _in_fence(positions: Array) -> NDArray[np.bool_]:
-    inside: NDArray[np.bool_] = np.all((positions >= fence.LOW) & (positions <= fence.HIGH), axis=1)
-    return inside
-
-
-def _check_ways(positions: Array, scene: Scene) -> list[Problem]:
-    """List the straight ways that lead into a wall.
-
-    `positions` are the start and the waypoints [m], world frame, shape (n, 3).
-    """
+def _check_ways(positions: Array, scene: Scene) -> Iterator[Problem]:
+    """List the straight ways between positions [m], shape (n, 3), that lead into a wall."""
     through = find_crossed_pipe(scene, positions[:-1], positions[1:])
-    problems = []
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
-        x, y, z = positions[index + 1].tolist()
         name = scene.pipes[through[index]].name
-        start = f"waypoint {index - 1}" if index else "the spawn"
+        before = f"waypoint {index - 1}" if index else "the spawn"
         reason = (
-            f"the straight way there from {start} leads through the wall of {name}, or within "
+            f"the straight way there from {before} leads through the wall of {name}, or within "
             f"{CLEARANCE_MIN:g} m of it; add waypoints in between that lead around it or through "
             "the pipe"
         )
-        path = ("waypoints", str(index), "position_m")
-        problems.append(Problem(path, _point((x, y, z)), reason))
-    return problems
+        yield _at_point(index, positions[index + 1], reason)
 
 
-def _check_steps(steps: Steps, scene: Scene) -> list[Problem]:
-    centre, reach = np.array(steps.centre_m), np.array(steps.range_m)
+def _check_steps(steps: Steps, scene: Scene) -> str:
+    """Say what is wrong with the box of setpoints; "" if nothing is."""
     axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     with np.errstate(over="ignore"):  # infinity is beyond the fence
-        positions = centre + box * reach
+        positions = np.array(steps.centre_m) + box * np.array(steps.range_m)
     if outside_fence(positions).any():
-        reason = (
+        return (
             "steps reach beyond the fence, or nearer to it than the guard flies: "
-            f"{_fence_in_words()}; choose a smaller range_m"
+            f"{_INNER}; choose a smaller range_m"
         )
-        return [Problem(("steps",), "", reason)]
-    hit = find_overlapped_pipe(scene, positions, np.zeros(len(positions)))
-    if (hit >= 0).any():
-        name = scene.pipes[hit.max()].name
-        reason = f"steps can end in the wall of {name}; choose another centre_m, range_m or scene"
-        return [Problem(("steps",), "", reason)]
-    return []
+    hit = find_overlapped_pipe(scene, positions, np.zeros(len(positions))).max()
+    if hit >= 0:
+        name = scene.pipes[hit].name
+        return f"steps can end in the wall of {name}; choose another centre_m, range_m or scene"
+    return ""
 
 
-def _fence_in_words() -> str:
-    spans = (
-        f"{name} {low:g} to {high:g}"
-        for name, low, high in zip("xyz", fence.INNER_LOW, fence.INNER_HIGH, strict=True)
-    )
-    return f"{', '.join(spans)} [m]"
+def _at_point(index: int, position: Array, reason: str) -> Problem:
+    return Problem(("waypoints", str(index), "position_m"), _point(position), reason)
 
 
-def _point(position: Vector) -> str:
+def _point(position: Array) -> str:
     return f"[{', '.join(f'{value:g}' for value in position)}]"

@@ -15,44 +15,30 @@ from __future__ import annotations
 import copy
 import inspect
 import json
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from cloudrc import plugins
 from cloudrc.config import problems
-from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, parse_value
+from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, child, parse_value
 from cloudrc.config.problems import Problem
-from cloudrc.config.schema import Direction, Experiment, PlugIn
+from cloudrc.config.schema import Experiment, PlugIn
 from cloudrc.errors import BadInputError
 
-_PLUGINS = {("cloud", key) for key in ("estimator", "predictor", "controller")}
-_DIRECTIONS = (("link", "uplink"), ("link", "downlink"))
-_DEFAULTS = Experiment().model_dump(mode="json")
 KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
 """Key under `cloud` -> kind of plug-in."""
+_DEFAULTS = Experiment().model_dump(mode="json")
 
 
-@dataclass(frozen=True, slots=True)
-class Override:
-    """One value to set.
-
-    Attributes:
-        path: Keys down to the value.
-        value: The value as parsed from YAML.
-    """
+class Override(NamedTuple):
+    """One value to set, as parsed from YAML, and the keys down to it."""
 
     path: KeyPath
     value: Any
-
-    @property
-    def inside_name(self) -> bool:
-        """Whether the key is inside the mission or the profile, which a file may give by name."""
-        inside_mission = self.path[0] == "mission" and len(self.path) > 1
-        return inside_mission or (self.path[:2] in _DIRECTIONS and len(self.path) > 2)
 
 
 def parse_settings(texts: Iterable[str]) -> list[Override]:
@@ -62,7 +48,7 @@ def parse_settings(texts: Iterable[str]) -> list[Override]:
         BadInputError: If a text has no key or no `=`, if a key is set twice, or if a value is not
             YAML.
     """
-    result: list[Override] = []
+    found: dict[KeyPath, Any] = {}
     for text in texts:
         key, equals, value = text.partition("=")
         path = tuple(part.strip() for part in key.split("."))
@@ -70,138 +56,88 @@ def parse_settings(texts: Iterable[str]) -> list[Override]:
             raise BadInputError(
                 f"{SET_LABEL} {text}: must be key=value; for example cloud.predictor=last_sample"
             )
-        if any(override.path == path for override in result):
+        if path in found:
             raise BadInputError(f"{SET_LABEL} {key}: is set twice; keep one of them")
-        result.append(Override(path, parse_value(value, f"{SET_LABEL} {key}")))
-    return sorted(result, key=lambda override: len(override.path))
+        found[path] = parse_value(value, f"{SET_LABEL} {key}")
+    return [Override(path, found[path]) for path in sorted(found, key=len)]
 
 
 def apply_overrides(document: Document, overrides: Iterable[Override]) -> None:
-    """Set values in a document.
-
-    Args:
-        document: An experiment; changed in place.
-        overrides: The values to set; relative paths in these values start at the working folder.
+    """Set values in a document; relative paths in them start at the working folder.
 
     Raises:
         BadInputError: If an index is not a number or beyond the end of its list.
     """
-    for override in overrides:
-        _make_parents(document, override.path)
-        value = copy.deepcopy(override.value)
-        document.set_value(override.path, value, Source(SET_LABEL, Path.cwd()))
+    source = Source(SET_LABEL, Path.cwd())
+    for path, value in overrides:
+        default: Any = _DEFAULTS
+        for depth, (key, below) in enumerate(pairwise(path), start=1):
+            _check_index(document, path[:depth])
+            default = child(default, key)
+            present = document.get(*path[:depth])
+            node = copy.deepcopy(default) if present is None else present
+            if path[0] == "cloud" and path[1] in KINDS and depth == 2 and isinstance(node, str):
+                node = {"name": node}  # keeps the place of the name
+                document.tree["cloud"][key] = node
+            elif not isinstance(node, dict | list):
+                document.set_value(path[:depth], [] if below == "0" else {}, source)
+            elif present is None:
+                document.set_value(path[:depth], node, document.source(path[:depth]))
+        _check_index(document, path)
+        document.set_value(path, value, source)
 
 
-def is_spelled_out(direction: Any) -> bool:
-    """Whether a direction has every key, as in a resolved file; old files have no `loop`."""
-    wanted = Direction.model_fields.keys() - {"loop"}
-    return isinstance(direction, dict) and direction.keys() >= wanted
-
-
-def _make_parents(document: Document, path: KeyPath) -> None:
-    """Create missing containers above `path`, with the schema's defaults if it has any."""
-    node: Any = document.tree
-    default: Any = _DEFAULTS
-    for depth, key in enumerate(path):
-        _check_index(node, path, depth)
-        default = _child(default, key)
-        if depth == len(path) - 1:
-            break
-        child = _child(node, key)
-        child = copy.deepcopy(default) if child is None else child
-        if path[: depth + 1] in _PLUGINS and isinstance(child, str):
-            child = {"name": child}
-        if not isinstance(child, dict | list):
-            child = [] if path[depth + 1] == "0" else {}
-            document.forget_sources(path[: depth + 1])
-            document.sources[path[: depth + 1]] = Source(SET_LABEL, Path.cwd())
-        node = _put(node, key, child)
-
-
-def _check_index(node: Any, path: KeyPath, depth: int) -> None:
-    key = path[depth]
-    if not isinstance(node, list):
-        return
-    if not key.isdecimal() or int(key) > len(node):
-        parent = ".".join(path[:depth])
+def _check_index(document: Document, path: KeyPath) -> None:
+    node, key = document.get(*path[:-1]), path[-1]
+    if isinstance(node, list) and not (key.isdecimal() and int(key) <= len(node)):
+        parent = ".".join(path[:-1])
         entries = f"entries 0 to {len(node) - 1}" if node else "no entries"
         raise BadInputError(
             f"{SET_LABEL}: {parent}.{key}: {parent} is a list with {entries}; "
             f"use one of these, or {len(node)} to append"
         )
-    if int(key) == len(node):
-        node.append(None)
 
 
-def _child(node: Any, key: str) -> Any:
-    if isinstance(node, dict):
-        return node.get(key)
-    if isinstance(node, list) and key.isdecimal() and int(key) < len(node):
-        return node[int(key)]
-    return None
-
-
-def _put(node: Any, key: str, child: Any) -> Any:
-    node[int(key) if isinstance(node, list) else key] = child
-    return child
-
-
-def resolve_plugins(document: Document) -> list[Problem]:
-    """Replace each plug-in of an experiment by a mapping with its name and all its parameters.
+def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
+    """Replace each plug-in of an experiment by a mapping with its name and its parameters.
 
     Args:
         document: An experiment; changed in place.
+        build: True: check all parameters, complete them and build the plug-in once. False: import
+            nothing, because file and plug-ins may come from somebody else.
 
     Returns:
         Problems of names and parameters; the schema finds values of a wrong type.
     """
     found: list[Problem] = []
-    for key, name, parameters in _choices(document):
-        kind, path = KINDS[key], ("cloud", key)
+    for key, kind in KINDS.items():
+        path = ("cloud", key)
+        choice = document.get(*path)
+        given = {"name": choice} if isinstance(choice, str) else choice
+        if not isinstance(given, dict) or not isinstance(given.get("name"), str):
+            continue
+        name, parameters = given["name"], {k: v for k, v in given.items() if k != "name"}
+        if plugins.is_path(name):
+            name = str(document.source((*path, "name")).absolute(name))
         try:
-            complete = _complete(kind, name, parameters)
+            if build:
+                checked = _check(kind, name, parameters)
+                plugins.load(kind, name, **_values(checked))
+                parameters = checked.model_dump(mode="json")
         except ValidationError as error:
             found += problems.from_pydantic(error, parameter_model(kind, name), path)
         except BadInputError as error:
             found.append(Problem(path, "", str(error)))
         else:
             # Not by `set_value`: the given parameters keep their places in the file.
-            document.tree["cloud"][key] = {"name": name, **complete}
+            document.tree["cloud"][key] = {"name": name, **parameters}
     return found
-
-
-def name_plugins(document: Document) -> list[Problem]:
-    """Replace each plug-in by a mapping with its name and the given parameters.
-
-    Unlike `resolve_plugins`, this imports nothing: file and plug-ins may come from somebody else.
-    """
-    for key, name, parameters in _choices(document):
-        document.tree["cloud"][key] = {"name": name, **parameters}
-    return []
-
-
-def locate_metrics(document: Document) -> None:
-    """Make the paths of the user's metrics absolute, and turn a single name into a list.
-
-    No metric is imported.
-    """
-    names = document.get("report", "metrics")
-    names = [names] if isinstance(names, str) else names
-    if not isinstance(names, list):
-        return  # missing, or refused by the schema later
-    document.tree["report"]["metrics"] = names
-    for index, name in enumerate(names):
-        if isinstance(name, str) and plugins.is_path(name):
-            source = document.source(("report", "metrics", str(index)))
-            names[index] = str(source.absolute(name))
 
 
 def build_plugin(kind: str, choice: PlugIn) -> Any:
     """Build a plug-in of a resolved experiment; convert parameters to the types in its `build`.
 
-    Args:
-        kind: One of `cloudrc.plugins.PACKAGES`.
-        choice: Name and parameters from `load_experiment`.
+    `kind` is a key of `cloudrc.plugins.PACKAGES`.
     """
     checked = _check(kind, choice.name, choice.model_extra or {})
     return plugins.load(kind, choice.name, **_values(checked))
@@ -209,41 +145,21 @@ def build_plugin(kind: str, choice: PlugIn) -> Any:
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
     """Create a model of a plug-in's parameters from the signature of its `build`."""
-    fields: dict[str, Any] = {}
-    for parameter in plugins.signature(kind, name).parameters.values():
-        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-            continue
-        empty = inspect.Parameter.empty
-        annotation = Any if parameter.annotation is empty else parameter.annotation
-        default = Field() if parameter.default is empty else Field(parameter.default)
-        fields[parameter.name] = (annotation, default)
+    empty = inspect.Parameter.empty
+    fields: dict[str, Any] = {
+        name: (
+            Any if parameter.annotation is empty else parameter.annotation,
+            Field() if parameter.default is empty else Field(parameter.default),
+        )
+        for name, parameter in plugins.signature(kind, name).parameters.items()
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+    }
     config = ConfigDict(
         extra="forbid", strict=True, arbitrary_types_allowed=True, allow_inf_nan=False,
         protected_namespaces=(),
     )  # fmt: skip
     model: type[BaseModel] = create_model("parameters", __config__=config, **fields)
     return model
-
-
-def _choices(document: Document) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield key, name and parameters of each plug-in; make a name that is a path absolute."""
-    for key in KINDS:
-        path = ("cloud", key)
-        choice = document.get(*path)
-        given = {"name": choice} if isinstance(choice, str) else choice
-        if not isinstance(given, dict) or not isinstance(given.get("name"), str):
-            continue
-        name = str(given["name"])
-        if plugins.is_path(name):
-            name = str(document.source((*path, "name")).absolute(name))
-        yield key, name, {key: value for key, value in given.items() if key != "name"}
-
-
-def _complete(kind: str, name: str, parameters: dict[str, Any]) -> dict[str, Any]:
-    checked = _check(kind, name, parameters)
-    # Built here once, so that an error of build() is listed with the file's other problems.
-    plugins.load(kind, name, **_values(checked))
-    return checked.model_dump(mode="json")
 
 
 def _check(kind: str, name: str, parameters: dict[str, Any]) -> BaseModel:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import NoneType
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
@@ -28,6 +27,8 @@ _TYPES = {
     NoneType: "null",
 }
 _SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
+_LISTED = 50
+"""Largest number of problems that are listed."""
 
 
 def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:
@@ -35,7 +36,7 @@ def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPat
     for key, info in model.model_fields.items():
         inner = list(_models(info.annotation))
         many = ("0",) if _is_list(info.annotation) else ()
-        if not inner or str in _types(info.annotation) or float in _types(info.annotation):
+        if not inner or {str, float} & {*_types(info.annotation)}:
             yield (*above, key), info
         for section in inner:
             yield from leaves(section, (*above, key, *many))
@@ -43,16 +44,12 @@ def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPat
 
 def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
     """Find the field of the last key of `path`; None if the schema has no such field."""
-    field = None
-    models = [model]
+    field, models = None, [model]
     for key in path:
-        if key.isdecimal():
-            continue
-        found = [inner.model_fields[key] for inner in models if key in inner.model_fields]
-        if not found:
-            return None
-        field = found[0]
-        models = [inner for info in found for inner in _models(info.annotation)]
+        if not key.isdecimal():
+            found = [inner.model_fields[key] for inner in models if key in inner.model_fields]
+            field = found[0] if found else None
+            models = [inner for info in found for inner in _models(info.annotation)]
     return field
 
 
@@ -61,53 +58,40 @@ def expectation(model: type[BaseModel], path: KeyPath) -> str:
     field = field_at(model, path)
     if field is None:
         return "is not valid"
-    inside_list = path[-1].isdecimal()
-    if get_origin(field.annotation) is Literal:
-        return f"must be one of {', '.join(map(repr, get_args(field.annotation)))}"
-    words = [_TYPES[kind] for kind in dict.fromkeys(_types(field.annotation)) if kind in _TYPES]
+    kind = field.annotation
+    if get_origin(kind) is Literal:
+        return f"must be one of {', '.join(map(repr, get_args(kind)))}"
+    words = [_TYPES[plain] for plain in dict.fromkeys(_types(kind)) if plain in _TYPES]
     if words and words[0].endswith("number"):
         words[0] = " ".join([words[0], " and ".join(dict.fromkeys(_limits(field)))]).strip()
-    if any(_models(field.annotation)):
+    if any(_models(kind)):
         words.append("a mapping of keys")
-    if _is_list(field.annotation) and not inside_list:
-        words = [_describe_list(field.annotation)]
+    if _is_list(kind) and not path[-1].isdecimal():
+        fixed = get_origin(kind) is tuple and Ellipsis not in get_args(kind)
+        size, numbers = len(get_args(kind)) if fixed else "", float in _types(kind)
+        words = [" ".join(f"a list{' of' * (fixed or numbers)} {size}".split())]
+        words[0] += " numbers" * numbers + " or null" * (not fixed and NoneType in get_args(kind))
     return " ".join(["must be", " or ".join(words), _unit(field)]).strip()
 
 
-def nearest_key(model: type[BaseModel], path: KeyPath) -> str:
+def _nearest_key(model: type[BaseModel], path: KeyPath) -> str:
     """Suggest a known key in place of an unknown key."""
     *above, key = path
-    siblings = _keys_at(model, tuple(above))
-    near = _near(key, siblings)
-    if near:
-        field = field_at(model, (*above, near))
-        unit = _unit(field) if field else ""
-        return f"did you mean {near}{' ' if unit else ''}{unit}?"
+    field = field_at(model, tuple(above))
+    models = _models(field.annotation) if field else [] if above else [model]
+    siblings = {name: info for inner in models for name, info in inner.model_fields.items()}
+    if near := _near(key, list(siblings)):
+        return f"did you mean {near} {_unit(siblings[near])}".strip() + "?"
     everywhere = {leaf[-1]: ".".join(leaf) for leaf, _ in reversed(list(leaves(model)))}
-    near = _near(key, list(everywhere))
-    if near:
+    if near := _near(key, list(everywhere)):
         return f"did you mean {everywhere[near]}?"
     return f"known here: {', '.join(siblings)}" if siblings else "no keys are known here"
-
-
-def nearest_choice(detail: ErrorDetails) -> str:
-    """List the allowed words, and suggest the allowed word nearest to a wrong word."""
-    expected = detail["ctx"]["expected"]
-    near = _near(str(detail["input"]), re.findall(r"'([^']*)'", expected))
-    return f"must be {expected}" + (f"; did you mean {near}?" if near else "")
 
 
 def _near(key: str, known: list[str]) -> str | None:
     # `delay` is nearest to `delay_ms`: a forgotten unit is more likely than a typo.
     without_unit = [name for name in known if name.startswith(f"{key}_")]
-    close = difflib.get_close_matches(key, known, n=1)
-    return next(iter(without_unit or close), None)
-
-
-def _keys_at(model: type[BaseModel], path: KeyPath) -> list[str]:
-    field = field_at(model, path)
-    models = [model] if not path else list(_models(field.annotation)) if field else []
-    return [key for inner in models for key in inner.model_fields]
+    return next(iter(without_unit or difflib.get_close_matches(key, known, n=1)), None)
 
 
 def _types(annotation: Any) -> Iterator[Any]:
@@ -130,36 +114,20 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _is_list(annotation: Any) -> bool:
-    return any(
-        get_origin(kind) in (tuple, list, Sequence) for kind in (annotation, *get_args(annotation))
-    )
-
-
-def _describe_list(annotation: Any) -> str:
-    size = len(get_args(annotation)) if get_origin(annotation) is tuple else 0
-    numbers = " numbers" if float in _types(annotation) else ""
-    fixed = size and Ellipsis not in get_args(annotation)
-    null = " or null" if NoneType in get_args(annotation) else ""
-    return (
-        f"a list of {size}{numbers}"
-        if fixed
-        else f"a list{' of' if numbers else ''}{numbers}{null}"
-    )
+    kinds = (annotation, *get_args(annotation))
+    return any(get_origin(kind) in (tuple, list, Sequence) for kind in kinds)
 
 
 def _limits(part: Any) -> Iterator[str]:
     """List the limits in a field or an annotation, as ">= 0"."""
     if isinstance(part, FieldInfo):
-        yield from (text for item in part.metadata for text in _limits(item))
-        yield from _limits(part.annotation)
-    elif type(part) in _SIGNS:
-        limit = next(
-            getattr(part, name) for name in ("ge", "gt", "le", "lt") if hasattr(part, name)
-        )
-        yield f"{_SIGNS[type(part)]} {limit}"
+        inner = (*part.metadata, part.annotation)
     else:
-        for item in (*getattr(part, "__metadata__", ()), *get_args(part)):
-            yield from _limits(item)
+        inner = (*getattr(part, "__metadata__", ()), *get_args(part))
+    if type(part) in _SIGNS:
+        yield f"{_SIGNS[type(part)]} {getattr(part, type(part).__name__.lower())}"
+    for item in inner:
+        yield from _limits(item)
 
 
 def _unit(field: FieldInfo) -> str:
@@ -167,23 +135,12 @@ def _unit(field: FieldInfo) -> str:
     return found.group() if found else ""
 
 
-_LISTED = 50
-"""Largest number of problems that are listed."""
+class Problem(NamedTuple):
+    """One problem of a configuration."""
 
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """One problem of a configuration.
-
-    Attributes:
-        path: Keys down to the value.
-        value: The value in words; empty without a value.
-        reason: What the value must be, and what to do.
-    """
-
-    path: KeyPath
-    value: str
-    reason: str
+    path: KeyPath  # keys down to the value
+    value: str  # in words; empty without a value
+    reason: str  # what the value must be, and what to do
 
     def __str__(self) -> str:
         return ": ".join(part for part in (".".join(self.path), self.value, self.reason) if part)
@@ -192,39 +149,27 @@ class Problem:
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[Problem]:
-    """Convert pydantic's errors to problems.
-
-    Args:
-        error: The error that `model` raised.
-        model: The model, which has keys, ranges and units.
-        prefix: Keys above the keys of the model.
-        limit: Largest number of problems; None for all.
-    """
+    """Convert the errors that `model` raised, at most `limit`; `prefix` are the keys above it."""
     details = error.errors(include_url=False)[:limit]
     return [_problem(detail, model, prefix) for detail in details]
 
 
 def raise_problems(document: Document, problems: Iterable[Problem], name: str) -> None:
-    """Raise a BadInputError that lists all problems with their places; do nothing if none exist."""
-    every = _deepest(problems)
-    lines = [f"{document.source(problem.path).label}: {problem}" for problem in every[:_LISTED]]
-    if len(every) == 1:
-        raise BadInputError(lines[0])
-    if len(every) > _LISTED:
-        lines.append(f"and {len(every) - _LISTED} more")
-    if every:
-        raise BadInputError("\n  ".join([f"{name} has {len(every)} problems:", *lines]))
+    """Raise a BadInputError that lists all problems with their places; do nothing if none exist.
 
-
-def _deepest(problems: Iterable[Problem]) -> list[Problem]:
-    """Drop the problem of a value if a part of the value has a problem, too.
-
-    For example, a plug-in is named but lacks a parameter. The missing parameter is one problem. The
-    schema also reports that the value is a name and not a mapping; that problem is dropped.
+    If a part of a value has a problem, too, the value's own problem is left out: a plug-in that
+    lacks a parameter is not also "a name instead of a mapping".
     """
     every = list(problems)
     above = {problem.path[:n] for problem in every for n in range(1, len(problem.path))}
-    return [problem for problem in every if problem.path not in above]
+    every = [problem for problem in every if problem.path not in above]
+    lines = [f"{document.source(problem.path).label}: {problem}" for problem in every[:_LISTED]]
+    if len(every) > _LISTED:
+        lines.append(f"and {len(every) - _LISTED} more")
+    if len(every) > 1:
+        lines.insert(0, f"{name} has {len(every)} problems:")
+    if every:
+        raise BadInputError("\n  ".join(lines))
 
 
 def in_words(value: Any) -> str:
@@ -239,33 +184,36 @@ def in_words(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+_WITHOUT_VALUE = ("extra_forbidden", "missing", "value_error", "too_long")
+"""Types of pydantic's errors whose value is not repeated: it is missing, large or in the reason."""
+_REASONS: Mapping[str, str] = {
+    "value_error": "{error}",
+    "too_long": "must have at most {max_length} entries",
+    "string_too_long": "must be text of at most {max_length} characters",
+    "string_pattern_mismatch": "must be text without slashes",
+    "finite_number": "must be finite",
+    "literal_error": "must be {expected}",
+}
+"""Type of pydantic's error -> reason."""
+
+
 def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> Problem:
-    kind, value = detail["type"], in_words(detail["input"])
-    keys = tuple(map(str, detail["loc"]))
+    kind, keys = detail["type"], tuple(map(str, detail["loc"]))
     # A union's members have tags such as <name>, which are not keys; an unknown key is kept as is.
     unknown = keys[-1:] if kind == "extra_forbidden" else ()
     known = keys[: len(keys) - len(unknown)]
     path = tuple(key for key in known if not key.startswith("<")) + unknown
-    if kind == "extra_forbidden":
-        return Problem(prefix + path, "", f"unknown key; {nearest_key(model, path)}")
-    if kind == "missing":
-        expected = expectation(model, path)
-        return Problem(prefix + path, "", f"is missing; {expected}")
-    if kind == "value_error":
-        return Problem(prefix + path, "", str(detail["ctx"]["error"]))
-    if kind == "too_long":
-        return Problem(
-            prefix + path, "", f"must have at most {detail['ctx']['max_length']} entries"
-        )
-    if kind == "string_too_long":
-        longest = detail["ctx"]["max_length"]
-        return Problem(prefix + path, value, f"must be text of at most {longest} characters")
     if kind == "unprintable":
-        return Problem(prefix + path, value, detail["msg"])
-    if kind == "literal_error":
-        return Problem(prefix + path, value, nearest_choice(detail))
-    if kind == "string_pattern_mismatch":
-        return Problem(prefix + path, value, "must be text without slashes")
-    if kind == "finite_number":
-        return Problem(prefix + path, value, "must be finite")
-    return Problem(prefix + path, value, expectation(model, path))
+        reason = detail["msg"]
+    elif kind in _REASONS:
+        reason = _REASONS[kind].format_map(detail.get("ctx", {}))
+    elif unknown:
+        reason = f"unknown key; {_nearest_key(model, path)}"
+    else:
+        reason = "is missing; " * (kind == "missing") + expectation(model, path)
+    if kind == "literal_error" and (
+        near := _near(str(detail["input"]), re.findall(r"'([^']*)'", detail["ctx"]["expected"]))
+    ):
+        reason += f"; did you mean {near}?"
+    value = "" if kind in _WITHOUT_VALUE else in_words(detail["input"])
+    return Problem(prefix + path, value, reason)

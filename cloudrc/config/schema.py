@@ -207,28 +207,6 @@ class Profile(Section):
     )
 
 
-__all__ = [
-    "Blackout",
-    "Change",
-    "Cloud",
-    "Criteria",
-    "Direction",
-    "Experiment",
-    "GilbertElliott",
-    "Guard",
-    "Link",
-    "LowLevel",
-    "Mission",
-    "PlugIn",
-    "Profile",
-    "Report",
-    "Sensors",
-    "Steps",
-    "Tunnel",
-    "Waypoint",
-    "World",
-]
-
 MAX_WAYPOINTS = 10_000
 """Largest number of waypoints in a mission."""
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from cloudrc.config import document
-from cloudrc.config.document import Document
+from cloudrc.config.document import Document, read_document
 from cloudrc.errors import BadInputError
 from cloudrc.plugins import suggest_name, unknown_name_text
 
@@ -33,45 +32,30 @@ def describe(kind: str, name: str) -> str:
 
 
 def read(kind: str, name: str, folder: Path) -> Document:
-    """Read a YAML file by its name or path.
+    """Read an experiment, mission or profile by its name or its path relative to `folder`.
 
-    Args:
-        kind: "experiment", "mission" or "profile".
-        name: Name of a shipped file, or a path. A path contains a slash or ends with `.yaml`.
-        folder: Folder at which a relative path starts.
+    A path contains a slash or ends with `.yaml`.
 
     Raises:
         BadInputError: If there is no such file, or the file cannot be read.
     """
-    if is_path(name):
-        path = folder / os.path.expanduser(name)
-        if not os.path.exists(path):  # False, not an exception, for an impossible name
-            raise BadInputError(f"no such file: {path}; {_shipped_names(kind, path.stem)}")
-        return document.read_document(path, name)
-    check_name(kind, name)
-    return document.read_document(FOLDERS[kind] / f"{name}.yaml", f"{name}.yaml")
+    if not is_path(name):
+        check_name(kind, name)
+        return read_document(FOLDERS[kind] / f"{name}.yaml", f"{name}.yaml")
+    path = folder / os.path.expanduser(name)
+    if not os.path.exists(path):  # False, not an exception, for an impossible name
+        raise _no_file("no such file", kind, path)
+    return read_document(path, name)
 
 
 def check_name(kind: str, name: str) -> None:
     """Raise a BadInputError if no shipped file of this kind has that name."""
-    available = names(kind)
-    if name not in available:
+    if name not in (available := names(kind)):
         raise BadInputError(unknown_name_text(kind, name, available))
-
-
-def _shipped_names(kind: str, name: str) -> str:
-    """Return a text that lists the shipped files and suggests the name most similar to `name`."""
-    available = names(kind)
-    return f"names of shipped {kind}s: {', '.join(available)}{suggest_name(name, available)}"
 
 
 def model_path(kind: str, name: str, folder: Path) -> str:
     """Return the name of a shipped robot or scene, or the absolute path of an .xml file.
-
-    Args:
-        kind: "robot" or "scene".
-        name: As in an experiment.
-        folder: Folder at which a relative path starts.
 
     Raises:
         BadInputError: If there is no such file.
@@ -79,13 +63,20 @@ def model_path(kind: str, name: str, folder: Path) -> str:
     if not (is_path(name) or name.endswith(".xml")):
         check_name(kind, name)
         return name
-    path = os.path.realpath(folder / os.path.expanduser(name))
-    if not path.endswith(".xml") or not os.path.isfile(path):
-        reason = "no such file" if path.endswith(".xml") else "not an .xml file"
-        raise BadInputError(f"{reason}: {path}; {_shipped_names(kind, Path(path).stem)}")
-    return path
+    path = Path(os.path.realpath(folder / os.path.expanduser(name)))
+    if path.suffix != ".xml":
+        raise _no_file("not an .xml file", kind, path)
+    if not os.path.isfile(path):
+        raise _no_file("no such file", kind, path)
+    return str(path)
 
 
 def is_path(name: str) -> bool:
     """Whether a name is the path of a file outside the package."""
     return "/" in name or "\\" in name or name.endswith((".yaml", ".yml"))
+
+
+def _no_file(problem: str, kind: str, path: Path) -> BadInputError:
+    available = names(kind)
+    hint = f"names of shipped {kind}s: {', '.join(available)}{suggest_name(path.stem, available)}"
+    return BadInputError(f"{problem}: {path}; {hint}")

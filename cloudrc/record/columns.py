@@ -3,11 +3,9 @@
     recording = Recording.read(path)
     recording["/odometry"]["position"]  # shape (n, 3)
 
-A topic without records is a table without rows.
-
-The log time of a row is its stamp. If the log time of the previous row is later, the row gets that
-log time. So log times never decrease within one end, and both ends can be merged by log time. Files
-and records in memory are merged by the same rule and give the same tables.
+A topic without records is a table without rows. The log time of a row is its stamp, or the previous
+row's log time if that is later. So log times never decrease within one end, and both ends can be
+merged by log time. Files and records in memory give the same tables.
 """
 
 from __future__ import annotations
@@ -28,53 +26,8 @@ from cloudrc.records import Record
 if TYPE_CHECKING:
     from cloudrc.record.reader import Contents
 
-
-FIRST_NS = -(2**63)
-"""Time earlier than every log time [ns]."""
-
-
-def logged(records: Iterable[Record], offset_ns: int = 0) -> Iterator[tuple[int, Row]]:
-    """Convert one end's records to rows with their log times.
-
-    Args:
-        records: Records of one end, oldest first.
-        offset_ns: Added to every row's stamp [ns].
-
-    Yields:
-        The log time [ns] and the row; the log times never decrease.
-    """
-    latest = FIRST_NS
-    for record in records:
-        for topic, stamp_ns, values in rows(record):
-            stamp_ns += offset_ns
-            if stamp_ns > latest:
-                latest = stamp_ns
-            yield latest, (topic, stamp_ns, values)
-
-
-def merged(
-    world_records: Iterable[Record], cloud_records: Iterable[Record], offset_ns: int = 0
-) -> Iterator[tuple[int, Row]]:
-    """Merge the records of both ends into one sequence of rows on world's clock.
-
-    Only the stamp of each row is converted; other times in a row stay on the clock that their
-    description names.
-
-    Args:
-        world_records: World's records, oldest first, on world's clock.
-        cloud_records: Cloud's records, oldest first, on cloud's clock.
-        offset_ns: World's clock minus cloud's clock [ns].
-
-    Yields:
-        The log time [ns] and the row; of rows with equal log times, world's rows come first.
-    """
-    world, cloud = logged(world_records), logged(cloud_records, offset_ns)
-    return heapq.merge(world, cloud, key=itemgetter(0))
-
-
 Column: TypeAlias = NDArray[Any]
 _Rows: TypeAlias = dict[str, list[tuple[int, Values]]]
-
 _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
     "int": (np.int64, ()),
     "float": (np.float64, ()),
@@ -83,6 +36,35 @@ _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
     "vector": (np.float64, (3,)),
     "quaternion": (np.float64, (4,)),
 }
+
+
+def merged(
+    world_records: Iterable[Record], cloud_records: Iterable[Record], offset_ns: int = 0
+) -> Iterator[tuple[int, Row]]:
+    """Merge the records of both ends, oldest first, into one sequence of rows on world's clock.
+
+    Only the stamp of each row is converted; other times in a row stay on the clock that their
+    description names.
+
+    Args:
+        world_records: World's records, on world's clock.
+        cloud_records: Cloud's records, on cloud's clock.
+        offset_ns: World's clock minus cloud's clock [ns].
+
+    Yields:
+        The log time [ns] and the row; of rows with equal log times, world's rows come first.
+    """
+    world, cloud = _logged(world_records, 0), _logged(cloud_records, offset_ns)
+    return heapq.merge(world, cloud, key=itemgetter(0))
+
+
+def _logged(records: Iterable[Record], offset_ns: int) -> Iterator[tuple[int, Row]]:
+    latest = -(2**63)
+    for record in records:
+        for topic, stamp_ns, values in rows(record):
+            stamp_ns += offset_ns
+            latest = max(latest, stamp_ns)
+            yield latest, (topic, stamp_ns, values)
 
 
 class Table:
@@ -94,15 +76,9 @@ class Table:
     """
 
     def __init__(self, topic: Topic, rows: list[tuple[int, Values]]) -> None:
-        """Convert rows to columns.
-
-        Args:
-            topic: Defines the columns.
-            rows: Stamp [ns] and values of each row.
-        """
-        stamps = [stamp_ns for stamp_ns, _ in rows]
+        """Convert the stamp [ns] and values of each row to columns."""
         columns = zip(*[values for _, values in rows], strict=True) if rows else repeat(())
-        self._columns = {"stamp_ns": _column("int", stamps)}
+        self._columns = {"stamp_ns": _column("int", [stamp_ns for stamp_ns, _ in rows])}
         for field, values in zip(topic.fields, columns, strict=False):
             self._columns[field.name] = _column(field.kind, values)
         self.topic = topic
@@ -135,12 +111,7 @@ class Recording:
     """
 
     def __init__(self, rows: _Rows, contents: Contents | None = None) -> None:
-        """Store rows by topic; most callers use `read` or `from_records`.
-
-        Args:
-            rows: Topic -> stamp [ns] and values of each row, in order.
-            contents: Contents of the file from which the rows come; None without a file.
-        """
+        """Store rows by topic; most callers use `read` or `from_records`."""
         self._rows = rows
         self._tables: dict[str, Table] = {}
         self.metadata: Mapping[str, str] = contents.metadata if contents else {}
@@ -161,13 +132,7 @@ class Recording:
         cloud_records: Iterable[Record] = (),
         offset_ns: int = 0,
     ) -> Self:
-        """Make a recording in memory; it equals a recording read from a merged file.
-
-        Args:
-            world_records: World's records, oldest first, on world's clock.
-            cloud_records: Cloud's records, oldest first, on cloud's clock.
-            offset_ns: World's clock minus cloud's clock [ns].
-        """
+        """Make a recording in memory, as if read from a file of rows that are `merged`."""
         rows: _Rows = {name: [] for name in TOPICS}
         for _, (topic, stamp_ns, values) in merged(world_records, cloud_records, offset_ns):
             rows[topic].append((stamp_ns, values))
@@ -176,9 +141,6 @@ class Recording:
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read an MCAP file up to its end or its first damaged part.
-
-        Args:
-            path: The file, complete or torn.
 
         Raises:
             BadInputError: If nothing in the file is readable.
@@ -190,11 +152,7 @@ class Recording:
 
     @classmethod
     def from_contents(cls, contents: Contents) -> Self:
-        """Decode the contents of a file.
-
-        Args:
-            contents: Result of `read_contents`.
-        """
+        """Decode the contents of a file."""
         from cloudrc.record.ros import decode
 
         rows: _Rows = {name: [] for name in TOPICS}

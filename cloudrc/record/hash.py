@@ -1,14 +1,9 @@
 """Identify a run by one SHA-256 over all its records.
 
-The bytes of a record are little-endian and the same in every process. They consist of four groups,
-in this order:
-
-1. Length and name of the record's type.
-2. Numbers: integers with 64 bits, floats as IEEE 754 doubles, truth values with one byte.
-3. Vectors.
-4. Strings as UTF-8, each after its 32-bit length.
-
-Within a group the order is that of the fields; the fields of a nested record replace its field.
+The bytes of a record are little-endian and the same in every process. They consist of length and
+name of the record's type; numbers (integers with 64 bits, floats as IEEE 754 doubles, truth values
+with one byte); vectors; and strings as UTF-8, each after its 32-bit length. Within a group the
+order is that of the fields; the fields of a nested record replace its field.
 """
 
 from __future__ import annotations
@@ -24,7 +19,7 @@ from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
 from cloudrc.records import Record
 
 _Pack: TypeAlias = Callable[[Any], bytes]
-_flatten = chain.from_iterable
+_CODES = {int: "q", float: "d", bool: "?", str: "s"}
 
 
 class RecordHash:
@@ -34,11 +29,7 @@ class RecordHash:
         self._sha256 = hashlib.sha256()
 
     def update(self, records: Iterable[Record]) -> None:
-        """Add records to the hash.
-
-        Args:
-            records: More records, oldest first.
-        """
+        """Add records to the hash, oldest first."""
         packers = _PACKERS
         self._sha256.update(b"".join([packers[type(record)](record) for record in records]))
 
@@ -48,10 +39,9 @@ class RecordHash:
 
 
 def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
-    """Hash the messages of a file, for real-time runs, which have no records in memory.
+    """Hash topic, log time [ns] and CDR bytes of the messages of a file, in the file's order.
 
-    Args:
-        messages: Topic, log time [ns] and CDR bytes of each message, in the file's order.
+    This is for real-time runs, which have no records in memory.
     """
     sha256 = hashlib.sha256()
     for message in messages:
@@ -60,14 +50,7 @@ def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
 
 
 def add_message(sha256: hashlib._Hash, topic: str, log_time_ns: int, data: bytes) -> None:
-    """Add a message to a hash as `messages_sha256` does.
-
-    Args:
-        sha256: The hash of all earlier messages.
-        topic: Topic of the message.
-        log_time_ns: Log time of the message [ns].
-        data: CDR bytes of the message.
-    """
+    """Add a message to a hash as `messages_sha256` does."""
     sha256.update(b"%s %d %d " % (topic.encode(), log_time_ns, len(data)))
     sha256.update(data)
 
@@ -90,16 +73,13 @@ def _packer(cls: type) -> _Pack:
     strings = _getter([path for path, code in leaves if code == "s"])
     codes = sorted((code for _, code in leaves if code != "s"), key=lambda code: len(code) > 1)
     name = cls.__name__.encode()
-    pack = struct.Struct(f"<B{len(name)}s" + "".join(codes)).pack
-    size = len(name)
+    size, pack = len(name), struct.Struct(f"<B{len(name)}s" + "".join(codes)).pack
 
-    def fixed(record: Any) -> bytes:
-        return pack(size, name, *numbers(record), *_flatten(vectors(record)))
+    def packed(record: Any) -> bytes:
+        fixed = pack(size, name, *numbers(record), *chain.from_iterable(vectors(record)))
+        return fixed + b"".join(map(_packed_string, strings(record)))
 
-    def with_strings(record: Any) -> bytes:
-        return fixed(record) + b"".join(map(_packed_string, strings(record)))
-
-    return with_strings if any(code == "s" for _, code in leaves) else fixed
+    return packed
 
 
 def _leaves(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
@@ -112,9 +92,6 @@ def _leaves(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
             yield path, "d" * len(get_args(kind))
         else:
             yield path, "q" if issubclass(kind, IntEnum) else _CODES[kind]
-
-
-_CODES = {int: "q", float: "d", bool: "?", str: "s"}
 
 
 def _getter(paths: list[str]) -> Callable[[Any], tuple[Any, ...]]:

@@ -8,10 +8,6 @@ telemetry datagram shows that world's clock is ahead of cloud's by at least (sen
 command datagram shows that world's clock is ahead by at most (arrived - sent). The fastest packets
 of both directions give the narrowest interval; its width is the sum of both delays. After a stall,
 world's clock also lags the clock of world's machine.
-
-`cut_to_last_mission` takes one mission from a pod's recording, which may hold several. A pod's file
-is still open when it is copied, so the end of the file may be missing. The mission is complete if
-the end of the mission is in the file.
 """
 
 from __future__ import annotations
@@ -21,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,20 +31,20 @@ from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import UNDER_WAY
 
+BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
+"""Times before a mission's start and after its end that are kept [ns]. The session and the guard's
+first change are before the start."""
+CUT_SHORT = "cut short"
+"""Start of the reader's note about a file without an end."""
+_MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
 
-@dataclass(frozen=True, slots=True)
-class ClockOffset:
-    """The offset between world's clock and cloud's clock.
 
-    Attributes:
-        offset_ns: World's clock minus cloud's clock [ns]; the value to add to cloud's stamps.
-        uncertainty_ns: Largest possible error of the offset [ns]; None if unknown.
-        method: "same clock"; "packets" if estimated from both directions; "first records" if the
-            clocks are unrelated and both recordings are assumed to begin together.
-    """
+class ClockOffset(NamedTuple):
+    """The offset between world's clock and cloud's clock."""
 
-    offset_ns: int
-    uncertainty_ns: int | None
+    offset_ns: int  # world's clock minus cloud's clock [ns], which is added to cloud's stamps
+    uncertainty_ns: int | None  # largest possible error [ns]; None if unknown
+    # "first records": the clocks are unrelated, and both recordings are assumed to begin together
     method: Literal["same clock", "packets", "first records"]
 
     def metadata(self) -> dict[str, str]:
@@ -65,18 +61,13 @@ SAME_CLOCK = ClockOffset(0, 0, "same clock")
 def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
     """Estimate the offset that puts cloud's stamps on world's clock.
 
+    It is 0 if both files name the same clock; else the centre of the interval that the packets
+    allow; without packets in both directions, the difference of the first stamps.
+
     Source: the clock filter of RFC 5905 (NTP), section 10: it uses the sample with the smallest
         round trip, and half of this round trip bounds the error.
     Deviation: each direction uses its own fastest packet. Clock drift is not modelled (50 ppm are
         3 ms per minute).
-
-    Args:
-        world: World's recording, on its clock.
-        cloud: Cloud's recording, on its clock.
-
-    Returns:
-        Offset 0 if both files name the same clock; else the centre of the interval that the packets
-        allow; without packets in both directions, the difference of the first stamps.
     """
     if _share_clock(world, cloud):
         return SAME_CLOCK
@@ -96,17 +87,16 @@ def _share_clock(world: Recording | Contents, cloud: Recording | Contents) -> bo
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
     """Return the smallest (arrival - departure) [ns]; each time is on the clock of its end."""
-    departures = dict(zip(_packet_ids(sent), sent["stamp_ns"].tolist(), strict=True))
-    differences = [
-        stamp_ns - departures[packet]
-        for packet, stamp_ns in zip(_packet_ids(arrived), arrived["stamp_ns"].tolist(), strict=True)
-        if packet in departures
-    ]
-    return min(differences, default=None)
 
+    def packets(table: Table) -> list[tuple[tuple[int, int], int]]:
+        epochs, counters, stamps_ns = (
+            table[name].tolist() for name in ("epoch", "counter", "stamp_ns")
+        )
+        return list(zip(zip(epochs, counters, strict=True), stamps_ns, strict=True))
 
-def _packet_ids(table: Table) -> list[tuple[int, int]]:
-    return list(zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True))
+    sent_ns = dict(packets(sent))
+    return min((at_ns - sent_ns[one] for one, at_ns in packets(arrived) if one in sent_ns),
+               default=None)  # fmt: skip
 
 
 def _first_ns(recording: Recording) -> int:
@@ -114,37 +104,26 @@ def _first_ns(recording: Recording) -> int:
     return min(stamps, default=0)
 
 
-class WorldTime:
-    """Converts instants from the clock of world's machine to world's clock, which may lag."""
+def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Convert instants from the clock of world's machine to world's clock, which may lag.
 
-    def __init__(self, telemetry: Table) -> None:
-        """Read the lag from telemetry.
+    Args:
+        telemetry: World's table of telemetry, with stamps on world's clock and their lag, which is
+            interpolated linearly.
+        machine_ns: Instants on the machine's clock [ns], shape (n,).
 
-        Args:
-            telemetry: World's table of telemetry, with stamps on world's clock.
-        """
-        self._slip_ns = telemetry["slip_ns"]
-        self._machine_ns = telemetry["stamp_ns"] + self._slip_ns
-
-    def at(self, machine_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Convert instants; between two samples the lag is interpolated linearly.
-
-        Args:
-            machine_ns: Instants on the machine's clock [ns], shape (n,).
-
-        Returns:
-            The instants on world's clock [ns], shape (n,); in rising order if `machine_ns` is.
-        """
-        if not self._slip_ns.any():
-            return machine_ns
-        # Differences are exact in float64; the stamps themselves need not be.
-        first: Any = self._machine_ns[0]
-        since, known = (machine_ns - first).astype(float), (self._machine_ns - first).astype(float)
-        slip_ns: NDArray[np.int64] = np.rint(np.interp(since, known, self._slip_ns)).astype(int)
-        return machine_ns - slip_ns
-
-
-_MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
+    Returns:
+        The instants on world's clock [ns], shape (n,); in rising order if `machine_ns` is.
+    """
+    lag_ns = telemetry["slip_ns"]
+    if not lag_ns.any():
+        return machine_ns
+    known_ns = telemetry["stamp_ns"] + lag_ns
+    # Differences are exact in float64; the stamps themselves need not be.
+    first: Any = known_ns[0]
+    since, known = (machine_ns - first).astype(float), (known_ns - first).astype(float)
+    at_ns: NDArray[np.int64] = machine_ns - np.rint(np.interp(since, known, lag_ns)).astype(int)
+    return at_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,11 +143,7 @@ class Mission:
         return Recording.from_contents(self.contents)
 
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
-        """Write the mission to an MCAP file.
-
-        Args:
-            target: Path of the file; an existing file is replaced atomically.
-            attachments: Name -> file to attach, in addition to the attachments of both ends.
+        """Write the mission and further `attachments` to an MCAP file, which is replaced at once.
 
         Raises:
             OSError: If the file cannot be written.
@@ -190,18 +165,14 @@ class Mission:
 def merge(world: Path, cloud: Path) -> Mission:
     """Merge the files of both ends, complete or torn, on world's clock.
 
-    Args:
-        world: World's recording.
-        cloud: Cloud's recording.
-
-    Returns:
-        The mission. If one file cannot be read, the mission contains only the other file, on that
-        file's own clock, and the note of the mission says so.
+    If one file cannot be read, the mission contains only the other file, on that file's own clock,
+    and the note of the mission says so.
 
     Raises:
         BadInputError: If neither file can be read.
     """
-    read, failures = {}, []
+    read: dict[str, Contents] = {}
+    failures = []
     for end, path in (("world", world), ("cloud", cloud)):
         try:
             read[end] = read_contents(path)
@@ -209,14 +180,10 @@ def merge(world: Path, cloud: Path) -> Mission:
             failures.append(error)
     if not read:
         raise failures[0]
+    one = next(iter(read.values()))
+    mission = Mission(one, SAME_CLOCK) if failures else _join(read["world"], read["cloud"])
     notes = [f"{end}: {contents.note}" for end, contents in read.items() if contents.note]
-    notes += map(str, failures)
-    if failures:
-        (only,) = read.values()
-        mission = Mission(only, SAME_CLOCK)
-    else:
-        mission = _join(read["world"], read["cloud"])
-    if notes:
+    if notes := [*notes, *map(str, failures)]:
         mission.contents.note = mission.contents.metadata[MISSING] = "; ".join(notes)
     return mission
 
@@ -224,7 +191,7 @@ def merge(world: Path, cloud: Path) -> Mission:
 def _join(world: Contents, cloud: Contents) -> Mission:
     logged_ns = np.array([message[1] for message in cloud.messages], dtype=np.int64)
     if _share_clock(world, cloud):
-        offset, moved_ns = SAME_CLOCK, WorldTime(_table(world, "/telemetry")).at(logged_ns)
+        offset, moved_ns = SAME_CLOCK, world_time_ns(_table(world, "/telemetry"), logged_ns)
     else:
         offset = clock_offset(Recording.from_contents(world), Recording.from_contents(cloud))
         moved_ns = logged_ns + offset.offset_ns
@@ -241,23 +208,13 @@ def _join(world: Contents, cloud: Contents) -> Mission:
     return Mission(joined, offset)
 
 
-BEFORE_NS = 1_000_000_000
-"""Time before a mission's start that is kept [ns]. The beginning of the session and the guard's
-first change are in this time."""
-AFTER_NS = 2_000_000_000
-"""Time after a mission's end that is kept [ns]."""
-CUT_SHORT = "cut short"
-"""Start of the reader's note about a file without an end."""
-
-
 def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
-    """Cut a recording down to its last mission.
-
-    Args:
-        mission: The merged recordings of both ends.
+    """Cut a pod's recording, which may hold several missions, down to the last one.
 
     Returns:
         The last mission that was started, and whether the recording contains the mission's end.
+        Then the mission is complete, although a pod's file is open when it is copied, so that the
+        file's own end may be missing.
     """
     contents = mission.contents
     began, ended = _last_mission(contents)

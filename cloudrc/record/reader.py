@@ -1,9 +1,9 @@
-"""Read an MCAP file from its start to its end, or to its first damaged part.
+"""Read or repair an MCAP file, from its start to its end or to its first damaged part.
 
 A killed process leaves a file without an end; such a file is read up to its last complete chunk.
-`Records` yields the records of any MCAP file. `read_contents` collects the topics that cloudrc
-records. The package `mcap` parses the format. This module limits the unpacked size of a file, and
-says in words what is missing.
+`Records` yields the records of any MCAP file; `read_contents` collects the topics of cloudrc, and
+`recover` writes a complete copy. The package `mcap` parses the format. This module limits the
+unpacked size of a file, and says in words what is missing.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from dataclasses import dataclass, field, replace
 from io import BufferedReader
 from itertools import pairwise
 from pathlib import Path
-from typing import Self
+from typing import IO, Any, Self
 
+from cloudrc import __version__
 from cloudrc.errors import BadInputError, to_one_line
-from cloudrc.files import open_file
+from cloudrc.files import atomic_file, open_file
 from cloudrc.record import missing
 from cloudrc.record.ros import is_known
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import CLOCK, COUNTS, MISSING
+from cloudrc.record.writer import CLOCK, COUNTS, METADATA, MISSING
 
 try:
     import lz4.frame
@@ -36,6 +37,7 @@ try:
         Channel,
         Chunk,
         DataEnd,
+        Header,
         McapRecord,
         Message,
         Metadata,
@@ -43,7 +45,7 @@ try:
         Statistics,
     )
     from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
-    from mcap.writer import MCAP0_MAGIC
+    from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 except ImportError as error:
     raise missing(error) from error
 
@@ -54,13 +56,16 @@ MESSAGE_COST = 128
 """Memory of a message's Python objects, in addition to the message's bytes [bytes]."""
 LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
-HEAD_SIZE = 16
-"""Number of first bytes that identify the type of a file [bytes]."""
-KINDS = (
-    (b"#ROSBAG V", "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert"),
-    (b"SQLite format 3", "is an SQLite file, not MCAP; convert it with: ros2 bag convert"),
-)
-"""First bytes of other types of recordings, and the text of the error about them."""
+CHANNELS_MAX = 65_535
+"""Limit of the number of channels plus schemas in a file; MCAP numbers both with 16 bits."""
+LOSSY_SHARE_MAX = 0.999
+"""Largest value of `Recovery.share` if anything is missing [1]."""
+KINDS = {
+    b"": "is empty; name a recording (.mcap)",
+    b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
+    b"SQLite format 3": "is an SQLite file, not MCAP; convert it with: ros2 bag convert",
+}
+"""First bytes of files that are not MCAP, and the text of the error about them."""
 
 
 class NothingReadableError(BadInputError):
@@ -90,7 +95,7 @@ class Records:
         """Open a file; use `with` to close it.
 
         Raises:
-            BadInputError: If the file cannot be opened or is not an MCAP file.
+            BadInputError: If the file cannot be opened.
         """
         self.path = path
         try:
@@ -120,29 +125,14 @@ class Records:
         Raises:
             BadInputError: If the file is not MCAP or has an unknown compression.
         """
-        self._stream.seek(0)
-        head = self._stream.read(HEAD_SIZE)
+        head = self._stream.read(16)
         if not head.startswith(MCAP0_MAGIC):
-            raise self._foreign(head)
+            kind = next((one for one in KINDS if one and head.startswith(one)), head.strip(b"\0"))
+            text = KINDS.get(kind, "is not an MCAP file; name a recording (.mcap)")
+            raise (BadInputError if kind else NothingReadableError)(f"{self.path}: {text}")
         self._stream.seek(0)
-        reader = StreamReader(
-            self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
-        )
         try:
-            for record in reader.records:
-                if isinstance(record, Chunk):
-                    yield from self._unpack(record)
-                    self.chunks += 1
-                elif not self.data_ended:  # what follows repeats the definitions
-                    yield record
-                if isinstance(record, Statistics):
-                    self.stated = record.message_count
-                self.data_ended |= isinstance(record, DataEnd)
-                self.position = self._stream.tell()
-            self.position = self._stream.tell()
-            self.ended = self.data_ended = True
-            if self.position < self.size:
-                self.fault = "something follows its end"
+            yield from self._read()
         except BadInputError:
             raise
         except CRCValidationError as error:
@@ -160,6 +150,25 @@ class Records:
         except Exception:  # the library may raise anything on damaged bytes
             self.cut = self._stream.tell() >= self.size
             self.fault = "cut short" if self.cut else "damaged"
+
+    def _read(self) -> Iterator[McapRecord]:
+        reader = StreamReader(
+            self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
+        )
+        for record in reader.records:
+            if isinstance(record, Chunk):
+                yield from self._unpack(record)
+                self.chunks += 1
+            elif not self.data_ended:  # what follows repeats the definitions
+                yield record
+            if isinstance(record, Statistics):
+                self.stated = record.message_count
+            self.data_ended |= isinstance(record, DataEnd)
+            self.position = self._stream.tell()
+        self.position = self._stream.tell()
+        self.ended = self.data_ended = True
+        if self.position < self.size:
+            self.fault = "something follows its end"
 
     @property
     def unread(self) -> int:
@@ -179,10 +188,8 @@ class Records:
             case "":
                 data = chunk.data
             case "zstd":
-                packed = zstandard.ZstdDecompressor().stream_reader(
-                    chunk.data, read_across_frames=True
-                )
-                data = packed.read(size + 1)
+                unpacker = zstandard.ZstdDecompressor()
+                data = unpacker.stream_reader(chunk.data, read_across_frames=True).read(size + 1)
             case "lz4":
                 data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
             case other if not self.chunks:
@@ -211,14 +218,6 @@ class Records:
             if stream.count != end:
                 raise ValueError("a record is not as long as it states")
 
-    def _foreign(self, head: bytes) -> BadInputError:
-        """Say by the first bytes what the file is instead of MCAP."""
-        if not head.strip(b"\0"):
-            return NothingReadableError(f"{self.path}: is empty; name a recording (.mcap)")
-        kinds = (text for magic, text in KINDS if head.startswith(magic))
-        text = next(kinds, "is not an MCAP file; name a recording (.mcap)")
-        return BadInputError(f"{self.path}: {text}")
-
 
 @dataclass(slots=True)
 class Contents:
@@ -246,17 +245,11 @@ class Contents:
 def read_contents(path: Path) -> Contents:
     """Read the topics that cloudrc records, up to the end of a file or its first damaged part.
 
-    Args:
-        path: An MCAP file, possibly torn.
-
     Raises:
         BadInputError: If nothing in the file is readable.
     """
     with Records(path) as records:
-        collector = _Collector(records)
-        for record in records:
-            collector.take(record)
-    return collector.finish()
+        return _Collector(records).collect()
 
 
 class _Collector:
@@ -265,69 +258,64 @@ class _Collector:
     def __init__(self, records: Records) -> None:
         self._records = records
         self._contents = Contents()
-        self._types: dict[int, tuple[str, str]] = {}
         self._channels: dict[int, tuple[str, bool]] = {}  # name of the topic; whether it is ours
         self._seen: Counter[int] = Counter()  # messages by channel
-        self._sequences = array("L")
 
-    def take(self, record: McapRecord) -> None:
-        contents = self._contents
-        if isinstance(record, Message):
-            self._seen[record.channel_id] += 1
-            topic, ours = self._channels.get(record.channel_id, ("", False))
-            if ours:
-                contents.messages.append((topic, record.log_time, record.data))
-                self._sequences.append(record.sequence)
-        elif isinstance(record, Schema):
-            self._types[record.id] = record.name, record.data.decode("utf-8", "replace")
-        elif isinstance(record, Channel):
-            topic, (ros_type, text) = record.topic, self._types.get(record.schema_id, ("", ""))
-            known = topic in TOPICS and TOPICS[topic].ros_type == ros_type
-            self._channels[record.id] = topic, known and is_known(ros_type, text)
-        elif isinstance(record, Metadata):
-            contents.metadata.update(record.metadata)
-        elif isinstance(record, Attachment):
-            contents.attachments[record.name] = record.data
-
-    def finish(self) -> Contents:
-        """Sort the messages, note what is missing, and return the contents."""
+    def collect(self) -> Contents:
+        """Read all records, sort the messages, and note what is missing."""
         contents, records = self._contents, self._records
-        messages = contents.messages
-        if not records.data_ended and not messages:
+        types: dict[int, tuple[str, str]] = {}
+        sequences = array("L")
+        for record in records:
+            if isinstance(record, Message):
+                self._seen[record.channel_id] += 1
+                topic, ours = self._channels.get(record.channel_id, ("", False))
+                if ours:
+                    contents.messages.append((topic, record.log_time, record.data))
+                    sequences.append(record.sequence)
+            elif isinstance(record, Schema):
+                types[record.id] = record.name, record.data.decode("utf-8", "replace")
+            elif isinstance(record, Channel):
+                topic, (ros_type, text) = record.topic, types.get(record.schema_id, ("", ""))
+                known = topic in TOPICS and TOPICS[topic].ros_type == ros_type
+                self._channels[record.id] = topic, known and is_known(ros_type, text)
+            elif isinstance(record, Metadata):
+                contents.metadata.update(record.metadata)
+            elif isinstance(record, Attachment):
+                contents.attachments[record.name] = record.data
+        if not records.data_ended and not contents.messages:
             raise NothingReadableError(
                 f"{records.path}: holds no readable message: {records.fault}; name another"
                 " recording"
             )
-        late = sum(after[1] < before[1] for before, after in pairwise(messages))
-        if late:
-            order = sorted(range(len(messages)), key=lambda n: (messages[n][1], self._sequences[n]))
-            contents.messages = messages = [messages[n] for n in order]
+        self._sort(sequences)
+        self._note()
+        return contents
+
+    def _sort(self, sequences: array[int]) -> None:
+        contents, messages = self._contents, self._contents.messages
+        if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
+            order = sorted(range(len(messages)), key=lambda n: (messages[n][1], sequences[n]))
+            contents.messages = [messages[n] for n in order]
             contents.remarks += (f"was not in order of time: {late} messages were sorted",)
+
+    def _note(self) -> None:
+        contents, records = self._contents, self._records
         cut, lacking = list[str](), list[str]()
         if records.data_ended and records.cut:
             contents.remarks += ("had a torn index: all its messages were read",)
-        elif records.fault:
-            (cut if records.cut else lacking).append(self._fault())
-        lacking += self._lacking(Counter(message[0] for message in messages))
+        elif fault := records.fault:
+            if not records.data_ended:
+                count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
+                fault += f": {count} messages were read, the last at {until:.2f} s"
+            (cut if records.cut else lacking).append(fault)
+        lacking += self._lacking(Counter(message[0] for message in contents.messages))
         told = to_one_line(contents.metadata.get(MISSING, ""))
-        contents.lacking = "; ".join(filter(None, lacking))
+        contents.lacking = "; ".join(lacking)
         contents.note = "; ".join(filter(None, [*cut, *lacking, told]))
-        return contents
-
-    def _fault(self) -> str:
-        """Describe the fault of the file, and how far the file was read."""
-        messages, fault = self._contents.messages, self._records.fault
-        if self._records.data_ended:
-            return fault
-        until = messages[-1][1] * 1e-9
-        return f"{fault}: {len(messages)} messages were read, the last at {until:.2f} s"
 
     def _lacking(self, read: Counter[str]) -> Iterator[str]:
-        """Describe the data that other programs have removed or added.
-
-        Args:
-            read: Number of messages by topic.
-        """
+        """Describe what others have removed or added; `read` are the messages by topic."""
         metadata, seen = self._contents.metadata, self._seen
         channels = [self._channels[number] for number in seen if number in self._channels]
         foreign = sorted({name for name, ours in channels if not ours and name not in TOPICS})
@@ -350,8 +338,7 @@ class _Collector:
             return
         counts = _parse_counts(metadata.get(COUNTS, ""))
         topics = [topic for topic in TOPICS if counts and read[topic] != counts.get(topic, 0)]
-        wrong = [f"{read[topic]} of {counts.get(topic, 0)} on {topic}" for topic in topics]
-        if wrong:
+        if wrong := [f"{read[topic]} of {counts.get(topic, 0)} on {topic}" for topic in topics]:
             yield f"messages were removed or added: it holds {_list(wrong)}"
         if metadata.get(COUNTS) == "" and MISSING not in metadata:
             yield "it was torn, and another program has put an end to it"
@@ -364,13 +351,146 @@ def _list(topics: list[str]) -> str:
 
 
 def _parse_counts(text: str) -> dict[str, int]:
-    """Parse the number of messages by topic that the writer has stored; empty if there is none.
-
-    Args:
-        text: Value of `COUNTS` in the metadata.
-    """
+    """Parse the value of `COUNTS`: messages by topic; empty if there is none."""
     try:
-        found = json.loads(text)
-        return {str(topic): int(count) for topic, count in found.items() if topic in TOPICS}
+        return {str(topic): int(count) for topic, count in json.loads(text).items()}
     except (AttributeError, TypeError, ValueError):
         return {}
+
+
+@dataclass(slots=True)
+class Recovery:
+    """The result of a recovery.
+
+    Attributes:
+        size: Size of the damaged file [bytes].
+        kept: Number of objects in the new file, by kind.
+        dropped: Number of objects that are known to be lost, by kind (only "messages").
+        bytes_lost: Size of the part behind the last intact record [bytes].
+        notes: What is missing or doubtful, in words.
+        index_is_new: Whether the old file had no readable index.
+    """
+
+    size: int
+    kept: dict[str, int]
+    dropped: dict[str, int]
+    bytes_lost: int
+    notes: list[str]
+    index_is_new: bool
+
+    @property
+    def complete(self) -> bool:
+        """Return whether nothing is missing or doubtful."""
+        return not self.notes
+
+    @property
+    def share(self) -> float:
+        """Return the kept share of messages, in [0, 1]; of bytes if that number is unknown.
+
+        The share is below 1 if anything is missing.
+        """
+        if self.complete:
+            return 1.0
+        kept, lost = self.kept["messages"], self.dropped.get("messages", 0)
+        share = kept / (kept + lost) if lost else 1.0 - self.bytes_lost / self.size
+        return min(share, LOSSY_SHARE_MAX)
+
+
+def recover(source: Path, target: Path) -> Recovery:
+    """Write a complete copy of a recording that may be torn, up to its first damaged part.
+
+    The copy keeps messages with their stamps, schemas, channels, attachments and metadata, and has
+    an index, checksums and a note about what is missing. It replaces `target` atomically.
+
+    Raises:
+        BadInputError: If the file holds no readable message.
+        OSError: If the new file cannot be written.
+    """
+    with Records(source) as records, atomic_file(target) as new:
+        return _Copy(new, records).finish()
+
+
+class _Copy:
+    """Copies records to a new file, with new numbers for channels and schemas."""
+
+    def __init__(self, new: IO[bytes], records: Records) -> None:
+        self._records = records
+        self._writer: Any = Writer(new, compression=CompressionType.ZSTD, enable_data_crcs=True)
+        self._schemas: dict[int, tuple[Schema, int]] = {}  # old number -> its new number
+        self._channels: dict[int, tuple[Channel, int]] = {}
+        self._defined = 0
+        self._kept = {"messages": 0, "attachments": 0, "metadata": 0}
+        self._homeless = 0  # messages of no channel
+        self._told = ""  # what the recording itself says is missing
+        for number, record in enumerate(records):
+            if isinstance(record, Header) or number == 0:
+                profile = record.profile if isinstance(record, Header) else ""
+                self._writer.start(profile=profile, library=f"cloudrc {__version__} recover")
+            self._take(record)
+
+    def _take(self, record: McapRecord) -> None:
+        add: Any = self._writer
+        if isinstance(record, Message):
+            _, channel = self._channels.get(record.channel_id, (None, 0))
+            self._homeless += not channel
+            self._kept["messages"] += bool(channel)
+            if channel:
+                add.add_message(
+                    channel, record.log_time, record.data, record.publish_time, record.sequence
+                )
+        elif isinstance(record, Schema):
+            self._define(record, self._schemas)
+        elif isinstance(record, Channel):
+            self._define(record, self._channels)
+        elif isinstance(record, Attachment):
+            self._kept["attachments"] += 1
+            add.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
+        elif isinstance(record, Metadata):
+            self._kept["metadata"] += 1
+            add.add_metadata(record.name, record.metadata)
+            if record.name == METADATA:
+                self._told = record.metadata.get(MISSING, self._told)
+
+    def finish(self) -> Recovery:
+        """Complete the new file; return what the file holds and what is lost."""
+        records, kept = self._records, self._kept
+        if not kept["messages"] and not kept["attachments"]:
+            reason = records.fault or "none is in it"
+            raise BadInputError(
+                f"{records.path}: holds no readable message: {reason}; nothing is written"
+            )
+        lost = max(self._homeless, (records.stated or 0) - kept["messages"])
+        new = []
+        if records.fault and not (records.data_ended and records.cut):
+            unread = f": {records.unread} bytes after the last intact part were not read"
+            new.append(records.fault + unread * bool(records.unread))
+        if lost:
+            new.append(f"{lost} messages are lost")
+        notes = [self._told, *new] if self._told else new
+        if new:  # otherwise the new file already has what the recording says
+            self._writer.add_metadata(METADATA, {MISSING: "; ".join(notes)})
+        self._writer.finish()
+        kept |= {"chunks": records.chunks, "channels": len(self._channels)}
+        dropped = {"messages": lost} if lost else {}
+        return Recovery(records.size, kept, dropped, records.unread, notes, not records.ended)
+
+    def _define(self, record: Any, known: dict[int, Any]) -> None:
+        """Register a schema or channel; register each definition of its number only once."""
+        if record.id in known and known[record.id][0] == record:
+            return
+        self._defined += 1
+        if self._defined > CHANNELS_MAX:
+            raise BadInputError(
+                f"{self._records.path}: defines more than {CHANNELS_MAX} channels and schemas;"
+                " use another file"
+            )
+        if isinstance(record, Schema):
+            number = self._writer.register_schema(record.name, record.encoding, record.data)
+        else:
+            _, schema = self._schemas.get(record.schema_id, (None, 0))
+            number = self._writer.register_channel(
+                record.topic, record.message_encoding, schema, record.metadata
+            )
+        known[record.id] = record, number

@@ -2,7 +2,7 @@
 
 The loop puts records into a bounded queue; a thread (`cloudrc/drivers/recording.py`) writes the
 records. If the queue is full, the oldest record is dropped and counted. An error of the file never
-stops the flight.
+stops the flight: no method raises an exception.
 """
 
 from __future__ import annotations
@@ -42,24 +42,19 @@ class Recorder:
         capacity: int = CAPACITY,
         size_max: int | None = None,
     ) -> None:
-        """Create the queue; the first `drain` opens the file.
+        """Create the queue of `capacity` records; the first `drain` opens the file.
 
-        Args:
-            path: The file.
-            open_sink: Opens the file: `lambda path: McapWriter(path, clock="world")`.
-            capacity: Number of records that the queue holds.
-            size_max: Size at which the file is ended [bytes]; None for no limit.
+        At `size_max` [bytes] the file is ended; None for no limit.
         """
         self.error = ""
-        self._size_max = size_max
         self._path = path
         self._open_sink = open_sink
         self._capacity = capacity
+        self._size_max = size_max
         self._queue: deque[Record] = deque()
         self._sink: McapWriter | None = None
         self._ended = False
-        self._overflowed = 0
-        self._unwritten = 0
+        self._overflowed = self._unwritten = 0
         self._sync_error: OSError | None = None
 
     @property
@@ -68,11 +63,7 @@ class Recorder:
         return self._overflowed + self._unwritten
 
     def put(self, records: Iterable[Record]) -> None:
-        """Queue records; never wait and never raise.
-
-        Args:
-            records: Records of the process, oldest first.
-        """
+        """Queue records, oldest first; never wait."""
         queue = self._queue
         queue.extend(records)
         while len(queue) > self._capacity:
@@ -82,29 +73,22 @@ class Recorder:
                 self._overflowed += 1
 
     def drain(self, max_records: int = 64) -> int:
-        """Write records from the queue; never raise.
-
-        Args:
-            max_records: Limit of records per call, so that the caller does not block the loop.
-
-        Returns:
-            Number of records taken from the queue.
-        """
-        sink = self._sink or self._open()
+        """Write at most `max_records` records, which delays the loop; return their number."""
+        if self._sink is None and not self._ended:
+            try:
+                self._sink = self._open_sink(self._path)
+            except OSError as error:
+                self._stop(error)
         taken = 0
         with contextlib.suppress(IndexError):
             while taken < max_records:
                 record = self._queue.popleft()
                 taken += 1
-                self._write(sink, record)
+                self._write(record)
         return taken
 
     def flush(self, *, sync: bool = True) -> None:
-        """Hand the written data to the operating system; never raise.
-
-        Args:
-            sync: Whether to sync the data to the disk, too, however long that takes.
-        """
+        """Hand the written data to the operating system; `sync` them to the disk, too."""
         if self._sink and not self._ended:
             try:
                 self._sink.flush()
@@ -118,11 +102,7 @@ class Recorder:
                 self._stop(error)
 
     def sync(self) -> bool:
-        """Sync the flushed data to the disk, however long that takes; never raise.
-
-        Returns:
-            False if the sync failed, or if no file is open.
-        """
+        """Sync the flushed data to the disk, however long that takes; return whether it worked."""
         sink = self._sink
         if sink is not None and not self._ended:
             try:
@@ -135,7 +115,7 @@ class Recorder:
         return False
 
     def close(self) -> None:
-        """Write the remaining records and close the file; never raise."""
+        """Write the remaining records and close the file."""
         while self.drain():
             pass
         if self._sink and not self._ended:
@@ -145,20 +125,12 @@ class Recorder:
             except OSError as error:
                 self._stop(error)
 
-    def _open(self) -> McapWriter | None:
-        if not self._ended:
-            try:
-                self._sink = self._open_sink(self._path)
-            except OSError as error:
-                self._stop(error)
-        return self._sink
-
-    def _write(self, sink: McapWriter | None, record: Record) -> None:
-        if sink is None or self._ended:
+    def _write(self, record: Record) -> None:
+        if self._sink is None or self._ended:
             self._unwritten += 1
             return
         try:
-            sink.write((record,))
+            self._sink.write((record,))
         except OSError as error:
             self._unwritten += 1
             self._stop(error)

@@ -8,9 +8,8 @@ velocities are in the world frame; `cloudrc/record/ros.py` converts both for ROS
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from cloudrc import records as rec
 from cloudrc.messages import MISSION_OVER, Cause
@@ -22,50 +21,27 @@ Row: TypeAlias = tuple[str, int, Values]
 """Topic, stamp [ns] on the clock of the end that records, values in the order of the fields."""
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
-    """A column of a topic.
+class Field(NamedTuple):
+    """A column of a topic."""
 
-    Attributes:
-        name: Name of the column and of the ROS field.
-        kind: Type of a value; vectors have shape (3,), quaternions shape (4,).
-        unit: Unit of the values; "" without a unit.
-        text: Meaning of the values.
-        path: Dotted path of the value in the record. "" means the record's field `name`; if the
-            record has no such field, `part` of the topic followed by `name`.
-    """
-
-    name: str
-    kind: Kind
-    unit: str
-    text: str
-    path: str = ""
+    name: str  # of the column and of the ROS field
+    kind: Kind  # of a value; vectors have shape (3,), quaternions shape (4,)
+    unit: str  # of the values; "" without a unit
+    text: str  # meaning of the values
+    path: str = ""  # dotted path of the value in the record; "" if it follows from the name
 
 
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """A table of the recording.
+class Topic(NamedTuple):
+    """A table of the recording."""
 
-    Attributes:
-        name: Name in the MCAP file, with its slash.
-        ros_type: Message type. A type of `cloudrc_msgs` is defined by `fields`.
-        source: Record class of the rows.
-        end: End that records the topic: "world", "cloud" or "either".
-        text: Meaning of a row.
-        fields: The columns after `stamp_ns`.
-        stamp_path: Dotted path of the row's stamp in the record.
-        part: Path to a nested record, with a dot at its end: "telemetry.". Fields that the record
-            itself does not have are read from there. "" without a nested record.
-    """
-
-    name: str
-    ros_type: str
-    source: type[Record]
-    end: Literal["world", "cloud", "either"]
-    text: str
-    fields: tuple[Field, ...]
-    stamp_path: str = "stamp_ns"
-    part: str = ""
+    name: str  # in the MCAP file, with its slash
+    ros_type: str  # a type of `cloudrc_msgs` is defined by `fields`
+    source: type[Record]  # class of the records
+    end: Literal["world", "cloud", "either"]  # that records the topic
+    text: str  # meaning of a row
+    fields: tuple[Field, ...]  # the columns after `stamp_ns`
+    stamp_path: str  # dotted path of the row's stamp in the record
+    part: str  # path to a nested record, with a dot at its end; it has what the record has not
 
     def paths(self) -> list[str]:
         """Return the dotted path of each field's value in the record."""
@@ -76,52 +52,17 @@ class Topic:
         ]
 
 
-LINK_TOPICS = (
-    Topic(
-        "/link",
-        "cloudrc_msgs/msg/LinkChanged",
-        rec.LinkChanged,
-        "either",
-        "The emulated link of this end was first seen, has changed or is repeated, in real time"
-        " only, clock of its end",
-        (
-            Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
-            Field("shaper", "string", "", "relay or netem"),
-            Field("cause", "string", "", "why it changed; empty before the first change"),
-            Field("age", "float", "s", "time since these conditions took effect"),
-            Field("time_line", "float", "s", "since the time line began; NaN: not restarted"),
-            Field("delay", "float", "s", "profile's delay at the start of the time line, one way"),
-            Field("jitter", "float", "s", "profile's jitter at the start of the time line"),
-            Field("loss", "float", "1", "profile's mean loss at the start of the time line"),
-            Field("rate", "float", "bit/s", "profile's rate at that instant; NaN without one"),
-            Field("conditions", "string", "", "the profile as JSON"),
-        ),
-    ),
-    Topic(
-        "/link_check",
-        "cloudrc_msgs/msg/LinkChecked",
-        rec.LinkChecked,
-        "either",
-        "A measured quantity of the link to this end, judged in flight, in real time only, clock of"
-        " its end",
-        (
-            Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
-            Field("quantity", "string", "", "mean, deviation, round_trip, loss..."),
-            Field("asked", "float", "s or 1", "expected from the profile: a delay or a share"),
-            Field("measured", "float", "s or 1", "measured: a delay or a share"),
-            Field("low", "float", "s or 1", "lowest accepted value"),
-            Field("high", "float", "s or 1", "highest accepted value"),
-            Field(
-                "verdict",
-                "string",
-                "",
-                "ok, off, or open with too few datagrams; told is not judged",
-            ),
-            Field("datagrams", "int", "", "number of datagrams measured"),
-        ),
-    ),
-)
-"""Topics of the link; the drivers make the records of these topics."""
+def _topic(
+    name: str,
+    ros_type: str,
+    source: type[Record],
+    end: Literal["world", "cloud", "either"],
+    text: str,
+    *fields: Field,
+    stamp_path: str = "stamp_ns",
+    part: str = "",
+) -> Topic:
+    return Topic(name, ros_type, source, end, text, fields, stamp_path, part)
 
 
 _POSE_AND_TWIST = (
@@ -158,235 +99,135 @@ _ARRIVAL = (
     Field("used", "bool", "", "true if it became the newest, false if late, repeated or refused"),
 )
 
+# fmt: off
 _TABLE = (
-    Topic(
-        "/odometry",
-        "nav_msgs/msg/Odometry",
-        rec.TelemetrySent,
-        "world",
+    _topic("/odometry", "nav_msgs/msg/Odometry", rec.TelemetrySent, "world",
         "Measured pose and twist as sent, at the instant of the measurement, world's clock",
-        _POSE_AND_TWIST,
-        "telemetry.odometry.stamp_ns",
-        "telemetry.odometry.",
-    ),
-    Topic(
-        "/telemetry",
-        "cloudrc_msgs/msg/Telemetry",
-        rec.TelemetrySent,
-        "world",
+        *_POSE_AND_TWIST,
+        stamp_path="telemetry.odometry.stamp_ns", part="telemetry.odometry."),
+    _topic("/telemetry", "cloudrc_msgs/msg/Telemetry", rec.TelemetrySent, "world",
         "The other fields of the telemetry sent, world's clock",
-        (
-            _EPOCH,
-            _COUNTER,
-            Field("odometry_stamp_ns", "int", "ns", _ODOMETRY, "telemetry.stamp_ns"),
-            Field("tip_force", "float", "N", "on the arm's tip"),
-            Field("echo_stamp_ns", "int", "ns", _ECHO),
-            Field("echo_hold_ns", "int", "ns", "time since world applied that command; 0 if none"),
-            Field("slip_ns", "int", "ns", _SLIP.text),
-            Field("mission", "int", "", "last request of the operator that world acted on"),
-            Field("guard", "int", "", _GUARD),
-            Field("pipe_contacts", "int", "", "contacts with a pipe that began in this mission"),
-            Field(
-                "touch_speed", "float", "m/s", "of the tip's first touch of the board; NaN before"
-            ),
-            Field("mission_id", "int", "", "identity of the mission started last; 0 if none"),
-            Field(
-                "reached", "int", "", f"waypoints reached; {MISSION_OVER} if the mission is over"
-            ),
-            Field("cause", "int", "", _CAUSES),
-        ),
-        part="telemetry.",
-    ),
-    Topic(
-        "/ground_truth",
-        "nav_msgs/msg/Odometry",
-        rec.GroundTruth,
-        "world",
+        _EPOCH,
+        _COUNTER,
+        Field("odometry_stamp_ns", "int", "ns", _ODOMETRY, "telemetry.stamp_ns"),
+        Field("tip_force", "float", "N", "on the arm's tip"),
+        Field("echo_stamp_ns", "int", "ns", _ECHO),
+        Field("echo_hold_ns", "int", "ns", "time since world applied that command; 0 if none"),
+        Field("slip_ns", "int", "ns", _SLIP.text),
+        Field("mission", "int", "", "last request of the operator that world acted on"),
+        Field("guard", "int", "", _GUARD),
+        Field("pipe_contacts", "int", "", "contacts with a pipe that began in this mission"),
+        Field("touch_speed", "float", "m/s", "of the tip's first touch of the board; NaN before"),
+        Field("mission_id", "int", "", "identity of the mission started last; 0 if none"),
+        Field("reached", "int", "", f"waypoints reached; {MISSION_OVER} if the mission is over"),
+        Field("cause", "int", "", _CAUSES),
+        part="telemetry."),
+    _topic("/ground_truth", "nav_msgs/msg/Odometry", rec.GroundTruth, "world",
         "True pose and twist, world's clock",
-        _POSE_AND_TWIST,
-        "odometry.stamp_ns",
-        "odometry.",
-    ),
-    Topic(
-        "/contact_force",
-        "cloudrc_msgs/msg/ContactForce",
-        rec.GroundTruth,
-        "world",
+        *_POSE_AND_TWIST,
+        stamp_path="odometry.stamp_ns", part="odometry."),
+    _topic("/contact_force", "cloudrc_msgs/msg/ContactForce", rec.GroundTruth, "world",
         "Force on the touch sensor, world's clock",
-        (Field("tip_force", "float", "N", "on the arm's tip"),),
-    ),
-    Topic(
-        "/reference",
-        "geometry_msgs/msg/TwistStamped",
-        rec.GroundTruth,
-        "world",
+        Field("tip_force", "float", "N", "on the arm's tip")),
+    _topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
         "Velocity that the guard lets the low-level controller follow, world's clock",
-        (Field("reference", "vector", "m/s", "after the guard's caps, world frame"),),
-    ),
-    Topic(
-        "/uplink_delay",
-        "cloudrc_msgs/msg/Arrival",
-        rec.Arrival,
-        "cloud",
+        Field("reference", "vector", "m/s", "after the guard's caps, world frame")),
+    _topic("/uplink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "cloud",
         "Telemetry arrived at cloud, including late ones, cloud's clock",
-        _ARRIVAL,
-    ),
-    Topic(
-        "/downlink_delay",
-        "cloudrc_msgs/msg/Arrival",
-        rec.Arrival,
-        "world",
+        *_ARRIVAL),
+    _topic("/downlink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "world",
         "A command arrived at world, including late ones, world's clock",
-        _ARRIVAL,
-    ),
-    Topic(
-        "/command_applied",
-        "cloudrc_msgs/msg/CommandApplied",
-        rec.CommandApplied,
-        "world",
+        *_ARRIVAL),
+    _topic("/command_applied", "cloudrc_msgs/msg/CommandApplied", rec.CommandApplied, "world",
         "A command was applied for the first time, world's clock",
-        (
-            *(_EPOCH, _COUNTER, _BASIS),
-            Field("velocity", "vector", "m/s", "before the guard's caps, world frame"),
-        ),
-    ),
-    Topic(
-        "/guard",
-        "cloudrc_msgs/msg/GuardChange",
-        rec.GuardChange,
-        "world",
+        *(_EPOCH, _COUNTER, _BASIS),
+        Field("velocity", "vector", "m/s", "before the guard's caps, world frame")),
+    _topic("/guard", "cloudrc_msgs/msg/GuardChange", rec.GuardChange, "world",
         "The guard changed its state, world's clock",
-        (Field("state", "int", "", _GUARD), Field("cause", "string", "", "why, in words")),
-    ),
-    Topic(
-        "/contact",
-        "cloudrc_msgs/msg/Contact",
-        rec.Contact,
-        "world",
+        Field("state", "int", "", _GUARD), Field("cause", "string", "", "why, in words")),
+    _topic("/contact", "cloudrc_msgs/msg/Contact", rec.Contact, "world",
         "The robot touched something, world's clock",
-        (
-            Field("body", "string", "", "the scene's body: pipe_1, board, floor"),
-            Field("position", "vector", "m", "of the base, world frame"),
-            Field("velocity", "vector", "m/s", "of the base just before, world frame"),
-            Field("tip_velocity", "vector", "m/s", "of the arm's tip just before, world frame"),
-            Field("tip", "bool", "", "true if the arm's tip touched, false for any other part"),
-        ),
-    ),
-    Topic(
-        "/session",
-        "cloudrc_msgs/msg/SessionOpened",
-        rec.SessionOpened,
-        "either",
+        Field("body", "string", "", "the scene's body: pipe_1, board, floor"),
+        Field("position", "vector", "m", "of the base, world frame"),
+        Field("velocity", "vector", "m/s", "of the base just before, world frame"),
+        Field("tip_velocity", "vector", "m/s", "of the arm's tip just before, world frame"),
+        Field("tip", "bool", "", "true if the arm's tip touched, false for any other part")),
+    _topic("/session", "cloudrc_msgs/msg/SessionOpened", rec.SessionOpened, "either",
         "A session began under a new epoch, clock of its end",
-        (_END, _EPOCH, Field("cause", "string", "", "why, in words")),
-    ),
-    Topic(
-        "/estimated_odometry",
-        "nav_msgs/msg/Odometry",
-        rec.Control,
-        "cloud",
+        _END, _EPOCH, Field("cause", "string", "", "why, in words")),
+    _topic("/estimated_odometry", "nav_msgs/msg/Odometry", rec.Control, "cloud",
         "Prediction that the controller used, stamped as the command, cloud's clock; it predicts"
         " for basis_stamp_ns + horizon of /delay_estimate",
-        _POSE_AND_TWIST[:3],
-    ),
-    Topic(
-        "/setpoint_position",
-        "geometry_msgs/msg/PointStamped",
-        rec.Control,
-        "cloud",
+        *_POSE_AND_TWIST[:3]),
+    _topic("/setpoint_position", "geometry_msgs/msg/PointStamped", rec.Control, "cloud",
         "What the controller tracks, cloud's clock",
-        (Field("setpoint", "vector", "m", "position to fly to, world frame"),),
-    ),
-    Topic(
-        "/cmd_vel",
-        "geometry_msgs/msg/TwistStamped",
-        rec.Control,
-        "cloud",
+        Field("setpoint", "vector", "m", "position to fly to, world frame")),
+    _topic("/cmd_vel", "geometry_msgs/msg/TwistStamped", rec.Control, "cloud",
         "Velocity commanded, cloud's clock",
-        (
-            Field("command", "vector", "m/s", "world frame"),
-            Field("yaw_rate", "float", "rad/s", "about the world's z axis"),
-        ),
-    ),
-    Topic(
-        "/delay_estimate",
-        "cloudrc_msgs/msg/DelayEstimate",
-        rec.Control,
-        "cloud",
+        Field("command", "vector", "m/s", "world frame"),
+        Field("yaw_rate", "float", "rad/s", "about the world's z axis")),
+    _topic("/delay_estimate", "cloudrc_msgs/msg/DelayEstimate", rec.Control, "cloud",
         "The delay that the prediction bridged, cloud's clock",
-        (
-            _EPOCH,
-            _COUNTER,
-            _BASIS,
-            Field("horizon", "float", "s", "time by which the odometry was predicted ahead"),
-            Field("rtt", "float", "s", "last round trip without the hold; NaN before the first"),
-            Field("loop_delay", "float", "s", "last round trip with the hold: tau_n of the paper"),
-            Field("measured", "vector", "m", "position in the odometry used, world frame"),
-        ),
-    ),
-    Topic(
-        "/pid",
-        "cloudrc_msgs/msg/Pid",
-        rec.Control,
-        "cloud",
+        _EPOCH,
+        _COUNTER,
+        _BASIS,
+        Field("horizon", "float", "s", "time by which the odometry was predicted ahead"),
+        Field("rtt", "float", "s", "last round trip without the hold; NaN before the first"),
+        Field("loop_delay", "float", "s", "last round trip with the hold: tau_n of the paper"),
+        Field("measured", "vector", "m", "position in the odometry used, world frame")),
+    _topic("/pid", "cloudrc_msgs/msg/Pid", rec.Control, "cloud",
         "Terms of the controller, cloud's clock",
-        (
-            Field("waypoint", "int", "", "index of the waypoint flown to; -1 if none"),
-            Field("proportional", "vector", "m/s", "term per axis, world frame"),
-            Field("integral", "vector", "m/s", "term per axis, world frame"),
-            Field("derivative", "vector", "m/s", "term per axis, world frame"),
-        ),
-    ),
-    Topic(
-        "/mission",
-        "cloudrc_msgs/msg/MissionEvent",
-        rec.MissionEvent,
-        "cloud",
+        Field("waypoint", "int", "", "index of the waypoint flown to; -1 if none"),
+        Field("proportional", "vector", "m/s", "term per axis, world frame"),
+        Field("integral", "vector", "m/s", "term per axis, world frame"),
+        Field("derivative", "vector", "m/s", "term per axis, world frame")),
+    _topic("/mission", "cloudrc_msgs/msg/MissionEvent", rec.MissionEvent, "cloud",
         "An event of the mission, cloud's clock",
-        (
-            Field("event", "string", "", _EVENTS),
-            Field("waypoint", "int", "", "index of the waypoint concerned; -1 if none"),
-            Field("text", "string", "", "the event in words"),
-        ),
-    ),
-    Topic(
-        "/fault",
-        "cloudrc_msgs/msg/Fault",
-        rec.Fault,
-        "either",
+        Field("event", "string", "", _EVENTS),
+        Field("waypoint", "int", "", "index of the waypoint concerned; -1 if none"),
+        Field("text", "string", "", "the event in words")),
+    _topic("/fault", "cloudrc_msgs/msg/Fault", rec.Fault, "either",
         "A fault that did not stop the flight, clock of its end",
-        (
-            Field("code", "string", "", _CODES),
-            Field("text", "string", "", "what, where, what to do"),
-        ),
-    ),
-    Topic(
-        "/count",
-        "cloudrc_msgs/msg/Counted",
-        rec.Counted,
-        "either",
+        Field("code", "string", "", _CODES),
+        Field("text", "string", "", "what, where, what to do")),
+    _topic("/count", "cloudrc_msgs/msg/Counted", rec.Counted, "either",
         "A counter, clock of its end",
-        (
-            _END,
-            Field("name", "string", "", _COUNTED),
-            Field("total", "int", "", "count since the start"),
-        ),
-    ),
-    *LINK_TOPICS,
-    Topic(
-        "/lateness",
-        "cloudrc_msgs/msg/Lateness",
-        rec.Lateness,
-        "either",
+        _END,
+        Field("name", "string", "", _COUNTED),
+        Field("total", "int", "", "count since the start")),
+    _topic("/link", "cloudrc_msgs/msg/LinkChanged", rec.LinkChanged, "either",
+        "The emulated link of this end was first seen, has changed or is repeated, in real time"
+        " only, clock of its end",
+        Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
+        Field("shaper", "string", "", "relay or netem"),
+        Field("cause", "string", "", "why it changed; empty before the first change"),
+        Field("age", "float", "s", "time since these conditions took effect"),
+        Field("time_line", "float", "s", "since the time line began; NaN: not restarted"),
+        Field("delay", "float", "s", "profile's delay at the start of the time line, one way"),
+        Field("jitter", "float", "s", "profile's jitter at the start of the time line"),
+        Field("loss", "float", "1", "profile's mean loss at the start of the time line"),
+        Field("rate", "float", "bit/s", "profile's rate at that instant; NaN without one"),
+        Field("conditions", "string", "", "the profile as JSON")),
+    _topic("/link_check", "cloudrc_msgs/msg/LinkChecked", rec.LinkChecked, "either",
+        "A measured quantity of the link to this end, judged in flight, in real time only, clock of"
+        " its end",
+        Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
+        Field("quantity", "string", "", "mean, deviation, round_trip, loss..."),
+        Field("asked", "float", "s or 1", "expected from the profile: a delay or a share"),
+        Field("measured", "float", "s or 1", "measured: a delay or a share"),
+        Field("low", "float", "s or 1", "lowest accepted value"),
+        Field("high", "float", "s or 1", "highest accepted value"),
+        Field("verdict", "string", "",
+            "ok, off, or open with too few datagrams; told is not judged"),
+        Field("datagrams", "int", "", "number of datagrams measured")),
+    _topic("/lateness", "cloudrc_msgs/msg/Lateness", rec.Lateness, "either",
         "The lateness of a wake, in real time only, clock of its end",
-        (
-            _END,
-            Field("lateness", "float", "s", "now minus the deadline"),
-            Field("busy", "float", "s", "time to handle it"),
-            _SLIP,
-        ),
-    ),
+        _END,
+        Field("lateness", "float", "s", "now minus the deadline"),
+        Field("busy", "float", "s", "time to handle it"),
+        _SLIP),
 )
+# fmt: on
 
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Name -> topic, for every topic of a recording."""
@@ -441,14 +282,7 @@ _UPLINK, _DOWNLINK = _EXTRACT.pop(rec.Arrival)
 
 
 def rows(record: Record) -> list[Row]:
-    """Convert a record to its rows.
-
-    Args:
-        record: A record of either end.
-
-    Returns:
-        One row for each topic of the record, in the order of `TOPICS`.
-    """
+    """Convert a record to one row for each of its topics, in the order of `TOPICS`."""
     if isinstance(record, rec.Arrival):
         name, stamp, values = _UPLINK if record.uplink else _DOWNLINK
         return [(name, stamp(record), values(record))]

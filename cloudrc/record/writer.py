@@ -55,21 +55,19 @@ class McapWriter:
     """Writes the rows of one end, or of a whole mission, to one MCAP file."""
 
     def __init__(self, target: Path | IO[bytes], *, clock: str, clock_id: str = "") -> None:
-        """Open the file and write its header.
+        """Open the file and write its header; every method may raise an OSError.
 
         Args:
             target: A path, overwritten if it exists, or a binary stream that the caller closes.
             clock: End whose clock the stamps use: "world" or "cloud".
             clock_id: Identity of the machine's clock, such as the kernel's boot id; "" if unknown.
                 Files with the same identity need no clock offset.
-
-        Raises:
-            OSError: If the file cannot be written.
         """
         self._owned = isinstance(target, Path)
         # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.
-        self._stream: IO[bytes] | FileIO
-        self._stream = target.open("wb", buffering=0) if isinstance(target, Path) else target
+        self._stream: IO[bytes] | FileIO = (
+            target.open("wb", buffering=0) if isinstance(target, Path) else target
+        )
         # Any, because mcap's writer is not annotated throughout.
         self._mcap: Any = Writer(
             self._stream, compression=CompressionType.ZSTD, enable_data_crcs=True
@@ -89,34 +87,21 @@ class McapWriter:
         self.note({CLOCK: clock, "clock_id": clock_id, "version": __version__, COUNTS: ""})
 
     def write(self, records: Iterable[Record]) -> None:
-        """Write all rows of the records.
-
-        Args:
-            records: Records of one end, oldest first.
-        """
+        """Write all rows of one end's records, oldest first."""
         for record in records:
             for row in rows(record):
                 self.write_row(row, row[1])
             self._open_records += 1
 
     def write_row(self, row: Row, log_time_ns: int) -> None:
-        """Write one row.
-
-        Args:
-            row: Topic, stamp and values.
-            log_time_ns: See `write_message` [ns].
-        """
+        """Write one row; `log_time_ns` [ns] is as in `write_message`."""
         topic, stamp_ns, values = row
         self.write_message(topic, log_time_ns, encode(TOPICS[topic], stamp_ns, values))
 
     def write_message(self, topic: str, log_time_ns: int, data: bytes) -> None:
-        """Write an encoded message.
+        """Write the CDR bytes of a message of a topic.
 
-        Args:
-            topic: A name in `TOPICS`.
-            log_time_ns: Log time of the message [ns]. A negative time becomes zero. A time before
-                the previous message's log time becomes that log time.
-            data: CDR bytes of the message.
+        A `log_time_ns` [ns] that is negative or before the previous message's becomes that one.
         """
         now_ns = self._latest_ns = max(self._latest_ns, log_time_ns)
         if self._chunk_start_ns is None:
@@ -132,22 +117,12 @@ class McapWriter:
         add_message(self._sha256, topic, now_ns, data)
 
     def note(self, metadata: Mapping[str, str]) -> None:
-        """Add values to the file's metadata; a later value of a key replaces an earlier value.
-
-        Args:
-            metadata: Key -> value.
-        """
+        """Add values to the file's metadata; a later value of a key replaces an earlier value."""
         self._noted |= metadata
         self._mcap.add_metadata(METADATA, dict(self._noted))
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
-        """Attach a file to the recording.
-
-        Args:
-            name: Name of the file, such as config.yaml or report.json.
-            data: Bytes of the file.
-            media_type: Media type of the file, such as application/json.
-        """
+        """Attach the bytes of a file, such as report.json, to the recording."""
         self._mcap.add_attachment(0, self._latest_ns, name, media_type, data)
 
     def flush(self) -> None:
@@ -167,10 +142,7 @@ class McapWriter:
                     raise
 
     def abandon(self, reason: str) -> int:
-        """End the file after an error: cut off the torn end, and add a note if there is disk space.
-
-        Args:
-            reason: Why the recording stopped, for the readers of the file.
+        """End the file after an error: cut off the torn end, and note the reason if there is space.
 
         Returns:
             Number of records that were written but are lost.

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from cloudrc.cli import run
-from cloudrc.cli.link_verify_report import as_text, make_report
+from cloudrc.cli.link_verify import as_text, make_report
 from cloudrc.cli.main import main
 from cloudrc.cli.output import print_line, table
 from cloudrc.cli.progress import FlightView

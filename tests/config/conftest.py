@@ -1,15 +1,18 @@
-"""For each key of the schema: a valid value, and the keys that it needs; for generated tests."""
+"""For each key of the schema: a valid value, and the settings that it needs."""
 
 from __future__ import annotations
 
 import json
 from typing import Any, Literal, get_args, get_origin
 
+import pytest
+
 from cloudrc.config import problems
+from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Experiment
+from cloudrc.errors import BadInputError
 
 LEAVES = {".".join(path): field for path, field in problems.leaves(Experiment)}
-
 SPECIAL: dict[str, Any] = {
     "mission": "hover",
     "mission.waypoints.0.position_m": [0.6, 0.1, 0.8],
@@ -32,6 +35,18 @@ SPECIAL: dict[str, Any] = {
 }
 
 
+def refused(name: object, *settings: str) -> str:
+    """Return the message that refuses an experiment."""
+    with pytest.raises(BadInputError) as caught:
+        load_experiment(str(name), settings)
+    assert caught.value.exit_code == 2
+    return str(caught.value)
+
+
+def words(key: str) -> str:
+    return problems.expectation(Experiment, tuple(key.split(".")))
+
+
 def valid(key: str) -> Any:
     """Return a valid value of the key, different from its default if possible."""
     if key in SPECIAL:
@@ -39,24 +54,18 @@ def valid(key: str) -> Any:
     field = LEAVES[key]
     if get_origin(field.annotation) is Literal:
         return get_args(field.annotation)[-1]
-    words = problems.expectation(Experiment, tuple(key.split(".")))
-    if "list of 3" in words:
-        return [0.25, 0.5, 0.75]
-    if "whole number" in words:
-        return 7
-    if "number" in words:
-        return 0.5
-    return (not field.default) if "true or false" in words else "some text"
+    known = {"list of 3": [0.25, 0.5, 0.75], "whole number": 7, "number": 0.5,
+             "true or false": not field.default}  # fmt: skip
+    return next((value for word, value in known.items() if word in words(key)), "some text")
 
 
 def beside(key: str) -> list[str]:
     """List the settings that the key needs."""
     above, _, last = key.rpartition(".")
-    if above.endswith(".loss") and last in ("loss_bad", "loss_good", "delay_bad_ms"):
-        return [f"{above}.bad_start=.1", f"{above}.bad_end=.5", *beside(above)]
     if above.endswith(".loss"):
-        other = {"bad_start": "bad_end", "bad_end": "bad_start"}[last]
-        return [f"{above}.{other}=.5", *beside(above)]
+        needed = {"bad_start": 0.1, "bad_end": 0.5}
+        found = [f"{above}.{name}={value}" for name, value in needed.items() if name != last]
+        return [*found, *beside(above)]
     if above.endswith("changes.0") and last != "at_s":
         return [f"{above}.at_s=3"]
     if above.endswith("blackouts.0"):

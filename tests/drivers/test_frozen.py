@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cloudrc.record.columns import Recording
-from cloudrc.record.recover import recover
+from cloudrc.record.reader import recover
 from tests.drivers.conftest import Release, ages_at_hold
 
 pytestmark = pytest.mark.process

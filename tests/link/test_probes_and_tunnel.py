@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cloudrc.cli.link_verify_local import make_plans
+from cloudrc.cli.link_verify import make_plans
 from cloudrc.config.load import load_experiment
 from cloudrc.link.verify.probe import PROBE
 from cloudrc.tunnel import codec

@@ -130,17 +130,7 @@ def rewrite(
     metadata: bool = True,
     **options: Any,
 ) -> Path:
-    """Rewrite a recording as another program does.
-
-    Args:
-        source: The recording.
-        target: The new file.
-        keep: Whether a message is kept.
-        rename: Gives the new name of a topic.
-        shuffle: Changes the list of messages in place.
-        metadata: Whether metadata and attachments are kept.
-        options: Options of mcap's writer.
-    """
+    """Rewrite a recording as another program does; `shuffle` changes the messages in place."""
     with source.open("rb") as old, target.open("wb") as new:
         reader = make_reader(old)
         messages = [(s, c, m) for s, c, m in reader.iter_messages() if keep(c, m)]

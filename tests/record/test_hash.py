@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import struct
-import subprocess
-import sys
 from typing import Any
 
 import pytest
@@ -54,11 +51,13 @@ def changed(value: Any) -> Any:
         return GuardState((value + 1) % len(GuardState))
     if isinstance(value, tuple):
         return (*value[:-1], changed(value[-1]))
-    return value + ("x" if isinstance(value, str) else 1)
+    if isinstance(value, str):
+        return value + "x"
+    return 0.1 if value != value else value + 1
 
 
 def variants(instance: Any) -> list[Any]:
-    """Yield the record with each of its values changed in turn."""
+    """Return the record with each of its values changed in turn."""
     found = []
     for name in instance._fields:
         value = getattr(instance, name)
@@ -70,34 +69,10 @@ def variants(instance: Any) -> list[Any]:
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
 def test_every_value_counts(cls: type[Any]) -> None:
     every = [*world_records(9), *cloud_records(9), LATE, LINK, CHECK]
-    record = without_nan(next(each for each in every if type(each) is cls))
+    record = next(each for each in every if type(each) is cls)
     digests = [digest(record), *map(digest, variants(record))]
     assert len(set(digests)) == len(digests) > len(record._fields)
 
 
-def without_nan(record: Any) -> Any:
-    """Replace each NaN, which would not change."""
-    for name, value in record._asdict().items():
-        if hasattr(value, "_fields"):
-            record = record._replace(**{name: without_nan(value)})
-        elif value != value:
-            record = record._replace(**{name: 0.1})
-    return record
-
-
-def test_order_and_the_bounds_of_texts_count() -> None:
-    one, other = world_records(3)[:2]
-    assert digest(one, other) != digest(other, one)
+def test_the_bounds_of_texts_count() -> None:
     assert digest(rec.Fault(1, "ab", "c")) != digest(rec.Fault(1, "a", "bc"))
-
-
-def test_another_process_with_another_hash_seed_agrees() -> None:
-    code = (
-        "from tests.record.test_hash import *\n"
-        "print(digest(*world_records(20), *cloud_records(20)))"
-    )
-    environment = {**os.environ, "PYTHONHASHSEED": "4711", "PYTHONPATH": os.pathsep.join(sys.path)}
-    found = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
-    assert found.stdout.strip() == digest(*world_records(20), *cloud_records(20))

@@ -1,9 +1,10 @@
-"""A file is read up to its end or its first damaged part; foreign files are named as they are."""
+"""A file is read or recovered up to its end or first damage; foreign files are named."""
 
 from __future__ import annotations
 
 import io
 import itertools
+import json
 import re
 import tracemalloc
 from contextlib import suppress
@@ -15,60 +16,78 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
+from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.hash import messages_sha256
-from cloudrc.record.reader import read_contents
+from cloudrc.record.reader import read_contents, recover
 from cloudrc.record.ros import definition
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import SHA256, McapWriter
-from tests.record.conftest import assert_equal, rewrite, world_records
+from cloudrc.record.writer import MISSING, SHA256, McapWriter
+from tests.record.conftest import assert_equal, rewrite, world_records, write
 
 RECORDS = world_records(160)
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("whole") / "whole.mcap"
-    with McapWriter(path, clock="world") as writer:
+def make_whole() -> bytes:
+    stream = io.BytesIO()
+    with McapWriter(stream, clock="world") as writer:
         writer.write(RECORDS)
         writer.attach("config.yaml", b"seed: 1\n" * 50)
-    return path
+    return stream.getvalue()
 
 
-def chunk_spans(data: bytes) -> list[tuple[int, int, int]]:
-    """Return the start and end of each chunk, and the number of messages up to there."""
-    found, start, count = [], 8, 0
-    chunks = StreamReader(io.BytesIO(data), emit_chunks=True).records
-    sizes = (
-        sum(isinstance(record, Message) for record in breakup_chunk(chunk))
-        for chunk in chunks
-        if isinstance(chunk, Chunk)
-    )
-    while data[start] != Opcode.FOOTER:
+WHOLE = make_whole()
+
+
+def spans(data: bytes) -> list[tuple[int, int, int]]:
+    """Return the opcode, start and end of each record."""
+    found, start = [], 8
+    while start < len(data) - 8:
         end = start + 9 + int.from_bytes(data[start + 1 : start + 9], "little")
-        if data[start] == Opcode.CHUNK:
-            count += next(sizes)
-            found.append((start, end, count))
+        found.append((data[start], start, end))
         start = end
     return found
 
 
-def test_a_cut_file_is_read_to_its_last_whole_chunk(whole: Path, tmp_path: Path) -> None:
-    data, path = whole.read_bytes(), tmp_path / "cut.mcap"
-    spans = chunk_spans(data)
-    for end, by in itertools.product([end for _, end, _ in spans], (-1, 0, 1, 500)):
-        path.write_bytes(data[: end + by])
-        expected = max((count for _, at, count in spans if at <= end + by), default=0)
-        if not expected:
-            with pytest.raises(BadInputError, match=r"cut\.mcap: holds no readable message: cut"):
+CHUNKS = [(start, end) for opcode, start, end in spans(WHOLE) if opcode == Opcode.CHUNK]
+SIZES = [
+    sum(isinstance(record, Message) for record in breakup_chunk(chunk))
+    for chunk in StreamReader(io.BytesIO(WHOLE), emit_chunks=True).records
+    if isinstance(chunk, Chunk)
+]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """The path of a file that does not exist yet."""
+    return tmp_path / "x.mcap"
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> Path:
+    (tmp_path / "whole.mcap").write_bytes(WHOLE)
+    return tmp_path / "whole.mcap"
+
+
+def flipped(at: int, mask: int = 255) -> bytes:
+    return WHOLE[:at] + bytes([WHOLE[at] ^ mask]) + WHOLE[at + 1 :]
+
+
+def test_a_cut_file_is_read_to_its_last_whole_chunk(path: Path) -> None:
+    for (_, end), by in itertools.product(CHUNKS, (-1, 0, 500)):
+        path.write_bytes(WHOLE[: end + by])
+        whole = [n for n, (_, last) in enumerate(CHUNKS) if last <= end + by]
+        if not whole:
+            with pytest.raises(BadInputError, match=r"x\.mcap: holds no readable message: cut"):
                 Recording.read(path)
             continue
-        recording = Recording.read(path)
+        expected, recording = sum(SIZES[: len(whole)]), Recording.read(path)
         assert sum(len(recording[topic]) for topic in TOPICS) == expected
         assert recording.note.startswith(f"cut short: {expected} messages were read, the last at ")
         assert (recording.complete, recording.lacking) == (False, "")
@@ -76,44 +95,39 @@ def test_a_cut_file_is_read_to_its_last_whole_chunk(whole: Path, tmp_path: Path)
 
 @given(st.data())
 @settings(max_examples=60, deadline=None)
-def test_no_cut_or_flipped_byte_passes_unnoticed(whole: Path, data: st.DataObject) -> None:
-    good = whole.read_bytes()
-    at, flip = data.draw(st.integers(0, len(good) - 1)), data.draw(st.integers(0, 255))
-    path = whole.with_name("damaged.mcap")
-    path.write_bytes(good[:at] + (bytes([good[at] ^ flip]) + good[at + 1 :] if flip else b""))
+def test_no_cut_or_flipped_byte_passes_unnoticed(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    at, flip = data.draw(st.integers(0, len(WHOLE) - 1)), data.draw(st.integers(0, 255))
+    path = tmp_path_factory.getbasetemp() / "damaged.mcap"
+    path.write_bytes(flipped(at, flip) if flip else WHOLE[:at])
     with suppress(BadInputError):
         recording = Recording.read(path)
         if recording.complete:  # a byte of the index, which is not read
             assert_equal(recording, Recording.from_records(RECORDS))
 
 
-def test_a_whole_file_is_complete(whole: Path, tmp_path: Path) -> None:
-    recording = Recording.read(whole)
-    assert (recording.complete, recording.note, recording.remarks) == (True, "", ())
-    assert_equal(recording, Recording.from_records(RECORDS))
-    torn = tmp_path / "index.mcap"
-    torn.write_bytes(whole.read_bytes()[:-1])
-    recording = Recording.read(torn)
-    assert recording.complete
-    assert recording.remarks == ("had a torn index: all its messages were read",)
-    assert recording.attachments["config.yaml"] == b"seed: 1\n" * 50
-    assert_equal(recording, Recording.from_records(RECORDS))
+def test_a_whole_file_is_complete(path: Path) -> None:
+    for data, remarks in (
+        (WHOLE, ()),
+        (WHOLE[:-1], ("had a torn index: all its messages were read",)),
+    ):
+        path.write_bytes(data)
+        recording = Recording.read(path)
+        assert (recording.complete, recording.note, recording.remarks) == (True, "", remarks)
+        assert recording.attachments["config.yaml"] == b"seed: 1\n" * 50
+        assert_equal(recording, Recording.from_records(RECORDS))
 
 
-def test_reading_stops_at_a_damaged_chunk(whole: Path, tmp_path: Path) -> None:
-    data, path = bytearray(whole.read_bytes()), tmp_path / "damaged.mcap"
-    (_, _, count), (start, end, _), *_ = chunk_spans(data)
-    data[(start + end) // 2] ^= 255
-    path.write_bytes(data)
-    recording = Recording.read(path)
-    assert recording.lacking == recording.note
-    assert recording.note.startswith(f"damaged: a checksum is wrong: {count} messages were read")
-
-
-def test_what_follows_the_end_is_told(whole: Path, tmp_path: Path) -> None:
-    path = tmp_path / "twice.mcap"
-    path.write_bytes(whole.read_bytes() * 2)
-    assert Recording.read(path).lacking == "something follows its end"
+def test_reading_stops_at_the_first_damage(path: Path) -> None:
+    for data, said in (
+        (flipped(sum(CHUNKS[1]) // 2), f"damaged: a checksum is wrong: {SIZES[0]} messages were"),
+        (WHOLE * 2, "something follows its end"),
+    ):
+        path.write_bytes(data)
+        recording = Recording.read(path)
+        assert recording.lacking == recording.note
+        assert recording.note.startswith(said)
 
 
 @pytest.mark.parametrize(
@@ -125,13 +139,18 @@ def test_what_follows_the_end_is_told(whole: Path, tmp_path: Path) -> None:
         (b"#ROSBAG V2.0\n", "is a ROS 1 bag, not an MCAP file"),
         (b"SQLite format 3\0", r"is an SQLite file, not MCAP; .*ros2 bag convert"),
         (b"PK\x03\x04 and so on", "is not an MCAP file"),
+        (
+            WHOLE.replace(b"\x04\0\0\0zstd", b"\x04\0\0\0snap"),
+            "its chunks are compressed by 'snap'",
+        ),
     ],
 )
-def test_a_file_of_another_kind_is_named(tmp_path: Path, data: bytes, reason: str) -> None:
-    path = tmp_path / "x.mcap"
+def test_a_file_of_another_kind_is_named(path: Path, data: bytes, reason: str) -> None:
     path.write_bytes(data)
-    with pytest.raises(BadInputError, match=rf"^[^\n]*x\.mcap: {reason}[^\n]*$"):
-        Recording.read(path)
+    for read in (read_contents, lambda path: recover(path, path.with_name("new.mcap"))):
+        with pytest.raises(BadInputError, match=rf"^[^\n]*x\.mcap: {reason}[^\n]*$"):
+            read(path)
+    assert not path.with_name("new.mcap").exists(), "an empty file is never offered"
 
 
 def test_a_folder_or_an_absent_file_is_named(tmp_path: Path) -> None:
@@ -152,20 +171,15 @@ def test_a_folder_or_an_absent_file_is_named(tmp_path: Path) -> None:
     ],
     ids=["lz4", "plain", "no-chunks", "no-crc", "no-summary", "shuffled"],
 )
-def test_an_unusual_layout_is_read(whole: Path, tmp_path: Path, options: dict[str, Any]) -> None:
-    path = rewrite(whole, tmp_path / "n.mcap", **options)
+def test_an_unusual_layout_is_read(whole: Path, path: Path, options: dict[str, Any]) -> None:
+    rewrite(whole, path, **options)
     contents = read_contents(path)
     assert contents.note == ""
     assert_equal(Recording.from_contents(contents), Recording.from_records(RECORDS))
     assert messages_sha256(contents.messages) == contents.metadata[SHA256]
     assert [remark[:9] for remark in contents.remarks] == ["was not i"] * ("shuffle" in options)
-
-
-def test_another_compression_is_named(whole: Path, tmp_path: Path) -> None:
-    path = tmp_path / "x.mcap"
-    path.write_bytes(whole.read_bytes().replace(b"\x04\0\0\0zstd", b"\x04\0\0\0snap"))
-    with pytest.raises(BadInputError, match=r"chunks are compressed by 'snap'; .* zstd and lz4"):
-        read_contents(path)
+    recovery = recover(path, path.with_name("new.mcap"))
+    assert (recovery.complete, recovery.index_is_new, recovery.share) == (True, False, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -181,33 +195,19 @@ def test_another_compression_is_named(whole: Path, tmp_path: Path) -> None:
     ids=["topic", "half", "renamed", "joined", "metadata", "doubled"],
 )
 def test_what_other_programs_changed_is_named(
-    whole: Path, tmp_path: Path, options: dict[str, Any], said: str
+    whole: Path, path: Path, options: dict[str, Any], said: str
 ) -> None:
-    recording = Recording.read(rewrite(whole, tmp_path / "n.mcap", **options))
+    recording = Recording.read(rewrite(whole, path, **options))
     assert recording.lacking == recording.note
     assert re.search(said, recording.lacking), recording.lacking
 
 
-def test_a_torn_recording_that_others_ended_is_told(tmp_path: Path) -> None:
-    stream = io.BytesIO()
-    writer = McapWriter(stream, clock="world")
-    writer.write(RECORDS)
-    writer._mcap.finish()
-    (tmp_path / "w.mcap").write_bytes(stream.getvalue())
-    assert "another program has put an end to it" in Recording.read(tmp_path / "w.mcap").lacking
-
-
-def foreign(path: Path, topic: str, ros_type: str, text: str, data: bytes, channels: int) -> Path:
+def test_a_torn_recording_that_others_ended_is_told(path: Path) -> None:
     with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2")
-        writer.add_metadata("cloudrc", {"clock": "world"})
-        schema = writer.register_schema(ros_type, "ros2msg", text.encode())
-        for n in range(channels):
-            channel = writer.register_channel(topic, "cdr", schema, {"robot": str(n)})
-            writer.add_message(channel, 1, data, 1)
-        writer.finish()
-    return path
+        writer = McapWriter(stream, clock="world")
+        writer.write(RECORDS)
+        writer._mcap.finish()
+    assert "another program has put an end to it" in Recording.read(path).lacking
 
 
 ARRIVAL = definition("cloudrc_msgs/msg/Arrival")
@@ -224,10 +224,18 @@ ARRIVAL = definition("cloudrc_msgs/msg/Arrival")
     ],
 )
 def test_foreign_topics_are_told_apart(
-    tmp_path: Path, topic: str, name: str, text: str, channels: int, said: str
+    path: Path, topic: str, name: str, text: str, channels: int, said: str
 ) -> None:
-    path, ros_type = tmp_path / "f.mcap", f"cloudrc_msgs/msg/{name}"
-    recording = Recording.read(foreign(path, topic, ros_type, text, b"\0\1\0\0\7", channels))
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        writer.add_metadata("cloudrc", {"clock": "world"})
+        schema = writer.register_schema(f"cloudrc_msgs/msg/{name}", "ros2msg", text.encode())
+        for n in range(channels):
+            channel = writer.register_channel(topic, "cdr", schema, {"robot": str(n)})
+            writer.add_message(channel, 1, b"\0\1\0\0\7", 1)
+        writer.finish()
+    recording = Recording.read(path)
     assert said in recording.lacking
     assert bool(said) == bool(recording.note)
     assert bool(recording.remarks) == (not said)
@@ -235,25 +243,21 @@ def test_foreign_topics_are_told_apart(
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
-@pytest.mark.parametrize("size", [0, 1 << 20])
+@pytest.mark.parametrize(("size", "count"), [(0, 40_000), (1 << 20, 20)])
 @pytest.mark.parametrize("stated", [None, 1000])
 def test_a_bomb_ends_with_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    compression: CompressionType,
-    size: int,
-    stated: int | None,
+    path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType, size, count, stated
 ) -> None:
     """A few kilobytes unpack to far more: in large messages, or in very many."""
     monkeypatch.setattr("cloudrc.record.reader.UNPACKED_MAX", limit := 4)
-    path = tmp_path / "bomb.mcap"
     with path.open("wb") as stream:
-        options = {"compression": compression, "index_types": IndexType.NONE}
-        writer = Writer(stream, chunk_size=1 << 27, **options)
+        writer = Writer(
+            stream, chunk_size=1 << 27, compression=compression, index_types=IndexType.NONE
+        )
         writer.start()
         schema = writer.register_schema("nav_msgs/msg/Odometry", "ros2msg", b"")
         channel = writer.register_channel("/odometry", "cdr", schema)
-        for _ in range(20 if size else 40_000):
+        for _ in range(count):
             writer.add_message(channel, 1, bytes(size), 1)
         writer.finish()
     if stated is not None:  # the chunk lies about its size
@@ -263,17 +267,114 @@ def test_a_bomb_ends_with_one_line(
         path.write_bytes(data)
     tracemalloc.start()
     try:
-        told = note_or_error(path)
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
+        told = read_contents(path).lacking
+    except BadInputError as error:
+        told = str(error)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
     assert told.count("\n") == 0
     assert ("unpacks to more than 4 times its size" in told) == (stated is None)
     assert peak < 4 * limit << 20
 
 
-def note_or_error(path: Path) -> str:
+def contents(data: bytes) -> list[str]:
+    """Return the contents of a file, without its layout and its library's name."""
+    reader = make_reader(io.BytesIO(data), validate_crcs=True)
+    found: list[object] = [*reader.iter_attachments(), *reader.iter_metadata()]
+    for schema, channel, message in reader.iter_messages():
+        assert schema is not None
+        what = (schema.name, schema.data, channel.topic, channel.message_encoding)
+        found.append((*what, channel.metadata, message.sequence, message))
+    return sorted(re.sub("(channel_)?id=[0-9]+", "", repr(each)) for each in found)
+
+
+def rescue(folder: Path, data: bytes) -> tuple[bool, list[str]]:
+    """Recover; return whether the copy is complete, and its contents."""
+    source, target = folder / "f.mcap", folder / "new.mcap"
+    target.unlink(missing_ok=True)
+    source.write_bytes(data)
     try:
-        return read_contents(path).lacking
-    except BadInputError as error:
-        return str(error)
+        recovery = recover(source, target)
+    except BadInputError:
+        assert not target.exists()
+        return False, []
+    assert recovery.share == 1.0 if recovery.complete else recovery.share <= 0.999
+    assert make_reader(io.BytesIO(target.read_bytes())).get_summary() is not None
+    return recovery.complete, contents(target.read_bytes())
+
+
+def test_a_lost_index_loses_nothing(tmp_path: Path) -> None:
+    for cut in (0, 1, 8, 30):
+        assert rescue(tmp_path, WHOLE[: len(WHOLE) - cut]) == (True, contents(WHOLE))
+
+
+def check_flips(folder: Path, places: list[int]) -> None:
+    """Each flip is reported, or the result is unchanged."""
+    expected = contents(WHOLE)
+    for at in places:
+        complete, new = rescue(folder, flipped(at, 1 << at % 8))
+        assert not complete or new == expected, f"byte {at}"
+
+
+def test_a_flipped_byte_is_detected_or_harmless(tmp_path: Path) -> None:
+    heads = {start + n for _, start, _ in spans(WHOLE) for n in (0, 1) if start + n < len(WHOLE)}
+    check_flips(tmp_path, [*sorted(heads)[::3], *range(3, len(WHOLE), 7919)])
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("part", range(4))
+def test_every_flipped_byte_is_detected_or_harmless(tmp_path: Path, part: int) -> None:
+    check_flips(tmp_path, [*range(part, len(WHOLE), 4)])
+
+
+def test_a_recovery_says_what_is_kept_and_lost(path: Path) -> None:
+    new, middle = path.with_name("new.mcap"), sum(CHUNKS[1]) // 2
+    for data, said in ((WHOLE[:middle], "cut short"), (flipped(middle), "damaged")):
+        path.write_bytes(data)
+        recovery = recover(path, new)
+        assert recovery.kept["chunks"] == 1
+        assert recovery.share == 1 - recovery.bytes_lost / len(data)
+        assert recovery.notes[0].startswith(f"{said}: ")
+        kept = Recording.read(new)
+        assert kept.note == "; ".join(recovery.notes)
+        assert 40 < len(kept["/odometry"]) < 80
+    path.write_bytes(WHOLE * 2)
+    recovery = recover(path, new)
+    assert (recovery.bytes_lost, recovery.share) == (len(WHOLE), pytest.approx(0.5))
+
+
+def test_messages_without_a_channel_are_counted(path: Path, tmp_path: Path) -> None:
+    source = write(tmp_path / "w.mcap", world_records(5))
+    flat = rewrite(source, path, use_chunking=False).read_bytes()
+    homeless = next(start for code, start, _ in spans(flat) if code == Opcode.CHANNEL)
+    path.write_bytes(flat[:homeless] + b"\x90" + flat[homeless + 1 :])  # an unknown record
+    recovery = recover(path, tmp_path / "new.mcap")
+    assert recovery.dropped["messages"] > 0
+    assert f"{recovery.dropped['messages']} messages are lost" in recovery.notes
+    assert "messages are of no topic" in Recording.read(path).lacking
+
+
+def test_the_command_says_what_is_kept_and_lost(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new, folder = path.with_name("new.mcap"), path.parent
+    path.write_bytes(WHOLE)
+    assert main(["recover", str(path)]) == 0
+    assert "kept 100.0%" in capsys.readouterr().out
+    path.write_bytes(WHOLE[: CHUNKS[0][1] + 100])
+    assert main(["recover", str(path), "--to", str(new), "-o", "json"]) == 1
+    account = json.loads(capsys.readouterr().out)
+    assert (account["schemaVersion"], account["complete"]) == (1, False)
+    assert 0 < account["bytes_lost"] <= 100
+    for target, reason in (
+        (new, "already there; name another file with --to"),
+        (folder / "none" / "n.mcap", "No such file or directory; name another"),
+    ):
+        assert main(["recover", str(path), "-t", str(target)]) == 2
+        assert f"{target}: {reason}" in capsys.readouterr().err
+    with McapWriter(path, clock="world") as writer:  # whose note cannot steer a terminal
+        writer.write(world_records(5))
+        writer.note({MISSING: "\x1b[2J all"})
+    new.unlink()
+    assert main(["recover", str(path), "--to", str(new)]) == 1
+    assert "lossy: \\x1b[2J all\n" in capsys.readouterr().out

@@ -10,46 +10,37 @@ import pytest
 from hypothesis import given, settings
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from cloudrc import records as rec
-from cloudrc.messages import Odometry
 from cloudrc.record.ros import decode, definition, encode, is_known, shifted, type_hash
 from cloudrc.record.topics import TOPICS, rows
 from tests.record.conftest import any_record
 
 
-def standard(ros_type: str, data: bytes) -> Any:
-    """Decode a message as a ROS 2 tool that knows only the standard types."""
-    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, ros_type)
+def standard(topic: str, stamp_ns: int, values: Any) -> Any:
+    """Encode a row, and decode it as a ROS 2 tool that knows only the standard types."""
+    data = encode(TOPICS[topic], stamp_ns, values)
+    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, TOPICS[topic].ros_type)
 
 
-def test_an_odometry_is_converted_at_the_edge() -> None:
+def xyz(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+def test_rows_are_converted_to_the_conventions_of_ros() -> None:
     half = math.sqrt(0.5)
     # A quarter turn to the left: forward is the world's y, so a motion along x is to the right.
-    odometry = Odometry(
-        2_500_000_000, (1.0, 2.0, 3.0), (half, 0.0, 0.0, half), (4.0, 1.0, 0.5), (0.1, 0.2, 0.3)
-    )
-    name, stamp_ns, values = rows(rec.GroundTruth(0, odometry, 0.0, (0.0, 0.0, 0.0)))[0]
-    message = standard("nav_msgs/msg/Odometry", encode(TOPICS[name], stamp_ns, values))
+    values = ((1.0, 2.0, 3.0), (half, 0.0, 0.0, half), (4.0, 1.0, 0.5), (0.1, 0.2, 0.3))
+    message = standard("/ground_truth", 2_500_000_000, values)
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (2, 500_000_000)
     assert (message.header.frame_id, message.child_frame_id) == ("world", "base_link")
     pose, twist = message.pose.pose, message.twist.twist
-    assert (pose.position.x, pose.position.y, pose.position.z) == (1.0, 2.0, 3.0)
-    turn = pose.orientation
-    assert (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, half, half)
-    linear = (twist.linear.x, twist.linear.y, twist.linear.z)
-    assert linear == pytest.approx((1.0, -4.0, 0.5), abs=1e-12)
-    assert (twist.angular.x, twist.angular.y, twist.angular.z) == (0.1, 0.2, 0.3)
-
-
-def test_a_command_and_a_prediction_are_converted() -> None:
-    data = encode(TOPICS["/cmd_vel"], 1, ((1.0, 2.0, 3.0), 0.4))
-    twist = standard("geometry_msgs/msg/TwistStamped", data).twist
-    assert (twist.linear.x, twist.linear.y, twist.linear.z) == (1.0, 2.0, 3.0)
-    assert (twist.angular.x, twist.angular.y, twist.angular.z) == (0.0, 0.0, 0.4)
-    values = ((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    data = encode(TOPICS["/estimated_odometry"], 0, values)
-    rate = standard("nav_msgs/msg/Odometry", data).twist.twist.angular.z
-    assert math.isnan(rate), "it is not predicted"
+    assert xyz(pose.position) == (1.0, 2.0, 3.0)
+    assert (*xyz(pose.orientation), pose.orientation.w) == (0.0, 0.0, half, half)
+    assert xyz(twist.linear) == pytest.approx((1.0, -4.0, 0.5), abs=1e-12)
+    assert xyz(twist.angular) == (0.1, 0.2, 0.3)
+    predicted = standard("/estimated_odometry", 0, values[:3]).twist.twist
+    assert math.isnan(predicted.angular.z), "it is not predicted"
+    twist = standard("/cmd_vel", 1, ((1.0, 2.0, 3.0), 0.4)).twist
+    assert (xyz(twist.linear), xyz(twist.angular)) == ((1.0, 2.0, 3.0), (0.0, 0.0, 0.4))
 
 
 @given(any_record())
@@ -70,7 +61,7 @@ def test_text_that_is_not_unicode_is_recorded_as_far_as_it_is() -> None:
     assert decode(topic, encode(topic, 0, ("bad_name", "file \udcff")))[1][1] == "file ?"
 
 
-@pytest.mark.parametrize("offset_ns", [0, 1, -1, -3_000_000_001, 10**15])
+@pytest.mark.parametrize("offset_ns", [0, -1, -3_000_000_001, 10**15])
 def test_a_stamp_is_moved_and_nothing_else(offset_ns: int) -> None:
     topic, values = TOPICS["/cmd_vel"], ((1.0, 2.0, 3.0), 0.4)
     data = shifted(encode(topic, 2_000_000_000, values), offset_ns)
@@ -84,21 +75,19 @@ def test_a_definition_stands_on_its_own(ros_type: str) -> None:
     store.register(get_types_from_msg(text, ros_type))
     assert store.hash_rihs01(ros_type) == type_hash(ros_type)
     assert is_known(ros_type, text)
-    own, _, _ = text.partition("=" * 80)
-    assert "cloudrc" not in ros_type or all("#" in line for line in own.splitlines())
 
 
 @pytest.mark.parametrize(
-    ("change", "known"),
+    ("old", "new", "known"),
     [
-        (("# [s]", "# seconds:"), True),
-        (("float64 delay", "float32 delay"), False),
-        (("bool used", "bool use"), False),
-        (("int64 epoch  # epoch of its session\n", ""), False),
-        (("int64 epoch", "int64 ("), False),
+        ("# [s]", "# seconds:", True),
+        ("float64 delay", "float32 delay", False),
+        ("int64 epoch  # epoch of its session\n", "", False),
+        ("int64 epoch", "int64 (", False),
+        ("int64 epoch", "#" * 70_000 + "\nint64 epoch", False),
     ],
 )
-def test_another_layout_is_noticed(change: tuple[str, str], known: bool) -> None:
+def test_another_layout_is_noticed(old: str, new: str, known: bool) -> None:
     text = definition("cloudrc_msgs/msg/Arrival")
-    assert change[0] in text
-    assert is_known("cloudrc_msgs/msg/Arrival", text.replace(*change)) is known
+    assert old in text
+    assert is_known("cloudrc_msgs/msg/Arrival", text.replace(old, new)) is known

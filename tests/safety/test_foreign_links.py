@@ -16,7 +16,7 @@ from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.state import publish
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
-from cloudrc.record.recover import recover
+from cloudrc.record.reader import recover
 from cloudrc.report.document import write_json
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf, isnan, sqrt
 from typing import NamedTuple, TypeAlias
 
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Told
-from cloudrc.link.verify.expect import netem_makes
-from cloudrc.link.verify.judge import Row
+from cloudrc.link.verify.judge import Row, netem_makes
 
 LATE = 1.5e-3
 """A relay whose 99 % quantile of the release error exceeds this lacks CPU [s]."""
@@ -63,37 +62,36 @@ def read_evidence(told: Told, metrics: Metrics, sent: int | None = None) -> Evid
     `sent` is what its end has sent since the process started; None if that was not counted.
     """
     netem, counted = told.shaper == "netem", sent is not None and bool(metrics)
+    shaper, applied, layers = told.shaper, told.applied, 1
+    interface, elsewhere = "", tuple[str, ...]()
     received, unread = (
         int(metrics.get(f"cloudrc_link_datagrams_total/{one}", 0.0)) if counted else None
         for one in ("received", "unread")
     )
+    passed = None if netem else received
+    if near := told.near:
+        interface, here = near.interface, list(near.netems.get(near.interface, ()))
+        if not netem:  # an end reaches a relay over lo
+            here += near.netems.get("lo", ()) if interface != "lo" else ()
+            layers = 1 + len(here)
+        else:
+            elsewhere = tuple(sorted(set(near.netems) - {interface}))
+            layers = len(here)
+            counts = [int(one.get("packets", 0)) + int(one.get("drops", 0)) for one in here]
+            passed = max(counts) if counts and sent is not None else None
+            shaper, applied = ("netem", applied) if here else ("none", None)
     stopped = metrics.get("cloudrc_cpu_throttled_periods_total", 0.0)
     periods = metrics.get("cloudrc_cpu_periods_total", 0.0)
-    known = Evidence(
-        told.shaper,
-        told.why,
-        layers=1,
-        applied=told.applied and netem_makes(told.applied) if netem else told.applied,
+    return Evidence(
+        *(shaper, told.why, interface, elsewhere, layers or None),
+        applied=netem_makes(applied) if netem and applied else applied,
         sent=sent,
-        passed=None if netem else received,
+        passed=passed,
         unread=unread,
         late=metrics.get("cloudrc_link_release_error_seconds/99"),
         throttled=stopped / periods if periods else None,
         restored=int(metrics.get("cloudrc_link_restored_total", 0.0)),
     )
-    if (near := told.near) is None:
-        return known
-    here = list(near.netems.get(near.interface, ()))
-    known = replace(known, interface=near.interface)
-    if not netem:  # an end reaches a relay over lo
-        here += near.netems.get("lo", ()) if near.interface != "lo" else ()
-        return replace(known, layers=1 + len(here))
-    elsewhere = tuple(sorted(set(near.netems) - {near.interface}))
-    if not here:
-        return replace(known, shaper="none", applied=None, elsewhere=elsewhere, layers=None)
-    passed = max(int(one.get("packets", 0)) + int(one.get("drops", 0)) for one in here)
-    passed_here = None if sent is None else passed
-    return replace(known, elsewhere=elsewhere, layers=len(here), passed=passed_here)
 
 
 class Cause(NamedTuple):
@@ -150,9 +148,9 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
     """Give the first cause that holds, and beside a lack of CPU what that cannot explain."""
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
-    for code, text in _of_machine(one.evidence, off, lost) if off else ():
-        yield code, text
-        if code != "throttled":
+    if off and (read := next(_of_machine(one.evidence, off, lost), None)):
+        yield read
+        if read[0] != "throttled":
             return
         beyond = lost > 1.2 * (one.evidence.unread or 0) / (one.evidence.sent or 1)
         kept = {name for name, row in off.items() if (_ratio(row) < 1.0) != (name == "rate")}

@@ -1,18 +1,36 @@
-"""Judge one direction: rows of what was requested, applied and measured.
+"""Predict what the datagrams of one direction measure, and judge what they did measure.
 
-A row is "ok" within what honest links measure, widened by a tolerance, and "off" beyond; "open" if
-chance could hide more than that; "told" is for information only.
+Draws are counter-based, so the fate of each datagram on a relay is known. netem draws its own
+chance, so the model is flown with 200 other seeds and the band of each quantity is taken. A row is
+"ok" within that band, widened by a tolerance, and "off" beyond; "open" if chance could hide more
+than that; "told" is for information only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from math import isnan, nan
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import isnan, nan, sqrt
+from typing import NamedTuple, TypeAlias
 
-from cloudrc.link.model import Stream
-from cloudrc.link.verify.expect import Expected, Plan
+import numpy as np
+from numpy.typing import NDArray
 
+from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
+
+Floats: TypeAlias = NDArray[np.float64]
+
+RUNS, RUN_LENGTH = 200, 1000
+"""Links that are flown for a band, and datagrams of each; for other numbers a band is scaled."""
+TAIL = 1e-3
+"""Share of honest links below a band, and share of them above it [1]."""
+SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
+"""Least correlation with predicted delays, and share of predicted losses, of a known link [1]."""
+STILL, SHAPE_FLOOR = 1e-4, 2e-3
+"""Below these standard deviations delays tell nothing about draws, and the machine itself changes
+the shape of their distribution [s]."""
 TOLERANCES = {
     "mean": (2e-3, 0.05),
     "round_trip": (2e-3, 0.05),
@@ -29,28 +47,204 @@ FEWEST, CHANCE_MAX = 300, 1.5
 """Datagrams that a verdict takes at least [1]; tolerances that chance may hide in it [1]."""
 
 
+class Flow(NamedTuple):
+    """Datagrams of one kind: seed and direction of their draws, UDP payload [bytes]."""
+
+    seed: int
+    uplink: bool
+    kind: int
+    size: int
+
+
+class Expected(NamedTuple):
+    """What honest links measure; if their draws are known, chance has no part in it."""
+
+    bands: dict[str, tuple[float, float, float]]  # mean, and what all but TAIL exceed
+    pooled: Floats  # delays about the requested ones, median 0, rising [s]
+    known: bool
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Datagrams of one direction, as probes or in flight, and what they measure on honest links.
+
+    Attributes:
+        profile: Requested conditions.
+        flow: The datagrams.
+        sent: When each is sent, since the link came up [s], shape (n,).
+        train: Datagrams per train; each follows as many single ones. 0 without trains.
+        pause: Called every few hundred microseconds, so that other threads run.
+    """
+
+    profile: DirectionProfile
+    flow: Flow
+    sent: Floats
+    train: int = 0
+    pause: Callable[[], None] = lambda: None
+
+    def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
+        """Draw what the link does to datagrams sent at `sent` [s] with counters from `first` on.
+
+        A damaged datagram is refused, and so is lost.
+        """
+        seed, uplink, kind, size = self.flow
+        link, whole = LinkDirection(self.profile, seed, uplink), bytes(size)
+        delays, copies = np.full(len(sent), np.nan), np.zeros(len(sent), int)
+        for place, now_ns in enumerate(np.rint(sent * 1e9).astype(np.int64).tolist()):
+            fate = link.send(epoch, kind, first + place, size, now_ns)
+            if link.corrupts and link.corrupted(epoch, kind, first + place, whole) != whole:
+                fate = ()
+            if fate:
+                delays[place], copies[place] = (min(fate) - now_ns) * 1e-9, len(fate)
+            if place % 128 == 0:
+                self.pause()
+        return Stream(sent, delays, copies)
+
+    @cached_property
+    def links(self) -> list[Stream]:
+        """Streams over links of other seeds, as netem realises the profile; RUN_LENGTH at most."""
+        few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
+        sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
+        seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
+        made = replace(self, profile=netem_makes(self.profile))
+        return [replace(made, flow=self.flow._replace(seed=seed)).draw(sent) for seed in seeds]
+
+    @cached_property
+    def chance(self) -> Expected:
+        """What these links measure."""
+        return self._expect(self.links)
+
+    def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
+        """Expect what the link drew if a stream met its own draws, otherwise what others draw."""
+        drawn = self.draw(measured.sent, epoch, first)
+        if self._fits(self._singles(measured), self._singles(drawn)):
+            return self._expect([drawn])
+        factor = sqrt(len(self.links[0].sent) / max(1, len(measured.sent)))
+        bands = {
+            name: (mean, mean - factor * (mean - low), mean + factor * (high - mean))
+            for name, (mean, low, high) in self.chance.bands.items()
+        }
+        return self.chance._replace(bands=bands)
+
+    def needed(self) -> int:
+        """Return how many datagrams it takes until chance hides no more than the tolerances."""
+        most = max(_hidden(name, self.chance) for name in self.chance.bands)
+        return round(len(self.links[0].sent) * max(1.0, most**2))
+
+    def applied(self, profile: DirectionProfile | None) -> dict[str, float]:
+        """Compute the quantities on a link of another profile, if that and the own never change."""
+        if profile is None or Timeline(self.profile).only() is None:
+            return {}
+        other = replace(self, profile=profile)
+        return other.quantities(other.draw(self.sent), np.zeros(0))
+
+    def quantities(self, stream: Stream, pooled: Floats) -> dict[str, float]:
+        """Compute what is judged of a stream in one pass; an unknown value is NaN.
+
+        The deviation [s] is about the delay requested at each time, so it shows the jitter alone;
+        the "distribution" is the distance of Kolmogorov and Smirnov from `pooled` [1].
+        """
+        singles = self._singles(stream)
+        found, shape = numbers(singles), self._shape(singles)
+        measured = {
+            "mean": found.mean,
+            "deviation": float(shape.std()) if len(shape) else np.nan,
+            "loss": found.loss,
+            "reordered": found.overtaken,
+            "duplicated": float((singles.copies > 1).sum()) / max(1, len(shape)),
+        }
+        if self.train:
+            measured["rate"] = self._rate(stream)
+        if len(shape) and len(pooled) and pooled.std() > SHAPE_FLOOR:
+            points, steps = np.sort(shape), np.arange(len(shape) + 1) / len(shape)
+            left, right = (np.searchsorted(pooled, points, side) for side in ("left", "right"))
+            far = steps[1:] - left / len(pooled), right / len(pooled) - steps[:-1]
+            measured["distribution"] = float(np.max(far))
+        return measured
+
+    def _fits(self, measured: Stream, drawn: Stream) -> bool:
+        """Say whether datagrams met their own draws: by their delays, else by the losses."""
+        lost = np.isnan(measured.delays), np.isnan(drawn.delays)
+        both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)
+        pair = [(one.delays - requested)[both] for one in (measured, drawn)]
+        if both.any() and min(one.std() for one in pair) > STILL:
+            return bool(np.corrcoef(pair[0], pair[1])[0, 1] > SAME_DELAYS)
+        return bool(np.mean(lost[0] == lost[1]) > SAME_LOSSES)
+
+    def _expect(self, links: Sequence[Stream]) -> Expected:
+        pooled = np.sort(np.concatenate([self._shape(self._singles(link)) for link in links]))
+        pooled = pooled[:: 1 + len(pooled) // 4096]
+        found, bands = [self.quantities(link, pooled) for link in links], {}
+        for name in found[0]:
+            values = np.nan_to_num([one.get(name, np.nan) for one in found])
+            low, high = np.quantile(values, (TAIL, 1.0 - TAIL)).tolist()
+            bands[name] = (float(values.mean()), low, high)
+        return Expected(bands, pooled, known=len(links) == 1)
+
+    def _singles(self, stream: Stream) -> Stream:
+        if not self.train:
+            return stream
+        parts = (stream.sent, stream.delays, stream.copies)
+        return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
+
+    def _shape(self, stream: Stream) -> Floats:
+        """Compute the delays about those requested at their time, with median 0 [s]."""
+        delays = stream.delays - _requested_delay(self.profile, stream.sent)
+        there: Floats = delays[np.isfinite(delays)]
+        return there - np.median(there) if len(there) else there
+
+    def _rate(self, stream: Stream) -> float:
+        """Compute the rate at which trains leave a bottleneck [bit/s].
+
+        Source: M. Jain, C. Dovrolis, IEEE/ACM Trans. Networking 12, 2004: packet dispersion.
+        """
+        arrival = (stream.sent + stream.delays).reshape(-1, 2 * self.train)[:, self.train :]
+        arrival = arrival[np.isfinite(arrival).sum(axis=1) > self.train // 2]
+        spans = np.nanmax(arrival, axis=1, initial=0.0) - np.nanmin(arrival, axis=1, initial=np.inf)
+        bits = (self.train - 1) * (self.flow.size + HEADER_BYTES) * 8.0
+        return float(bits / spans.mean()) if len(spans) and spans.mean() > 0.0 else np.nan
+
+
+def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
+    """Return the delay that a profile requests at each time since the link came up [s]."""
+    timeline = Timeline(profile)
+    if timeline.period_ns is not None:
+        sent = np.where(sent > 0.0, sent % (timeline.period_ns * 1e-9), sent)
+    starts = np.array(timeline.pass_ns) * 1e-9
+    delays = np.array([piece.delay_ns for piece in timeline.pieces]) * 1e-9
+    found: Floats = delays[np.maximum(np.searchsorted(starts, sent, side="right") - 1, 0)]
+    return found
+
+
+def netem_makes(profile: DirectionProfile) -> DirectionProfile:
+    """Return the profile that an end meets behind netem, in the model's terms.
+
+    netem draws delays without correlation, loses either a packet or its copy, and sends the copy
+    through its losses once more. Source: Linux, net/sched/sch_netem.c.
+    """
+    loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
+    twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)
+    if isinstance(loss, GilbertElliott):
+        loss = replace(loss, loss_bad=single * loss.loss_bad, loss_good=single * loss.loss_good)
+    else:
+        loss *= single
+    return replace(profile, correlation=0.0, loss=loss, duplicate=twice)
+
+
 class Row(NamedTuple):
     """One quantity of one direction; an unknown value is NaN.
 
-    Attributes:
-        name: Quantity, as in `Plan.quantities`, or "round_trip".
-        unit: Of the numbers: "s", "1" or "bit/s".
-        asked: Mean on links of the requested profile [unit].
-        applied: Likewise of the profile that the shaper says is in force [unit].
-        measured: Measured value [unit].
-        low: Lowest value that is believed [unit].
-        high: Highest value that is believed [unit].
-        verdict: "ok", "off", "open" or "told".
+    The values asked, applied, measured, low and high have the unit `unit`, so any unit.
     """
 
-    name: str
-    unit: str
-    asked: float
-    applied: float
+    name: str  # as in `Plan.quantities`, or "round_trip"
+    unit: str  # "s", "1" or "bit/s"
+    asked: float  # mean on links of the requested profile
+    applied: float  # likewise of the profile that the shaper says is in force
     measured: float
-    low: float
-    high: float
-    verdict: str
+    low: float  # lowest value that is believed
+    high: float  # highest value that is believed
+    verdict: str  # "ok", "off", "open" or "told"
 
 
 def judge(
@@ -67,7 +261,7 @@ def judge(
 
 
 def judge_value(name: str, expected: Expected, value: float, applied: float = nan) -> Row:
-    """Judge one value [unit] beside the `applied` one [unit].
+    """Judge one value beside the `applied` one [any unit].
 
     Where the draws are known, a jitter may be off by half as much.
     """
@@ -76,27 +270,21 @@ def judge_value(name: str, expected: Expected, value: float, applied: float = na
     slack = max(TOLERANCES[name][0], 0.5 * tolerance(name, mean)) if half else tolerance(name, mean)
     low, high = max(0.0, low - slack), high + slack
     verdict = "ok" if low <= value <= high else "off"
-    if isnan(value) or (verdict == "ok" and hidden(name, expected) > CHANCE_MAX):
+    if isnan(value) or (verdict == "ok" and _hidden(name, expected) > CHANCE_MAX):
         verdict = "open"
     return Row(name, UNITS.get(name, "1"), mean, applied, value, low, high, verdict)
 
 
 def tolerance(name: str, asked: float) -> float:
-    """Return how far a quantity may be off from what was asked, in its unit [unit]."""
+    """Return how far a quantity may be off from what was asked [any unit]."""
     floor, share = TOLERANCES.get(name, SHARE_TOLERANCE)
     return max(floor, share * asked)
 
 
-def hidden(name: str, expected: Expected) -> float:
+def _hidden(name: str, expected: Expected) -> float:
     """Return how much chance hides of a quantity, in tolerances [1]."""
     mean, low, high = expected.bands[name]
     return 0.5 * (high - low) / tolerance(name, mean)
-
-
-def needed(plan: Plan) -> int:
-    """Return how many datagrams it takes until chance hides no more than the tolerances."""
-    most = max(hidden(name, plan.chance) for name in plan.chance.bands)
-    return round(len(plan.links[0].sent) * max(1.0, most**2))
 
 
 def look_twice(first: Sequence[Row], second: Sequence[Row]) -> list[Row]:

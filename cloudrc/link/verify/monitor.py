@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import hypot, inf, isnan, nan
+from math import hypot, inf, isinf, isnan, nan
 from pathlib import Path
 from typing import TypeAlias
 
@@ -23,8 +23,19 @@ from cloudrc.link.model import Stream
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.state import STATE_MAX, from_text
 from cloudrc.link.verify.causes import describe
-from cloudrc.link.verify.expect import RUN_LENGTH, TAIL, Expected, Floats, Flow, Plan
-from cloudrc.link.verify.judge import FEWEST, Row, judge, judge_value, needed, verdict_of
+from cloudrc.link.verify.judge import (
+    FEWEST,
+    RUN_LENGTH,
+    TAIL,
+    Expected,
+    Floats,
+    Flow,
+    Plan,
+    Row,
+    judge,
+    judge_value,
+    verdict_of,
+)
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
 PERIOD = 0.01
@@ -56,7 +67,7 @@ class LinkMonitor:
         """Set up for the end that receives a flow: cloud the uplink; then call `follow`."""
         self._uplink, self._flow = uplink, flow
         self._arrivals = deque[_Heard](maxlen=KEPT)
-        self._trips, self._lates = deque[float](maxlen=KEPT), deque[float](maxlen=KEPT)
+        self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
         self._asked: Asked | None = None
         self._plans: list[Plan] = []  # of what is received, and of the other direction
         self._epoch, self._trip, self._fresh, self._seen = -1, nan, True, ""
@@ -133,9 +144,11 @@ class LinkMonitor:
         if self._asked is None:
             return []
         if self._fresh:  # a time line that runs is not judged: where it began is not known here
-            lengths_ns = [Timeline(profile).last_ns for profile in self._asked]
-            self._since_ns = now_ns + SETTLE_NS + max(lengths_ns)
-            self._due_ns = now_ns + SETTLE_NS + CHECK_NS
+            last_ns = max(Timeline(profile).last_ns for profile in self._asked)
+            self._since_ns, self._due_ns = (
+                now_ns + SETTLE_NS + last_ns,
+                now_ns + SETTLE_NS + CHECK_NS,
+            )
             self._fresh, self._suspects = False, set()
         if now_ns < self._since_ns:
             self._forget()
@@ -176,7 +189,7 @@ class LinkMonitor:
             expected = plan.expected(stream, self._epoch, first)
             rows = judge(plan, stream, expected, {})
             if not expected.known:
-                told["datagrams"] = (needed(plan), len(stream.sent))
+                told["datagrams"] = (plan.needed(), len(stream.sent))
                 told |= {"correlation": (profile.correlation, 0)} if profile.correlation else {}
         rows = [row for row in rows if row.name in (TIMED if timed else UNTIMED)]
         if not timed and len(self._trips) >= FEWEST:
@@ -184,11 +197,13 @@ class LinkMonitor:
         rows = [_excused(row, np.array(self._lates)) for row in rows]
         if profile.rate:
             told["rate"] = (profile.rate, nan)
-        if any(Timeline(one).only() is None for one in self._asked or ()):
-            told["time_line"] = (1, 0)
-        for name, (asked, measured) in told.items():
-            rows.append(Row(name, "1", asked, nan, measured, nan, nan, "told"))
-        return rows
+        timelines = [Timeline(one) for one in self._asked or ()]
+        if any(one.only() is None for one in timelines):  # 1: it loops, and is never judged
+            told["time_line"] = (1, float(any(isinf(one.last_ns) for one in timelines)))
+        return rows + [
+            Row(name, "1", asked, nan, measured, nan, nan, "told")
+            for name, (asked, measured) in told.items()
+        ]
 
     def _round_trip(self) -> list[Row]:
         """Judge round trips: the newest wins, so datagrams that none overtook make them."""

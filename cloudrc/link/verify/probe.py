@@ -19,8 +19,7 @@ import numpy as np
 from cloudrc.link.model import HEADER_BYTES, Stream
 from cloudrc.link.profile import DirectionProfile, Timeline
 from cloudrc.link.relay import ANCILLARY_SIZE, DATAGRAM_MAX, Stamps, ask_for_stamps
-from cloudrc.link.verify.expect import Flow, Plan
-from cloudrc.link.verify.judge import needed
+from cloudrc.link.verify.judge import Flow, Plan
 from cloudrc.tunnel.codec import Direction, encode_header, peek
 
 PROBE = 254
@@ -65,7 +64,7 @@ def plan_probes(
     last = timeline.last_ns * 1e-9
     found = plan(seconds or max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
     if drawn and not last and not seconds:
-        found = plan(max(COUNT * step, min(needed(found) * step, LONGEST)))
+        found = plan(max(COUNT * step, min(found.needed() * step, LONGEST)))
     return found
 
 

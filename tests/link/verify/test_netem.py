@@ -9,13 +9,22 @@ from contextlib import contextmanager
 
 import pytest
 
-from cloudrc.cli import link_verify_local
-from cloudrc.cli.link_verify import find_experiment
-from cloudrc.cli.link_verify_local import DEVICE, HOSTS, Way, make_plans, probe_link, run_link
-from cloudrc.cli.link_verify_report import Report, as_text, make_report
+from cloudrc.cli import link_verify
+from cloudrc.cli.link_verify import (
+    DEVICE,
+    HOSTS,
+    Report,
+    Way,
+    as_text,
+    find_experiment,
+    make_plans,
+    make_report,
+    probe_link,
+    run_link,
+)
 from cloudrc.config.schema import Profile
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
-from cloudrc.link.verify.expect import Plan
+from cloudrc.link.verify.judge import Plan
 
 pytestmark = pytest.mark.netem
 SETTINGS = [
@@ -74,7 +83,7 @@ def running(
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_verify_local, "START_LIMIT", 300.0)  # emulated processors are slow
+    monkeypatch.setattr(link_verify, "START_LIMIT", 300.0)  # emulated processors are slow
 
 
 def causes(report: Report) -> list[tuple[str, str]]:

@@ -1,0 +1,234 @@
+"""`cloudrc link verify` of a release, which `helm test` runs, over real HTTP."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from cloudrc.cli import link_verify
+from cloudrc.cli.link_verify import Report, as_text, find_experiment, verify_release
+from cloudrc.config.load import load_experiment
+from cloudrc.drivers.exporter import Exporter
+from cloudrc.errors import TimedOutError
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.sidecar import Near, Told, write_told
+from cloudrc.records import LinkChecked
+
+APPLIED = DirectionProfile(0.045, loss=0.02, duplicate=0.01, rate=3e6)
+MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}
+
+
+@dataclass
+class Release:
+    """The exporters of two pods."""
+
+    ends: dict[str, Exporter]
+    links: dict[str, Exporter]
+    pods: dict[str, tuple[str, str]]
+    looks: int = 0
+
+    def hears(self, *, stamp_ns: int = 5, name: str = "mean", **verdicts: str) -> None:
+        """Give ends a verdict on the direction that they receive."""
+        for end, verdict in verdicts.items():
+            up, value = end == "cloud", MEASURED[verdict]
+            rows = [
+                LinkChecked(stamp_ns, up, name, 0.045, value, 0.043, 0.047, verdict, 3300),
+                LinkChecked(stamp_ns, up, "loss", 0.0, 0.0, 0.0, 0.02, "ok", 3300),
+            ]
+            self.ends[end].see(rows)
+
+    def tells(self, name: str, asked: float, measured: float = math.nan) -> None:
+        """Let cloud tell a row that it does not judge."""
+        row = LinkChecked(5, True, name, asked, measured, 0.0, 0.0, "told", 3300)
+        self.ends["cloud"].see([row])
+
+    def shapes(self, way: str, told: Told) -> None:
+        self.links[way].tells(lambda: write_told(told))
+
+    def ask(self, limit: float = 30.0) -> Report:
+        return verify_release("demo", self.pods, limit, lambda line: None)
+
+
+@pytest.fixture
+def release(monkeypatch: pytest.MonkeyPatch) -> Iterator[Release]:
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # a proxy is not used
+    with ExitStack() as stack:
+
+        def served(role: str) -> tuple[Exporter, str]:
+            exporter = stack.enter_context(closing(Exporter(role)))
+            return exporter, f"http://127.0.0.1:{exporter.serve(('127.0.0.1', 0))}"
+
+        (world, at_world), (cloud, at_cloud) = served("world"), served("cloud")
+        (up, at_up), (down, at_down) = served("link"), served("link")
+        pods = {"world": (at_world, at_up), "cloud": (at_cloud, at_down)}
+        made = Release({"world": world, "cloud": cloud}, {"uplink": up, "downlink": down}, pods)
+        for way, link in made.links.items():
+            link.shaped("relay", way, "auto")
+            made.shapes(way, Told("relay", "", APPLIED, Near("eth0", {})))
+
+        def count(seconds: float) -> None:
+            made.looks += 1
+
+        monkeypatch.setattr(link_verify.time, "sleep", count)
+        monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)  # as no time passes
+        yield made
+
+
+def causes(report: Report) -> list[tuple[str, str]]:
+    return [(cause["code"], cause["way"]) for cause in report["causes"]]
+
+
+def rows(report: Report) -> dict[str, Any]:
+    return {row["name"]: row for row in report["directions"]["uplink"]["rows"]}
+
+
+def test_a_release_is_believed_once_both_ends_do(release: Release) -> None:
+    release.hears(world="ok", cloud="ok")
+    said = release.ask()
+    assert (said["verdict"], said["shaper"]) == ("believed", "shaped by relay")
+    # The mean includes the transmission time.
+    assert rows(said)["mean"]["applied"] == pytest.approx(0.0456, abs=1e-4)
+    assert rows(said)["loss"]["applied"] == pytest.approx(0.02, abs=0.01)
+    assert as_text(said).splitlines()[-1].startswith("BELIEVED")
+    release.links["uplink"].tells(lambda: "{}")
+    said = release.ask()
+    assert said["verdict"] == "believed"
+    assert all("applied" not in row for row in rows(said).values())
+
+
+@pytest.mark.parametrize(
+    ("shaper", "leaves", "code"),
+    [("relay", "eth0", "shaped_twice"), ("netem", "eth1", "wrong_interface")],
+)
+def test_qdiscs_that_the_links_find_are_named(
+    release: Release, shaper: str, leaves: str, code: str
+) -> None:
+    for way in release.links:
+        release.shapes(way, Told(shaper, "", APPLIED, Near(leaves, {"eth0": [{"kind": "netem"}]})))
+    release.hears(world="off", cloud="off")
+    assert causes(release.ask()) == [(code, "both")]
+
+
+@pytest.mark.parametrize(("applied", "told_so"), [(0.090, True), (0.0452, False)])
+def test_a_fault_names_its_direction_and_the_shapers_word(
+    release: Release, applied: float, told_so: bool
+) -> None:
+    release.shapes("downlink", Told("relay", "", DirectionProfile(applied)))
+    release.hears(world="off", cloud="ok")
+    said = release.ask()
+    assert said["verdict"] == "not believed"
+    assert causes(said) == [("doubled_delay", "downlink")]
+    text = said["causes"][0]["text"]
+    assert f"the shaper says {applied * 1e3:.2f} ms" in text
+    assert ("it was told so" in text) is told_so
+
+
+def test_once_one_direction_is_off_the_wait_is_short(
+    release: Release, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link_verify, "OFF_TIMEOUT", 0.0)
+    release.hears(world="off", cloud="open")
+    assert release.ask(limit=5.0)["verdict"] == "not believed"
+    assert release.looks <= 3, "once at the start, once it is off"
+
+
+def test_a_verdict_off_for_a_moment_does_not_end_the_wait(
+    release: Release, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    release.hears(world="off", cloud="open")
+
+    def recover(seconds: float) -> None:
+        release.looks += 1
+        if release.looks > 2:
+            cloud = "ok" if release.looks > 4 else "open"
+            release.hears(world="ok", cloud=cloud, stamp_ns=5 + release.looks)
+
+    monkeypatch.setattr(link_verify.time, "sleep", recover)
+    assert release.ask()["verdict"] == "believed"
+
+
+@pytest.mark.parametrize(
+    ("told", "notes"),
+    [
+        ({}, ["downlink: no datagrams to measure; fly a mission first"]),
+        ({"datagrams": (8800, 3300)}, ["uplink: 3300 of 8800 datagrams, 55 s more"]),
+        ({"rate": (3e6, math.nan)}, ["uplink: rate NOT JUDGED"]),
+        ({"correlation": (0.9, 0.0)}, ["uplink: correlation 0.9 NOT JUDGED: netem realises"]),
+        ({"time_line": (1.0, 0.0)}, ["uplink: its time line NOT JUDGED in flight"]),
+    ],
+)
+def test_what_is_not_judged_is_noted(
+    release: Release, told: dict[str, tuple[float, float]], notes: list[str]
+) -> None:
+    release.hears(
+        cloud="open" if "datagrams" in told else "ok", **({"world": "ok"} if told else {})
+    )
+    for name, values in told.items():
+        release.tells(name, *values)
+    said = release.ask(0.0)
+    undecided = not told or "datagrams" in told
+    assert said["verdict"] == ("undecided" if undecided else "believed")
+    for note in notes:
+        assert note in as_text(said)
+    partly = as_text(said).splitlines()[-1].endswith("except what is NOT JUDGED (above)")
+    assert partly is not undecided
+
+
+def test_nobody_waits_for_a_time_line_that_loops(release: Release) -> None:
+    release.hears(world="ok")
+    release.tells("time_line", 1.0, 1.0)
+    release.tells("datagrams", 300, 0)
+    said = release.ask(limit=5.0)
+    assert (said["verdict"], release.looks) == ("undecided", 1)
+    assert said["notes"] == [
+        "uplink: NOT JUDGED in flight: a time line loops; probe it without --mode cluster"
+    ]
+
+
+def test_a_verdict_by_round_trips_is_noted(release: Release) -> None:
+    release.hears(world="ok")
+    release.hears(cloud="ok", name="round_trip")
+    assert "do not share a clock" in "".join(release.ask()["notes"])
+
+
+@pytest.mark.parametrize(
+    ("asked", "applied", "code"),
+    [(2e6, 3e6, "rate_ignored"), (2e6, None, "rate_ignored"), (5e6, 3e6, "slow")],
+)
+def test_a_shaper_that_reports_another_rate_is_not_believed(
+    release: Release, asked: float, applied: float | None, code: str
+) -> None:
+    """Single datagrams do not measure the rate."""
+    release.shapes("uplink", Told("relay", "", DirectionProfile(0.045, rate=applied)))
+    release.hears(world="ok", cloud="ok")
+    release.tells("rate", asked)
+    said = release.ask()
+    assert said["verdict"] == "not believed"
+    assert causes(said) == [(code, "uplink")]
+    in_words = f"{applied * 1e-3:.0f} kbit/s" if applied else "no limit"
+    assert f"the shaper says {in_words} instead of" in said["causes"][0]["text"]
+    assert "NOT JUDGED" not in as_text(said)
+
+
+def test_ends_that_do_not_answer_are_a_timeout(release: Release) -> None:
+    release.ends["world"].close()
+    with pytest.raises(TimedOutError, match="world did not answer"):
+        release.ask(0.0)
+
+
+@pytest.mark.parametrize("key", ["seed: 7", "criteria: {}", "guard: {}", "tunnel: {}"])
+def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(
+    key: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text(key + "\n")
+    assert find_experiment("./mine.yaml", []).uplink == load_experiment("./mine.yaml").uplink
+    (tmp_path / "mine.yaml").write_text("description: mine\nuplink: {delay_ms: 12}\n")
+    assert find_experiment("./mine.yaml", []).uplink.delay_ms == 12.0
