@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cloudrc.faults.hold_invariants import GROUND_NS, RAMP
+from cloudrc.faults.invariants import GROUND_NS, RAMP
 from cloudrc.messages import ZERO, Cause, GuardState, Request, Start
 from tests.faults.conftest import ESTOP, GROUND, HOLD, LAND, MS, TRACK, FakeRobot
 

@@ -13,12 +13,11 @@ import pytest
 
 from cloudrc.cli import faults as command
 from cloudrc.cli.main import main
-from cloudrc.faults import measures, report
-from cloudrc.faults.datagrams import HostileSender
+from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.report import Result
-from cloudrc.faults.scenario import Check, Outcome, Scenario
+from cloudrc.faults.scenario import Check, Outcome, Result, Scenario, as_junit
 from cloudrc.faults.scenarios import SCENARIOS, find
+from cloudrc.faults.scenarios.intruder import HostileSender
 from cloudrc.records import Counted
 from tests.conftest import nightly
 
@@ -116,7 +115,7 @@ def results() -> list[Result]:
 
 
 def test_results_as_junit() -> None:
-    suite = Xml.fromstring(report.as_junit(results(), 7))
+    suite = Xml.fromstring(as_junit(results(), 7))
     assert (suite.attrib["tests"], suite.attrib["failures"]) == ("3", "2")
     failures = [case.find("failure") for case in suite]
     texts = ["" if failure is None else failure.attrib["message"] for failure in failures]
@@ -155,14 +154,14 @@ def test_the_list_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
         ("run", "required"),
         ("run F13 --seed -1", "'-1' is not a whole number"),
         ("run F1 --seed 9007199254740992", "argument --seed: '9007199254740992' is not a whole"),
-        ("run F13 --junit none/x.xml", "this file cannot be written"),
+        ("run F13 --junit /dev/null/x.xml", "/dev/null/x.xml: cannot be written"),
         ("run none.yaml", "none.yaml: "),
         ("run F99", "no fault 'F99'; there are: F1 short-blackout, F2 "),
         ("run cloud-kiled", "; did you mean cloud-killed?"),
         ("search --first -5", "'-5' is not a whole number"),
         ("search --minutes 0", "'0' is not a number of minutes"),
         ("search --minutes nan", "'nan' is not a number of minutes"),
-        ("search --store /dev/null/found", "this folder cannot be made"),
+        ("search --store /dev/null/found", "cannot be written"),
     ],
 )
 def test_bad_input_is_told_in_one_line(
