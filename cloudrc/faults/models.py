@@ -366,7 +366,7 @@ class SeparateTeleop(InProcessTeleop):
         self._peer = _Peer(lambda: self.service is not None)
         self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)
         self._peer.other, self._clouds.other = self._clouds, self._peer
-        self._phase_ns = phase_ns
+        self._phase_ns, self._free_ns = phase_ns, 0
         super().__init__(contact_speed_max)
 
     def start(self) -> None:
@@ -411,7 +411,7 @@ class SeparateTeleop(InProcessTeleop):
         self._calls: list[Action] = []
         self._stops: list[Action] = []
         self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
-        self._free_ns: int = 0
+        self._free_ns = 0
         self._turn_ns, self._blind = NEVER_NS, 0
 
     def _wake(self, now_ns: int) -> None:
