@@ -170,21 +170,11 @@ class Flight:
         self.fly(limit, lambda: self.teleop.service is not None and self.mission.ended)
         return self.fly(self.now + 1.0)
 
-    def kill_cloud(self, now_ns: int, down: float) -> None:
-        """Kill cloud's process at `now_ns` [ns]; a new one starts after `down` [s]."""
-        self.cloud.kill(now_ns)
-        self.cloud.at(now_ns * 1e-9 + down, self.cloud.start)
-
-    def kill_cloud_pod(self, now_ns: int, down: float) -> None:
+    def restart_pod(self, now_ns: int, down: float) -> None:
         """Kill cloud and teleop at `now_ns` [ns]; new ones start after `down` [s]."""
         self.teleop.kill()
-        self.kill_cloud(now_ns, down)
+        self.cloud.restart(now_ns, down)
         self.cloud.at(now_ns * 1e-9 + down, lambda _: self.teleop.start())
-
-    def kill_world(self, now_ns: int, down: float) -> None:
-        """Kill world at `now_ns` [ns]; a new one, at the spawn, starts after `down` [s]."""
-        self.world.kill(now_ns)
-        self.world.at(now_ns * 1e-9 + down, self.world.start)
 
     def replace_key(self, end: str, keys: KeySet) -> None:
         """Write an end's key file; a process that is down reads it later."""

@@ -108,6 +108,11 @@ class RestartableEndpoint:
         self.inner = self._build(self.clock.at(now_ns))
         self._set_deadline()
 
+    def restart(self, now_ns: int, down: float) -> None:
+        """Kill the process at `now_ns` [ns]; a new one starts after `down` [s]."""
+        self.kill(now_ns)
+        self.at(now_ns * 1e-9 + down, self.start)
+
     def freeze(self, now_ns: int, duration: float) -> None:
         """Stop the process as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
         self._frozen_until_ns = max(self._frozen_until_ns, now_ns + round(duration * 1e9))

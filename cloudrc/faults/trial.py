@@ -310,15 +310,15 @@ def _inject_into_ends(flight: Flight, event: Event) -> None:
     at, lasts, cloud, world = event.at, event.duration, flight.cloud, flight.world
     match event.kind:
         case "cloud_killed":
-            cloud.at(at, lambda now_ns: flight.kill_cloud(now_ns, lasts))
+            cloud.at(at, lambda now_ns: cloud.restart(now_ns, lasts))
         case "pod_killed":
-            cloud.at(at, lambda now_ns: flight.kill_cloud_pod(now_ns, lasts))
+            cloud.at(at, lambda now_ns: flight.restart_pod(now_ns, lasts))
         case "cloud_paused":
             cloud.at(at, lambda now_ns: cloud.freeze(now_ns, lasts))
         case "cloud_throttled":
             cloud.throttle(at, lasts, event.value)
         case "world_killed":
-            world.at(at, lambda now_ns: flight.kill_world(now_ns, lasts))
+            world.at(at, lambda now_ns: world.restart(now_ns, lasts))
         case "world_paused":
             world.at(at, lambda now_ns: world.freeze(now_ns, lasts))
         case "world_throttled":
@@ -354,7 +354,7 @@ def _inject_into_teleop(flight: Flight, event: Event) -> None:
             cloud.at(event.end, lambda _: teleop.start())
         case "pod_shut_down":
             cloud.at(at, ask(MissionService.pause))
-            cloud.at(gone, lambda now_ns: flight.kill_cloud_pod(now_ns, event.end - gone))
+            cloud.at(gone, lambda now_ns: flight.restart_pod(now_ns, event.end - gone))
         case "second_order":
             cloud.at(at, flight.order_if_possible)
         case "stopped":

@@ -112,7 +112,7 @@ def test_captured_greetings_do_not_delay_a_restarted_cloud(
     assert len(hellos) == 2, "with a cookie and without"
     to_world = {"old hello": hellos[:1], "fresh hello": fresh}.get(which, hellos + fresh)
     restarted_ns = flight.run.now_ns
-    flight.kill_cloud(restarted_ns, 0.0)
+    flight.cloud.restart(restarted_ns, 0.0)
     for _ in range((4 if challenges else 2) * rate):
         flight.replay({"world": to_world, "cloud": challenges})
         flight.fly(flight.now + 1.0 / rate)

@@ -54,7 +54,7 @@ def interrupt(figure: Figure, kill: bool, at: float, *settings: str, calm: float
     links = {} if kill else {"uplink": cut, "downlink": cut}
     flight = Flight(*PATIENCE, *settings, **links)
     if kill:
-        flight.cloud.at(at, lambda now_ns: flight.kill_cloud(now_ns, KILLED))
+        flight.cloud.at(at, lambda now_ns: flight.cloud.restart(now_ns, KILLED))
     flight.fly_mission(200.0)
     (hold,) = measures.held(flight)
     held, basis_age = hold.stamp_ns * 1e-9, measures.basis_age_at_hold(flight)

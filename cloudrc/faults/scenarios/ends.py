@@ -13,6 +13,7 @@ from cloudrc.faults.models import EndpointGroup
 from cloudrc.faults.scenario import Outcome, generator, scenario
 from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, Fault
+from cloudrc.teleop.service import NO_CLOUD
 from cloudrc.tunnel.handshake import BUSY_TEXT
 
 
@@ -27,7 +28,7 @@ from cloudrc.tunnel.handshake import BUSY_TEXT
 def _cloud_killed(outcome: Outcome, seed: int) -> None:
     at, down = measures.instant(seed), 0.8
     flight = Flight(seed=seed)
-    flight.cloud.at(at, lambda now_ns: flight.kill_cloud(now_ns, down))
+    flight.cloud.at(at, partial(flight.cloud.restart, down=down))
     flight.fly_mission()
     measures.safe_and_done(outcome, flight)
     measures.held_in_time(outcome, flight)
@@ -52,12 +53,12 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
     at, missed = measures.instant(seed), "loop_missed_periods_total"
     flight = Flight(seed=seed, separate=True)
-    flight.cloud.at(at, lambda now_ns: flight.cloud.freeze(now_ns, 5.0))
+    flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
     shown = measures.look(flight, at + 4.0)
     flight.fly_mission()
     measures.safe_and_done(outcome, flight)
     measures.held_in_time(outcome, flight)
-    measures.silence_told(outcome, shown, 4.0, cloud=False, what="cloud stalled")
+    measures.silence_told(outcome, shown, NO_CLOUD, "cloud stalled")
     measures.causes_told(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
@@ -79,7 +80,7 @@ def _cloud_paused(outcome: Outcome, seed: int) -> None:
 def _world_restarted(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
     flight, back = Flight(seed=seed), at + 2.0
-    flight.world.at(at, lambda now_ns: flight.kill_world(now_ns, 2.0))
+    flight.world.at(at, partial(flight.world.restart, down=2.0))
     flight.fly(at + 12.0)
     measures.safe(outcome, flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]

@@ -9,6 +9,7 @@ from cloudrc.faults.flight import Flight, conditions, silent
 from cloudrc.faults.scenario import Outcome, scenario
 from cloudrc.link.profile import GilbertElliott
 from cloudrc.messages import Cause, GuardState
+from cloudrc.teleop.service import NOT_HEARD
 
 
 @scenario(
@@ -71,7 +72,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
             outcome.most(f"{what}: below 0.05 m/s after", calm, 1.0, "s")
             drift = measures.drift(flight, began + 2.0, back)
             outcome.most(f"{what}: drift", drift, 0.10, "m")
-            measures.silence_told(outcome, shown, 0.9 * duration, cloud=True, what=what)
+            measures.silence_told(outcome, shown, NOT_HEARD, what)
         measures.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
         outcome.most(f"{what}: resumed after", measures.resumed_after(flight, back), 1.0, "s")
 
@@ -103,7 +104,7 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     shown = measures.look(flight, at + 70.0)
     flight.fly(at + 80.0)
     measures.safe(outcome, flight)
-    measures.silence_told(outcome, shown, 70.0, cloud=True, what=where)
+    measures.silence_told(outcome, shown, NOT_HEARD, where)
     held = next(iter(measures.changes_into(flight, GuardState.HOLD)), nan)
     landed = next(iter(measures.changes_into(flight, GuardState.LAND)), nan)
     outcome.most(f"{where}: LAND 60 s after HOLD, off by", abs(landed - held - 60.0), 0.01, "s")
