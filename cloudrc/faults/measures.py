@@ -184,25 +184,6 @@ def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
     outcome.true(f"{what}each TRACK after it tells of fresh commands", right)
 
 
-def look(flight: Flight, at: float) -> dict[str, Any]:
-    """Return a dictionary that gets teleop's status, as its API shows it, at an instant [s]."""
-    state: dict[str, Any] = {}
-
-    def ask(now_ns: int) -> None:
-        assert flight.teleop.service is not None
-        state.update(flight.teleop.service.state(flight.cloud.clock.at(now_ns)))
-
-    flight.cloud.at(at, ask)
-    return state
-
-
-def silence_told(outcome: Outcome, state: dict[str, Any], advice: str, what: str) -> None:
-    """Check that the status in a silence shows no past as present, and tells whom to look after."""
-    seen = state["seen"]
-    outcome.true(f"{what}: the status shows the guard's state as past", seen["guard_for_s"] is None)
-    outcome.true(f"{what}: its next step is: {advice}", seen["next_step"] == advice)
-
-
 # The path.
 
 

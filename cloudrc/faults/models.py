@@ -294,6 +294,9 @@ class InProcessTeleop:
         """Make an emergency stop at `now_ns` of cloud's clock [ns]."""
         self.ask(MissionService.stop_rotors, now_ns)
 
+    def freeze(self, now_ns: int, duration: float) -> None:
+        """Stop the process as SIGSTOP does; inside cloud's process it cannot."""
+
     def run_on(self, host: RestartableEndpoint) -> None:
         """Begin to run on the machine of `host`."""
 

@@ -11,6 +11,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from math import inf, nan
 
@@ -20,7 +21,7 @@ from cloudrc.faults.adversary import Lie, dishonesty
 from cloudrc.faults.flight import SECRET, Flight
 from cloudrc.faults.invariants import LATCHED, Breach
 from cloudrc.faults.measures import events_of_missions, held
-from cloudrc.faults.models import Call, Clock, SeparateTeleop, Tamper
+from cloudrc.faults.models import Action, Call, Clock, RestartableEndpoint, Tamper
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event, Schedule, shaped
 from cloudrc.messages import Command, GuardState
@@ -267,12 +268,50 @@ def _check_alarms(flight: Flight) -> None:
 def inject(flight: Flight, schedule: Schedule) -> None:
     """Schedule all faults on a flight."""
     for event in schedule.events:
-        _inject_into_ends(flight, event)
-        _inject_into_teleop(flight, event)
+        process = flight.world if event.kind.startswith("world") else flight.cloud
+        if event.kind.endswith("throttled"):
+            process.throttle(event.at, event.duration, event.value)
+        for time, action in _actions(flight, process, event).get(event.kind, ()):
+            process.at(time, action)
     intrusions, rng = schedule.of("corruption", "garbage", "replay"), generator(schedule.seed, 41)
     for way, process in (("down", flight.world), ("up", flight.cloud)):
         if mine := [event for event in intrusions if event.way in ("both", way)]:
             process.tamper = _tamper(mine, rng)
+
+
+def _actions(
+    flight: Flight, process: RestartableEndpoint, event: Event
+) -> dict[str, tuple[tuple[float, Action], ...]]:
+    """Return what happens when [s] in a fault of each kind; `process` is the one that it hits."""
+    at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
+    gone = at + event.value * lasts  # for teleop that was asked to end
+
+    def ask(call: Call) -> Action:
+        return lambda now_ns: teleop.ask(call, flight.cloud.clock.at(now_ns))
+
+    def read(end: str, keys: KeySet | None = None) -> Action:
+        return lambda now_ns: flight.replace_key(end, keys or flight.secrets["world"])
+
+    restart, freeze = partial(process.restart, down=lasts), partial(process.freeze, duration=lasts)
+    kill, start = lambda now_ns: teleop.kill(), lambda now_ns: teleop.start()
+    return {
+        **dict.fromkeys(("cloud_killed", "world_killed"), ((at, restart),)),
+        **dict.fromkeys(("cloud_paused", "world_paused"), ((at, freeze),)),
+        "pod_killed": ((at, partial(flight.restart_pod, down=lasts)),),
+        "pod_shut_down": (
+            (at, ask(MissionService.pause)),
+            (gone, partial(flight.restart_pod, down=end - gone)),
+        ),
+        "teleop_killed": ((at, kill), (end, start)),
+        "teleop_shut_down": ((at, ask(MissionService.pause)), (gone, kill), (end, start)),
+        "teleop_paused": ((at, lambda now_ns: teleop.freeze(now_ns, lasts)),),
+        "second_cloud": ((end, lambda now_ns: flight.end_rival()),),
+        "key_rotated": ((at, read("world", NEXT_KEY)), (end, read("cloud", NEXT_KEY))),
+        "key_wrong": ((at, read("cloud", WRONG_KEY)), (end, read("cloud"))),
+        "second_order": ((at, flight.order_if_possible),),
+        "stopped": ((at, lambda now_ns: teleop.stop_rotors(flight.cloud.clock.at(now_ns))),),
+        "held": ((at, ask(MissionService.hold)), (end, ask(MissionService.resume))),
+    }
 
 
 def _tamper(events: list[Event], rng: np.random.Generator) -> Tamper:
@@ -303,65 +342,6 @@ def flipped(data: bytes, rng: np.random.Generator, flips: int) -> bytes:
     for place in rng.choice(8 * len(data), min(flips, 8 * len(data)), replace=False).tolist():
         bits[place >> 3] ^= 1 << (place & 7)
     return bytes(bits)
-
-
-def _inject_into_ends(flight: Flight, event: Event) -> None:
-    """Schedule a fault of world, cloud, their keys, or of another cloud."""
-    at, lasts, cloud, world = event.at, event.duration, flight.cloud, flight.world
-    match event.kind:
-        case "cloud_killed":
-            cloud.at(at, lambda now_ns: cloud.restart(now_ns, lasts))
-        case "pod_killed":
-            cloud.at(at, lambda now_ns: flight.restart_pod(now_ns, lasts))
-        case "cloud_paused":
-            cloud.at(at, lambda now_ns: cloud.freeze(now_ns, lasts))
-        case "cloud_throttled":
-            cloud.throttle(at, lasts, event.value)
-        case "world_killed":
-            world.at(at, lambda now_ns: world.restart(now_ns, lasts))
-        case "world_paused":
-            world.at(at, lambda now_ns: world.freeze(now_ns, lasts))
-        case "world_throttled":
-            world.throttle(at, lasts, event.value)
-        case "second_cloud":
-            cloud.at(event.end, lambda _: flight.end_rival())
-        case "key_rotated":
-            world.at(at, lambda _: flight.replace_key("world", NEXT_KEY))
-            cloud.at(event.end, lambda _: flight.replace_key("cloud", NEXT_KEY))
-        case "key_wrong":
-            cloud.at(at, lambda _: flight.replace_key("cloud", WRONG_KEY))
-            cloud.at(event.end, lambda _: flight.replace_key("cloud", flight.secrets["world"]))
-
-
-def _inject_into_teleop(flight: Flight, event: Event) -> None:
-    """Schedule a fault of teleop, or an action of the operator."""
-    at, cloud, teleop = event.at, flight.cloud, flight.teleop
-    gone = at + event.value * event.duration  # a share of the duration after it was asked to end
-
-    def ask(call: Call) -> Callable[[int], None]:
-        return lambda now_ns: teleop.ask(call, cloud.clock.at(now_ns))
-
-    match event.kind:
-        case "teleop_killed":
-            cloud.at(at, lambda _: teleop.kill())
-            cloud.at(event.end, lambda _: teleop.start())
-        case "teleop_paused":
-            assert isinstance(teleop, SeparateTeleop), "the flight of such a schedule has one"
-            cloud.at(at, lambda now_ns: teleop.freeze(now_ns, event.duration))
-        case "teleop_shut_down":
-            cloud.at(at, ask(MissionService.pause))
-            cloud.at(gone, lambda _: teleop.kill())
-            cloud.at(event.end, lambda _: teleop.start())
-        case "pod_shut_down":
-            cloud.at(at, ask(MissionService.pause))
-            cloud.at(gone, lambda now_ns: flight.restart_pod(now_ns, event.end - gone))
-        case "second_order":
-            cloud.at(at, flight.order_if_possible)
-        case "stopped":
-            cloud.at(at, lambda now_ns: teleop.stop_rotors(cloud.clock.at(now_ns)))
-        case "held":
-            cloud.at(at, ask(MissionService.hold))
-            cloud.at(event.end, ask(MissionService.resume))
 
 
 def _bugs(schedule: Schedule, clock: Clock) -> Lie:

@@ -54,7 +54,7 @@ def test_one_seed_is_one_run() -> None:
 @pytest.mark.parametrize(
     ("name", "broken", "value", "said"),
     [
-        ("F15", "cloudrc.teleop.service.SILENCE", 1e9, "shows the guard's state as past"),
+        ("F13", "cloudrc.world.guard.state.SETTLE_NS", 3 * 10**9, "TRACK again after its start"),
         ("F40", "cloudrc.world.endpoint.REAL_TIME_FACTOR_MIN", 0.0, "times that world tells"),
         ("F13", "cloudrc.faults.invariants.HIGH", (1.2, 1.2, 1.2), "breaches of an invariant"),
     ],

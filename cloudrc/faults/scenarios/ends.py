@@ -13,7 +13,6 @@ from cloudrc.faults.models import EndpointGroup
 from cloudrc.faults.scenario import Outcome, generator, scenario
 from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, Fault
-from cloudrc.teleop.service import NO_CLOUD
 from cloudrc.tunnel.handshake import BUSY_TEXT
 
 
@@ -47,18 +46,16 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     "cloud-paused",
     injects="SIGSTOP of the cloud process for 5 s",
     expects="HOLD; of what it computed before nothing is applied",
-    shows="guard HOLD with its cause; in the status: cloud not heard, nor the robot; "
-    "cloudrc_guard_transitions_total, then cloudrc_loop_missed_periods_total",
+    shows="guard HOLD with its cause, cloudrc_guard_transitions_total, then "
+    "cloudrc_loop_missed_periods_total",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
     at, missed = measures.instant(seed), "loop_missed_periods_total"
     flight = Flight(seed=seed, separate=True)
     flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
-    shown = measures.look(flight, at + 4.0)
     flight.fly_mission()
     measures.safe_and_done(outcome, flight)
     measures.held_in_time(outcome, flight)
-    measures.silence_told(outcome, shown, NO_CLOUD, "cloud stalled")
     measures.causes_told(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
