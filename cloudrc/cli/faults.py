@@ -6,10 +6,10 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
@@ -18,8 +18,7 @@ from cloudrc.cli.pool import WorkerDiedError, interrupt_on_signals, map_in_order
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.faults.report import Result
-    from cloudrc.faults.search import Search
+    from cloudrc.faults.scenario import Result
 
 EPILOG = """\
 examples:
@@ -44,6 +43,7 @@ ACTIONS = {
     "search": "fly random combinations of faults and check the invariants in every step",
 }
 FAILED, INTERRUPTED = 1, 130
+Item = TypeVar("Item")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,51 +55,36 @@ def arguments(parser: argparse.ArgumentParser) -> None:
             name, help=text, description=text[0].upper() + text[1:] + "."
         )
         output_argument(parsers[name])
-    _run_arguments(parsers["run"])
-    _search_arguments(parsers["search"])
-
-
-def _run_arguments(parser: argparse.ArgumentParser) -> None:
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument(
-        "name",
-        nargs="?",
-        type=_name_or_file,
-        metavar="NAME",
-        help="name of the fault, its number: F13, or a schedule's file (.yaml)",
-    )
+    run_, search_ = parsers["run"], parsers["search"]
+    what = run_.add_mutually_exclusive_group(required=True)
+    text = "name of the fault, its number: F13, or a schedule's file (.yaml)"
+    what.add_argument("name", nargs="?", type=_name_or_file, metavar="NAME", help=text)
     what.add_argument("--all", action="store_true", help="every fault")
-    parser.add_argument("--seed", type=read_seed, default=1, metavar="N", help="seed (default: 1)")
-    parser.add_argument("--jobs", type=read_count, default=1, metavar="J", help=JOBS)
-    parser.add_argument(
-        "--junit", type=_output_file, metavar="FILE", help="write the results as JUnit XML"
+    run_.add_argument("--seed", type=_seed, default=1, metavar="N", help="seed (default: 1)")
+    run_.add_argument("--jobs", type=read_count, default=1, metavar="J", help=JOBS)
+    text = "write the results as JUnit XML"
+    run_.add_argument("--junit", type=_output_path, metavar="FILE", help=text)
+    text = "duration (default: 1)"
+    search_.add_argument("--minutes", type=_minutes, default=1.0, metavar="M", help=text)
+    text = "first seed (default: 1)"
+    search_.add_argument("--first", type=_seed, default=1, metavar="SEED", help=text)
+    text = "the cloud has valid keys and tries to break the invariants"
+    search_.add_argument("--adversarial", action="store_true", help=text)
+    search_.add_argument("--jobs", type=read_count, default=1, metavar="J", help=JOBS)
+    text, store = (
+        "folder for failing schedules, after reduction (default: ./faults-found)",
+        Path("faults-found"),
     )
+    search_.add_argument("--store", type=_output_path, default=store, metavar="DIR", help=text)
 
 
-def _search_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--minutes", type=_minutes, default=1.0, metavar="M", help="duration (default: 1)"
-    )
-    parser.add_argument(
-        "--first", type=read_seed, default=1, metavar="SEED", help="first seed (default: 1)"
-    )
-    parser.add_argument(
-        "--adversarial",
-        action="store_true",
-        help="the cloud has valid keys and tries to break the invariants",
-    )
-    parser.add_argument("--jobs", type=read_count, default=1, metavar="J", help=JOBS)
-    parser.add_argument(
-        "--store",
-        type=_output_folder,
-        default=Path("faults-found"),
-        metavar="DIR",
-        help="folder for failing schedules, after reduction (default: ./faults-found)",
-    )
+def _name_or_file(text: str) -> str | Path:
+    """Parse the name of a fault, or the path of a schedule's file."""
+    is_file = os.path.isfile(text) or text.endswith((".yaml", ".yml"))
+    return input_file(text) if is_file else text
 
 
-def read_seed(text: str) -> int:
-    """Parse a seed for argparse."""
+def _seed(text: str) -> int:
     if not text.isdecimal() or int(text) > SEED_MAX:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {SEED_MAX}")
     return int(text)
@@ -115,89 +100,89 @@ def _minutes(text: str) -> float:
     return minutes
 
 
-def _name_or_file(text: str) -> str | Path:
-    """Parse the name of a fault, or the path of a schedule's file."""
-    return input_file(text) if os.path.exists(text) or text.endswith((".yaml", ".yml")) else text
-
-
-def _output_file(text: str) -> Path:
-    """Parse the name of an output file; refuse one that cannot be written."""
-    path = Path(text)
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise argparse.ArgumentTypeError(f"{text}: this file cannot be written")
-    return path
-
-
-def _output_folder(text: str) -> Path:
-    """Parse the name of an output folder; refuse one that cannot be made."""
+def _output_path(text: str) -> Path:
+    """Parse the path of an output; refuse one that cannot be made."""
     path = Path(text)
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
-    if not (existing.is_dir() and os.access(existing, os.W_OK)):
-        raise argparse.ArgumentTypeError(f"{text}: this folder cannot be made")
+    if not ((existing.is_dir() or existing == path) and os.access(existing, os.W_OK)):
+        raise argparse.ArgumentTypeError(f"{text}: cannot be written")
     return path
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run the chosen action."""
+    """Run the chosen action; return 1 if a check failed, 130 if it was interrupted."""
     if options.action is None:
         names = ", ".join(ACTIONS)
         raise BadInputError(f"an action is missing: {names}; see 'cloudrc faults --help'")
     require("the fault suite", ("world", "record"))
     interrupt_on_signals()
-    if options.action == "run":
-        return fly_file(options) if isinstance(options.name, Path) else run(options)
-    return {"list": print_faults, "search": search}[options.action](options)
+    return {"list": print_faults, "run": run, "search": search}[options.action](options)
 
 
 def print_faults(options: argparse.Namespace) -> int:
     """Print the list of faults."""
     from cloudrc.faults.scenarios import SCENARIOS
 
+    names = ("id", "name", "injects", "expects", "loses", "shows")
+    faults = [{name: getattr(each, name) for name in names} for each in SCENARIOS]
     if options.output != "table":
-        names = ("id", "name", "injects", "expects", "loses", "shows")
-        faults = [{n: getattr(each, n) for n in names} for each in SCENARIOS]
         print(format_document({"schemaVersion": 1, "faults": faults}, options.output))
-        return 0
-    rows = [("fault", "name", "injection", "expected reaction")]
-    rows += [(each.id, each.name, each.injects, each.expects) for each in SCENARIOS]
-    print(table(rows))
+    else:
+        rows = [tuple(each[name] for name in names[:4]) for each in faults]
+        print(table([("fault", "name", "injection", "expected reaction"), *rows]))
     return 0
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run one fault or all; return 1 if a check failed, 130 if interrupted."""
-    from cloudrc.faults import report
+    """Run one fault, all, or those of a schedule's file."""
+    from cloudrc.faults.scenario import as_json, as_junit
     from cloudrc.faults.scenarios import SCENARIOS, find
 
+    if isinstance(options.name, Path):
+        return fly_file(options)
     chosen = SCENARIOS if options.all else (find(options.name),)
-    say = print if options.output == "table" else _silent
-    results, cause, code = [], "", 0
-    try:
-        jobs = [(each.name, options.seed) for each in chosen]
-        for result in map_in_order(_run, jobs, options.jobs):
-            results.append(result)
-            _print_result(result, options.all, say)
-    except KeyboardInterrupt:
-        cause, code = "interrupted", INTERRUPTED
-    except WorkerDiedError as error:
-        cause, code = str(error), error.exit_code
+    results: list[Result] = []
+
+    def take(result: Result) -> None:
+        results.append(result)
+        if options.output == "table":
+            _print_result(result, options.all)
+
+    jobs = [(each.name, options.seed) for each in chosen]
+    cause, code = _take_each(map_in_order(_run, jobs, options.jobs), take)
     if options.junit is not None:
-        options.junit.write_text(report.as_junit(results, options.seed), encoding="utf-8")
-    if options.output != "table":
-        print(format_document(report.as_json(results, options.seed), options.output))
+        options.junit.parent.mkdir(parents=True, exist_ok=True)
+        options.junit.write_text(as_junit(results, options.seed), encoding="utf-8")
     passed = sum(result.passed for result in results)
     failed = len(results) - passed
-    say(f"\nseed {options.seed}: {passed} of {len(results)} passed, {failed} failed")
+    if options.output != "table":
+        print(format_document(as_json(results, options.seed), options.output))
+    else:
+        print(f"\nseed {options.seed}: {passed} of {len(results)} passed, {failed} failed")
     if cause:
         message = f"cloudrc: {cause}; {len(results)} of {len(chosen)} faults were run before"
         print(message, file=sys.stderr, flush=True)
     return code or (FAILED if failed else 0)
 
 
+def _take_each(
+    results: Generator[Item, Any, None], take: Callable[[Item], None]
+) -> tuple[str, int]:
+    """Take all results; return what ended them early and its exit code, or "" and 0."""
+    try:
+        with closing(results):
+            for result in results:
+                take(result)
+    except KeyboardInterrupt:
+        return "interrupted", INTERRUPTED
+    except WorkerDiedError as error:
+        return str(error), error.exit_code
+    return "", 0
+
+
 def _run(job: tuple[str, int]) -> Result:
     """Run one fault, in this process or in a worker; an exception becomes a failed result."""
-    from cloudrc.faults.report import Result
-    from cloudrc.faults.scenario import Outcome
+    from cloudrc.faults.scenario import Outcome, Result
     from cloudrc.faults.scenarios import find
 
     name, seed = job
@@ -209,30 +194,30 @@ def _run(job: tuple[str, int]) -> Result:
         return Result(scenario, Outcome(), time.monotonic() - began, text)
 
 
-def _print_result(result: Result, briefly: bool, say: Callable[[str], object]) -> None:
+def _print_result(result: Result, briefly: bool) -> None:
     scenario, outcome = result.scenario, result.outcome
     word = paint(result.word, "green" if result.passed else "red")
     sha = f"  {outcome.sha256[:12]}" if outcome.sha256 else ""
-    say(f"{word:8} {scenario.id:4} {scenario.name:26} {result.seconds:6.1f} s{sha}")
+    print(f"{word:8} {scenario.id:4} {scenario.name:26} {result.seconds:6.1f} s{sha}")
     if result.error:
-        say(f"           {escape(result.error)}")
+        print(f"           {escape(result.error)}")
     for check in outcome.checks:
         if not (briefly and check.passed):
-            say(f"         {'' if check.passed else 'x '}{escape(check.show())}")
+            print(f"         {'' if check.passed else 'x '}{escape(check.show())}")
 
 
 def fly_file(options: argparse.Namespace) -> int:
-    """Fly the schedule of a file; return 1 if an invariant breaks."""
+    """Fly the schedule of a file; an invariant that breaks is a failed check."""
     from cloudrc.faults.schedule import load
     from cloudrc.faults.trial import fly
 
     if options.junit is not None or options.seed != 1:
         raise BadInputError("--junit and --seed belong to named faults, not to a schedule's file")
+    schedule = load(options.name)
     try:
-        finding = fly(load(options.name), keep=True)
+        finding = fly(schedule, keep=True)
     except BadInputError as error:  # an unknown profile or policy
-        where = "" if str(options.name) in str(error) else f"{options.name}: "
-        raise BadInputError(f"{where}{error}") from error
+        raise BadInputError(f"{options.name}: {error}") from error
     breaches = [breach._asdict() for breach in finding.breaches]
     if options.output != "table":
         document = {"schemaVersion": 1, "records_sha256": finding.sha256, "breaches": breaches}
@@ -245,42 +230,29 @@ def fly_file(options: argparse.Namespace) -> int:
 
 
 def search(options: argparse.Namespace) -> int:
-    """Search for some minutes; return 1 if an invariant broke, 130 if interrupted."""
-    from cloudrc.faults import report
-    from cloudrc.faults.search import Search
+    """Search for some minutes, and say how to continue."""
+    from cloudrc.faults.search import Search, search_rows, search_summary
 
-    kind = "adversarial" if options.adversarial else "random"
+    kind, shown = "adversarial" if options.adversarial else "random", options.output == "table"
     searched = Search(kind, options.first, options.store)
-    say = print_line if options.output == "table" else _silent
-    say(f"{kind} schedules from seed {options.first} on, for {options.minutes:g} min")
-    cause, code = "", 0
-    try:
-        _search(searched, options, say)
-    except KeyboardInterrupt:
-        cause, code = "interrupted", INTERRUPTED
-    except WorkerDiedError as error:
-        cause, code = str(error), error.exit_code
+
+    def take(failure: dict[str, Any] | None) -> None:
+        if failure is not None and shown:
+            print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
+            print_line(f"  again: cloudrc faults run {failure['file']}")
+
+    if shown:
+        print(f"{kind} schedules from seed {options.first} on, for {options.minutes:g} min")
+    flights = searched.run(options.minutes, map_in_order, options.jobs)
+    cause, code = _take_each(flights, take)
+    again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
+    again += f" --first {searched.next}"
     document = searched.document()
-    if options.output != "table":
-        print(format_document(document, options.output))
+    if shown:
+        print(f"\n{table(search_rows(document), right=(1, 2))}\n\n{search_summary(document)}")
+        print(f"to continue: {again}")
     else:
-        print("\n" + table(report.search_rows(document), right=(1, 2)))
-        print(f"\n{report.search_summary(document)}")
-    flags = f"{' --adversarial' if options.adversarial else ''} --first {searched.next}"
-    say(f"to continue: cloudrc faults search{flags}")
+        print(format_document(document, options.output))
     if cause:
-        message = f"cloudrc: {cause}; continue with 'cloudrc faults search{flags}'"
-        print(message, file=sys.stderr, flush=True)
+        print(f"cloudrc: {cause}; continue with '{again}'", file=sys.stderr, flush=True)
     return code or (FAILED if searched.failures else 0)
-
-
-def _search(searched: Search, options: argparse.Namespace, say: Callable[[str], object]) -> None:
-    with closing(searched.run(options.minutes, map_in_order, options.jobs)) as flights:
-        for failure in flights:
-            if failure is not None:
-                say(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
-                say(f"  again: cloudrc faults run {failure['file']}")
-
-
-def _silent(text: str) -> None:
-    """Print nothing: stdout is for the document alone."""

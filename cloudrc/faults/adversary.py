@@ -4,15 +4,13 @@ A policy sees what an honest cloud sees (the newest odometry and its own estimat
 sends any command, properly sealed. Some policies also lie about the odometry that a command was
 computed from, fall silent to time the guard's transitions, or make requests in the operator's name:
 world cannot tell who makes them, because cloud relays the operator's requests.
-
-The lies enter at public seams: the control loop and the operator that cloud's end is built with.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from math import cos, inf, nan, pi, sin
+from math import cos, inf, nan, pi, sin, sqrt
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -35,11 +33,13 @@ from cloudrc.messages import (
     Vector,
 )
 from cloudrc.records import Control, Fault
-from cloudrc.teleop.wire import Outcome, Output, RobotStatus
+from cloudrc.teleop.wire import Output, RobotStatus
 from cloudrc.world.robot import STEP_NS
 
+Generator: TypeAlias = np.random.Generator
 Lie: TypeAlias = Callable[[Command, Control], Command]
 """Returns what is sent in place of a command; the record has what cloud knew."""
+Policy: TypeAlias = Callable[[Generator], Lie]
 Words: TypeAlias = Callable[[int, RobotStatus], OperatorRequest | None]
 """Returns a request in the operator's name, if any, at a time of cloud's clock [ns]; the robot is
 as it was last seen. The request's number is not used."""
@@ -49,12 +49,7 @@ class DishonestLoop(ControlLoop):
     """Computes the honest command and sends another one."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any) -> None:
-        """Change each command by these lies, one after the other.
-
-        Args:
-            lies: The lies.
-            plugins: Arguments of `ControlLoop`.
-        """
+        """Change each command by these lies, one after the other; `plugins` as `ControlLoop`."""
         super().__init__(*plugins)
         self._lies = lies
 
@@ -74,27 +69,14 @@ class HostileOperator:
     Until the first setpoint it passes teleop's requests on, so that a mission begins.
     """
 
+    outcome, settled = None, True
+
     def __init__(self, honest: Operator, words: Words) -> None:
         self._honest, self._words = honest, words
-        self._outputs: list[Output | Fault] = []
+        self.outputs: Sequence[Output | Fault] = []
         self._seen: RobotStatus | None = None
         self._has_setpoint = False
         self._number = 0  # of the last request in this session
-
-    @property
-    def outputs(self) -> Sequence[Output | Fault]:
-        """See `Operator`."""
-        return self._outputs
-
-    @property
-    def outcome(self) -> Outcome | None:
-        """See `Operator`."""
-        return self._honest.outcome
-
-    @property
-    def settled(self) -> bool:
-        """See `Operator`."""
-        return self._honest.settled
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """See `Operator`."""
@@ -111,25 +93,22 @@ class HostileOperator:
         if self._has_setpoint and self._seen is not None:
             if (request := self._words(now_ns, self._seen)) is not None:
                 self._number += 1
-                self._outputs.append(request._replace(number=self._number))
+                self.outputs = [*self.outputs, request._replace(number=self._number)]
 
     def take_outputs(self) -> Sequence[Output | Fault]:
         """See `Operator`."""
-        outputs, self._outputs = self._outputs, []
+        outputs, self.outputs = self.outputs, []
         return outputs
 
     def _collect(self) -> None:
         for output in self._honest.take_outputs():
-            if isinstance(output, Setpoint):
-                self._has_setpoint = True
+            self._has_setpoint = self._has_setpoint or isinstance(output, Setpoint)
             if isinstance(output, OperatorRequest):
                 if self._has_setpoint:
                     continue
                 self._number = max(self._number, output.number)
-            self._outputs.append(output)
+            self.outputs = [*self.outputs, output]
 
-
-Generator: TypeAlias = np.random.Generator
 
 BEGIN = OperatorRequest(0, Request.START, Start.HERE)
 AGAIN = OperatorRequest(0, Request.START, Start.SPAWN)
@@ -159,7 +138,7 @@ def at_bad_moments(rng: Generator) -> Words:
 
     def words(now_ns: int, seen: RobotStatus) -> OperatorRequest | None:
         nonlocal due_ns, waits
-        far = seen.guard is GuardState.TRACK and distance_to_fence(seen.position) > near
+        far = seen.guard is GuardState.TRACK and min(_faces(seen.position))[0] > near
         if now_ns < (due_ns + PATIENCE_NS if far and waits else due_ns):
             return None
         due_ns = now_ns + int(rng.exponential(pause) * 1e9)
@@ -172,20 +151,10 @@ def at_bad_moments(rng: Generator) -> Words:
     return words
 
 
-def distance_to_fence(position: Vector) -> float:
-    """Return the distance [m] of a position [m], shape (3,), to the nearest wall or the ceiling."""
-    return min(
-        HIGH[2] - position[2],
-        *(min(position[n] - LOW[n], HIGH[n] - position[n]) for n in (0, 1)),
-    )
-
-
-Policy: TypeAlias = Callable[[Generator], Lie]
-
-HUGE = 1e308
-STRANGE = (nan, inf, -inf, HUGE, -HUGE, 5e-324, -0.0, 1e3, 6.0, -6.0, 0.0)
-NONSENSE_NS = 80_000_000
-"""Duration of impossible commands that makes the guard land [ns]."""
+def _faces(position: Vector) -> list[tuple[float, int, float]]:
+    """Return each wall and the ceiling: its distance [m], its axis, and the way to it (1 or -1)."""
+    walls = [(p - LOW[n], n, -1.0) for n, p in enumerate(position) if n < 2]
+    return [(HIGH[n] - p, n, 1.0) for n, p in enumerate(position)] + walls
 
 
 def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
@@ -204,20 +173,37 @@ def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
 
 def choose(seed: int) -> Schedule:
     """Choose the hostile cloud of a seed, alone or amid faults of every kind."""
-    rng = generator(seed, 665)
-    names = sorted(POLICIES)
+    rng, names = generator(seed, 665), sorted(POLICIES)
     profile = ("ideal", *PAPER)[int(rng.integers(4))]
     calm = Schedule(seed, profile, duration=DURATION)
     return replace(calm if rng.random() < 0.5 else compose(seed), policy=names[seed % len(names)])
+
+
+# Policies: each draws its parameters and returns its lie.
+
+FAST = 6.0
+"""Largest speed that the guard lets a cloud fly [m/s]."""
+STRANGE = (nan, inf, -inf, 1e308, -1e308, 5e-324, -0.0, 1e3, FAST, -FAST, 0.0)
+NONSENSE_NS = 80_000_000
+"""Duration of impossible commands that makes the guard land [ns]."""
+
+
+def _fly(command: Command, velocity: Sequence[float], **others: Any) -> Command:
+    """Replace a command's velocity [m/s], and perhaps other fields."""
+    x, y, z = velocity
+    return command._replace(velocity=(x, y, z), **others)
+
+
+def _along(axis: int, speed: float) -> list[float]:
+    return [speed if n == axis else 0.0 for n in range(3)]
 
 
 def _towards_a_face(rng: Generator) -> Lie:
     """Fly towards a face, an edge or a corner of the fence."""
     way: list[int] = rng.choice([-1, 0, 1], 3).tolist()
     way = way if any(way) else [0, 0, 1]
-    speed = float(rng.choice([2.0, 6.0, 40.0, 1e3]))
-    velocity = (way[0] * speed, way[1] * speed, way[2] * speed)
-    return lambda command, control: command._replace(velocity=velocity)
+    speed = float(rng.choice([2.0, FAST, 40.0, 1e3]))
+    return lambda command, control: _fly(command, [each * speed for each in way])
 
 
 def _face_after_face(rng: Generator) -> Lie:
@@ -232,9 +218,7 @@ def _face_after_face(rng: Generator) -> Lie:
             way = -way
             if rng.random() < 0.3:
                 axis = int(rng.integers(3))
-        velocity = [0.0, 0.0, 0.0]
-        velocity[axis] = way * 6.0
-        return command._replace(velocity=_vector(velocity))
+        return _fly(command, _along(axis, way * FAST))
 
     return lie
 
@@ -244,12 +228,10 @@ def _greedy(rng: Generator) -> Lie:
     decoy = float(rng.uniform(0.0, 0.2))
 
     def lie(command: Command, control: Control) -> Command:
-        faces = [(HIGH[n] - p, n, 6.0) for n, p in enumerate(control.measured)]
-        faces += [(p - LOW[n], n, -6.0) for n, p in enumerate(control.measured) if n < 2]
-        _, axis, speed = min(faces)
-        velocity = rng.uniform(-6.0, 6.0, 3).tolist() if rng.random() < decoy else [0.0, 0.0, 0.0]
-        velocity[axis] = speed
-        return command._replace(velocity=_vector(velocity))
+        _, axis, way = min(_faces(control.measured))
+        velocity = rng.uniform(-FAST, FAST, 3).tolist() if rng.random() < decoy else [0.0] * 3
+        velocity[axis] = way * FAST
+        return _fly(command, velocity)
 
     return lie
 
@@ -260,17 +242,16 @@ def _on_the_limit(rng: Generator) -> Lie:
     way: list[int] = rng.choice([-1, 1], 3).tolist()
 
     def allowed(distance: float) -> float:
-        reach = max(distance - 0.1, 0.0)
-        return 3.0 * (float(np.sqrt(0.04 + 2.0 * reach / 3.0)) - 0.2)
+        return 3.0 * (sqrt(0.04 + 2.0 * max(distance - 0.1, 0.0) / 3.0) - 0.2)
 
     def lie(command: Command, control: Control) -> Command:
-        x, y, z = (
+        velocity = [
             way[n] * more * allowed(HIGH[n] - p if way[n] > 0 else p - LOW[n])
             for n, p in enumerate(control.measured)
-        )
+        ]
         if rng.random() < 0.005:
             way[int(rng.integers(3))] *= -1
-        return command._replace(velocity=(x, y, z))
+        return _fly(command, velocity)
 
     return lie
 
@@ -282,24 +263,24 @@ def _shaking(rng: Generator) -> Lie:
 
     def lie(command: Command, control: Control) -> Command:
         phase = 2.0 * pi * frequency * control.stamp_ns * 1e-9
-        velocity = [0.0, 0.0, 0.0]
-        velocity[plane[0]], velocity[plane[1]] = 6.0 * sin(phase), 6.0 * cos(phase)
-        x, y, z = (v + b for v, b in zip(velocity, bias, strict=True))
-        return command._replace(velocity=(x, y, z), yaw_rate=1e3 * sin(phase))
+        velocity = bias.copy()
+        velocity[plane[0]] += FAST * sin(phase)
+        velocity[plane[1]] += FAST * cos(phase)
+        return _fly(command, velocity, yaw_rate=1e3 * sin(phase))
 
     return lie
 
 
 def _random(rng: Generator) -> Lie:
     """Change to a random velocity at random times."""
-    velocity, until_ns = ZERO, 0
+    velocity, until_ns = list(ZERO), 0
 
     def lie(command: Command, control: Control) -> Command:
         nonlocal velocity, until_ns
         if control.stamp_ns >= until_ns:
-            velocity = _vector(rng.normal(0.0, 5.0, 3).tolist())
+            velocity = rng.normal(0.0, 5.0, 3).tolist()
             until_ns = control.stamp_ns + int(rng.exponential(0.7e9))
-        return command._replace(velocity=velocity, yaw_rate=float(rng.normal(0.0, 3.0)))
+        return _fly(command, velocity, yaw_rate=float(rng.normal(0.0, 3.0)))
 
     return lie
 
@@ -310,9 +291,9 @@ def _strange_numbers(rng: Generator) -> Lie:
 
     def lie(command: Command, control: Control) -> Command:
         if rng.random() > share:
-            return command._replace(velocity=_vector(rng.uniform(-6.0, 6.0, 3).tolist()))
-        x, y, z, yaw = (STRANGE[n] for n in rng.integers(0, len(STRANGE), 4).tolist())
-        return command._replace(velocity=(x, y, z), yaw_rate=yaw)
+            return _fly(command, rng.uniform(-FAST, FAST, 3).tolist())
+        *velocity, yaw = (STRANGE[n] for n in rng.integers(0, len(STRANGE), 4).tolist())
+        return _fly(command, velocity, yaw_rate=yaw)
 
     return lie
 
@@ -321,10 +302,9 @@ def _false_basis(rng: Generator) -> Lie:
     """Name odometry of the future, or old odometry, as the basis of commands."""
     shift_ns = int(rng.choice([1, STEP_NS, 10_000_000, 200_000_000, 2**62]))
     sign = int(rng.choice([-1, 1]))
-    velocity = (6.0 * sign, 6.0, 2.0)
 
     def lie(command: Command, control: Control) -> Command:
-        moved = command._replace(velocity=velocity)
+        moved = _fly(command, (FAST * sign, FAST, 2.0))
         if rng.random() < 0.3:
             basis_ns = min(max(command.basis_stamp_ns + sign * shift_ns, -(2**62)), 2**62)
             return moved._replace(basis_stamp_ns=basis_ns, basis_hold_ns=2**62)
@@ -336,20 +316,18 @@ def _false_basis(rng: Generator) -> Lie:
 def _stop_and_go(rng: Generator) -> Lie:
     """Let commands become stale and fresh again, and dash at every resumption."""
     period_ns = int(rng.uniform(0.3e9, 3e9))
-    velocity = _vector(rng.uniform(-6.0, 6.0, 3).tolist())
+    velocity = rng.uniform(-FAST, FAST, 3).tolist()
 
     def lie(command: Command, control: Control) -> Command:
-        dash = command._replace(velocity=velocity)
-        if control.stamp_ns % period_ns < period_ns // 2:
-            return dash._replace(basis_stamp_ns=command.basis_stamp_ns - 260_000_000)
-        return dash
+        stale_ns = 260_000_000 if control.stamp_ns % period_ns < period_ns // 2 else 0
+        return _fly(command, velocity, basis_stamp_ns=command.basis_stamp_ns - stale_ns)
 
     return lie
 
 
 def _operators_voice(rng: Generator) -> Lie:
     """Fly by another policy; the requests come from `at_bad_moments`."""
-    return FAST[int(rng.integers(len(FAST)))](rng)
+    return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
@@ -364,23 +342,13 @@ def _refused_and_released(rng: Generator) -> Lie:
     return lie
 
 
-def _vector(values: list[float]) -> Vector:
-    x, y, z = values
-    return (x, y, z)
-
-
-FAST: tuple[Policy, ...] = (_towards_a_face, _face_after_face, _greedy, _on_the_limit, _random)
+FASTEST: tuple[Policy, ...] = (_towards_a_face, _face_after_face, _greedy, _on_the_limit, _random)
 SPEAKING = ("operators-voice", "refused-and-released")
 POLICIES: dict[str, Policy] = {
-    "face-after-face": _face_after_face,
-    "false-basis": _false_basis,
-    "greedy": _greedy,
-    "on-the-limit": _on_the_limit,
-    "operators-voice": _operators_voice,
-    "random": _random,
-    "refused-and-released": _refused_and_released,
-    "shaking": _shaking,
-    "stop-and-go": _stop_and_go,
-    "strange-numbers": _strange_numbers,
-    "towards-a-face": _towards_a_face,
+    policy.__name__[1:].replace("_", "-"): policy
+    for policy in (
+        *(*FASTEST, _false_basis, _operators_voice, _refused_and_released),
+        *(_shaking, _stop_and_go, _strange_numbers),
+    )
 }
+"""Every policy by its name: towards-a-face."""

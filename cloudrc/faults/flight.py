@@ -15,7 +15,7 @@ from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
-from cloudrc.config.load import ResolvedExperiment, load_experiment
+from cloudrc.config.load import load_experiment
 from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.endpoint import Endpoint
@@ -45,11 +45,14 @@ SECRET = KeySet(Key(b"a key of the fault suite, 32 b.."))
 SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
-def blackouts(*spans: tuple[float, float]) -> Shape:
-    """Let nothing pass; each span is a start and a duration [s]."""
-    return lambda profile: replace(
-        profile, blackouts=(*profile.blackouts, *(Blackout(*span) for span in spans))
-    )
+def conditions(**changes: object) -> Shape:
+    """Replace fields of a direction's profile."""
+    return lambda profile: replace(profile, **changes)  # type: ignore[arg-type]
+
+
+def silent(start: float, duration: float, **changes: object) -> Shape:
+    """Let nothing pass from `start` on for `duration` [s]."""
+    return conditions(blackouts=(Blackout(start, duration),), **changes)
 
 
 class Flight:
@@ -64,13 +67,11 @@ class Flight:
         uplink: Link from world to cloud.
         downlink: Link from cloud to world.
         watch: The invariants.
-        of_world: World's records, if they are kept.
-        of_cloud: Cloud's records, if they are kept.
+        of_world: World's records, if they are kept; `of_cloud` are those of cloud.
         changes: Changes of the guard's state.
         world_starts_ns: Start of each process of world [ns], world's clock.
         generations: Number of processes of each end so far.
-        rings: Keys of the running processes, by end.
-        secrets: Contents of the key files, by end.
+        rings: Keys of the running processes, by end; `secrets` are the contents of the key files.
         listeners: Get world's new records and the time [ns] every 100 ms.
     """
 
@@ -101,14 +102,14 @@ class Flight:
             honest: Whether a contact is a breach.
             keep: Whether all records are kept and hashed.
             start: Whether the experiment's mission is ordered at once.
-            life: Distinguishes the processes of one flight from those of another, as nonces do.
+            life: Makes the nonces differ from those of another flight.
             lies: Change cloud's commands, one after the other.
             words: Takes the operator's place in cloud.
-            second: When another cloud asks for the robot [s]; None for never.
+            second: When another cloud asks for the robot [s].
             separate: Whether teleop is a process of its own, not in cloud's.
         """
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
-        self.honest, self._keep = honest, keep
+        self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
         self._clock, self._clock_id = cloud_clock or Clock(), OTHER if cloud_clock else SHARED
         self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()
@@ -121,16 +122,14 @@ class Flight:
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock, "cloud")
         self.teleop.run_on(self.cloud)
-        self.uplink = _link(self.experiment, uplink, up=True)
-        self.downlink = _link(self.experiment, downlink, up=False)
+        self.uplink = self._make_link(uplink, up=True)
+        self.downlink = self._make_link(downlink, up=False)
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
 
     def _make_teleop(self, separate: bool, start: bool) -> InProcessTeleop:
         limit = self.experiment.criteria.contact_speed_max_mps
-        teleop = InProcessTeleop(limit)
-        if separate:
-            phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
-            teleop = SeparateTeleop(limit, phase_ns=phase_ns)
+        phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
+        teleop = SeparateTeleop(limit, phase_ns) if separate else InProcessTeleop(limit)
         if start:
             teleop.order(self.make_order(), self._clock.at(0))
         return teleop
@@ -158,8 +157,7 @@ class Flight:
 
     def order_if_possible(self, now_ns: int) -> None:
         """Order the experiment's mission at `now_ns` [ns, virtual time], unless it is refused."""
-        order = self.make_order()
-        own_ns = self._clock.at(now_ns)
+        order, own_ns = self.make_order(), self._clock.at(now_ns)
         self.teleop.ask(lambda service, own_ns: service.create(order, own_ns), own_ns)
 
     def fly(self, until: float, is_over: Callable[[], bool] = lambda: False) -> Flight:
@@ -172,21 +170,11 @@ class Flight:
         self.fly(limit, lambda: self.teleop.service is not None and self.mission.ended)
         return self.fly(self.now + 1.0)
 
-    def kill_cloud(self, now_ns: int, down: float) -> None:
-        """Kill cloud's process at `now_ns` [ns]; a new one starts after `down` [s]."""
-        self.cloud.kill(now_ns)
-        self.cloud.at(now_ns * 1e-9 + down, self.cloud.start)
-
-    def kill_cloud_pod(self, now_ns: int, down: float) -> None:
+    def restart_pod(self, now_ns: int, down: float) -> None:
         """Kill cloud and teleop at `now_ns` [ns]; new ones start after `down` [s]."""
         self.teleop.kill()
-        self.kill_cloud(now_ns, down)
+        self.cloud.restart(now_ns, down)
         self.cloud.at(now_ns * 1e-9 + down, lambda _: self.teleop.start())
-
-    def kill_world(self, now_ns: int, down: float) -> None:
-        """Kill world at `now_ns` [ns]; a new one, at the spawn, starts after `down` [s]."""
-        self.world.kill(now_ns)
-        self.world.at(now_ns * 1e-9 + down, self.world.start)
 
     def replace_key(self, end: str, keys: KeySet) -> None:
         """Write an end's key file; a process that is down reads it later."""
@@ -206,11 +194,10 @@ class Flight:
         """Return the ground truth, every 10 ms."""
         return [record for record in self.of_world if isinstance(record, GroundTruth)]
 
-    def count(self, name: str, end: str = "world") -> int:
-        """Return how often something happened at an end, by its last record of it."""
-        records = self.of_world if end == "world" else self.of_cloud
-        totals = [r.total for r in records if isinstance(r, Counted) and r.name == name]
-        return totals[-1] if totals else 0
+    def count(self, name: str) -> int:
+        """Return how often something happened in world, by its last record of it."""
+        counted = [r.total for r in self.of_world if isinstance(r, Counted) and r.name == name]
+        return counted[-1] if counted else 0
 
     def events(self, *names: str) -> list[MissionEvent]:
         """Return the events of missions with these names."""
@@ -228,36 +215,36 @@ class Flight:
     def _build_world(self, start_ns: int) -> WorldEndpoint:
         identity = WorldIdentity(SHARED, self._nonce("world"), self._read_key("world"))
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
-        self.watch.attach(world.robot, start_ns, honest=self.honest)
+        self.watch.attach(world.robot, start_ns, honest=self._honest)
         self.world_starts_ns.append(start_ns)
         return world
 
     def _build_cloud(self, start_ns: int) -> Endpoint:
         identity = CloudIdentity(self._clock_id, self._nonce("cloud"), self._read_key("cloud"))
-        teleop = self.teleop.join(start_ns)
+        teleop: Operator = self.teleop.join(start_ns)
         if self._words is not None:
             teleop = HostileOperator(teleop, self._words)
-        cloud = self._make_cloud(identity, start_ns, teleop)
+        make_loop = partial(DishonestLoop, self._lies) if self._lies else ControlLoop
+        cloud = assembly.build_cloud(
+            self.experiment, identity, lambda: start_ns, teleop, make_loop=make_loop
+        )
         if self._second is None:
             return cloud
         joins_ns = max(self._clock.at(round(self._second * 1e9)), start_ns)
         return EndpointGroup([cloud, self._build_rival(joins_ns)])
 
-    def _make_cloud(
-        self, identity: CloudIdentity, start_ns: int, teleop: Operator
-    ) -> CloudEndpoint:
-        make_loop = partial(DishonestLoop, self._lies) if self._lies else ControlLoop
-        return assembly.build_cloud(
-            self.experiment, identity, lambda: start_ns, teleop, make_loop=make_loop
-        )
-
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build another cloud with the same key, which wants to fly the same mission."""
-        limit = self.experiment.criteria.contact_speed_max_mps
-        teleop = InProcessTeleop(limit, name=b"rival")
+        teleop = InProcessTeleop(self.experiment.criteria.contact_speed_max_mps, name=b"rival")
         teleop.order(Order(assembly.build_plan(self.experiment)), start_ns)
         identity = CloudIdentity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
+
+    def _make_link(self, shape: Shape | None, *, up: bool) -> LinkDirection:
+        resolved = self.experiment.uplink if up else self.experiment.downlink
+        profile = assembly.link_profile(resolved)
+        profile = profile if shape is None else shape(profile)
+        return LinkDirection(profile, self.experiment.seed, uplink=up)
 
     def _nonce(self, end: str) -> bytes:
         self.generations[end] += 1
@@ -276,8 +263,3 @@ class Flight:
         self.changes += [record for record in of_world if isinstance(record, GuardChange)]
         for listen in self.listeners:
             listen(of_world, self.run.now_ns)
-
-
-def _link(experiment: ResolvedExperiment, shape: Shape | None, *, up: bool) -> LinkDirection:
-    profile = assembly.link_profile(experiment.uplink if up else experiment.downlink)
-    return LinkDirection(shape(profile) if shape else profile, experiment.seed, uplink=up)

@@ -3,47 +3,54 @@
 fence      The base stays inside the fence while the rotors turn. After an emergency stop or a hit
            the robot may leave the fence, but at most by `FALL_MAX`. Rotors that have stopped turn
            again only where the robot lies still inside.
-cap, stop  The reference stays below the caps and can be stopped before the fence. In LAND the floor
-           is no limit.
-stale      No command with an older basis than the limit is accepted, nor flown in TRACK.
+cap, stop  The reference stays below the caps and can be stopped before the fence; in LAND the floor
+           is no limit. After a HOLD the reference grows slowly at first.
+stale      No command with an older basis than the limit is accepted, nor flown in TRACK. HOLD
+           becomes TRACK on `RESUME_COMMANDS` fresh commands within `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
            request, after a hit, or where the robot stands.
 collision  With an honest cloud only the arm's tip touches anything, and only the board. A robot
            that lands, or that the operator stopped, may come down on anything: the guard does not
            know what is below.
+latch      TRACK is for missions that the operator has started. What has landed or was stopped stays
+           so until the operator acknowledges it.
+hold       TRACK begins at least `SETTLE_NS` after the last TRACK, and a HOLD for silence as long
+           after the last HOLD, unless commands go back to older odometry. In a mission a robot
+           without commands lands after the configured time, and not before, unless its cloud sends
+           impossible commands.
 tick       Each step of the physics has a tick of the guard.
 
-`hold_invariants` has the other invariants: of the operator's requests and of the end of a HOLD. All
-limits come from the configuration, none from the guard.
+All limits come from the configuration, none from the guard.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from math import hypot, inf, sqrt
 from typing import NamedTuple
 
 from cloudrc.config.load import ResolvedGuard
-from cloudrc.faults.hold_invariants import (
-    ESTOP,
-    HOLD,
-    LAND,
-    SLACK,
-    TRACK,
-    HoldInvariants,
-    Note,
-    OperatorInvariants,
-    growth,
-)
 from cloudrc.geometry.fence import HIGH, LOW, inside
-from cloudrc.messages import ZERO, Command, GuardState, OperatorRequest, Request, Start, Vector
+from cloudrc.messages import (
+    ZERO,
+    Cause,
+    Command,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Start,
+    Vector,
+)
 from cloudrc.world.readings import Readings, RotorSpeeds
-from cloudrc.world.robot import STEP_NS, Robot
+from cloudrc.world.robot import STEP, STEP_NS, Robot
 from cloudrc.world.rotors import STOPPED
 
-FLOWN = (TRACK, HOLD, LAND)
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
+FLOWN, LATCHED = (TRACK, HOLD, LAND), (LAND, ESTOP)
 REPORTED = 5
 """Number of breaches of each kind that are kept."""
+SLACK = 1e-9
+"""Tolerance for rounding [m/s]."""
 STILL = 0.12
 """Speed below which a robot lies still [m/s]: the guard's 0.1, plus one tick of free fall."""
 STANDS = 0.2
@@ -63,16 +70,32 @@ REELS_NS = 1_000_000_000
 """Time after a hit in which the hit explains the robot's motion [ns]."""
 THROWN_NS = 3_000_000_000
 """Time after a hit in which the robot may be thrown out of the fence [ns]."""
+RESUME_COMMANDS = 10
+RESUME_NS = 500_000_000
+"""Time within which RESUME_COMMANDS fresh commands end a HOLD [ns].
+Source: docs/reference/plant.md, "Leaving HOLD"."""
+SETTLE_NS = 1_000_000_000
+"""Shortest time from one TRACK to the next, and from one HOLD to the next [ns].
+Source: docs/reference/faults.md, "F5"."""
+INVALID_COMMANDS = 5
+INVALID_NS = 1_000_000_000
+"""Time within which INVALID_COMMANDS impossible commands make the robot land [ns].
+Source: docs/reference/faults.md, "F23"."""
+INVALID = ("range", "future")
+"""Reasons for which the guard rejects impossible commands."""
+GROUND_NS = 10_000_000_000
+"""Shortest time for which a robot on the ground waits for a mission's first command [ns].
+Source: docs/safety.md, "The guard"."""
+RAMP = 3.0
+"""Largest growth of the reference after a HOLD [m/s^2].
+Source: docs/reference/plant.md, "Leaving HOLD"."""
+RAMP_MIN = 1.0
+"""Shortest time for which the reference grows slowly [s]; it is longer if the cap is higher.
+Source: docs/safety.md, "The guard"."""
 
 
 class Breach(NamedTuple):
-    """An invariant that did not hold.
-
-    Attributes:
-        time: World's clock [s].
-        kind: Name of the invariant: "fence".
-        text: What happened.
-    """
+    """An invariant that did not hold: world's clock [s], the invariant's name, what happened."""
 
     time: float
     kind: str
@@ -144,132 +167,197 @@ class Watch:
 
 
 class RobotInvariants:
-    """Distributes what one robot does to the checks; an `Observer`."""
+    """Checks what one robot does; an `Observer`."""
 
     def __init__(self, robot: Robot, watch: Watch, start_ns: int, honest: bool) -> None:
-        limits = watch.limits
-        self._robot, self._guard, self._note = robot, robot.guard, watch.note
-        self._motion = MotionInvariants(robot, watch, honest)
-        self._rotors = RotorInvariants(robot, watch.note, honest)
-        self._operator = OperatorInvariants(watch.note)
-        self._hold = HoldInvariants(watch.note, self._operator, limits.speed, limits.hold_ns)
+        self._guard, self._simulator, self._honest = robot.guard, robot.simulator, honest
+        self._watch, self._note, self._limits = watch, watch.note, watch.limits
         self._was = self._state = robot.guard.state  # after the last step; after the last event
         self._next_ns, self._steps = start_ns, 0
-
-    def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
-        """See `Observer`."""
-        guard, steps = self._guard, self._robot.simulator.steps
-        state, was = guard.state, self._was
-        if now_ns != self._next_ns or steps != self._steps + 1:
-            self._note(now_ns, "tick", "a step of the physics without a tick of the guard")
-        self._next_ns, self._steps = now_ns + STEP_NS, steps
-        reference = guard.reference
-        if state is not was:
-            self._operator.see_change(was, state, now_ns)
-            self._hold.see_change(was, state, guard.cause, now_ns)
-        if state is TRACK and not self._operator.armed:
-            self._note(now_ns, "latch", "TRACK without the operator's start")
-        self._hold.see_step(state, reference, now_ns)
-        self._rotors.see_step(was, state, readings, rotor_speeds, now_ns)
-        self._motion.see_step(was, state, readings, rotor_speeds, now_ns)
-        self._was = self._state = state
-
-    def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """See `Observer`."""
-        self._motion.see_command(command, rejection, now_ns)
-        self._hold.see_command(command, rejection, self._state, now_ns)
-        self._state = self._guard.state
-
-    def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """See `Observer`."""
-        resets = request.request is Request.START and request.start is Start.SPAWN
-        if resets:
-            self._steps = 0
-        self._rotors.see_request(stops=resets or request.request is Request.ESTOP)
-        if request.request is Request.ESTOP:
-            self._motion.see_stop(self._state)
-        self._hold.see_request(request, now_ns)
-        self._operator.see_request(request, self._state)
-        self._state = self._guard.state
-
-    def see_session(self, now_ns: int) -> None:
-        """See `Observer`."""
-        self._hold.forget_commands()
-
-
-class MotionInvariants:
-    """Checks where the robot is, what it touches, and the reference that it flies."""
-
-    def __init__(self, robot: Robot, watch: Watch, honest: bool) -> None:
-        self._robot, self._guard, self._honest = robot, robot.guard, honest
-        self._watch, self._note = watch, watch.note
-        self._speed_max = watch.limits.speed + SLACK
-        self._step_max = watch.limits.acceleration * STEP_NS * 1e-9 + SLACK
+        self._before = ZERO  # the last reference [m/s]
+        self._newest_ns = -1  # basis of the accepted commands
+        # Motion: after a stop or a hit, and after TRACK.
         self._comes_down = False  # whether it lands, or fell after an emergency stop
         self._falls = self._hit = False  # outside of flight: after a stop; after a hit
-        self._basis_ns, self._before = -1, ZERO
         self._landed_ns = -2 * BRAKE_NS
+        self._left, self._way = ZERO, inf  # where TRACK ended, and how far the robot may go
+        # Contacts and rotors.
         self._touches, self._seen = robot.simulator.touches, 0
         self._touched: tuple[int, str] | None = None
         self._is_thrown = False  # by a hit, and not yet back inside the fence
-        self._left, self._way = ZERO, inf  # where TRACK ended, and how far the robot may go
+        self._turned = self._halted = self._is_asked = False
+        # The operator, and the wait for commands.
+        self._ramp_ns = round(max(RAMP_MIN, watch.limits.speed / RAMP) * 1e9)
+        self._ramp_until_ns, self._alone_ns = -1, 0
+        self._tracked_ns = self._held_ns = -SETTLE_NS
+        self._armed = False  # whether a mission is on
+        self._released = set[GuardState]()  # states acknowledged since the last change
+        self._is_reset = self._impossible = self._goes_back = False
+        self._basis_ns = -1  # of the commands in a mission
+        self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
+        self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
 
-    def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Check the age of an accepted command."""
-        if rejection is None:
-            age_ns = now_ns - command.basis_stamp_ns
-            if not 0 <= age_ns <= self._watch.limits.age_ns:
-                self._note(now_ns, "stale", f"accepted a command {age_ns * 1e-9:.3f} s old")
-            self._basis_ns = max(self._basis_ns, command.basis_stamp_ns)
+    # What the robot shows.
 
-    def see_stop(self, state: GuardState) -> None:
-        """Note an emergency stop in a state."""
-        self._falls = self._falls or state in FLOWN
-        self._comes_down = self._comes_down or self._falls
-
-    def see_step(
-        self,
-        was: GuardState,
-        state: GuardState,
-        readings: Readings,
-        rotor_speeds: RotorSpeeds,
-        now_ns: int,
-    ) -> None:
-        """Check a step in `state`, after one in `was`."""
-        position, reference, flies = readings.position, self._guard.reference, state in FLOWN
-        self._hit = self._hit or (was in FLOWN and state is ESTOP and not self._falls)
-        if flies and (self._falls or self._hit):
-            self._falls = self._hit = False
-            self._check_take_off(readings, now_ns)
+    def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
+        """See `Observer`."""
+        guard, steps, was = self._guard, self._simulator.steps, self._was
+        state, reference, position = guard.state, guard.reference, readings.position
+        if now_ns != self._next_ns or steps != self._steps + 1:
+            self._note(now_ns, "tick", "a step of the physics without a tick of the guard")
+        self._next_ns, self._steps = now_ns + STEP_NS, steps
+        if state is not was:
+            self._check_change(was, state, now_ns)
+        self._check_wait(state, now_ns)
+        self._check_rotors(was, state, readings, rotor_speeds, now_ns)
+        self._check_falls(was, state, readings, now_ns)
         self._check_fence(position, now_ns)
         if was is TRACK and state is not TRACK:
             self._leave_track(readings, now_ns)
-        if flies:
+        if state in FLOWN:
             self._comes_down = state is LAND
             self._check_stop(position, reference, state is LAND, now_ns)
-            if not abs(self._guard.yaw_rate) <= self._watch.limits.yaw_rate:  # or it is NaN
-                self._note(now_ns, "cap", f"reference turns by {self._guard.yaw_rate:.3f} rad/s")
+            if not abs(guard.yaw_rate) <= self._limits.yaw_rate:  # or it is NaN
+                self._note(now_ns, "cap", f"reference turns by {guard.yaw_rate:.3f} rad/s")
             if reference is not self._before:
                 self._check_caps(reference, state is TRACK, now_ns)
-            if state is not TRACK:
-                if any(rotor_speeds):
-                    self._check_rest(position, now_ns)
-            elif now_ns - self._basis_ns > self._watch.limits.age_ns:
-                age = (now_ns - self._basis_ns) * 1e-9
-                self._note(now_ns, "stale", f"TRACK on a command {age:.3f} s old")
+            if state is TRACK:
+                age_ns = now_ns - self._newest_ns
+                if age_ns > self._limits.age_ns:
+                    self._note(now_ns, "stale", f"TRACK on a command {age_ns * 1e-9:.3f} s old")
+            elif any(rotor_speeds):
+                self._check_rest(position, now_ns)
         elif any(rotor_speeds):
             self._note(now_ns, "latch", f"rotors turn in {state.name}")
         if state is LAND:
             self._landed_ns = now_ns
-        self._before = reference
         self._check_touches(state, now_ns)
+        self._was, self._state, self._before = state, state, reference
+
+    def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
+        """See `Observer`; count the fresh commands in a HOLD, and the impossible ones."""
+        if rejection is None:
+            basis_ns = command.basis_stamp_ns
+            if not 0 <= now_ns - basis_ns <= self._limits.age_ns:
+                age = (now_ns - basis_ns) * 1e-9
+                self._note(now_ns, "stale", f"accepted a command {age:.3f} s old")
+            self._newest_ns = max(self._newest_ns, basis_ns)
+            if self._armed:
+                self._goes_back = basis_ns < self._basis_ns
+                self._basis_ns = max(self._basis_ns, basis_ns)
+                if self._state is HOLD:
+                    self._fresh_ns.append(now_ns)
+                elif self._state is GROUND:
+                    self._alone_ns = now_ns
+        elif rejection in INVALID:
+            self._invalid_ns.append(now_ns)
+            took_ns = now_ns - self._invalid_ns[0]
+            if len(self._invalid_ns) == INVALID_COMMANDS and took_ns <= INVALID_NS:
+                self._impossible = True
+        self._state = self._guard.state
+
+    def see_request(self, request: OperatorRequest, now_ns: int) -> None:
+        """See `Observer`."""
+        match request.request:
+            case Request.START:
+                if request.start is Start.SPAWN:
+                    self._steps, self._is_asked = 0, True
+                    self._tracked_ns = self._held_ns = -SETTLE_NS
+                    self._is_reset, self._ramp_until_ns = True, -1
+                if request.start is Start.SPAWN or not self._armed:
+                    self.see_session(now_ns)
+                    self._alone_ns = now_ns
+                self._armed = True
+            case Request.ESTOP:
+                self._armed, self._is_asked = False, True
+                self._falls = self._falls or self._state in FLOWN
+                self._comes_down = self._comes_down or self._falls
+            case Request.END:
+                self._armed = False
+            case Request.ACKNOWLEDGE:
+                self._released.add(self._state)
+        self._state = self._guard.state
+
+    def see_session(self, now_ns: int) -> None:
+        """See `Observer`."""
+        self._fresh_ns.clear()
+        self._invalid_ns.clear()
+
+    # Where the robot is, and the reference that it flies.
+
+    def _check_falls(
+        self, was: GuardState, state: GuardState, readings: Readings, now_ns: int
+    ) -> None:
+        """Note a hit in flight; rotors that have stopped turn again only where it lies still."""
+        self._hit = self._hit or (was in FLOWN and state is ESTOP and not self._falls)
+        if (self._falls or self._hit) and state in FLOWN:
+            self._falls = self._hit = False
+            position, speed = readings.position, hypot(*readings.velocity)
+            if speed > STILL or not inside(position):
+                text = f"took off after a stop, base at {_show(position)} at {speed:.2f} m/s"
+                self._note(now_ns, "fence", text)
+
+    def _check_fence(self, position: Vector, now_ns: int) -> None:
+        watch, (x, y, z) = self._watch, position
+        (xl, yl, zl), (xh, yh, zh) = LOW, HIGH
+        margin = min(x - xl, xh - x, y - yl, yh - y, zh - z)
+        if z < zl:
+            self._note(now_ns, "fence", f"base at {_show(position)}, below the floor")
+        if self._is_thrown and margin >= 0.0 and self._touched is not None:
+            self._is_thrown = now_ns - self._touched[0] < THROWN_NS
+        if self._falls or self._hit or (self._is_thrown and margin < 0.0):
+            if margin < -FALL_MAX:
+                self._note(now_ns, "fence", f"base fell to {_show(position)}")
+        elif margin < watch.margin:
+            watch.margin = margin
+            if margin < 0.0:
+                text = f"base at {_show(position)}"
+                if self._touched is not None:
+                    since = (now_ns - self._touched[0]) * 1e-9
+                    text += f", {since:.2f} s after it hit {self._touched[1]}"
+                self._note(now_ns, "fence", text)
+
+    def _check_stop(self, position: Vector, reference: Vector, lands: bool, now_ns: int) -> None:
+        (x, y, z), (vx, vy, vz) = position, reference
+        (xl, yl, zl), (xh, yh, zh) = LOW, HIGH
+        if not (
+            can_stop(vx, x - xl, xh - x)
+            and can_stop(vy, y - yl, yh - y)
+            and (can_stop(vz, z - zl, zh - z) or (lands and vz < 0.0))
+        ):
+            text = f"reference ({vx:.3f}, {vy:.3f}, {vz:.3f}) m/s at {_show(position)}"
+            self._note(now_ns, "stop", text)
+
+    def _check_caps(self, reference: Vector, ramped: bool, now_ns: int) -> None:
+        vx, vy, vz = reference
+        speed = sqrt(vx * vx + vy * vy + vz * vz)
+        if speed > self._watch.speed:
+            self._watch.speed = speed
+        if not speed <= self._limits.speed + SLACK:  # or it is NaN
+            self._note(now_ns, "cap", f"reference {speed:.3f} m/s")
+        if ramped:  # braking may be as hard as needed: at the fence, or after a hit
+            grown, after = growth(self._before, reference), now_ns < self._ramp_until_ns
+            if not grown <= (RAMP if after else self._limits.acceleration) * STEP + SLACK:
+                text = f"reference grows by {grown:.9f} m/s in a tick"
+                self._note(now_ns, "cap", f"{text}{' after a HOLD' if after else ''}")
+
+    def _leave_track(self, readings: Readings, now_ns: int) -> None:
+        """From now on the robot may move only as far as it needs to stop."""
+        speed = max(hypot(*readings.velocity), hypot(*self._before))
+        self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
+        if self._touched is not None and now_ns - self._touched[0] < REELS_NS:
+            self._way = inf
+
+    def _check_rest(self, position: Vector, now_ns: int) -> None:
+        dx, dy = position[0] - self._left[0], position[1] - self._left[1]
+        if dx * dx + dy * dy > self._way * self._way:
+            self._note(now_ns, "rest", f"{hypot(dx, dy):.2f} m from where the last command ended")
+
+    # What it touches, and how its rotors stop.
 
     def _check_touches(self, state: GuardState, now_ns: int) -> None:
-        """Check the contacts that began in this step.
-
-        With a dishonest cloud, a contact only explains what follows.
-        """
-        touches = self._robot.simulator.touches
+        """Check the contacts that began in this step; they explain what follows."""
+        touches = self._simulator.touches
         if touches is not self._touches:
             self._touches, self._seen = touches, 0
         for body, tip, *_ in touches[self._seen :]:
@@ -286,85 +374,7 @@ class MotionInvariants:
                 self._note(now_ns, "collision", f"{part} touched {body} in {state.name}")
         self._seen = len(touches)
 
-    def _leave_track(self, readings: Readings, now_ns: int) -> None:
-        """From now on the robot may move only as far as it needs to stop."""
-        speed = max(hypot(*readings.velocity), hypot(*self._before))
-        self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
-        if self._touched is not None and now_ns - self._touched[0] < REELS_NS:
-            self._way = inf
-
-    def _check_rest(self, position: Vector, now_ns: int) -> None:
-        dx, dy = position[0] - self._left[0], position[1] - self._left[1]
-        if dx * dx + dy * dy > self._way * self._way:
-            self._note(now_ns, "rest", f"{hypot(dx, dy):.2f} m from where the last command ended")
-
-    def _check_take_off(self, readings: Readings, now_ns: int) -> None:
-        speed = hypot(*readings.velocity)
-        if speed > STILL or not inside(readings.position):
-            x, y, z = readings.position
-            text = f"base at ({x:.2f}, {y:.2f}, {z:.2f}) at {speed:.2f} m/s"
-            self._note(now_ns, "fence", f"took off after a stop, {text}")
-
-    def _check_fence(self, position: Vector, now_ns: int) -> None:
-        watch, (x, y, z) = self._watch, position
-        (xl, yl, zl), (xh, yh, zh) = LOW, HIGH
-        margin = min(x - xl, xh - x, y - yl, yh - y, zh - z)
-        if z < zl:
-            self._note(now_ns, "fence", f"base at ({x:.2f}, {y:.2f}, {z:.2f}), below the floor")
-        if self._is_thrown and margin >= 0.0 and self._touched is not None:
-            self._is_thrown = now_ns - self._touched[0] < THROWN_NS
-        if self._falls or self._hit or (self._is_thrown and margin < 0.0):
-            if margin < -FALL_MAX:
-                self._note(now_ns, "fence", f"base fell to ({x:.2f}, {y:.2f}, {z:.2f})")
-        elif margin < watch.margin:
-            watch.margin = margin
-            if margin < 0.0:
-                text = f"base at ({x:.2f}, {y:.2f}, {z:.2f})"
-                if self._touched is not None:
-                    since = (now_ns - self._touched[0]) * 1e-9
-                    text += f", {since:.2f} s after it hit {self._touched[1]}"
-                self._note(now_ns, "fence", text)
-
-    def _check_stop(self, position: Vector, reference: Vector, lands: bool, now_ns: int) -> None:
-        (x, y, z), (vx, vy, vz) = position, reference
-        (xl, yl, zl), (xh, yh, zh) = LOW, HIGH
-        if not (
-            can_stop(vx, x - xl, xh - x)
-            and can_stop(vy, y - yl, yh - y)
-            and (can_stop(vz, z - zl, zh - z) or (lands and vz < 0.0))
-        ):
-            text = f"({vx:.3f}, {vy:.3f}, {vz:.3f}) m/s at ({x:.2f}, {y:.2f}, {z:.2f})"
-            self._note(now_ns, "stop", f"reference {text}")
-
-    def _check_caps(self, reference: Vector, ramped: bool, now_ns: int) -> None:
-        vx, vy, vz = reference
-        speed = sqrt(vx * vx + vy * vy + vz * vz)
-        if speed > self._watch.speed:
-            self._watch.speed = speed
-        if not speed <= self._speed_max:  # or it is NaN
-            self._note(now_ns, "cap", f"reference {speed:.3f} m/s")
-        # Braking may be as hard as needed: at the fence, or after a hit.
-        grown = growth(self._before, reference)
-        if ramped and not grown <= self._step_max:
-            self._note(now_ns, "cap", f"reference grows by {grown:.9f} m/s in a tick")
-
-
-class RotorInvariants:
-    """Checks how the rotors stop: on a request, after a hit, or where the robot stands.
-
-    Stopped rotors are recognised by the constant that the robot gives to the simulator: hard
-    braking also commands speeds of 0.
-    """
-
-    def __init__(self, robot: Robot, note: Note, honest: bool) -> None:
-        self._simulator, self._note, self._honest = robot.simulator, note, honest
-        self._turned = self._halted = self._is_asked = False
-
-    def see_request(self, *, stops: bool) -> None:
-        """Note a request, which may stop the rotors."""
-        self._is_asked = self._is_asked or stops
-
-    def see_step(
+    def _check_rotors(
         self,
         was: GuardState,
         state: GuardState,
@@ -372,10 +382,16 @@ class RotorInvariants:
         rotor_speeds: RotorSpeeds,
         now_ns: int,
     ) -> None:
-        """Check a step in `state`, after one in `was`."""
+        """Check how the rotors stop: on a request, after a hit, or where the robot stands.
+
+        Stopped rotors are recognised by the constant that the robot gives to the simulator: hard
+        braking also commands speeds of 0.
+        """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
-        if state is ESTOP and was is not ESTOP and self._honest and not (asked or self._touches):
-            self._note(now_ns, "collision", "stopped by a hit although nothing was touched")
+        if state is ESTOP and was is not ESTOP and self._honest and not asked:
+            if not self._just_touched:
+                text = "stopped by a hit although nothing was touched"
+                self._note(now_ns, "collision", text)
         if self._turned and not turns:
             self._halted = not asked and state is not ESTOP
             fastest = max(map(abs, readings.velocity))
@@ -383,15 +399,74 @@ class RotorInvariants:
                 self._note(now_ns, "rest", f"rotors stopped in {state.name} at {fastest:.2f} m/s")
         elif self._halted:
             self._halted = not turns and not asked
-            if self._halted and readings.velocity[2] < -FALL and not self._touches:
+            if self._halted and readings.velocity[2] < -FALL and not self._just_touched:
                 self._note(now_ns, "rest", f"falls in {state.name}, its rotors stopped in the air")
                 self._halted = False
         self._turned, self._is_asked = turns, False
 
     @property
-    def _touches(self) -> bool:
+    def _just_touched(self) -> bool:
         """Whether the robot touches something, or just has."""
         return self._simulator.touch_age <= REELS_NS * 1e-9
+
+    # What the operator allows, the wait for commands, and the way out of HOLD.
+
+    def _check_change(self, was: GuardState, state: GuardState, now_ns: int) -> None:
+        """Check a change of the guard's state."""
+        if was in LATCHED and self._released.isdisjoint(LATCHED) and state is not ESTOP:
+            self._note(now_ns, "latch", f"{was.name} left for {state.name} without the operator")
+        self._released.intersection_update({state})
+        self._armed = self._armed and state not in LATCHED
+        self._ramp_until_ns = -1
+        if state is TRACK:
+            self._check_track(was, now_ns)
+        elif state is HOLD or (was is TRACK and state is GROUND and not self._is_reset):
+            self._check_hold(state, now_ns)  # perhaps it has not left the ground yet
+        elif state is LAND and not self._impossible:
+            alone_ns = now_ns - self._alone_ns
+            if was is TRACK or alone_ns <= self._wait_ns(was):
+                text = f"LAND out of {was.name} after {alone_ns * 1e-9:.3f} s alone"
+                self._note(now_ns, "hold", text)
+        if state is not HOLD:
+            self._fresh_ns.clear()
+        self._is_reset = self._impossible = False
+
+    def _check_wait(self, state: GuardState, now_ns: int) -> None:
+        """Check how long the robot waits for its cloud in a mission."""
+        if state is TRACK:
+            if not self._armed:
+                self._note(now_ns, "latch", "TRACK without the operator's start")
+            return
+        self._impossible = False
+        alone_ns = now_ns - self._alone_ns
+        if self._armed and alone_ns > self._wait_ns(state) + STEP_NS:
+            self._note(now_ns, "hold", f"{state.name} for {alone_ns * 1e-9:.3f} s of a mission")
+            self._alone_ns = now_ns
+
+    def _check_track(self, was: GuardState, now_ns: int) -> None:
+        fresh_ns, settled_ns = self._fresh_ns, now_ns - self._tracked_ns
+        self._tracked_ns = now_ns
+        if settled_ns < SETTLE_NS:
+            self._note(now_ns, "hold", f"TRACK again after {settled_ns * 1e-9:.3f} s")
+        if was is HOLD and not self._is_reset:
+            self._ramp_until_ns = now_ns + self._ramp_ns
+            took_ns = now_ns - fresh_ns[0] if fresh_ns else 0
+            if len(fresh_ns) < RESUME_COMMANDS or fresh_ns[-1] - fresh_ns[0] > RESUME_NS:
+                text = f"{len(fresh_ns)} fresh commands within {took_ns * 1e-9:.3f} s"
+                self._note(now_ns, "stale", f"HOLD left for TRACK on {text}")
+
+    def _check_hold(self, state: GuardState, now_ns: int) -> None:
+        settled_ns = now_ns - self._held_ns
+        self._held_ns = self._alone_ns = now_ns
+        silent = state is HOLD and self._guard.cause is Cause.SILENCE and not self._goes_back
+        if silent and settled_ns < SETTLE_NS:
+            self._note(now_ns, "hold", f"HOLD again after {settled_ns * 1e-9:.3f} s")
+
+    def _wait_ns(self, state: GuardState) -> float:
+        """Return how long a robot in a mission waits for its cloud [ns]."""
+        if state is GROUND:
+            return max(self._limits.hold_ns, GROUND_NS)
+        return self._limits.hold_ns if state is HOLD else inf
 
 
 def can_stop(speed: float, below: float, above: float) -> bool:
@@ -407,3 +482,19 @@ def can_stop(speed: float, below: float, above: float) -> bool:
     if speed > 0.0:
         return speed * (0.2 + speed / 6.0) <= above - 0.1 + SLACK
     return speed == 0.0 or speed * (speed / 6.0 - 0.2) <= below - 0.1 + SLACK
+
+
+def growth(before: Vector, after: Vector) -> float:
+    """Return how much further from rest a reference [m/s] is than a tick before [m/s]."""
+    (ux, uy, uz), (vx, vy, vz) = before, after
+    return sqrt(_grown(ux, vx) ** 2 + _grown(uy, vy) ** 2 + _grown(uz, vz) ** 2)
+
+
+def _grown(before: float, after: float) -> float:
+    if before * after < 0.0:
+        return abs(after)
+    return max(abs(after) - abs(before), 0.0)
+
+
+def _show(position: Vector) -> str:
+    return f"({', '.join(f'{each:.2f}' for each in position)})"

@@ -13,59 +13,62 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import (
-    CommandApplied,
-    Fault,
-    GuardChange,
-    Record,
-    SessionOpened,
-    TelemetrySent,
-)
+from cloudrc.records import CommandApplied, Fault, GuardChange, Record, SessionOpened
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
-from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD
 
 AGE_MAX = 0.252 + 1e-9
 """Largest age of a command's basis at a HOLD [s]: `command_age_max` and one tick."""
 SOON = 5.0
 """Time within which a fault has to show in its metric [s]."""
-OTHERS = ("rest", "latch", "hold", "order", "error")
-"""Kinds of breaches for which no scenario has a check of its own."""
 STANDS = 0.05
 """Speed up to which the robot stands [m/s]."""
+SAMPLE = 0.01
+"""Time between two records of the ground truth [s]."""
 WINDOW_NS = 1_000_000_000
 """Window in which changes of the guard are counted [ns]."""
-ALONE = "held for 60 s without the cloud"
-"""Cause of a LAND that ends a long HOLD."""
 ENDED = Cause.ENDED.words
 """Cause of a HOLD that the operator has requested."""
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose when a fault begins [s]: anywhere in the flight through the pipes.
-
-    Args:
-        seed: Seed of the scenario.
-        first: Earliest instant [s].
-        last: Latest instant [s].
-    """
+    """Choose when a fault begins, from `first` to `last` [s]: by default amid the pipes."""
     return float(generator(seed, 77).uniform(first, last))
 
 
 # Metrics.
 
 
-def reading(role: str, records: Iterable[Record], name: str, *labels: str) -> float:
-    """Return the value of a metric after some records; the mean of a histogram; NaN if absent.
+def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Record]:
+    """Return the records of a process up to `until` [s] of virtual time; all without it.
 
     Args:
-        role: Role of the process: "world", "cloud" or "teleop".
-        records: Records that it has seen, oldest first.
+        flight: The flight.
+        role: "world", "cloud" or "teleop".
+        until: Virtual time [s].
+    """
+    records: Iterable[Record] = flight.of_world if role == "world" else flight.of_cloud
+    records = flight.teleop.events if role == "teleop" else records
+    if until is None:
+        return list(records)
+    until_ns = (flight.world if role == "world" else flight.cloud).clock.at(round(until * 1e9))
+    return [record for record in records if record.stamp_ns <= until_ns]
+
+
+def reading(
+    flight: Flight, role: str, name: str, *labels: str, until: float | None = None
+) -> float:
+    """Return the value of a metric, the mean of a histogram; NaN if it is absent.
+
+    Args:
+        flight: The flight.
+        role: Role of the process that shows it; see `seen_by`.
         name: Name of the metric, without its prefix.
         labels: Values of its labels.
+        until: Virtual time at which it is read [s]; None for the end.
     """
     live = LiveMetrics(role)
-    live.see(records)
+    live.see(seen_by(flight, role, until))
     shown = live.read().get(f"cloudrc_{name}", {})
     if isinstance(shown, Histogram):
         count = shown.cumulative()[-1]
@@ -73,39 +76,17 @@ def reading(role: str, records: Iterable[Record], name: str, *labels: str) -> fl
     return float(shown.get(labels, nan))
 
 
-def above(role: str, records: Iterable[Record], name: str, bound: float) -> tuple[int, float]:
-    """Return how many values of a histogram are above a bound, and their share [1].
-
-    Args:
-        role: Role of the process.
-        records: Records that it has seen, oldest first.
-        name: Name of the metric, without its prefix.
-        bound: Bound of one of its buckets [unit of the metric].
-    """
+def above(
+    flight: Flight, role: str, name: str, bound: float, until: float | None = None
+) -> tuple[int, float]:
+    """Return how many values of a histogram are above a bucket's bound, and their share [1]."""
     live = LiveMetrics(role)
-    live.see(records)
+    live.see(seen_by(flight, role, until))
     shown = live.read()[f"cloudrc_{name}"]
     assert isinstance(shown, Histogram)
     counts = shown.cumulative()
     count = counts[-1] - counts[shown.bounds.index(bound)]
     return count, count / counts[-1] if counts[-1] else nan
-
-
-def seen_by(flight: Flight, role: str, until: float) -> list[Record]:
-    """Return the records of a process up to `until` [s] of virtual time."""
-    if role == "teleop":
-        records: Iterable[Record] = flight.teleop.events
-    else:
-        records = flight.of_world if role == "world" else flight.of_cloud
-    clock = flight.world.clock if role == "world" else flight.cloud.clock
-    until_ns = clock.at(round(until * 1e9))
-    return [record for record in records if record.stamp_ns <= until_ns]
-
-
-def metric(flight: Flight, end: str, name: str, *labels: str) -> float:
-    """Return the value of a metric of an end after the flight; see `reading`."""
-    records = flight.of_world if end == "world" else flight.of_cloud
-    return reading(end, records, name, *labels)
 
 
 def moves(
@@ -117,22 +98,13 @@ def moves(
     since: float,
     over: float | None = None,
 ) -> None:
-    """Check that a metric changes within 5 s of a fault.
+    """Check that a metric changes within 5 s of a fault that begins at `since` [s].
 
-    Args:
-        outcome: Takes the check.
-        flight: The flight.
-        role: Role of the process that shows the metric.
-        name: Name of the metric, without its prefix.
-        labels: Values of its labels.
-        since: Beginning of the fault [s].
-        over: End of the fault [s], if the time counts from there: a frozen process shows nothing,
-            and a loss is known when newer datagrams arrive.
+    The time counts from the fault's end `over` [s] if that is given: a frozen process shows
+    nothing, and a loss is known when newer datagrams arrive.
     """
-    last = since if over is None else over
-    before, after = (
-        reading(role, seen_by(flight, role, until), name, *labels) for until in (since, last + SOON)
-    )
+    last = (since if over is None else over) + SOON
+    before, after = (reading(flight, role, name, *labels, until=each) for each in (since, last))
     moved = after == after and before != after  # absent before is as good as another value
     end = "" if over is None else " of its end"
     outcome.true(f"metric {' '.join((name, *labels))} moves within {SOON:g} s{end}", moved)
@@ -201,96 +173,25 @@ def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
 
 
 def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
-    """Check that the guard's changes tell why: the command's age, and what ended the HOLD.
-
-    Args:
-        outcome: Takes the checks.
-        flight: A flight that has held and continued.
-        what: Distinguishes it from the scenario's other flights.
-    """
+    """Check that a flight which held and went on tells why; each text begins with `what`."""
     ages, limit = _ages_at_hold(flight), flight.experiment.guard.command_age_max_ms * 1e-3
     texts = [(c.cause, f"command age {age:.3f} s above {limit:.3f} s") for c, age in ages]
-    prefix = f"{what}: " if what else ""
     right = bool(texts) and all(cause == text for cause, text in texts)
-    outcome.true(f"{prefix}each HOLD tells the age of its command, to 1 ms", right)
+    outcome.true(f"{what}each HOLD tells the age of its command, to 1 ms", right)
     after = [c for c in flight.changes if ages and c.stamp_ns > ages[0][0].stamp_ns]
     causes = [change.cause for change in after if change.state is GuardState.TRACK]
     right = bool(causes) and all("fresh commands within" in cause for cause in causes)
-    outcome.true(f"{prefix}each TRACK after it tells of fresh commands", right)
-    sent = [r.telemetry for r in flight.of_world if isinstance(r, TelemetrySent)]
-    shown = {telemetry.cause for telemetry in sent if telemetry.guard is GuardState.HOLD}
-    right = Cause.SILENCE in shown <= {Cause.SILENCE, Cause.SESSION, Cause.ENDED}
-    outcome.true(f"{prefix}so does telemetry: {Cause.SILENCE.words}", right)
-
-
-def landing_told(outcome: Outcome, flight: Flight) -> None:
-    """Check that guard, mission and status tell that the robot landed without its cloud."""
-    causes = [change.cause for change in flight.changes if change.state is GuardState.LAND]
-    outcome.true(f"LAND tells why: {ALONE}", causes[:1] == [ALONE])
-    failed, verdict = flight.mission.state == "failed", str(flight.mission.verdict)
-    text = f"guard went to LAND ({Cause.ALONE.words})"
-    outcome.true("the mission says why it failed", failed and text in verdict)
-    assert flight.teleop.service is not None
-    seen = flight.teleop.service.state(flight.run.now_ns)["seen"]
-    right = (seen["guard"], seen["cause"]) == ("LAND", Cause.ALONE.words)
-    outcome.true(f"the status says so, too: LAND, {Cause.ALONE.words}", right)
-
-
-def look(flight: Flight, at: float) -> dict[str, Any]:
-    """Return a dictionary that gets teleop's status, as its API shows it, at an instant [s]."""
-    state: dict[str, Any] = {}
-
-    def ask(now_ns: int) -> None:
-        assert flight.teleop.service is not None
-        state.update(flight.teleop.service.state(flight.cloud.clock.at(now_ns)))
-
-    flight.cloud.at(at, ask)
-    return state
-
-
-def silence_told(
-    outcome: Outcome, state: dict[str, Any], silent: float, *, cloud: bool, what: str
-) -> None:
-    """Check that the status in a silence shows no past as present, and tells who is silent.
-
-    Args:
-        outcome: Takes the checks.
-        state: The status.
-        silent: How long the robot has been silent, apart from the way of its telemetry [s].
-        cloud: Whether cloud was heard.
-        what: Distinguishes this silence from the scenario's others.
-    """
-    seen, cloud_age = state["seen"], state["cloud_age_s"]
-    wrong = abs(seen["age_s"] - silent)
-    outcome.most(f"{what}: the status says for how long, wrong by", wrong, 0.2, "s")
-    outcome.true(f"{what}: it shows the guard's state as past", seen["guard_for_s"] is None)
-    if cloud:
-        outcome.most(f"{what}: it says that cloud was heard before", cloud_age, 0.25, "s")
-    else:
-        text = f"{what}: it says that cloud is silent, too, for"
-        outcome.least(text, cloud_age, silent - 0.2, "s")
-    who = "the robot, not cloud" if cloud else "cloud"
-    right = seen["next_step"] == (NOT_HEARD if cloud else NO_CLOUD)
-    outcome.true(f"{what}: its next step is to look after {who}", right)
+    outcome.true(f"{what}each TRACK after it tells of fresh commands", right)
 
 
 # The path.
 
 
-def stopping_time(flight: Flight, since: float) -> float:
-    """Return how long after `since` [s] the robot stands, for at least 0.2 s [s]."""
-    slow_since = nan
-    for record in flight.trajectory():
-        now = record.stamp_ns * 1e-9
-        if now < since:
-            continue
-        if hypot(*record.odometry.velocity) > STANDS:
-            slow_since = nan
-        elif slow_since != slow_since:
-            slow_since = now
-        elif now - slow_since >= 0.2:
-            return slow_since - since
-    return nan
+def calm_after(flight: Flight, start: float, end: float) -> float:
+    """Return how long after `start` the robot was last too fast to stand, until `end` [s]."""
+    path = [(r.stamp_ns * 1e-9, hypot(*r.odometry.velocity)) for r in flight.trajectory()]
+    fast = [time for time, speed in path if start <= time < end and speed >= STANDS]
+    return fast[-1] + SAMPLE - start if fast else 0.0
 
 
 def drift(flight: Flight, start: float, end: float) -> float:
@@ -322,16 +223,15 @@ def applied_in_order(flight: Flight) -> bool:
 
 def epochs(flight: Flight) -> list[int]:
     """Return every epoch that world opened."""
-    records = flight.of_world
-    return [r.epoch for r in records if isinstance(r, SessionOpened) and r.end == "world"]
+    opened = [r for r in flight.of_world if isinstance(r, SessionOpened)]
+    return [record.epoch for record in opened if record.end == "world"]
 
 
 def done(outcome: Outcome, flight: Flight) -> None:
     """Check that the mission was flown to its end, each waypoint once and in order."""
     outcome.true("mission done", flight.mission.state == "done")
     reached = [event.waypoint for event in flight.events("reached")]
-    in_order = reached == list(range(len(reached)))
-    outcome.true("each waypoint reached once, in order", in_order)
+    outcome.true("each waypoint reached once, in order", reached == list(range(len(reached))))
 
 
 def safe_and_done(outcome: Outcome, flight: Flight) -> None:
@@ -341,17 +241,8 @@ def safe_and_done(outcome: Outcome, flight: Flight) -> None:
 
 
 def safe(outcome: Outcome, flight: Flight) -> None:
-    """Check the invariants, and add the hash of the flight's records.
-
-    With a dishonest cloud no contact is checked, and none is reported.
-    """
-    breaches = flight.watch.counts
-    if flight.honest:
-        outcome.same("collisions", breaches["collision"], 0)
-    guarded = breaches["fence"] + breaches["cap"] + breaches["stop"]
-    outcome.same("breaches of the fence, a cap or the stop rule", guarded, 0)
-    others = sum(breaches[kind] for kind in OTHERS)
-    outcome.same("breaches of other invariants", others, 0)
-    outcome.same("ticks flown on stale commands", breaches["stale"], 0)
-    outcome.same("steps without the guard's tick", breaches["tick"], 0)
+    """Check that no invariant broke, and add the hash of the flight's records."""
+    outcome.same("breaches of an invariant", flight.watch.counts.total(), 0)
+    for breach in flight.watch.breaches:
+        outcome.true(f"{breach.kind} at {breach.time:.3f} s: {breach.text}", False)
     outcome.flown(flight.sha256())

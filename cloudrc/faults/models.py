@@ -1,11 +1,4 @@
-"""Models in virtual time of what runs around the two ends: processes, clocks and teleop.
-
-`RestartableEndpoint` puts an end into a process that a scenario can kill, freeze and start again.
-`InProcessTeleop` is teleop inside cloud's process; `SeparateTeleop` is teleop as a process of its
-own, joined to cloud's end as in production:
-
-    CloudEndpoint - RemoteTeleop  <- two sockets, 11 datagrams each ->  SeparateTeleop
-"""
+"""Models in virtual time of what runs around the two ends: processes, clocks and teleop."""
 
 from __future__ import annotations
 
@@ -52,20 +45,13 @@ Call: TypeAlias = Callable[[MissionService, int], object]
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A monotonic clock.
-
-    Attributes:
-        offset_ns: Its time at virtual time 0 [ns].
-        drift_ppm: How fast it is [ppm].
-    """
+    """A monotonic clock: its time at virtual time 0 [ns], and how fast it is [ppm]."""
 
     offset_ns: int = 0
     drift_ppm: int = 0
 
     def at(self, now_ns: int) -> int:
         """Return its time at `now_ns` of virtual time [ns]."""
-        if not self.drift_ppm:
-            return now_ns + self.offset_ns
         return now_ns + self.offset_ns + now_ns * self.drift_ppm // 1_000_000
 
     def when(self, own_ns: int) -> int:
@@ -80,13 +66,12 @@ class Clock:
 
 
 class RestartableEndpoint:
-    """World or cloud in a process that a scenario can kill, freeze and start again.
+    """World or cloud in a process that a scenario can kill, freeze and start; an `Endpoint`.
 
     Attributes:
         inner: The end that runs; None while there is no process.
         tamper: Changes the datagrams that arrive; None for no change.
         clock: The process's clock.
-        lost: Number of datagrams that no process took.
     """
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
@@ -99,14 +84,11 @@ class RestartableEndpoint:
         """
         self._build, self.clock, self._name = build, clock, name
         self.tamper: Tamper | None = None
-        self.lost = 0
-        self._frozen_until_ns = -1
+        self._scheduled, self._frozen_until_ns = 0, -1
         self._waiting: list[bytes] = []
         self._left: list[Record] = []
         self._actions: list[tuple[int, int, Action]] = []
-        self._scheduled = 0
         self.inner: Endpoint | None = build(clock.at(0))
-        self._due_ns = FAR_NS
         self._set_deadline()
 
     def at(self, seconds: float, action: Action) -> None:
@@ -117,8 +99,7 @@ class RestartableEndpoint:
 
     def kill(self, now_ns: int) -> None:
         """Kill the process as SIGKILL does; its records so far are kept."""
-        if self.inner is not None:
-            self._left += self.inner.take_records()
+        self._left = self.take_records()
         self.inner, self._waiting, self._frozen_until_ns = None, [], -1
         self._set_deadline()
 
@@ -127,19 +108,18 @@ class RestartableEndpoint:
         self.inner = self._build(self.clock.at(now_ns))
         self._set_deadline()
 
+    def restart(self, now_ns: int, down: float) -> None:
+        """Kill the process at `now_ns` [ns]; a new one starts after `down` [s]."""
+        self.kill(now_ns)
+        self.at(now_ns * 1e-9 + down, self.start)
+
     def freeze(self, now_ns: int, duration: float) -> None:
         """Stop the process as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
         self._frozen_until_ns = max(self._frozen_until_ns, now_ns + round(duration * 1e9))
         self._set_deadline()
 
     def throttle(self, start: float, duration: float, share: float) -> None:
-        """Give the process a share of each CFS period only.
-
-        Args:
-            start: Beginning, virtual time [s].
-            duration: Duration [s].
-            share: Share of the time in which the process runs, in [0, 1].
-        """
+        """From `start` on for `duration` [s], run for a `share` [1] of each CFS period only."""
         stall = (1.0 - share) * CFS_PERIOD
         for n in range(int(duration / CFS_PERIOD)):
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
@@ -147,16 +127,11 @@ class RestartableEndpoint:
     def receive_now(self, data: bytes, now_ns: int) -> None:
         """Hand a datagram to the process, past `tamper`."""
         if self.inner is None:
-            self.lost += 1
-        elif self._frozen_until_ns > now_ns:
-            if len(self._waiting) < SOCKET_MAX:
-                self._waiting.append(data)
-            else:
-                self.lost += 1
-        else:
+            return
+        if self._frozen_until_ns <= now_ns:
             self.inner.receive_datagram(data, self.clock.at(now_ns))
-
-    # The contract of an endpoint.
+        elif len(self._waiting) < SOCKET_MAX:
+            self._waiting.append(data)
 
     @property
     def sealed(self) -> bool:
@@ -206,16 +181,15 @@ class RestartableEndpoint:
     def _note_late_wake(self, inner: Endpoint, own_ns: int, late_ns: int) -> None:
         """Record a late wake, as the driver of real time does; others are on time."""
         slip_ns = getattr(inner, "slip_ns", 0)
-        self._left += inner.take_records()
+        self._left = self.take_records()
         self._left.append(Lateness(own_ns - slip_ns, self._name, late_ns * 1e-9, 0.0, slip_ns))
 
     def _set_deadline(self) -> None:
         due_ns = self._actions[0][0] if self._actions else FAR_NS
         if self.inner is not None:
-            if self._frozen_until_ns >= 0:
-                due_ns = min(due_ns, self._frozen_until_ns)
-            else:
-                due_ns = min(due_ns, self.clock.when(self.inner.next_deadline_ns()))
+            frozen = self._frozen_until_ns >= 0
+            wake_ns = self.inner.next_deadline_ns()
+            due_ns = min(due_ns, self._frozen_until_ns if frozen else self.clock.when(wake_ns))
         self._due_ns = due_ns
 
 
@@ -269,6 +243,7 @@ class InProcessTeleop:
     Attributes:
         service: The service that runs; None while teleop is down.
         events: All events of missions, oldest first.
+        outputs: See `Operator`.
     """
 
     outcome: Outcome | None = None
@@ -285,7 +260,7 @@ class InProcessTeleop:
         self._disk = b""  # the bytes of its database
         self.events: list[MissionEvent] = []
         self.service: MissionService | None = None
-        self._outputs: list[Output | Fault] = []
+        self.outputs: Sequence[Output | Fault] = []
         self.start()
 
     def start(self) -> None:
@@ -302,13 +277,12 @@ class InProcessTeleop:
         if self.service is not None:
             self._disk = self._database.serialize()
             self._database.close()
-        self.service = None
-        self._outputs.clear()
+        self.service, self.outputs = None, []
 
-    def order(self, order: Order, now_ns: int) -> Mission:
+    def order(self, order: Order, now_ns: int) -> None:
         """Order a mission at `now_ns` of cloud's clock [ns]; it starts at once."""
         assert self.service is not None, "teleop is down"
-        return self.service.create(order, now_ns)[0]
+        self.service.create(order, now_ns)
 
     def ask(self, call: Call, now_ns: int) -> None:
         """Make a call of the API at `now_ns` of cloud's clock [ns]; a refusal is ignored."""
@@ -320,10 +294,8 @@ class InProcessTeleop:
         """Make an emergency stop at `now_ns` of cloud's clock [ns]."""
         self.ask(MissionService.stop_rotors, now_ns)
 
-    def shut_down(self, now_ns: int) -> None:
-        """Ask the process to end, as SIGTERM does, at `now_ns` of cloud's clock [ns]."""
-        if self.service is not None:
-            self.service.pause(now_ns)
+    def freeze(self, now_ns: int, duration: float) -> None:
+        """Stop the process as SIGSTOP does; inside cloud's process it cannot."""
 
     def run_on(self, host: RestartableEndpoint) -> None:
         """Begin to run on the machine of `host`."""
@@ -337,13 +309,6 @@ class InProcessTeleop:
         """All missions, oldest first; none while teleop is down."""
         return list(self.service.book.missions.values()) if self.service is not None else []
 
-    # The contract of an operator.
-
-    @property
-    def outputs(self) -> Sequence[Output | Fault]:
-        """See `Operator`."""
-        return self._outputs
-
     def hear(self, now_ns: int) -> None:
         """Note that cloud runs."""
         if self.service is not None:
@@ -353,31 +318,30 @@ class InProcessTeleop:
         """See `Operator`."""
         if self.service is not None:
             self.service.see(seen, now_ns)
-            self._collect()
+            self._collect(self.service)
 
     def handle_deadline(self, now_ns: int) -> None:
         """See `Operator`."""
         if self.service is not None:
             self.service.handle_deadline(now_ns)
-            self._collect()
+            self._collect(self.service)
 
     def take_outputs(self) -> Sequence[Output | Fault]:
         """See `Operator`."""
-        outputs, self._outputs = self._outputs, []
+        outputs, self.outputs = self.outputs, []
         return outputs
 
-    def _collect(self) -> None:
-        assert self.service is not None
-        outputs = self.service.take_outputs()
-        self.events += [each for each in outputs if isinstance(each, MissionEvent)]
-        self._outputs += outputs
+    def _collect(self, service: MissionService) -> None:
+        if outputs := service.take_outputs():
+            self.events += [each for each in outputs if isinstance(each, MissionEvent)]
+            self.outputs = [*self.outputs, *outputs]
 
 
 class _Peer(UnixPeer):
     """A process's Unix datagram socket, joined to that of another one."""
 
     def __init__(self, is_open: Callable[[], bool]) -> None:
-        self.unsent, self.other, self._is_open = 0, self, is_open
+        self.other, self._is_open = self, is_open
         self.waiting: list[bytes] = []
 
     def receive(self) -> list[bytes]:
@@ -390,24 +354,26 @@ class _Peer(UnixPeer):
         sent = self.other._is_open() and len(self.other.waiting) < UNIX_SOCKET_MAX
         if sent:
             self.other.waiting.append(data)
-        self.unsent += not sent
         return sent
 
 
 class SeparateTeleop(InProcessTeleop):
-    """Teleop as a process of its own, which wakes every 20 ms."""
+    """Teleop as a process of its own, which wakes every 20 ms.
 
-    def __init__(self, contact_speed_max: float, *, phase_ns: int = 0) -> None:
+    It is joined to cloud's end as in production, by two Unix sockets.
+    """
+
+    def __init__(self, contact_speed_max: float, phase_ns: int) -> None:
         """Start for the first time.
 
         Args:
             contact_speed_max: Speed limit of the arm's tip at the board [m/s].
             phase_ns: Time of the first wake, below `PERIOD_NS` [ns].
         """
+        self._host: RestartableEndpoint | None = None
         self._peer = _Peer(lambda: self.service is not None)
         self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)
         self._peer.other, self._clouds.other = self._clouds, self._peer
-        self._host: RestartableEndpoint | None = None
         self._phase_ns, self._free_ns = phase_ns, 0
         super().__init__(contact_speed_max)
 
@@ -434,17 +400,13 @@ class SeparateTeleop(InProcessTeleop):
     def ask(self, call: Call, now_ns: int) -> None:
         """See `InProcessTeleop`; the call is made in the next wake."""
         if self.service is not None:
-            self._calls.append(call)
+            self._calls.append(partial(super().ask, call))
 
     def stop_rotors(self, now_ns: int) -> None:
         """See `InProcessTeleop`; its alarm goes to cloud at once, past teleop's loop."""
         if self.service is not None:
-            self._stops.append(MissionService.stop_rotors)
+            self._stops.append(partial(super().ask, MissionService.stop_rotors))
             self._peer.send(wire.encode(wire.ALARM))
-
-    def shut_down(self, now_ns: int) -> None:
-        """See `InProcessTeleop`; it ends in its next wake."""
-        self._ends = self.service is not None
 
     def freeze(self, now_ns: int, duration: float) -> None:
         """Stop the process as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
@@ -454,10 +416,11 @@ class SeparateTeleop(InProcessTeleop):
 
     def _forget(self) -> None:
         self._peer.waiting.clear()
-        self._calls: list[Call] = []
-        self._stops: list[Call] = []
+        self._calls: list[Action] = []
+        self._stops: list[Action] = []
         self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
-        self._ends, self._free_ns, self._turn_ns, self._blind = False, 0, NEVER_NS, 0
+        self._free_ns = 0
+        self._turn_ns, self._blind = NEVER_NS, 0
 
     def _wake(self, now_ns: int) -> None:
         assert self._host is not None
@@ -472,8 +435,8 @@ class SeparateTeleop(InProcessTeleop):
             self,
             self._peer,
             wire.decode,
-            self._take_calls,
-            stops=self._take_stops,
+            lambda: _take_all(self._calls),
+            stops=lambda: _take_all(self._stops),
             blind=self._blind,
             late_ns=now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0,
             now_ns=self._host.clock.at(now_ns),
@@ -481,13 +444,8 @@ class SeparateTeleop(InProcessTeleop):
         # Events wait for a cloud that is there; everything else is repeated.
         send(self.take_outputs(), self._unsent, self._peer, wire.encode)
 
-    def _take_calls(self) -> list[Callable[[int], None]]:
-        ask, shut_down = super().ask, super().shut_down
-        calls: list[Callable[[int], None]] = [shut_down] if self._ends else []
-        calls += [partial(ask, call) for call in self._calls]
-        self._calls, self._ends = [], False
-        return calls
 
-    def _take_stops(self) -> list[Callable[[int], None]]:
-        ask, stops, self._stops = super().ask, self._stops, []
-        return [partial(ask, stop) for stop in stops]
+def _take_all(calls: list[Action]) -> list[Action]:
+    taken = calls[:]
+    calls.clear()
+    return taken

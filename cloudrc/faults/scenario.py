@@ -1,18 +1,18 @@
-"""A fault, what brings it about, and the checks of what has to follow."""
+"""Named faults, the checks of what has to follow, and their results as JSON and JUnit XML."""
 
 from __future__ import annotations
 
 import hashlib
 import operator
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import xml.etree.ElementTree as Xml
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from math import isfinite
-from typing import Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 Relation: TypeAlias = Literal["<=", ">=", "=="]
-
 _COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 YES = "yes"
 """Unit of a check that is a question: its value is 1 for yes, 0 for no."""
@@ -25,15 +25,7 @@ def generator(seed: int, use: int) -> np.random.Generator:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing that has to follow.
-
-    Attributes:
-        text: The thing in words.
-        measured: Measured value [`unit`].
-        relation: How the value has to compare with the limit.
-        limit: Limit [`unit`].
-        unit: Unit of both; "" for counts, `YES` for yes (1) or no (0).
-    """
+    """One thing that has to follow: how `measured` compares with `limit`, both in `unit`."""
 
     text: str
     measured: float
@@ -58,12 +50,7 @@ class Check:
 
 @dataclass(slots=True)
 class Outcome:
-    """Result of a scenario.
-
-    Attributes:
-        checks: Checks, in order.
-        sha256: Hash of all records of all flights; "" if there are none.
-    """
+    """Checks of a scenario, in order, and the hash of all records of its flights."""
 
     checks: list[Check] = field(default_factory=list)
     sha256: str = ""
@@ -73,12 +60,6 @@ class Outcome:
         both = f"{self.sha256} {sha256}".encode()
         self.sha256 = hashlib.sha256(both).hexdigest() if self.sha256 else sha256
 
-    def add(self, other: Outcome) -> None:
-        """Add the result of another part of the scenario."""
-        self.checks += other.checks
-        if other.sha256:
-            self.flown(other.sha256)
-
     def most(self, text: str, measured: float, limit: float, unit: str = "") -> None:
         """Check that `measured` is at most its `limit`, both in `unit` [any unit]."""
         self.checks.append(Check(text, measured, "<=", limit, unit))
@@ -87,9 +68,9 @@ class Outcome:
         """Check that `measured` is at least its `limit`, both in `unit` [any unit]."""
         self.checks.append(Check(text, measured, ">=", limit, unit))
 
-    def same(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that `measured` is exactly its `limit`, both in `unit` [any unit]."""
-        self.checks.append(Check(text, measured, "==", limit, unit))
+    def same(self, text: str, measured: float, limit: float) -> None:
+        """Check that a count is exactly its limit [1]."""
+        self.checks.append(Check(text, measured, "==", limit))
 
     def true(self, text: str, holds: bool) -> None:
         """Check that a statement holds."""
@@ -99,6 +80,10 @@ class Outcome:
     def passed(self) -> bool:
         """Whether every check passed, and there were some."""
         return bool(self.checks) and all(check.passed for check in self.checks)
+
+
+Inject: TypeAlias = Callable[[Outcome, int], None]
+"""Injects a fault with a seed, and adds the checks to an outcome."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +97,7 @@ class Scenario:
         expects: What the robot does and within what time, in words.
         loses: What may be lost.
         shows: What the user sees, or which metric moves.
-        run: Injects the fault with a seed, and checks.
+        inject: Injects the fault, and checks.
     """
 
     number: int
@@ -121,9 +106,77 @@ class Scenario:
     expects: str
     loses: str
     shows: str
-    run: Callable[[int], Outcome]
+    inject: Inject
 
     @property
     def id(self) -> str:
         """Name of the fault: F13."""
         return f"F{self.number}"
+
+    def run(self, seed: int) -> Outcome:
+        """Inject the fault with a seed, and check."""
+        outcome = Outcome()
+        self.inject(outcome, seed)
+        return outcome
+
+
+def scenario(
+    number: int, name: str, *, injects: str, expects: str, loses: str = "none", shows: str
+) -> Callable[[Inject], Scenario]:
+    """Make a `Scenario` of the function that injects the fault; the arguments are its fields."""
+    return lambda inject: Scenario(number, name, injects, expects, loses, shows, inject)
+
+
+class Result(NamedTuple):
+    """A scenario that was run for `seconds` [s]; `error` is the exception that ended it, or ""."""
+
+    scenario: Scenario
+    outcome: Outcome
+    seconds: float
+    error: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed."""
+        return not self.error and self.outcome.passed
+
+    @property
+    def word(self) -> str:
+        """One word for a table."""
+        return "passed" if self.passed else "FAILED"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the result as plain values."""
+        checks = self.outcome.checks
+        return {
+            "id": self.scenario.id,
+            "name": self.scenario.name,
+            "mode": "virtual",
+            "result": self.word.lower(),
+            "reason": self.error,
+            "seconds": round(self.seconds, 3),
+            "records_sha256": self.outcome.sha256,
+            "checks": [asdict(check) | {"passed": check.passed} for check in checks],
+        }
+
+
+def as_json(results: Sequence[Result], seed: int) -> dict[str, Any]:
+    """Return the results of scenarios as plain values."""
+    passed, faults = all(each.passed for each in results), [each.as_json() for each in results]
+    return {"schemaVersion": 1, "seed": seed, "passed": passed, "faults": faults}
+
+
+def as_junit(results: Sequence[Result], seed: int) -> str:
+    """Return the results of scenarios as JUnit XML, one test case per fault."""
+    failures = str(sum(not result.passed for result in results))
+    counts = {"tests": str(len(results)), "failures": failures, "skipped": "0"}
+    suite = Xml.Element("testsuite", {"name": f"cloudrc faults, seed {seed}", **counts})
+    for result in results:
+        name, seconds = f"{result.scenario.id} {result.scenario.name}", f"{result.seconds:.3f}"
+        case = Xml.SubElement(suite, "testcase", classname="faults", name=name, time=seconds)
+        if not result.passed:
+            lines = [check.show() for check in result.outcome.checks if not check.passed]
+            lines = [*filter(None, [result.error]), *lines] or ["it checked nothing"]
+            Xml.SubElement(case, "failure", message=lines[0]).text = "\n".join(lines)
+    Xml.indent(suite)
+    return Xml.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"

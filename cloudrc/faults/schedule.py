@@ -19,13 +19,9 @@ from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElli
 
 
 class Kind(NamedTuple):
-    """A kind of fault.
+    """A kind of fault: what happens, and what is drawn at random.
 
-    Attributes:
-        text: What happens; `value` is the event's.
-        longest: Longest duration that is drawn [s]; 0 for an instant.
-        low: Lowest value that is drawn [any unit].
-        high: Highest value that is drawn [any unit].
+    That is the longest duration [s], 0 for an instant, and the range of `value` [any unit].
     """
 
     text: str
@@ -84,14 +80,9 @@ WAYS: tuple[Way, ...] = ("both", "up", "down")
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One fault.
+    """One of `KINDS`, from `at` on for `duration` [s], on one way of the link or both.
 
-    Attributes:
-        kind: One of `KINDS`.
-        at: Beginning [s].
-        duration: Duration [s].
-        value: Severity, as `KINDS` says [any unit].
-        way: Direction of the link: "both", "up" or "down".
+    `value` is its severity, as `KINDS` says [any unit].
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -100,6 +91,13 @@ class Event:
     duration: Time = 0.0
     value: Annotated[float, Field(ge=0.0, le=1e9)] = 0.0
     way: Way = "both"
+
+    def __post_init__(self) -> None:
+        """Check the kind and its value."""
+        if self.kind not in KINDS:
+            raise ValueError(f"no fault '{self.kind}'; there are: {', '.join(KINDS)}")
+        if self.kind in SHARES and self.value > 1.0:
+            raise ValueError(f"the value {self.value:g} is not between 0 and 1")
 
     @property
     def end(self) -> float:
@@ -210,6 +208,9 @@ def dump(schedule: Schedule, note: str = "") -> str:
     return head + text
 
 
+_SCHEDULE = TypeAdapter(Schedule)
+
+
 def load(path: Path) -> Schedule:
     """Read a schedule.
 
@@ -217,31 +218,13 @@ def load(path: Path) -> Schedule:
         BadInputError: If the file is no schedule, or its schedule cannot be flown.
     """
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-        if not isinstance(document, dict):
-            raise _none(path, "it has no keys")
-        schedule = _SCHEDULE.validate_python(document)
-        for n, event in enumerate(schedule.events):
-            if event.kind not in KINDS:
-                text = f"events.{n}.kind: no fault '{event.kind}'; there are: {', '.join(KINDS)}"
-                raise _none(path, text)
-            if event.kind in SHARES and event.value > 1.0:
-                raise _none(path, f"events.{n}.value: {event.value:g} is not between 0 and 1")
+        return _SCHEDULE.validate_python(yaml.safe_load(path.read_text(encoding="utf-8")))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place = ".".join(map(str, first["loc"]))
-        raise _none(path, f"{place}: {first['msg']}" if place else first["msg"]) from error
+        text = ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"]]))
     except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
         text = getattr(error, "strerror", None) or to_one_line(str(error))
-        raise _none(path, text) from error
-    return schedule
-
-
-_SCHEDULE = TypeAdapter(Schedule)
-
-
-def _none(path: Path, text: str) -> BadInputError:
-    return BadInputError(f"{path}: is no schedule of faults: {text}")
+    raise BadInputError(f"{path}: is no schedule of faults: {text}")
 
 
 CALM = 45.0
@@ -304,9 +287,10 @@ def _swizzle(rng: np.random.Generator) -> list[Event]:
 
     Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
     """
-    things: list[tuple[str, Way]] = [("blackout", "up"), ("blackout", "down")]
-    things.append(("cloud_paused", "both"))
-    things.append(("world_paused", "both"))
+    things: tuple[tuple[str, Way], ...] = (
+        *(("blackout", "up"), ("blackout", "down")),
+        *(("cloud_paused", "both"), ("world_paused", "both")),
+    )
     starts = float(rng.uniform(1.0, 35.0)) + np.cumsum(rng.uniform(0.05, 0.8, 4))
     ends = rng.permutation(starts[-1] + np.cumsum(rng.uniform(0.05, 1.0, 4)))
     return [

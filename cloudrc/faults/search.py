@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc import __version__
 from cloudrc.faults.adversary import choose
-from cloudrc.faults.invariants import Breach
-from cloudrc.faults.report import INVARIANTS
-from cloudrc.faults.schedule import Event, Schedule, compose, dump
-from cloudrc.faults.trial import Finding, checked_in, fly
+from cloudrc.faults.schedule import Schedule, compose, dump
+from cloudrc.faults.trial import INVARIANTS, Finding, checked_in, fly
 
 KINDS: dict[str, Callable[[int], Schedule]] = {"random": compose, "adversarial": choose}
 """Kinds of searches: random faults, and hostile clouds with or without random faults."""
@@ -48,13 +46,7 @@ class Search:
     """
 
     def __init__(self, kind: str, first: int, store: Path) -> None:
-        """Prepare a search.
-
-        Args:
-            kind: One of `KINDS`.
-            first: First seed.
-            store: Folder for failing schedules; it is made when needed.
-        """
+        """Prepare a search; `store` is the folder for failing schedules, made when needed."""
         self.kind, self.first, self.next, self._store = kind, first, first, store
         self.failures: list[dict[str, Any]] = []
         self._checked: Counter[str] = Counter()
@@ -65,23 +57,20 @@ class Search:
     def run(
         self, minutes: float, call: Map, jobs: int = 1
     ) -> Generator[dict[str, Any] | None, None, None]:
-        """Fly seed after seed until the time is over; at least one.
-
-        Args:
-            minutes: Budget of time [min].
-            call: Calls a function in several processes.
-            jobs: Number of processes.
+        """Fly seed after seed until `minutes` [min] are over; at least one.
 
         Yields:
             After each flight, what was stored if it failed, else None.
         """
         began = time.monotonic()
-        for finding in self._findings(call, jobs):
-            failure = self._take(finding)
-            self._seconds = time.monotonic() - began
-            yield failure
-            if self._seconds >= 60.0 * minutes:
-                return
+        while True:
+            chunk = [(self.kind, self.next + n) for n in range(CHUNK)]
+            for finding in call(fly_seed, chunk, jobs):
+                failure = self._take(finding)
+                self._seconds = time.monotonic() - began
+                yield failure
+                if self._seconds >= 60.0 * minutes:
+                    return
 
     def document(self) -> dict[str, Any]:
         """Return the result so far as plain values."""
@@ -105,10 +94,6 @@ class Search:
             "failures": self.failures,
         }
 
-    def _findings(self, call: Map, jobs: int) -> Iterator[Finding]:
-        while True:
-            yield from call(fly_seed, [(self.kind, self.next + n) for n in range(CHUNK)], jobs)
-
     def _take(self, finding: Finding) -> dict[str, Any] | None:
         self.next += 1
         self._checked.update(checked_in(finding.schedule))
@@ -130,69 +115,66 @@ class Search:
         def fails(schedule: Schedule) -> bool:
             return time.monotonic() < until and bool(fly(schedule).kinds & kinds)
 
-        smallest = shrink(finding.schedule, fails)
+        smallest, seed = shrink(finding.schedule, fails), finding.schedule.seed
+        name = f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{seed}.yaml"
+        lines = [f"{each.time:.3f} s: {each.kind}: {each.text}" for each in finding.breaches[:3]]
+        note = "\n".join([f"Found by seed {seed}, before it was shrunk:", *lines])
         self._store.mkdir(parents=True, exist_ok=True)
-        name = f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{smallest.seed}.yaml"
-        path = self._store / name
-        path.write_text(dump(smallest, _note(finding.schedule.seed, finding.breaches)), "utf-8")
+        (self._store / name).write_text(dump(smallest, note), encoding="utf-8")
         return {
-            "seed": finding.schedule.seed,
+            "seed": seed,
             "breaches": [breach._asdict() for breach in finding.breaches],
             "schedule": asdict(smallest),
-            "file": str(path),
+            "file": str(self._store / name),
         }
 
 
-def _note(seed: int, breaches: Iterable[Breach]) -> str:
-    lines = [f"{each.time:.3f} s: {each.kind}: {each.text}" for each in breaches]
-    return "\n".join([f"Found by seed {seed}, before it was shrunk:", *lines[:3]])
-
-
-Fails: TypeAlias = Callable[[Schedule], bool]
-"""Tells whether a schedule fails in the same way."""
-
-
-def shrink(schedule: Schedule, fails: Fails) -> Schedule:
-    """Remove faults from a failing schedule, then simplify the rest, while it still fails.
-
-    Source: A. Zeller, R. Hildebrandt, Simplifying and isolating failure-inducing input, IEEE TSE
-    28(2), 2002: ddmin, on the list of faults.
-    """
-    schedule = replace(schedule, events=_ddmin(schedule, fails))
-    changed = True
-    while changed:
-        changed = False
-        for simpler in _simpler(schedule):
-            if simpler != schedule and fails(simpler):
-                schedule, changed = simpler, True
-                break
-    return schedule
-
-
-def _ddmin(schedule: Schedule, fails: Fails) -> tuple[Event, ...]:
-    events, parts = schedule.events, 2
-    while len(events) >= 2:
-        size = -(-len(events) // parts)
-        rests = [events[:at] + events[at + size :] for at in range(0, len(events), size)]
-        rest = next((r for r in rests if fails(replace(schedule, events=r))), None)
-        if rest is not None:
-            events, parts = rest, max(parts - 1, 2)
-        elif size == 1:
-            break
-        else:
-            parts = min(2 * parts, len(events))
-    return events
+def shrink(schedule: Schedule, fails: Callable[[Schedule], bool]) -> Schedule:
+    """Remove faults from a failing schedule, then simplify the rest, while it still fails."""
+    while True:
+        simpler = (each for each in _simpler(schedule) if each != schedule and fails(each))
+        found = next(simpler, None)
+        if found is None:
+            return schedule
+        schedule = found
 
 
 def _simpler(schedule: Schedule) -> Iterator[Schedule]:
-    """Yield schedules with one thing less."""
+    """Yield schedules without all faults, half of them, a quarter... one; and simpler ones."""
+    events, size = schedule.events, len(schedule.events)
+    while size:
+        for at in range(0, len(events), size):
+            yield replace(schedule, events=events[:at] + events[at + size :])
+        size //= 2
     plain = Schedule(schedule.seed)
     for name in ("duplicate", "reorder", "cloud_offset", "cloud_drift", "profile", "separate",
                  "hold_max"):  # fmt: skip
         yield replace(schedule, **{name: getattr(plain, name)})
-    for n, event in enumerate(schedule.events):
+    for n, event in enumerate(events):
         shorter = replace(event, duration=round(event.duration / 2, 2))
         if shorter.duration > 0.0:
-            events = list(schedule.events)
-            events[n] = shorter
-            yield replace(schedule, events=tuple(events))
+            yield replace(schedule, events=(*events[:n], shorter, *events[n + 1 :]))
+
+
+def search_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return a table of a search: each invariant with its upper bound of failure probability.
+
+    The bound is the rule of three: 0 events in N runs mean p < 3/N with 95 % confidence.
+    """
+    lines: list[tuple[str, ...]] = [("invariant", "broken in", "of N", "95 % bound")]
+    for name, words in INVARIANTS.items():
+        judged, broken = (document["invariants"][name][each] for each in ("judged", "broken"))
+        bound = "not judged" if not judged else "-" if broken else f"p < {min(3 / judged, 1):.2g}"
+        lines.append((words, str(broken) if judged else "-", str(judged), bound))
+    return lines
+
+
+def search_summary(document: dict[str, Any]) -> str:
+    """Describe in one sentence how much a search flew, and the extreme values."""
+    return (
+        f"{document['count']} {document['kind']} schedules in {document['seconds']:.0f} s, seeds "
+        f"{document['first']} to {document['next'] - 1}, {document['hours']:.2f} virtual hours: "
+        f"{len(document['failures'])} broken, {document['missions_done']} missions done, "
+        f"{document['holds']} HOLDs, nearest to the fence {document['smallest_margin_m']:.3f} m, "
+        f"fastest {document['largest_speed_mps']:.2f} m/s"
+    )

@@ -1,34 +1,67 @@
 """Flies one schedule in virtual time, and returns the invariants that broke.
 
 An operator flies one mission after the other, and acknowledges what is latched. In the calm at the
-end the robot must fly again; otherwise it is stuck.
+end the robot must fly again; otherwise it is stuck. The faults of the link are in its conditions:
+see `cloudrc.faults.schedule.shaped`.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from math import inf, nan
 
-from cloudrc.faults.adversary import dishonesty
-from cloudrc.faults.flight import Flight
-from cloudrc.faults.injection import BUGS, buggy, inject
-from cloudrc.faults.invariants import Breach
+import numpy as np
+
+from cloudrc.faults.adversary import Lie, dishonesty
+from cloudrc.faults.flight import SECRET, Flight
+from cloudrc.faults.invariants import LATCHED, Breach
 from cloudrc.faults.measures import events_of_missions, held
-from cloudrc.faults.models import Clock
-from cloudrc.faults.schedule import Schedule, shaped
-from cloudrc.messages import GuardState
-from cloudrc.records import CommandApplied, GuardChange, Record, SessionOpened
-from cloudrc.teleop.service import LATCHED, MissionService
+from cloudrc.faults.models import Action, Call, Clock, RestartableEndpoint, Tamper
+from cloudrc.faults.scenario import generator
+from cloudrc.faults.schedule import Event, Schedule, shaped
+from cloudrc.messages import Command, GuardState
+from cloudrc.records import CommandApplied, Control, GuardChange, Record, SessionOpened
+from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import QUEUED
+from cloudrc.tunnel.keys import Key, KeySet
 
+INVARIANTS = {
+    "collision": "collisions",
+    "fence": "fence breaches",
+    "cap": "cap breaches",
+    "stop": "too fast towards the fence",
+    "stale": "motion on stale commands",
+    "rest": "motion long after the last command",
+    "latch": "rotors on without an acknowledgement",
+    "hold": "HOLDs that end too early or too late",
+    "tick": "steps without the guard",
+    "obeyed": "emergency stops without effect",
+    "order": "commands applied out of order",
+    "waypoint": "waypoints reached out of order, or twice",
+    "stuck": "stuck states",
+    "alarm": "false alarms",
+    "error": "errors in an end",
+}
+SOMETIMES = {"collision", "obeyed", "waypoint", "stuck", "alarm"}
+"""Invariants that are not checked in every flight."""
 BACK = 10.0
 """Time of calm in which the robot must have flown [s]."""
-ALWAYS = ("fence", "cap", "stop", "stale", "rest", "latch", "hold", "tick", "order", "error")
-"""Invariants that are checked in every flight."""
 FORGETFUL = ("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down")
 """Faults after which there is another robot, or a teleop that need not know of a stop."""
 PATIENCE_NS = 1_000_000_000
 """Shortest time between two actions of the operator [ns]."""
+CAPTURED = 2_000
+"""Number of datagrams that an intruder keeps."""
+NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)
+WRONG_KEY = KeySet(Key(b"a key that world has never read!"))
+BUGS = ("values_invalid", "values_huge")
+"""Faults of an honest cloud whose controller has a bug."""
+IMPOSSIBLE = (nan, inf, -inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,43 +104,54 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
         BadInputError: If there is no such profile or policy.
     """
     flight = _prepare(schedule, settings, keep)
-    operator, order = Operator(flight, schedule), OrderInvariant(flight)
+    watch, operator, order = flight.watch, Operator(flight, schedule), OrderInvariant(flight)
     inject(flight, schedule)
     try:
         flight.fly(schedule.duration)
     except Exception as error:  # an end has to survive whatever comes
-        flight.watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
-    checked = checked_in(schedule)
-    if "waypoint" in checked:
-        order.check_waypoints()
-    if "stuck" in checked:
-        operator.check_stuck()
-    if "obeyed" in checked:
-        operator.check_stops()
-    if "alarm" in checked:
-        _check_alarms(flight)
-    watch = flight.watch
-    return Finding(
-        schedule,
-        tuple(watch.breaches),
-        flight.sha256() if keep else "",
-        watch.margin,
-        watch.speed,
-        len(held(flight)),
-        len(flight.events("done")),
-    )
+        watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
+    checks: dict[str, Callable[[], None]] = {
+        "waypoint": order.check_waypoints,
+        "stuck": operator.check_stuck,
+        "obeyed": operator.check_stops,
+        "alarm": lambda: _check_alarms(flight),
+    }
+    for kind in [kind for kind in checks if kind in checked_in(schedule)]:
+        checks[kind]()
+    sha256, done = flight.sha256() if keep else "", len(flight.events("done"))
+    breaches = tuple(watch.breaches)
+    return Finding(schedule, breaches, sha256, watch.margin, watch.speed, len(held(flight)), done)
+
+
+def checked_in(schedule: Schedule) -> frozenset[str]:
+    """Return the invariants that a schedule is checked for.
+
+    With a dishonest cloud a contact is no breach, and nothing has to go on. A robot needs `BACK` of
+    calm to recover. A HOLD, LAND or ESTOP is a false alarm if there are no faults. A stop must be
+    obeyed by the robot that it was meant for, if teleop runs on.
+    """
+    kinds = INVARIANTS.keys() - SOMETIMES
+    if not schedule.policy:
+        kinds |= {"collision", "waypoint"}
+        if schedule.duration - schedule.quiet_from >= BACK:
+            kinds.add("stuck")
+            if schedule.of("stopped") and not schedule.of(*FORGETFUL):
+                kinds.add("obeyed")
+        if not schedule.events:
+            kinds.add("alarm")
+    return frozenset(kinds)
 
 
 def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Flight:
     has_own_clock = bool(schedule.cloud_offset or schedule.cloud_drift)
-    clock = Clock(round((schedule.cloud_offset + 1e6) * 1e9), schedule.cloud_drift)
-    clock = clock if has_own_clock else Clock()
+    offset_ns = round((schedule.cloud_offset + 1e6) * 1e9)
+    clock = Clock(offset_ns, schedule.cloud_drift) if has_own_clock else Clock()
     lies, words = [], None
     if schedule.policy:
         lie, words = dishonesty(schedule)
         lies.append(lie)
     if schedule.of(*BUGS):
-        lies.append(buggy(schedule, clock))
+        lies.append(_bugs(schedule, clock))
     return Flight(
         f"link.profile={schedule.profile}",
         f"guard.hold_max_s={schedule.hold_max:g}",
@@ -123,25 +167,6 @@ def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Fligh
         second=min((event.at for event in schedule.of("second_cloud")), default=None),
         separate=schedule.teleop_is_separate,
     )
-
-
-def checked_in(schedule: Schedule) -> frozenset[str]:
-    """Return the invariants that a schedule is checked for.
-
-    With a dishonest cloud a contact is no breach, and nothing has to go on. A robot needs `BACK` of
-    calm to recover. A HOLD, LAND or ESTOP is a false alarm if there are no faults. A stop must be
-    obeyed by the robot that it was meant for, if teleop runs on.
-    """
-    kinds = set(ALWAYS)
-    if not schedule.policy:
-        kinds |= {"collision", "waypoint"}
-        if schedule.duration - schedule.quiet_from >= BACK:
-            kinds.add("stuck")
-            if schedule.of("stopped") and not schedule.of(*FORGETFUL):
-                kinds.add("obeyed")
-        if not schedule.events:
-            kinds.add("alarm")
-    return frozenset(kinds)
 
 
 class Operator:
@@ -235,3 +260,112 @@ def _check_alarms(flight: Flight) -> None:
     for change in (*held(flight), *latched):
         text = f"{change.state.name} in a flight without faults: {change.cause}"
         flight.watch.note(change.stamp_ns, "alarm", text)
+
+
+# Faults of processes, keys, datagrams, teleop and the operator.
+
+
+def inject(flight: Flight, schedule: Schedule) -> None:
+    """Schedule all faults on a flight."""
+    for event in schedule.events:
+        process = flight.world if event.kind.startswith("world") else flight.cloud
+        if event.kind.endswith("throttled"):
+            process.throttle(event.at, event.duration, event.value)
+        for time, action in _actions(flight, process, event).get(event.kind, ()):
+            process.at(time, action)
+    intrusions, rng = schedule.of("corruption", "garbage", "replay"), generator(schedule.seed, 41)
+    for way, process in (("down", flight.world), ("up", flight.cloud)):
+        if mine := [event for event in intrusions if event.way in ("both", way)]:
+            process.tamper = _tamper(mine, rng)
+
+
+def _actions(
+    flight: Flight, process: RestartableEndpoint, event: Event
+) -> dict[str, tuple[tuple[float, Action], ...]]:
+    """Return what happens when [s] in a fault of each kind; `process` is the one that it hits."""
+    at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
+    gone = at + event.value * lasts  # for teleop that was asked to end
+
+    def ask(call: Call) -> Action:
+        return lambda now_ns: teleop.ask(call, flight.cloud.clock.at(now_ns))
+
+    def read(end: str, keys: KeySet | None = None) -> Action:
+        return lambda now_ns: flight.replace_key(end, keys or flight.secrets["world"])
+
+    restart, freeze = partial(process.restart, down=lasts), partial(process.freeze, duration=lasts)
+    kill, start = lambda now_ns: teleop.kill(), lambda now_ns: teleop.start()
+    return {
+        **dict.fromkeys(("cloud_killed", "world_killed"), ((at, restart),)),
+        **dict.fromkeys(("cloud_paused", "world_paused"), ((at, freeze),)),
+        "pod_killed": ((at, partial(flight.restart_pod, down=lasts)),),
+        "pod_shut_down": (
+            (at, ask(MissionService.pause)),
+            (gone, partial(flight.restart_pod, down=end - gone)),
+        ),
+        "teleop_killed": ((at, kill), (end, start)),
+        "teleop_shut_down": ((at, ask(MissionService.pause)), (gone, kill), (end, start)),
+        "teleop_paused": ((at, lambda now_ns: teleop.freeze(now_ns, lasts)),),
+        "second_cloud": ((end, lambda now_ns: flight.end_rival()),),
+        "key_rotated": ((at, read("world", NEXT_KEY)), (end, read("cloud", NEXT_KEY))),
+        "key_wrong": ((at, read("cloud", WRONG_KEY)), (end, read("cloud"))),
+        "second_order": ((at, flight.order_if_possible),),
+        "stopped": ((at, lambda now_ns: teleop.stop_rotors(flight.cloud.clock.at(now_ns))),),
+        "held": ((at, ask(MissionService.hold)), (end, ask(MissionService.resume))),
+    }
+
+
+def _tamper(events: list[Event], rng: np.random.Generator) -> Tamper:
+    captured: deque[bytes] = deque(maxlen=CAPTURED)
+
+    def tamper(data: bytes, now_ns: int) -> list[bytes]:
+        captured.append(data)
+        hostile = list[bytes]()
+        for event in events:
+            if not event.at <= now_ns * 1e-9 < event.end:
+                continue
+            if event.kind == "corruption":
+                if rng.random() < event.value:
+                    data = flipped(data, rng, int(rng.integers(1, 9)))
+            elif event.kind == "garbage":
+                hostile += [rng.bytes(int(rng.integers(0, 200))) for _ in range(int(event.value))]
+            else:
+                start = int(rng.integers(0, len(captured)))
+                hostile += islice(captured, start, start + int(event.value))
+        return [*hostile, data]
+
+    return tamper
+
+
+def flipped(data: bytes, rng: np.random.Generator, flips: int) -> bytes:
+    """Return a datagram with some bits flipped."""
+    bits = bytearray(data)
+    for place in rng.choice(8 * len(data), min(flips, 8 * len(data)), replace=False).tolist():
+        bits[place >> 3] ^= 1 << (place & 7)
+    return bytes(bits)
+
+
+def _bugs(schedule: Schedule, clock: Clock) -> Lie:
+    """Make the lie of a schedule's bugs: `value` impossible commands a second of cloud's clock."""
+    rng, events = generator(schedule.seed, 43), schedule.of(*BUGS)
+    due = [event.at for event in events]
+
+    def lie(command: Command, control: Control) -> Command:
+        now = clock.when(control.stamp_ns) * 1e-9
+        for n, event in enumerate(events):
+            if due[n] <= now < event.end:
+                due[n] = now + 1.0 / max(event.value, 1e-3)
+                command = _ruined(command, event, rng)
+        return command
+
+    return lie
+
+
+def _ruined(command: Command, event: Event, rng: np.random.Generator) -> Command:
+    """Make one of the four numbers not finite, or the velocity huge."""
+    if event.kind == "values_huge":
+        x, y, z = rng.choice([1e308, -1e308], 3).tolist()
+        return command._replace(velocity=(x, y, z))
+    numbers = [*command.velocity, command.yaw_rate]
+    numbers[int(rng.integers(4))] = IMPOSSIBLE[int(rng.integers(len(IMPOSSIBLE)))]
+    x, y, z, yaw_rate = numbers
+    return command._replace(velocity=(x, y, z), yaw_rate=yaw_rate)

@@ -177,4 +177,4 @@ def containers(spec: Object) -> dict[str, Object]:
 
 
 def values_of(path: Path) -> Object:
-    return dict(yaml.load(path.read_text(), LOADER) or {})
+    return dict(yaml.load(path.read_text(), LOADER) or {})  # noqa: S506

@@ -10,8 +10,7 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cli.pool import WorkerDiedError
-from cloudrc.faults.report import Result
-from cloudrc.faults.scenario import Outcome
+from cloudrc.faults.scenario import Outcome, Result
 from cloudrc.faults.scenarios import find
 from cloudrc.faults.schedule import Schedule
 from cloudrc.faults.trial import Finding

@@ -29,7 +29,7 @@ def no_waiting() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("words", ["recover", "faults run"])
+@pytest.mark.parametrize("words", ["recover"])
 @pytest.mark.parametrize("what", ["pipe", "/dev/null", "."])
 def test_a_pipe_device_or_folder_is_refused_at_once(
     words: str,

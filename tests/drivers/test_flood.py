@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from cloudrc.config.schema import Criteria
-from cloudrc.faults.datagrams import REFUSED
+from cloudrc.faults.scenarios.intruder import REFUSED
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import Flight
 from cloudrc.metrics.control import wakes

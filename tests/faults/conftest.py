@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from cloudrc.faults.invariants import FLOWN, Limits, Watch
+from cloudrc.faults.invariants import FLOWN, TRACK, Limits, Watch
 from cloudrc.messages import (
     ZERO,
     Cause,
@@ -20,8 +20,6 @@ from cloudrc.world.readings import Touch
 from cloudrc.world.rotors import STOPPED
 
 MS = 1_000_000
-INSIDE, OUTSIDE = (1.0, 1.0, 1.0), (9.3, 1.0, 1.0)
-GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 TURNING = (900.0,) * 4
 
 
@@ -34,23 +32,19 @@ class FakeRobot:
         )
         self.simulator: Any = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
         self.observers: list[Any] = []
-        self.position, self.velocity = INSIDE, ZERO
+        self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0
         self.watch = Watch(Limits(hold_ns=hold_ms * MS))
         self.watch.attach(self, 0, honest=honest)  # type: ignore[arg-type]
         (self.observer,) = self.observers
         self.request(Request.START)
 
-    @property
-    def kinds(self) -> set[str]:
-        """Kinds of breaches so far."""
-        return set(self.watch.counts)
-
-    def request(self, request: Request, start: Start = Start.HERE) -> None:
-        """Carry out an operator request; the guard's state stays what a test says."""
-        if start is Start.SPAWN:
-            self.simulator.steps = 0
-        self.observer.see_request(OperatorRequest(1, request, start), self.now_ns)
+    def request(self, *requests: Request, start: Start = Start.HERE) -> None:
+        """Carry out operator requests; the guard's state stays what a test says."""
+        for request in requests:
+            if start is Start.SPAWN:
+                self.simulator.steps = 0
+            self.observer.see_request(OperatorRequest(1, request, start), self.now_ns)
 
     def offer(
         self, count: int = 1, rejection: str | None = None, basis_ms: float | None = None
@@ -65,11 +59,13 @@ class FakeRobot:
         """Let a contact begin in the next step."""
         self.simulator.touches.append(Touch(body, tip, self.position, ZERO, ZERO))
 
-    def release(self) -> None:
-        """Let the operator acknowledge and start, and ten fresh commands come."""
-        self.request(Request.ACKNOWLEDGE)
-        self.request(Request.START)
-        self.offer(10)
+    def put(self, velocity: Vector = ZERO, touch_age: float = float("inf")) -> None:
+        """Let the robot move [m/s], and have touched something some time ago [s]."""
+        self.velocity, self.simulator.touch_age = velocity, touch_age
+
+    def skip(self, ms: float) -> None:
+        """Let time pass without a step [ms]."""
+        self.now_ns += round(ms * MS)
 
     def step(
         self,
@@ -77,6 +73,7 @@ class FakeRobot:
         *,
         ms: int = 2,
         reference: Vector | None = None,
+        position: Vector | None = None,
         turns: bool | None = None,
         fresh: bool = True,
     ) -> set[str]:
@@ -86,12 +83,13 @@ class FakeRobot:
             state: State of the guard.
             ms: Duration [ms].
             reference: New reference [m/s]; None for the last one.
+            position: New position [m]; None for the last one.
             turns: Whether the rotors turn; by default in flight.
             fresh: Whether a fresh command comes before each step in TRACK.
         """
         self.guard.state = state
-        if reference is not None:
-            self.guard.reference = reference
+        self.guard.reference = self.guard.reference if reference is None else reference
+        self.position = self.position if position is None else position
         speeds = TURNING if (state in FLOWN if turns is None else turns) else STOPPED
         for _ in range(ms // 2):
             if state is TRACK and fresh:
@@ -100,4 +98,4 @@ class FakeRobot:
             readings = SimpleNamespace(position=self.position, velocity=self.velocity)
             self.observer.see_step(self.now_ns, readings, speeds)
             self.now_ns += 2 * MS
-        return self.kinds
+        return set(self.watch.counts)

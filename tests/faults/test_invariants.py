@@ -1,272 +1,250 @@
-"""The invariants of motion and rotors: what is a breach, and what is not."""
+"""The invariants: what is a breach, and what is not. Each row is a story and the breaches in it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from operator import methodcaller
+from typing import Any, TypeAlias
+
 import pytest
 
-from cloudrc.messages import ZERO, GuardState, Request, Start, Vector
-from tests.faults.conftest import (
-    ESTOP,
-    GROUND,
-    HOLD,
-    INSIDE,
-    LAND,
-    MS,
-    OUTSIDE,
-    TRACK,
-    FakeRobot,
-)
+from cloudrc.faults.invariants import ESTOP, GROUND, HOLD, LAND, RAMP, TRACK
+from cloudrc.messages import ZERO, Cause, GuardState, Request, Start, Vector
+from tests.faults.conftest import MS, FakeRobot
 
-FAR = (9.2 + 1.51, 1.0, 1.0)
+Deed: TypeAlias = Callable[[FakeRobot], object]
+step, offer, request, touch, put, skip = (
+    partial(methodcaller, name) for name in ("step", "offer", "request", "touch", "put", "skip")
+)
+OUTSIDE, FAR = (9.3, 1.0, 1.0), (9.2 + 1.51, 1.0, 1.0)
 NAN = float("nan")
+IMPOSSIBLE = offer(5, "range")
+"""Impossible commands, after which the robot may land."""
+STOP, END = request(Request.ESTOP), request(Request.END)
+SPAWN = request(Request.START, start=Start.SPAWN)
+RELEASE = (request(Request.ACKNOWLEDGE, Request.START), offer(10))
+STEPPED = lambda robot: setattr(robot.simulator, "steps", robot.simulator.steps + 1)  # noqa: E731
 
 
-@pytest.mark.parametrize("state", [GROUND, TRACK, HOLD, LAND])
-def test_a_base_outside_the_fence_is_a_breach(state: GuardState) -> None:
-    robot = FakeRobot()
-    robot.offer(5, "range")  # so that it may land
-    assert robot.step(state) == set()
-    robot.position = OUTSIDE
-    assert "fence" in robot.step(state)
+def play(*story: Deed, **options: Any) -> set[str]:
+    """Return the kinds of breaches of a story."""
+    robot = FakeRobot(**options)
+    for deed in story:
+        deed(robot)
+    return set(robot.watch.counts)
 
 
-@pytest.mark.parametrize("hit", [False, True])
-def test_after_a_stop_or_a_hit_it_may_fall_out_a_little(hit: bool) -> None:
-    for place, kinds in ((OUTSIDE, set()), (FAR, {"fence"})):
-        robot = FakeRobot()
-        robot.step(TRACK)
-        if not hit:
-            robot.request(Request.ESTOP)
-        robot.position = place
-        assert robot.step(ESTOP) == kinds
-    robot = FakeRobot()
-    robot.guard.state = ESTOP
-    robot.step(ESTOP)
-    robot.request(Request.ESTOP)  # it was stopped before: this request causes no fall
-    robot.position = OUTSIDE
-    assert robot.step(ESTOP) == set() if hit else {"fence"}
+def cause(cause: Cause) -> Deed:
+    return lambda robot: setattr(robot.guard, "cause", cause)
 
 
-def test_a_hit_may_throw_it_out_a_little_and_for_some_seconds() -> None:
-    robot = FakeRobot()
-    robot.touch("pipe_1")
-    robot.step(TRACK)
-    robot.position = OUTSIDE
-    assert robot.step(TRACK, ms=4000) == set(), "it comes back slowly"
-    robot.position = INSIDE
-    robot.step(TRACK)
-    robot.position = OUTSIDE
-    assert robot.step(TRACK) == {"fence"}
+def fly(*references: Vector) -> tuple[Deed, ...]:
+    return tuple(step(TRACK, reference=reference) for reference in references)
 
 
-@pytest.mark.parametrize(
-    ("position", "speed", "kinds"),
-    [(INSIDE, 0.11, set()), (INSIDE, 0.13, {"fence"}), (OUTSIDE, 0.0, {"fence"})],
-)
-def test_after_a_stop_it_takes_off_where_it_lies_inside(
-    position: Vector, speed: float, kinds: set[str]
-) -> None:
-    robot = FakeRobot()
-    robot.step(TRACK)
-    robot.request(Request.ESTOP)
-    robot.position, robot.velocity = position, (0.0, 0.0, -speed)
-    assert robot.step(ESTOP, ms=2000) == set()
-    robot.release()
-    assert robot.step(TRACK) == kinds
+def holds(state: GuardState, position: Vector, reference: Vector) -> tuple[Deed, ...]:
+    return (IMPOSSIBLE, step(state, position=position, reference=reference))
 
 
-@pytest.mark.parametrize(
-    ("references", "kinds"),
-    [
-        ([(0.02, 0.013, 0.0)], set()),
-        ([(0.02, 0.014, 0.0)], {"cap"}),
-        ([(6.001, 0.0, 0.0)], {"cap"}),
-        ([(0.02, 0.0, 0.0), ZERO, (0.0, -0.02, 0.0)], set()),
-        ([(0.02, 0.0, 0.0), (-0.025, 0.0, 0.0)], {"cap"}),
-    ],
-)
-def test_the_reference_grows_slowly_and_may_drop_at_once(
-    references: list[Vector], kinds: set[str]
-) -> None:
-    robot = FakeRobot()
-    for reference in references:
-        robot.step(TRACK, reference=reference)
-    assert robot.kinds == kinds
+def rest(speed: float, way: float) -> tuple[Deed, ...]:
+    moved = step(HOLD, position=(1.0, 1.0 + way, 1.0))
+    return (put(velocity=(0.0, speed, 0.0)), step(TRACK), step(HOLD), moved)
+
+
+MOTION: list[tuple[set[str], tuple[Deed, ...]]] = [
+    # The base is inside the fence, except after a stop or a hit.
+    *(({"fence"}, (IMPOSSIBLE, step(each, position=OUTSIDE))) for each in (GROUND, TRACK, LAND)),
+    (set(), (step(TRACK), STOP, step(ESTOP, position=OUTSIDE))),
+    (set(), (step(TRACK), step(ESTOP, position=OUTSIDE))),
+    ({"fence"}, (step(TRACK), STOP, step(ESTOP, position=FAR))),
+    ({"fence"}, (step(TRACK), step(ESTOP, position=FAR))),
+    ({"fence"}, (step(GROUND), STOP, step(GROUND, position=OUTSIDE))),
+    (set(), (touch("pipe_1"), step(TRACK), step(TRACK, ms=4000, position=OUTSIDE))),
+    (
+        {"fence"},
+        (touch("pipe_1"), step(TRACK, ms=4000), step(TRACK, position=OUTSIDE)),
+    ),
+    # After a stop it takes off only where it lies still inside.
+    *(
+        (kinds, (step(TRACK), STOP, put(velocity), step(ESTOP, ms=2000, position=position),
+                 *RELEASE, step(TRACK)))
+        for velocity, position, kinds in (
+            ((0.0, 0.0, -0.11), None, set()),
+            ((0.0, 0.0, -0.13), None, {"fence"}),
+            (ZERO, OUTSIDE, {"fence"}),
+        )
+    ),
+    # The reference grows slowly, may drop at once, and can be stopped before the fence.
+    (set(), fly((0.02, 0.013, 0.0))),
+    ({"cap"}, fly((0.02, 0.014, 0.0))),
+    ({"cap"}, fly((6.001, 0.0, 0.0))),
+    (set(), fly((0.02, 0.0, 0.0), ZERO, (0.0, -0.02, 0.0))),
+    ({"cap"}, fly((0.02, 0.0, 0.0), (-0.025, 0.0, 0.0))),
+    (set(), holds(HOLD, (8.9, 1.0, 1.0), (0.64, 0.0, 0.0))),  # 0.2 v + v^2/6 <= 0.2: 0.647 m/s
+    ({"stop"}, holds(HOLD, (8.9, 1.0, 1.0), (0.66, 0.0, 0.0))),
+    (set(), holds(ESTOP, (8.9, 1.0, 1.0), (0.66, 0.0, 0.0))),
+    (set(), holds(HOLD, (1.0, 1.0, 0.5), (0.0, 0.0, -1.06))),  # <= 0.4: 1.061 m/s
+    ({"stop"}, holds(HOLD, (1.0, 1.0, 0.5), (0.0, 0.0, -1.07))),
+    (set(), holds(LAND, (1.0, 1.0, 0.5), (0.0, 0.0, -1.07))),
+    ({"fence"}, holds(LAND, (1.0, 1.0, -0.01), ZERO)),
+    # Commands are fresh; each step has its tick.
+    (set(), (offer(basis_ms=0), step(TRACK, ms=252, fresh=False))),
+    ({"stale"}, (offer(), step(TRACK, ms=254, fresh=False))),
+    ({"stale"}, (offer(basis_ms=-251),)),
+    ({"stale"}, (offer(basis_ms=1),)),
+    ({"tick"}, (step(TRACK), STEPPED, step(TRACK))),
+    ({"tick"}, (step(GROUND), skip(2), step(GROUND))),
+    (set(), (step(GROUND), SPAWN, step(GROUND))),
+    # Without commands it stops within its stopping distance.
+    *((set(), rest(*each)) for each in ((0.0, 0.49), (2.0, 1.56))),
+    *(({"rest"}, rest(*each)) for each in ((0.0, 0.51), (2.0, 1.58))),
+    # Rotors stand still on the ground and after a stop; they stop where the robot stands.
+    *((set(), (step(each),)) for each in (GROUND, ESTOP)),
+    *(({"latch"}, (step(each, turns=True),)) for each in (GROUND, ESTOP)),
+    (set(), (step(HOLD), put((0.19, -0.2, 0.2)), step(GROUND))),
+    ({"rest"}, (step(HOLD), put((0.0, -0.21, 0.0)), step(GROUND))),
+    ({"rest"}, (step(HOLD), put((NAN, 0.0, 0.0)), step(GROUND))),
+    *((set(), (step(HOLD), put((0.0, 0.0, -3.0)), each, step(GROUND, ms=4)))
+      for each in (STOP, SPAWN)),
+    (set(), (step(TRACK), put((0.0, 0.0, -3.0)), step(ESTOP, ms=4))),  # after a hit
+    (set(), (step(HOLD), step(GROUND), put((0.0, 0.0, -0.9)), step(GROUND))),
+    ({"rest"}, (step(HOLD), step(GROUND), put((0.0, 0.0, -1.1)), step(GROUND))),
+    (set(), (step(HOLD), step(GROUND), put((0.0, 0.0, -1.1), 0.9), step(GROUND))),
+]  # fmt: skip
+
+
+def wait(state: GuardState, ms: int, then: GuardState | None = None) -> tuple[Deed, ...]:
+    return (step(state, ms=ms), step(then or state))
+
+
+def resumes(count: int, apart_ms: float) -> tuple[Deed, ...]:
+    """Offer some fresh commands in HOLD."""
+    took = -count * apart_ms
+    deeds = [each for _ in range(count) for each in (offer(), skip(apart_ms))]
+    return (step(HOLD), *deeds, skip(took), step(TRACK, fresh=False))
+
+
+def held_again(why: Cause, apart_ms: int, *others: Deed) -> tuple[Deed, ...]:
+    begun = (step(TRACK, ms=1000), step(HOLD, ms=apart_ms - 20), offer(10), step(TRACK, ms=10))
+    return (*begun, step(TRACK, ms=10, fresh=False), *others, cause(why), step(HOLD))
+
+
+def ramp(growth: float) -> tuple[Deed, ...]:
+    speeds = [n * growth * 0.002 for n in range(5)]
+    return (step(HOLD, ms=1000), offer(10), *fly(*((0.6 * v, 0.0, 0.8 * v) for v in speeds)))
+
+
+NINE = (offer(10), step(HOLD, ms=1000), offer(9))
+"""A HOLD with nine fresh commands in it, and ten before."""
+OPERATOR: list[tuple[set[str], tuple[Deed, ...]]] = [
+    # What is latched ends by an acknowledgement only; one of nothing counts for no later landing.
+    *((kinds, (IMPOSSIBLE, request(Request.ACKNOWLEDGE), step(latched), *release, step(after)))
+      for latched in (LAND, ESTOP) for after in (GROUND, HOLD)
+      for kinds, release in ((set(), RELEASE), ({"latch"}, ()))),
+    # TRACK needs a mission; nobody has to wait for its end.
+    *((set(), (step(TRACK), each, step(HOLD, ms=60_100))) for each in (STOP, END)),
+    *(({"latch"}, (each, step(TRACK))) for each in (STOP, END)),
+    *((set(), (each, request(Request.START), step(TRACK))) for each in (STOP, END)),
+    # A HOLD ends after ten fresh commands in half a second, of one session and mission.
+    *((set(), resumes(*each)) for each in ((10, 55), (30, 55))),
+    *(({"stale"}, resumes(*each)) for each in ((10, 56), (9, 10), (0, 10))),
+    ({"stale"}, (*NINE, lambda robot: robot.observer.see_session(0), offer(), step(TRACK))),
+    ({"stale"}, (*NINE, request(Request.END, Request.START), offer(), step(TRACK, fresh=False))),
+    ({"stale"}, (*NINE, offer(9, "stale"), step(TRACK, fresh=False), offer())),
+    (set(), (step(HOLD), SPAWN, step(TRACK))),  # from the spawn one command is enough
+    # TRACK and HOLD for silence begin a second apart, unless commands go back.
+    ({"hold"}, (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=898), offer(10), step(TRACK))),
+    (set(), (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=900), offer(10), step(TRACK))),
+    ({"hold"}, held_again(Cause.SILENCE, 998)),
+    (set(), held_again(Cause.SILENCE, 1000)),
+    *((set(), held_again(each, 998)) for each in (Cause.SESSION, Cause.ENDED)),
+    ({"hold"}, held_again(Cause.SILENCE, 998, offer(basis_ms=1990), offer(basis_ms=1991))),
+    (set(), held_again(Cause.SILENCE, 998, offer(basis_ms=1991), offer(basis_ms=1990))),
+    # After a HOLD the reference grows slowly at first.
+    (set(), ramp(RAMP)),
+    ({"cap"}, ramp(1.01 * RAMP)),
+    (set(), (*ramp(RAMP), step(TRACK, ms=2000, reference=ZERO), *fly((0.024, 0.0, 0.0)))),
+    # Five impossible commands just now justify a landing.
+    *((kinds, (step(TRACK, ms=100), step(HOLD, ms=100), offer(count, "range"),
+               step(HOLD, ms=wait), step(LAND)))
+      for count, wait, kinds in ((5, 0, set()), (4, 0, {"hold"}), (5, 100, {"hold"}))),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kinds", "story"), [*MOTION, *OPERATOR])
+def test_a_story_has_its_breaches_and_no_others(kinds: set[str], story: tuple[Deed, ...]) -> None:
+    assert play(*story) == kinds
 
 
 @pytest.mark.parametrize("yaw_rate", [-1.0, 1.001, -1.001, NAN])
 def test_the_reference_turns_no_faster_than_the_cap(yaw_rate: float) -> None:
-    robot = FakeRobot(yaw_rate=yaw_rate)
-    assert robot.step(TRACK) == (set() if yaw_rate == -1.0 else {"cap"})
+    assert play(step(TRACK), yaw_rate=yaw_rate) == (set() if yaw_rate == -1.0 else {"cap"})
 
 
 @pytest.mark.parametrize(
-    ("position", "reference", "state", "kinds"),
+    ("state", "hold_ms", "wait_ms"),
     [
-        ((8.9, 1.0, 1.0), (0.64, 0.0, 0.0), HOLD, set()),  # 0.2 v + v^2/6 <= 0.2: 0.647 m/s
-        ((8.9, 1.0, 1.0), (0.66, 0.0, 0.0), HOLD, {"stop"}),
-        ((8.9, 1.0, 1.0), (0.66, 0.0, 0.0), ESTOP, set()),
-        ((1.0, 1.0, 0.5), (0.0, 0.0, -1.06), HOLD, set()),  # <= 0.4: 1.061 m/s
-        ((1.0, 1.0, 0.5), (0.0, 0.0, -1.07), HOLD, {"stop"}),
-        ((1.0, 1.0, 0.5), (0.0, 0.0, -1.07), LAND, set()),
-        ((1.0, 1.0, -0.01), ZERO, LAND, {"fence"}),
+        (HOLD, 60_000, 60_000),
+        (GROUND, 60_000, 60_000),
+        (HOLD, 2_000, 2_000),
+        (GROUND, 2_000, 10_000),
     ],
 )
-def test_what_is_flown_can_stop_before_the_fence(
-    position: Vector, reference: Vector, state: GuardState, kinds: set[str]
+def test_a_mission_waits_for_its_cloud_as_long_as_configured(
+    state: GuardState, hold_ms: int, wait_ms: int
 ) -> None:
-    robot = FakeRobot()
-    robot.position = position
-    robot.offer(5, "range")
-    assert robot.step(state, reference=reference) == kinds
+    assert play(step(state, ms=wait_ms), hold_ms=hold_ms) == set()
+    assert play(step(state, ms=wait_ms + 6), hold_ms=hold_ms) == {"hold"}
+    assert play(*wait(state, wait_ms, LAND), hold_ms=hold_ms) == {"hold"}
+    assert play(*wait(state, wait_ms + 2, LAND), hold_ms=hold_ms) == set()
 
 
-def test_track_is_for_fresh_commands() -> None:
-    robot = FakeRobot()
-    robot.offer()
-    assert robot.step(TRACK, ms=252, fresh=False) == set()
-    assert robot.step(TRACK, fresh=False) == {"stale"}
-    for basis_ms, kinds in ((0, set()), (-251, {"stale"}), (1, {"stale"})):
-        robot = FakeRobot()
-        robot.offer(basis_ms=basis_ms)
-        assert robot.kinds == kinds
-
-
-def test_a_step_without_a_tick_of_the_guard_is_a_breach() -> None:
-    robot = FakeRobot()
-    robot.step(TRACK)
-    robot.simulator.steps += 1  # one that no tick has ruled
-    assert robot.step(TRACK) == {"tick"}
-    robot = FakeRobot()
-    robot.step(TRACK)
-    robot.now_ns += 2 * MS
-    assert robot.step(TRACK) == {"tick"}
-    robot = FakeRobot()
-    robot.step(GROUND)
-    robot.request(Request.START, Start.SPAWN)
-    assert robot.step(GROUND) == set(), "a reset begins to count anew"
-
-
-@pytest.mark.parametrize("state", [GROUND, ESTOP])
-def test_rotors_stand_still_on_the_ground_and_after_a_stop(state: GuardState) -> None:
-    assert FakeRobot().step(state) == set()
-    assert FakeRobot().step(state, turns=True) == {"latch"}
+COMES_DOWN = (touch("pipe_3"), step(LAND), touch("pipe_2"), step(GROUND))
+FALLS = (step(TRACK), STOP, touch("pipe_3"), step(ESTOP), touch("pipe_2"), step(ESTOP))
 
 
 @pytest.mark.parametrize(
-    ("speed", "way", "kinds"),
-    [(0.0, 0.49, set()), (0.0, 0.51, {"rest"}), (2.0, 1.56, set()), (2.0, 1.58, {"rest"})],
-)
-def test_without_commands_the_robot_stops_where_it_can(
-    speed: float, way: float, kinds: set[str]
-) -> None:
-    robot = FakeRobot()
-    robot.velocity = (0.0, speed, 0.0)
-    robot.step(TRACK)
-    robot.step(HOLD)
-    robot.position = (1.0, 1.0 + way, 1.0)
-    assert robot.step(HOLD) == kinds
-
-
-@pytest.mark.parametrize(
-    ("body", "tip", "state", "kinds"),
+    ("kinds", "story"),
     [
-        ("board", True, TRACK, set()),
-        ("board", False, TRACK, {"collision"}),
-        ("pipe_1", True, TRACK, {"collision"}),
-        ("floor", False, HOLD, {"collision"}),
-        ("floor", False, LAND, set()),
-        ("pipe_1", False, LAND, set()),
-        ("pipe_1", False, GROUND, {"collision"}),
+        (set(), (touch("board", tip=True), step(TRACK))),
+        ({"collision"}, (touch("board"), step(TRACK))),
+        ({"collision"}, (touch("pipe_1", tip=True), step(TRACK))),
+        ({"collision"}, (touch("floor"), step(HOLD))),
+        (set(), (IMPOSSIBLE, touch("floor"), step(LAND))),
+        ({"collision"}, (touch("pipe_1"), step(GROUND))),
+        # A robot that comes down may touch what is below, until it flies again.
+        (set(), (IMPOSSIBLE, *COMES_DOWN[:3], step(LAND))),
+        (set(), FALLS),
+        ({"collision"}, (*FALLS, *RELEASE, step(TRACK), touch("pipe_3"), step(TRACK))),
+        # An acknowledged landing ends within a brake.
+        (
+            set(),
+            (IMPOSSIBLE, step(LAND), *RELEASE, step(HOLD, ms=198), touch("pipe_3"), step(HOLD)),
+        ),
+        (
+            {"collision"},
+            (IMPOSSIBLE, step(LAND), *RELEASE, step(HOLD, ms=204), touch("pipe_3"), step(HOLD)),
+        ),
+        # No hit is felt without a touch.
+        ({"collision"}, (step(TRACK), put(touch_age=9.0), step(ESTOP))),
+        (set(), (step(TRACK), put(touch_age=0.5), step(ESTOP))),
+        (set(), (step(TRACK), put(touch_age=9.0), STOP, step(ESTOP))),
     ],
 )
-def test_with_an_honest_cloud_only_the_tip_touches_the_board(
-    body: str, tip: bool, state: GuardState, kinds: set[str]
+def test_an_honest_cloud_touches_only_the_board_and_only_by_the_tip(
+    kinds: set[str], story: tuple[Deed, ...]
 ) -> None:
-    for honest, found in ((True, kinds), (False, set())):
-        robot = FakeRobot(honest=honest)
-        robot.offer(5, "range")
-        robot.touch(body, tip=tip)
-        assert robot.step(state) == found
-        robot.simulator.touches = []  # as after the telemetry
-        assert robot.step(state) == found
+    assert play(*story, honest=True) == kinds
+    assert play(*story) == set(), "with a hostile one a contact is no breach"
 
 
-@pytest.mark.parametrize("stopped", [False, True])
-def test_a_robot_that_comes_down_may_touch_what_is_below(stopped: bool) -> None:
+def test_what_the_robot_landed_on_is_kept() -> None:
     robot = FakeRobot(honest=True)
-    robot.step(TRACK)
-    if stopped:
-        robot.request(Request.ESTOP)
-    robot.offer(5, "range")
-    robot.touch("pipe_3")
-    robot.step(ESTOP if stopped else LAND)
-    robot.touch("pipe_2")  # it slides off
-    assert robot.step(GROUND) - {"latch"} == set()
+    for deed in (IMPOSSIBLE, *COMES_DOWN):
+        deed(robot)
+    robot.simulator.touches = []  # as after the telemetry
+    robot.step(GROUND)
     assert robot.watch.landed_on == {"pipe_2", "pipe_3"}
-    robot.release()
-    robot.step(TRACK)
-    robot.touch("pipe_3")
-    assert "collision" in robot.step(TRACK), "it has flown since"
-
-
-@pytest.mark.parametrize(("ms", "kinds"), [(198, set()), (204, {"collision"})])
-def test_an_acknowledged_landing_ends_within_a_brake(ms: int, kinds: set[str]) -> None:
-    robot = FakeRobot(honest=True)
-    robot.offer(5, "range")
-    robot.step(LAND)
-    robot.release()
-    robot.step(HOLD, ms=ms)
-    robot.touch("pipe_3")
-    assert robot.step(HOLD) == kinds
-
-
-@pytest.mark.parametrize(
-    ("velocity", "kinds"),
-    [((0.19, -0.2, 0.2), set()), ((0.0, -0.21, 0.0), {"rest"}), ((NAN, 0.0, 0.0), {"rest"})],
-)
-def test_rotors_stop_where_the_robot_stands(velocity: Vector, kinds: set[str]) -> None:
-    robot = FakeRobot()
-    robot.step(HOLD)
-    robot.velocity = velocity
-    assert robot.step(GROUND) == kinds
-
-
-def test_a_request_or_a_hit_may_stop_rotors_in_the_air() -> None:
-    for request, start in ((Request.ESTOP, Start.HERE), (Request.START, Start.SPAWN)):
-        robot = FakeRobot()
-        robot.step(HOLD)
-        robot.velocity = (0.0, 0.0, -3.0)
-        robot.request(request, start)
-        assert robot.step(GROUND, ms=4) == set()
-    robot = FakeRobot()
-    robot.step(TRACK)
-    robot.velocity = (0.0, 0.0, -3.0)
-    assert robot.step(ESTOP, ms=4) == set()
-
-
-@pytest.mark.parametrize(
-    ("touch_age", "speed", "kinds"), [(9.0, 0.9, set()), (9.0, 1.1, {"rest"}), (0.9, 1.1, set())]
-)
-def test_a_robot_dropped_in_the_air_is_found(
-    touch_age: float, speed: float, kinds: set[str]
-) -> None:
-    robot = FakeRobot()
-    robot.step(HOLD)
-    robot.step(GROUND)
-    robot.simulator.touch_age, robot.velocity = touch_age, (0.0, 0.0, -speed)
-    assert robot.step(GROUND) == kinds
-
-
-@pytest.mark.parametrize("honest", [True, False])
-@pytest.mark.parametrize(("touch_age", "asked"), [(9.0, False), (0.5, False), (9.0, True)])
-def test_with_an_honest_cloud_no_hit_is_felt_without_a_touch(
-    honest: bool, touch_age: float, asked: bool
-) -> None:
-    robot = FakeRobot(honest=honest)
-    robot.step(TRACK)
-    robot.simulator.touch_age = touch_age
-    if asked:
-        robot.request(Request.ESTOP)
-    wrong = honest and not asked and touch_age > 1.0
-    assert robot.step(ESTOP) == ({"collision"} if wrong else set())
+    assert robot.watch.counts.keys() == {"latch"}, "left LAND by itself"
+    assert robot.now_ns == 6 * MS

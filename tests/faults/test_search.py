@@ -15,16 +15,7 @@ from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.invariants import Breach
-from cloudrc.faults.schedule import (
-    CALM,
-    KINDS,
-    Event,
-    Schedule,
-    compose,
-    dump,
-    load,
-    shaped,
-)
+from cloudrc.faults.schedule import CALM, KINDS, Event, Schedule, compose, dump, load, shaped
 from cloudrc.faults.search import shrink
 from cloudrc.faults.trial import Finding, fly
 from cloudrc.link.profile import Change, DirectionProfile
@@ -49,13 +40,9 @@ def test_random_schedules_have_all_faults_and_calm_at_the_end() -> None:
     assert 10 < sum(not schedule.events for schedule in drawn) < 60
     assert 150 < sum(schedule.separate for schedule in drawn) < 250
     assert 70 < sum(schedule.hold_max < 60.0 for schedule in drawn) < 180
-
-
-def test_a_hostile_cloud_flies_alone_or_amid_faults() -> None:
-    chosen = [choose(seed) for seed in range(200)]
-    for policy in POLICIES:
-        alone = {not schedule.events for schedule in chosen if schedule.policy == policy}
-        assert alone == {True, False}
+    # A hostile cloud flies alone or amid faults.
+    hostile = {(chosen.policy, not chosen.events) for chosen in map(choose, range(200))}
+    assert hostile == {(policy, alone) for policy in POLICIES for alone in (True, False)}
 
 
 @pytest.mark.parametrize("kind", nightly(*KINDS))
@@ -68,15 +55,8 @@ def test_each_kind_of_fault_is_survived(kind: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "[1, 2]",
-        "{{",
-        "[" * 5000,
-        "seed: one",
-        "seed: -1",
-        "seed: 1\nwind: 3",
-        "seed: 1\nduration: .inf",
-        "seed: 1\nreorder: 2",
+        *("", "[1, 2]", "{{", "[" * 2000, "seed: one", "seed: -1", "seed: 1\nwind: 3"),
+        *("seed: 1\nduration: .inf", "seed: 1\nreorder: 2"),
         "seed: 1\nevents: [{kind: rain, at: 1}]",
         "seed: 1\nevents: [{kind: blackout, at: .nan}]",
         "seed: 1\nevents: [{kind: blackout, at: 1, duration: -3}]",
@@ -122,45 +102,40 @@ def test_a_failing_schedule_is_shrunk_to_what_it_takes() -> None:
     assert (smallest.profile, smallest.reorder, smallest.separate) == ("paper-p2", 0.0, False)
 
 
-BAD = 5
-"""Seed whose schedule fails."""
-
-
-def _fly(schedule: Schedule, *, keep: bool = False) -> Finding:
-    breaches = (Breach(1.0, "stuck", "not flown"),) if schedule.seed == BAD else ()
-    return Finding(schedule, breaches, "", 1.0 / (1 + schedule.seed), 2.0, 1, 2)
-
-
-Find = Callable[..., dict[str, Any]]
+BAD, INTERRUPTED = 5, 9
+"""Seeds whose schedule fails, and in whose flight the search is interrupted."""
 
 
 @pytest.fixture
 def find(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Find:
-    """Search with flights that take no time, a number of them; return the document."""
+) -> Callable[..., tuple[dict[str, Any], str]]:
+    """Search with a number of flights that take no time; return the document and stderr."""
     monkeypatch.chdir(tmp_path)
 
-    def run(count: int, *flags: str, code: int) -> dict[str, Any]:
-        def fly_for(schedule: Schedule, *, keep: bool = False) -> Finding:
+    def run(count: int, *flags: str, code: int) -> tuple[dict[str, Any], str]:
+        def fly(schedule: Schedule) -> Finding:
             clock[0] += 60.0 / count
-            return _fly(schedule)
+            if schedule.seed == INTERRUPTED:
+                os.kill(os.getpid(), signal.SIGTERM)
+            breaches = (Breach(1.0, "stuck", "not flown"),) if schedule.seed == BAD else ()
+            return Finding(schedule, breaches, "", 1.0 / (1 + schedule.seed), 2.0, 1, 2)
 
         clock = [0.0]
-        monkeypatch.setattr("cloudrc.faults.search.fly", fly_for)
+        monkeypatch.setattr("cloudrc.faults.search.fly", fly)
         monkeypatch.setattr("cloudrc.faults.search.SHRINK_MAX", 0.0)
         monkeypatch.setattr("cloudrc.faults.search.time.monotonic", lambda: clock[0])
         assert main(["faults", "search", "-o", "json", *flags]) == code
-        document: dict[str, Any] = json.loads(capsys.readouterr().out)
-        return document
+        out, error = capsys.readouterr()
+        return json.loads(out), error
 
     return run
 
 
-def test_a_search_counts_stores_and_can_continue(find: Find) -> None:
-    told = find(3, code=0)
+def test_a_search_counts_stores_and_can_continue(find: Callable[..., Any]) -> None:
+    told, _ = find(3, code=0)
     assert (told["kind"], told["first"], told["next"], told["count"]) == ("random", 1, 4, 3)
-    told = find(3, "--first", "4", code=1)
+    told, _ = find(3, "--first", "4", code=1)
     assert (told["first"], told["next"]) == (4, 7)
     assert told["invariants"]["stuck"]["broken"] == 1
     assert told["invariants"]["fence"] == {"judged": 3, "broken": 0}
@@ -169,33 +144,23 @@ def test_a_search_counts_stores_and_can_continue(find: Find) -> None:
     assert failure["seed"] == BAD
     assert load(Path(failure["file"])).seed == BAD
     assert "Found by seed 5" in Path(failure["file"]).read_text()
+    told, error = find(9, "--first", "7", code=130)
+    assert told["count"] == 2
+    assert "continue with 'cloudrc faults search --first 9'" in error
 
 
-def test_no_zero_is_told_of_what_was_not_checked(find: Find) -> None:
-    told = find(1, "--adversarial", code=0)
+def test_no_zero_is_told_of_what_was_not_checked(find: Callable[..., Any]) -> None:
+    told, _ = find(1, "--adversarial", code=0)
     assert told["kind"] == "adversarial"
     assert told["invariants"]["collision"] == {"judged": 0, "broken": 0}
     assert told["invariants"]["fence"] == {"judged": 1, "broken": 0}
 
 
-def test_an_interrupted_search_says_how_to_continue(
-    find: Find, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupt(schedule: Schedule, *, keep: bool = False) -> Finding:
-        if schedule.seed == 3:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return _fly(schedule)
-
-    monkeypatch.setattr("cloudrc.faults.search.fly", interrupt)
-    assert main(["faults", "search", "--minutes", "9"]) == 130
-    out, err = capsys.readouterr()
-    assert "2 random schedules" in out
-    assert "continue with 'cloudrc faults search --first 3'" in err
-
-
-def test_a_stored_schedule_is_flown_again(
+def test_a_search_and_its_schedule_are_flown_for_real(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    assert main(["faults", "search", "--minutes", "1e-9", "--store", str(tmp_path / "new")]) == 0
+    assert "1 random schedules" in capsys.readouterr().out
     path = tmp_path / "schedule.yaml"
     path.write_text(dump(Schedule(1, events=(Event("blackout", 2.0, 0.5),), duration=3.0)))
     assert main(["faults", "run", str(path), "-o", "json"]) == 0

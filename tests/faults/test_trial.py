@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from cloudrc.faults import invariants
 from cloudrc.faults.adversary import POLICIES, choose, dishonesty
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.invariants import Limits, Watch
@@ -19,6 +20,7 @@ from cloudrc.messages import ZERO, Command, GuardState, Request
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
+from cloudrc.world.guard import state
 from cloudrc.world.guard.limits import Limits as GuardLimits
 from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
@@ -47,15 +49,12 @@ def test_a_hostile_cloud_causes_no_breach(policy: str) -> None:
     assert fly(replace(choose(seed), duration=8.0)).breaches == ()
 
 
-STIFFER = "world.low_level.integral_limit_xy=0.30"
-"""Three times the default; it removes the steady error of 32 mm."""
-
-
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("seed", [2, *nightly(*range(3, 40))])
 def test_it_causes_none_with_a_stiffer_low_level_controller(seed: int) -> None:
+    """Three times the default integral removes the steady error of 32 mm."""
     hostile = replace(choose(seed), events=(), duration=15.0)
-    assert fly(hostile, STIFFER).breaches == ()
+    assert fly(hostile, "world.low_level.integral_limit_xy=0.30").breaches == ()
 
 
 def test_a_hostile_cloud_makes_every_request() -> None:
@@ -95,11 +94,8 @@ def test_a_flight_without_faults_is_clean() -> None:
 HELD = Schedule(
     3,
     events=(
-        Event("blackout", 6.0, 0.4),
-        Event("blackout", 6.8, 0.3),
-        Event("blackout", 9.5, 1.5),
-        Event("stopped", 12.0),
-        Event("blackout", 15.0, 3.0),
+        *(Event("blackout", at, lasts) for at, lasts in ((6.0, 0.4), (6.8, 0.3), (9.5, 1.5))),
+        *(Event("stopped", 12.0), Event("blackout", 15.0, 3.0)),
     ),
     duration=21.0,
     hold_max=2.0,
@@ -107,32 +103,14 @@ HELD = Schedule(
 """Several HOLDs, a stop, and a LAND."""
 
 
-def test_this_schedule_breaks_nothing() -> None:
-    assert fly(HELD).breaches == ()
+def limits(**changes: float) -> Callable[[Patch], None]:
+    """Judge by other limits than those of the guard."""
+    wrong = Limits(hold_ns=2000 * MS)._replace(**changes)
+    return lambda patch: patch.setattr(Limits, "of", lambda guard: wrong)
 
 
-def ignores_the_fence(patch: Patch) -> None:
-    patch.setattr("cloudrc.faults.invariants.HIGH", (1.2, 1.2, 1.2))
-
-
-def ignores_the_age_of_commands(patch: Patch) -> None:
-    patch.setattr(Limits, "of", lambda guard: Limits(age_ns=50 * MS, hold_ns=2000 * MS))
-
-
-def ignores_the_caps(patch: Patch) -> None:
-    patch.setattr(Limits, "of", lambda guard: Limits(speed=0.1, hold_ns=2000 * MS))
-
-
-def ignores_the_ramp(patch: Patch) -> None:
-    patch.setattr(GuardLimits, "ramp_ns", 0)
-
-
-def ignores_the_settling_time(patch: Patch) -> None:
-    patch.setattr("cloudrc.world.guard.state.SETTLE_NS", 0)
-
-
-def waits_for_ever(patch: Patch) -> None:
-    patch.setattr(GuardLimits, "alone_max_ns", lambda limits, flies: 3_600_000 * MS)
+def ignores(owner: object, name: str, value: object = lambda *_: None) -> Callable[[Patch], None]:
+    return lambda patch: patch.setattr(owner, name, value)
 
 
 def needs_no_start(patch: Patch) -> None:
@@ -150,14 +128,6 @@ def applies_late_commands(patch: Patch) -> None:
     patch.setattr(Channel, "take", lambda *_: USED if (said := take(*_)) == LATE else said)
 
 
-def ignores_stops(patch: Patch) -> None:
-    patch.setattr(MissionService, "stop_rotors", lambda service, now_ns: None)
-
-
-def ignores_acknowledgements(patch: Patch) -> None:
-    patch.setattr(MissionService, "acknowledge", lambda service, now_ns: None)
-
-
 def fails_to_shut_down(patch: Patch) -> None:
     def fail(service: MissionService, now_ns: int) -> None:
         raise OSError("no way to end")
@@ -168,16 +138,21 @@ def fails_to_shut_down(patch: Patch) -> None:
 @pytest.mark.parametrize(
     ("breaks", "kind", "schedule"),
     [
-        (ignores_the_fence, "fence", Schedule(8, "ideal", policy="towards-a-face", duration=8.0)),
-        (ignores_the_age_of_commands, "stale", replace(HELD, duration=3.0)),
-        (ignores_the_caps, "cap", replace(HELD, duration=3.0)),
-        (ignores_the_ramp, "cap", replace(HELD, duration=9.0)),
-        (ignores_the_settling_time, "hold", replace(HELD, duration=9.0)),
-        (waits_for_ever, "hold", HELD),
+        (lambda patch: None, "", HELD),
+        (
+            ignores(invariants, "HIGH", (1.2, 1.2, 1.2)),
+            "fence",
+            Schedule(8, "ideal", policy="towards-a-face", duration=8.0),
+        ),
+        (limits(age_ns=50 * MS), "stale", replace(HELD, duration=3.0)),
+        (limits(speed=0.1), "cap", replace(HELD, duration=3.0)),
+        (ignores(GuardLimits, "ramp_ns", 0), "cap", replace(HELD, duration=9.0)),
+        (ignores(state, "SETTLE_NS", 0), "hold", replace(HELD, duration=9.0)),
+        (ignores(GuardLimits, "alone_max_ns", lambda *_: 3_600_000 * MS), "hold", HELD),
         (needs_no_start, "latch", HELD),
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
-        (ignores_stops, "obeyed", replace(HELD, duration=30.0)),
-        (ignores_acknowledgements, "stuck", replace(HELD, duration=30.0)),
+        (ignores(MissionService, "stop_rotors"), "obeyed", replace(HELD, duration=30.0)),
+        (ignores(MissionService, "acknowledge"), "stuck", replace(HELD, duration=30.0)),
         (
             fails_to_shut_down,
             "error",
@@ -189,7 +164,8 @@ def test_a_broken_part_is_found(
     breaks: Callable[[Patch], None], kind: str, schedule: Schedule, monkeypatch: Patch
 ) -> None:
     breaks(monkeypatch)
-    assert kind in fly(schedule).kinds
+    found = fly(schedule).kinds
+    assert kind in found if kind else found == set()
 
 
 @pytest.mark.parametrize(

@@ -1,25 +1,15 @@
-"""Provide endpoints and flights for the tests.
-
-There are endpoints without robot and loop; flights in virtual time with a verdict; flights with a
-silent link, recorded tick by tick; the instants of silences and kills (200 in the pipes, 200
-anywhere); and a world with a cloud whose datagrams the test writes itself.
-"""
+"""Endpoints without robot and loop; flights in virtual time; a world and the test's own cloud."""
 
 from __future__ import annotations
 
-from functools import cache
-from math import dist, hypot
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun
-from cloudrc.geometry.clearance import pipe_index
-from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import (
     NEVER_NS,
     UPRIGHT,
@@ -31,12 +21,10 @@ from cloudrc.messages import (
     Request,
     Start,
     Telemetry,
-    Vector,
 )
-from cloudrc.metrics import Flight
 from cloudrc.record.columns import Recording
 from cloudrc.record.hash import RecordHash
-from cloudrc.records import Arrival, CommandApplied, Contact, Counted, Fault, GuardChange, Record
+from cloudrc.records import Arrival, Counted, Fault, Record
 from cloudrc.report.document import Run
 from cloudrc.report.write import Assessment, assess
 from cloudrc.tunnel import codec
@@ -45,7 +33,6 @@ from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import Session, make_session
 from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
-from cloudrc.world.robot import STEP_NS
 
 MS = 1_000_000
 CLOCK = bytes(16)
@@ -237,18 +224,24 @@ def join(experiment: ResolvedExperiment, *, offset_ns: int = 0) -> Ends:
     return Ends(world, cloud, VirtualRun(world, cloud, *links, cloud_clock_offset_ns=offset_ns))
 
 
-def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record], list[Record]]:
-    """Fly and return the records of world and of cloud."""
-    _, cloud, run = join(experiment, **options)
-    of_world: list[Record] = []
-    of_cloud: list[Record] = []
+def fly_on(
+    run: VirtualRun, until_ns: int, over: Callable[[], bool] = lambda: False
+) -> tuple[list[Record], list[Record]]:
+    """Fly on; return the new records of world and of cloud."""
+    of_world, of_cloud = list[Record](), list[Record]()
 
     def sink(new_of_world: list[Record], new_of_cloud: list[Record]) -> None:
         of_world.extend(new_of_world)
         of_cloud.extend(new_of_cloud)
 
-    run.fly(lambda: cloud.mission_over, LIMIT_NS, sink)
+    run.fly(over, until_ns, sink)
     return of_world, of_cloud
+
+
+def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record], list[Record]]:
+    """Fly and return the records of world and of cloud."""
+    _, cloud, run = join(experiment, **options)
+    return fly_on(run, LIMIT_NS, lambda: cloud.mission_over)
 
 
 def fly(name: str, *settings: str) -> Assessment:
@@ -270,164 +263,6 @@ def digest(experiment: ResolvedExperiment) -> str:
     for each in records(experiment):
         digest.update(each)
     return digest.hexdigest()
-
-
-BOTH = ("uplink", "downlink")
-PATIENCE = (
-    "criteria.time_limit_s=200",
-    *(f"mission.waypoints.{k}.time_limit_s=200" for k in range(7)),
-)
-"""Time limit that a mission waiting for its link does not reach."""
-SLOW = ("cloud.controller.speed_max=1.5",)
-
-
-class Instant(NamedTuple):
-    """State of the robot after one tick."""
-
-    stamp_ns: int
-    state: GuardState
-    position: Vector
-    speed: float
-
-
-class Silence(NamedTuple):
-    """A flight with one silence in it; times [s] since the start of the silence or of the HOLD.
-
-    Attributes:
-        pipe: Index of the one that the base was in when the silence began; -1 for none.
-        outcome: Of the mission.
-        held_after: From the start of the silence to HOLD; None if there was none.
-        basis_age: How old what the newest applied command was computed from is at HOLD.
-        calm_after: From HOLD on until the speed stays below 0.05 m/s, up to the link's return.
-        drift: Farthest from where the robot first came to rest [m], up to the link's return.
-        resumed_after: From the link's return to TRACK.
-        speed: When HOLD began [m/s].
-        touched: What was touched, but for the board by the arm's tip.
-    """
-
-    pipe: int
-    outcome: str
-    held_after: float | None
-    basis_age: float
-    calm_after: float
-    drift: float
-    resumed_after: float | None
-    speed: float
-    touched: list[str]
-
-
-def fly_through(
-    start_s: float, duration_s: float, *settings: str, ways: tuple[str, ...] = BOTH
-) -> Silence:
-    """Fly `paper` with a silence of one or both directions."""
-    blackouts = [
-        f"link.{way}.blackouts=[{{start_s: {start_s}, duration_s: {duration_s}}}]" for way in ways
-    ]
-    experiment = load_experiment("paper", [*PATIENCE, *blackouts, *settings])
-    ends = join(experiment)
-    records: list[Record] = []
-    trace: list[Instant] = []
-    begin_ns, end_ns = round(start_s * 1e9), round((start_s + duration_s) * 1e9)
-    _watch(ends.world.robot, trace, begin_ns)
-
-    def over() -> bool:
-        return ends.cloud.mission_over and ends.run.now_ns > end_ns
-
-    ends.run.fly(over, LIMIT_NS, lambda w, c: records.extend(w))
-    outcome = ends.cloud.teleop.outcome
-    changes = [r for r in records if isinstance(r, GuardChange) and r.stamp_ns >= begin_ns]
-    held = next((c for c in changes if c.state is GuardState.HOLD), None)
-    contacts = [r for r in records if isinstance(r, Contact)]
-    touched = [r.body for r in contacts if r.body != "board" or not r.tip]
-    code = outcome.code if outcome else "none"
-    (pipe,) = pipe_index(load_scene(experiment.world.scene), trace[0].position).tolist()
-    if held is None or held.cause == "mission ended":
-        return Silence(pipe, code, None, 0.0, 0.0, 0.0, None, 0.0, touched)
-    held_ns = held.stamp_ns
-    bases_ns = [
-        r.basis_stamp_ns for r in records if isinstance(r, CommandApplied) and r.stamp_ns <= held_ns
-    ]
-    silent = [i for i in trace if held_ns <= i.stamp_ns <= max(end_ns, held_ns + STEP_NS)]
-    fast = [i.stamp_ns for i in silent if i.speed >= 0.05]
-    rest = next((i.position for i in silent if i.speed < 0.05), None)
-    still = silent[next((k for k, i in enumerate(silent) if i.position is rest), 0) :]
-    back = [c.stamp_ns for c in changes if c.state is GuardState.TRACK and c.stamp_ns > held_ns]
-    return Silence(
-        pipe,
-        code,
-        (held_ns - begin_ns) * 1e-9,
-        (held_ns - max(bases_ns)) * 1e-9,
-        (fast[-1] + STEP_NS - held_ns) * 1e-9 if fast else 0.0,
-        max(dist(i.position, rest) for i in still) if rest else 0.0,
-        (back[0] - end_ns) * 1e-9 if back else None,
-        silent[0].speed,
-        touched,
-    )
-
-
-def _watch(robot, trace: list[Instant], begin_ns: int) -> None:
-    """Note the robot after every tick from `begin_ns` on."""
-    guard, simulator, step = robot.guard, robot.simulator, robot.guard.step
-
-    def noting(now_ns, readings, dt):
-        reference = step(now_ns, readings, dt)
-        if now_ns >= begin_ns:
-            speed = hypot(*readings.velocity)
-            trace.append(Instant(now_ns, guard.state, simulator.readings.position, speed))
-        return reference
-
-    guard.step = noting
-
-
-COUNT = 200
-DAILY = range(COUNT)[13::40]
-"""Indices of the instants in the pipes that are tested in every run."""
-REST = [k for k in range(COUNT) if k not in DAILY]
-LAST_S = 27.0
-"""Uncapped the board is touched 1 s later; at 1.5 m/s 4.9 s later, 2.2 s after pipe 3's mouth."""
-ANYWHERE = [round(1.5 + k * (LAST_S - 1.5) / (COUNT - 1), 3) for k in range(COUNT)]
-"""Evenly from the first waypoint on [s], before, in and between the pipes: half are in one."""
-DAILY_ANYWHERE = ANYWHERE[13::160]
-"""Before pipe 1, and at 1.5 m/s between pipes 2 and 3."""
-REST_ANYWHERE = [start_s for start_s in ANYWHERE if start_s not in DAILY_ANYWHERE]
-ENDING_NS = 100_000_000
-"""Before a mission's end [ns]: what was sent before a silence this late still ends the mission, and
-there is nothing left to resume."""
-
-
-class MidPipe(NamedTuple):
-    """Return an instant [s] at which the undisturbed robot is in the pipe of this index."""
-
-    start_s: float
-    pipe: int
-
-
-@cache
-def undisturbed(*settings: str) -> Flight:
-    """Fly without any silence or kill."""
-    return fly("paper", *PATIENCE, *settings).flight
-
-
-@cache
-def mid_pipe(*settings: str) -> tuple[MidPipe, ...]:
-    """200 instants, evenly over the time in which the undisturbed robot's base is in a pipe.
-
-    In pipes 1, 2 and 3 are 47, 51 and 102 of them at 1.5 m/s, 41, 48 and 111 uncapped: the robot
-    touches the board from within pipe 3.
-    """
-    flight = undisturbed(*settings)
-    stamps_ns, inside = flight.truth["stamp_ns"], flight.inside
-    early = stamps_ns[1:] <= flight.end_ns - ENDING_NS
-    steps = np.flatnonzero(inside[:-1] & inside[1:] & early)
-    spent_ns = np.cumsum((stamps_ns[1:] - stamps_ns[:-1])[steps])
-    wanted_ns = (np.arange(COUNT) + 0.5) * spent_ns[-1] / COUNT
-    found = np.searchsorted(spent_ns, wanted_ns)
-    at_ns = stamps_ns[steps[found] + 1] - (spent_ns[found] - wanted_ns)
-    at_ms = (at_ns // 1_000_000).astype(np.int64)
-    pipes = pipe_index(flight.scene, flight.true_position(at_ms * 1_000_000))
-    assert len(set(at_ms.tolist())) == COUNT
-    assert (pipes >= 0).all()
-    return tuple(map(MidPipe, (at_ms / 1000).tolist(), pipes.tolist()))
 
 
 HOVER = load_experiment("hover", ["link.profile=ideal"])
@@ -479,15 +314,11 @@ class Talk:
         answers = self.hear(Kind.CHALLENGE, Kind.ACCEPT)
         for kind, _, body in answers:
             if kind == Kind.CHALLENGE:
-                self.send(
-                    session.greet(
-                        Kind.HELLO, handshake.answer_challenge(codec.decode_challenge(body))
-                    )
-                )
+                hello = handshake.answer_challenge(codec.decode_challenge(body))
+                self.send(session.greet(Kind.HELLO, hello))
                 answers = self.hear(Kind.ACCEPT)
         for _, epoch, body in answers:
-            accept = codec.decode_accept(body)
-            nonces = handshake.receive_accept(epoch, accept, asks=True)
+            nonces = handshake.receive_accept(epoch, codec.decode_accept(body), asks=True)
             if nonces is not None:
                 session.begin(epoch, nonces)
             return epoch

@@ -1,19 +1,26 @@
-"""The same experiment and seed give identical records, for any clocks."""
+"""The same experiment and seed give identical records, for any clocks and on any wall clock."""
 
+from __future__ import annotations
+
+import ast
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cloudrc.config.load import load_experiment
+from cloudrc.config.load import ResolvedExperiment, dump, load_experiment
 from cloudrc.record.columns import Recording
 from tests.flights.conftest import digest, records
 
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "criteria.contact=false")
 ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = sorted((ROOT / "cloudrc").rglob("*.py"))
 PRINT = """
 from cloudrc.config.load import load_experiment
 from tests.flights.conftest import digest
@@ -21,31 +28,32 @@ print(digest(load_experiment('paper', {settings!r})))
 """
 
 
-def short(*settings):
+def short(*settings: str) -> ResolvedExperiment:
     return load_experiment("paper", (*SHORT, *settings))
 
 
 @pytest.mark.promise("one-seed-one-run")
-def test_the_same_seed_gives_the_same_records_and_another_others():
-    assert digest(short()) == digest(short()) != digest(short("seed=2"))
-
-
-@pytest.mark.promise("one-seed-one-run")
-def test_another_process_gives_the_same_records():
+def test_the_same_seed_gives_the_same_records_in_any_process() -> None:
     command = [sys.executable, "-c", PRINT.format(settings=SHORT)]
     env = os.environ | {"PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)}
     printed = subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
-    assert printed.strip() == digest(short())
+    assert printed.strip() == digest(short()) == digest(short()) != digest(short("seed=2"))
 
 
 @pytest.mark.full
-def test_twenty_runs_give_the_same_records():
+def test_twenty_runs_give_the_same_records() -> None:
     experiment = load_experiment("paper")
     assert len({digest(experiment) for _ in range(20)}) == 1
 
 
+def test_the_resolved_experiment_flies_the_same_run_again(tmp_path: Path) -> None:
+    path, flown = tmp_path / "config.yaml", short("link.profile=lossy", "seed=5")
+    path.write_text(dump(flown))
+    assert digest(load_experiment(path)) == digest(flown)
+
+
 @pytest.mark.parametrize("offset_ns", [1_234_567_891, 86_400_000_000_000])
-def test_the_clocks_of_the_ends_need_not_agree(offset_ns):
+def test_the_clocks_of_the_ends_need_not_agree(offset_ns: int) -> None:
     """Cloud depends on ages only, never on the value of its clock."""
     shared, apart = records(short()), records(short(), offset_ns=offset_ns)
     ours = Recording.from_records(*shared)
@@ -58,9 +66,66 @@ def test_the_clocks_of_the_ends_need_not_agree(offset_ns):
     assert not np.isnan(ours["/uplink_delay"]["delay"]).any()
 
 
-def test_the_resolved_experiment_flies_the_same_run_again(tmp_path):
-    from cloudrc.config.load import dump
+STEPS: dict[str, Callable[[int, float], float]] = {
+    "an hour ahead": lambda call, now: now + 3600.0,
+    "stepping at every look": lambda call, now: now + 3600.0 * (-1) ** call,
+    "in 1970": lambda call, now: 0.0,
+    "in 2106": lambda call, now: 4_294_967_296.0,
+    "running backwards": lambda call, now: 2e9 - now,
+}
 
-    path = tmp_path / "config.yaml"
-    path.write_text(dump(short("link.profile=lossy", "seed=5")))
-    assert digest(load_experiment(path)) == digest(short("link.profile=lossy", "seed=5"))
+
+@pytest.mark.promise("wall-clock-does-not-matter")
+def test_the_flight_is_the_same_whatever_the_wall_clock_does(
+    monkeypatch: pytest.MonkeyPatch, figure: Callable[..., None]
+) -> None:
+    experiment = load_experiment("hover", ["mission.waypoints.0.dwell_s=0.5", "link.profile=wifi"])
+    undisturbed, true, calls = digest(experiment), time.time, count()
+    for clock in STEPS.values():
+        monkeypatch.setattr(time, "time", lambda clock=clock: clock(next(calls), true()))
+        monkeypatch.setattr(time, "time_ns", lambda: int(time.time() * 1e9))
+        differs = int(digest(experiment) != undisturbed)
+        figure("steps and drifts of the wall clock: flights that differ", differs, "==", 0)
+
+
+WALL = ("time", "time_ns", "localtime", "gmtime", "ctime", "strftime")
+
+
+def wall_clocks(tree: ast.AST) -> list[str]:
+    """Find calls that read a wall clock."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            text = ast.unparse(node)
+            if text in {f"time.{name}" for name in WALL} | {"time.CLOCK_REALTIME"}:
+                found.append(text)
+            if node.attr in ("now", "utcnow", "today") and "date" in text:
+                found.append(text)
+        elif isinstance(node, ast.ImportFrom) and node.module == "time":
+            found += [alias.name for alias in node.names if alias.name in WALL]
+    return found
+
+
+CONTROL_PATH = ("world/", "cloud/", "teleop/", "tunnel/", "link/", "endpoint", "drivers/")
+ALLOWED = {
+    # The kernel stamps datagrams and probes by this clock; only ages of 0 to 50 ms are used.
+    *("link/relay.py", "link/verify/probe.py"),
+    # Only people read these times.
+    *("teleop/audit.py", "drivers/recording.py"),
+}
+
+
+@pytest.mark.promise("wall-clock-does-not-matter")
+def test_nothing_on_the_control_path_reads_a_wall_clock() -> None:
+    places = {path.relative_to(ROOT / "cloudrc").as_posix(): path for path in PACKAGE}
+    mine = {place: path for place, path in places.items() if place.startswith(CONTROL_PATH)}
+    assert len(mine) > 60
+    reads = {place for place, path in mine.items() if wall_clocks(ast.parse(path.read_text()))}
+    assert reads - ALLOWED == set()
+
+
+@pytest.mark.parametrize(
+    "code", ["time.time()", "from time import time_ns", "datetime.now()", "datetime.date.today()"]
+)
+def test_the_check_finds_a_wall_clock(code: str) -> None:
+    assert wall_clocks(ast.parse(code))

@@ -1,51 +1,51 @@
 """Operator requests reach the guard, which confirms only those that it acts on."""
 
+from __future__ import annotations
+
 import pytest
 
 from cloudrc.messages import GuardState, Request, Start
 from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
-from tests.flights.conftest import MS, talking
+from tests.flights.conftest import MS, Talk, talking
 
 
 @pytest.fixture
-def talk():
+def talk() -> Talk:
     """Fly; the request to start had number 1."""
     talk = talking()
     fly(talk, 10)
     return talk
 
 
-def fly(talk, count):
+def fly(talk: Talk, count: int) -> None:
     for _ in range(count):
         talk.send(talk.command())
         talk.wait(talk.now_ns + 10 * MS)
 
 
-def ask(talk, number, request, start=Start.HERE):
+def ask(
+    talk: Talk, number: int, request: Request, start: Start = Start.HERE
+) -> tuple[GuardState, int]:
     talk.request(number, request, start)
     talk.wait(talk.now_ns + 20 * MS)
     telemetry = talk.take(TelemetrySent)[-1].telemetry
     return telemetry.guard, telemetry.mission
 
 
-def test_an_emergency_stop_acts_at_the_next_tick(talk):
-    assert ask(talk, 2, Request.ESTOP) == (GuardState.ESTOP, 2)
-    assert talk.take(GuardChange)[-1].cause == "emergency stop"
-
-
 @pytest.mark.promise("only-the-operator-arms")
 @pytest.mark.parametrize("start", Start)
-def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
-    ask(talk, 2, Request.ESTOP)
+def test_a_start_is_refused_until_the_stop_is_acknowledged(talk: Talk, start: Start) -> None:
+    assert ask(talk, 2, Request.ESTOP) == (GuardState.ESTOP, 2)
     sessions = len(talk.take(SessionOpened))
     assert ask(talk, 3, Request.START, start) == (GuardState.ESTOP, 2)
     assert len(talk.take(SessionOpened)) == sessions
     assert talk.counts()["start_refused"] == 1
-    assert ask(talk, 4, Request.ACKNOWLEDGE) == (GuardState.GROUND, 4)
-    assert ask(talk, 3, Request.START, start) == (GuardState.GROUND, 4)  # a late copy
+    assert ask(talk, 4, Request.END) == (GuardState.ESTOP, 4), "an end is confirmed even then"
+    assert ask(talk, 5, Request.ACKNOWLEDGE) == (GuardState.GROUND, 5)
+    assert ask(talk, 3, Request.START, start) == (GuardState.GROUND, 5)  # a late copy
     fly(talk, 5)
     assert talk.take(GuardChange)[-1].state is GuardState.GROUND
-    assert ask(talk, 5, Request.START)[1] == 5
+    assert ask(talk, 6, Request.START)[1] == 6
     fly(talk, 5)
     assert talk.take(GuardChange)[-1].state is GuardState.TRACK
 
@@ -53,16 +53,11 @@ def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
 @pytest.mark.parametrize("start", Start)
 @pytest.mark.parametrize(
     ("held_back", "ahead", "outcome"),
-    [
-        (998 * MS, 0, ""),
-        (1_003 * MS, 0, "stale"),
-        (200_000 * MS, 0, "stale"),
-        (0, 3 * MS, "future"),
-    ],
+    [(998 * MS, 0, ""), (1_003 * MS, 0, "stale"), (60_000 * MS, 0, "stale"), (0, 3 * MS, "future")],
 )
 def test_a_start_that_was_held_back_on_the_way_starts_nothing(
-    talk, start, held_back, ahead, outcome
-):
+    talk: Talk, start: Start, held_back: int, ahead: int, outcome: str
+) -> None:
     """Its mission may be over by then, so nobody expects the robot to take off."""
     talk.request(2, Request.END, Start.HERE)
     talk.now_ns += ahead
@@ -77,15 +72,15 @@ def test_a_start_that_was_held_back_on_the_way_starts_nothing(
 
 
 @pytest.mark.parametrize("request_", [Request.END, Request.ESTOP])
-def test_a_late_stop_still_stops_the_robot(talk, request_):
+def test_a_late_stop_still_stops_the_robot(talk: Talk, request_: Request) -> None:
     captured = talk.asked(2, request_, Start.HERE)
-    talk.wait(talk.now_ns + 200_000 * MS)
+    talk.wait(talk.now_ns + 20_000 * MS)
     talk.send(captured)
     assert not talk.world.robot.guard.armed
     assert talk.world._orders.number == 2
 
 
-def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
+def test_a_start_that_waited_through_a_stall_starts_nothing(talk: Talk) -> None:
     """World's clock stood still in the meantime, so the age of its basis is meaningless."""
     captured = talk.asked(2, Request.START, Start.SPAWN)
     talk.now_ns += 60_000 * MS
@@ -94,39 +89,27 @@ def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
     assert talk.world._orders.number == 1
 
 
-def test_a_command_waiting_during_a_stop_is_not_echoed(talk):
+def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk: Talk) -> None:
     applied = len(talk.take(CommandApplied))
-    talk.send(talk.command())
-    talk.request(2, Request.ESTOP, Start.HERE)
-    talk.wait(talk.now_ns + 20 * MS)
-    assert len(talk.take(CommandApplied)) == applied
-
-
-def test_the_end_of_a_mission_is_confirmed_even_while_latched(talk):
-    ask(talk, 2, Request.ESTOP)
-    assert ask(talk, 3, Request.END) == (GuardState.ESTOP, 3)
-
-
-def test_in_hold_commands_are_neither_flown_nor_echoed(talk):
     talk.wait(talk.now_ns + 2_000 * MS)
-    applied = len(talk.take(CommandApplied))
     echo_ns = talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns
     fly(talk, 9)
     assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns == echo_ns
     fly(talk, 1)
     assert len(talk.take(CommandApplied)) == applied + 1
     assert talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns > echo_ns
+    talk.send(talk.command())
+    talk.request(2, Request.ESTOP, Start.HERE)
+    talk.wait(talk.now_ns + 20 * MS)
+    assert len(talk.take(CommandApplied)) == applied + 1
 
 
-def test_limited_commands_are_counted(talk):
+def test_limited_commands_and_a_missions_holds_are_counted(talk: Talk) -> None:
     for _ in range(10):
         talk.send(talk.command((0.0, 0.0, 9.0)))
         talk.wait(talk.now_ns + 10 * MS)
     assert talk.counts()["limited_speed"] == 10
-
-
-def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
-    talk.wait(talk.now_ns + 4_000 * MS)
+    talk.wait(talk.now_ns + 3_000 * MS)
     held = talk.counts()["held_seconds"]
     assert 4 <= held <= 5
     ask(talk, 2, Request.END)
@@ -134,28 +117,25 @@ def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
     assert talk.counts()["held_seconds"] == held
 
 
-def test_contacts_are_reported_until_the_next_mission_starts(talk):
+def test_contacts_are_reported_until_the_next_mission_starts(talk: Talk) -> None:
     """Cloud may die right after the touch; the next cloud must learn of it."""
     ask(talk, 2, Request.END)
     talk.world._orders.touches.pipes = 1
     talk.wait(talk.now_ns + 300 * MS)
     talk.hello(b"another")
-    talk.request(3, Request.START, Start.HERE)
-    talk.wait(talk.now_ns + 20 * MS)
-    assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == 1
-    talk.request(4, Request.START, Start.HERE, mission_id=7)
-    talk.wait(talk.now_ns + 20 * MS)
-    assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == 0
+    for number, mission_id, contacts in ((3, 0, 1), (4, 7, 0)):
+        talk.request(number, Request.START, Start.HERE, mission_id)
+        talk.wait(talk.now_ns + 20 * MS)
+        assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == contacts
 
 
-def test_requests_of_an_earlier_cloud_do_not_count(talk):
+def test_commands_of_an_earlier_cloud_do_not_count(talk: Talk) -> None:
     """Nine fresh commands of one cloud and one of another do not prove a link."""
     fly(talk, 100)
     ask(talk, 2, Request.END)
     talk.request(3, Request.START, Start.HERE)
     talk.wait(talk.now_ns + 1_000 * MS)
     fly(talk, 9)
-    assert talk.take(GuardChange)[-1].state is GuardState.HOLD
     talk.wait(talk.now_ns + 260 * MS)
     assert talk.hello(b"another") > 0
     fly(talk, 2)

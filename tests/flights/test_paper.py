@@ -1,13 +1,24 @@
-"""The paper's mission and its required numbers, in virtual time; `-m full` flies more seeds."""
+"""The missions and their required numbers, in virtual time; `-m full` flies more seeds."""
+
+from __future__ import annotations
+
+import re
+from statistics import mean
 
 import pytest
 
-from tests.flights.conftest import fly, numbers
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.records import MissionEvent
+from tests.conftest import nightly
+from tests.flights.conftest import fly, numbers, records
 
 PROFILES = ("paper-p1", "paper-p2", "paper-p3")
 
 
-def check(profile, seed):
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("seed", [1, *nightly(*range(2, 11))])
+def test_the_paper_flies(profile: str, seed: int) -> None:
     flight = fly("paper", f"link.profile={profile}", f"seed={seed}")
     assert flight.verdict.failures == ()
     n = numbers(flight)
@@ -19,57 +30,83 @@ def check(profile, seed):
     assert n["waypoints_reached"] == 7
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_the_paper_flies(profile):
-    check(profile, seed=1)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("seed", range(1, 11))
-def test_the_paper_flies_thirty_times(profile, seed):
-    check(profile, seed)
-
-
-def check_silence(start_s):
-    flight = fly(
-        "paper",
-        "cloud.controller.speed_max=2",
-        f"link.downlink.blackouts=[{{start_s: {start_s}, duration_s: 20}}]",
-    )
+# In pipe 1 at speed, and just before the board is touched.
+@pytest.mark.parametrize(
+    "start", [11.3, 28.85, *nightly(*(round(0.5 + 1.3 * k, 2) for k in range(24)))]
+)
+def test_a_silent_downlink_is_survived(start: float) -> None:
+    cut = f"link.downlink.blackouts=[{{start_s: {start}, duration_s: 20}}]"
+    flight = fly("paper", "cloud.controller.speed_max=2", cut)
     assert flight.verdict.failures == ()
     n = numbers(flight)
-    assert n["hold_count"] == 1
-    assert n["pipe_contacts"] == 0
-    assert n["waypoints_reached"] == 7
+    assert (n["hold_count"], n["pipe_contacts"], n["waypoints_reached"]) == (1, 0, 7)
 
 
-# In pipe 1 at speed, at the second bend, and just before the board is touched.
-@pytest.mark.parametrize("start_s", [11.3, 22.1, 28.85])
-def test_a_silent_downlink_is_survived(start_s):
-    check_silence(start_s)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("start_s", [round(0.5 + 1.3 * k, 2) for k in range(24)])
-def test_a_silent_downlink_is_survived_at_any_instant(start_s):
-    check_silence(start_s)
-
-
-def test_verbatim_flies_although_late_commands_win():
+def test_verbatim_flies_although_late_commands_win() -> None:
     flight = fly("paper-verbatim")
     assert flight.verdict.failures == ()
     assert numbers(flight)["loop_delay_mean"] > numbers(fly("paper"))["loop_delay_mean"]
 
 
 @pytest.mark.parametrize(
-    "profile", ["ideal", "wifi", "lte", "5g", "handover", "lossy", "satellite"]
+    "setting",
+    [
+        *(f"link.profile={n}" for n in ("ideal", "wifi", "lte", "5g", "handover", "lossy")),
+        "link.profile=satellite",
+        "world.sensors={position_noise_m: 0.005, velocity_noise_mps: 0.02}",
+    ],
 )
-def test_every_other_profile_flies_too(profile):
-    flight = fly("paper", f"link.profile={profile}")
-    assert flight.verdict.failures == ()
+def test_the_paper_flies_under_other_conditions_too(setting: str) -> None:
+    assert fly("paper", setting).verdict.failures == ()
 
 
-def test_the_paper_flies_with_noisy_odometry():
-    noise = "world.sensors={position_noise_m: 0.005, velocity_noise_mps: 0.02}"
-    assert fly("paper", noise).verdict.failures == ()
+@pytest.mark.parametrize(("limit", "low", "high"), [(0.10, 0.030, 0.034), (0.30, 0.0, 0.001)])
+def test_the_steady_error_is_that_of_the_integral_limit(
+    limit: float, low: float, high: float
+) -> None:
+    n = numbers(fly("hover", f"world.low_level.integral_limit_xy={limit}"))
+    assert low <= n["steady_error_x"] <= high
+    assert max(n["steady_error_y"], n["steady_error_z"]) < 1e-4
+
+
+def prediction_error(predictor: str, seeds: range) -> float:
+    settings = ("link.profile=paper-p3", f"cloud.predictor={predictor}")
+    flights = [fly("steps", *settings, f"seed={seed}") for seed in seeds]
+    return mean(numbers(flight)["prediction_error_rms"] for flight in flights)
+
+
+@pytest.mark.parametrize("seeds", [range(1, 2), *nightly(range(1, 11))])
+def test_constant_velocity_predicts_far_better_than_nothing(seeds: range) -> None:
+    better, worse = (prediction_error(n, seeds) for n in ("constant_velocity", "last_sample"))
+    assert better < 0.3 * worse
+    if len(seeds) > 1:
+        assert better <= 0.013
+        assert 0.045 <= worse <= 0.065
+
+
+def test_split_estimates_the_delay_better_than_the_running_mean() -> None:
+    split, mean_ = (
+        numbers(fly("steps", f"cloud.estimator={name}"))["delay_estimate_error_rms"]
+        for name in ("split", "running_mean")
+    )
+    assert split < 0.8 * mean_
+
+
+@pytest.mark.parametrize(
+    ("position", "scene"), [([9.2, 0.0, 1.0], "empty"), ([0.0, 0.0, 1.0], "pipes")]
+)
+def test_a_point_offered_for_one_that_the_guard_refuses_is_reached(
+    position: list[float], scene: str
+) -> None:
+    def settings(point: list[float]) -> list[str]:
+        waypoint = f"mission.waypoints=[{{position_m: {point}}}]"
+        return [waypoint, f"world.scene={scene}", "criteria.time_limit_s=25"]
+
+    with pytest.raises(BadInputError) as caught:
+        load_experiment("hover", settings(position))
+    offered = re.search(r"nearest legal point found: \[(.*)\]", str(caught.value))
+    assert offered is not None
+    near = [float(word) for word in offered[1].split(",")]
+    _, cloud = records(load_experiment("hover", settings(near)))
+    events = [record.event for record in cloud if isinstance(record, MissionEvent)]
+    assert events == ["started", "reached", "done"]

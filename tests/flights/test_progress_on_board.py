@@ -7,12 +7,11 @@ import pytest
 from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Mission, Waypoint
-from cloudrc.messages import GuardState, OperatorRequest, Request, Start, Telemetry
+from cloudrc.messages import GuardState, OperatorRequest, Request, Start
 from cloudrc.records import GuardChange, MissionEvent, TelemetrySent
-from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
-from tests.flights.conftest import Talk, join, records
+from tests.flights.conftest import MS, Talk, records
 
 ID = 2**62 + 5
 
@@ -26,75 +25,39 @@ def test_the_robot_stores_every_waypoint_reached() -> None:
             shown.setdefault(record.telemetry.reached, record.stamp_ns)
     assert sorted(shown) == list(range(len(reached) + 1))
     for count, event in enumerate(reached, 1):
-        assert shown[count] - event.stamp_ns < 300_000_000
+        assert shown[count] - event.stamp_ns < 300 * MS
 
 
-class Operated(Talk):
-    """A world that gets requests."""
-
-    def ask(self, request: Request, number: int = 0, **what: int) -> Telemetry:
-        what |= {"basis_stamp_ns": self.world_ns}
-        asked = OperatorRequest(number, request, Start.HERE, **what)
-        self.say(Kind.OPERATOR, codec.encode_operator(asked))
-        self.wait(self.now_ns + 20_000_000)
-        telemetry = [codec.decode_telemetry(body) for *_, body in self.hear(Kind.TELEMETRY)]
-        return telemetry[-1]
-
-    def say(self, kind: Kind, body: bytes) -> None:
-        self.send(self.session.seal(kind, body))
-
-
-@pytest.fixture
-def talk() -> Operated:
-    talk = Operated()
-    talk.hello(b"cloud")
-    return talk
-
-
-def progress(telemetry: Telemetry) -> tuple[int, int]:
+def ask(talk: Talk, request: Request, number: int = 0, **fields: int) -> tuple[int, int]:
+    """Return the mission and the progress that the robot shows after a request."""
+    fields = {"start": Start.HERE, "basis_stamp_ns": talk.world_ns} | fields
+    body = codec.encode_operator(OperatorRequest(number, request, **fields))
+    talk.send(talk.session.seal(Kind.OPERATOR, body))
+    talk.wait(talk.now_ns + 20 * MS)
+    telemetry = talk.take(TelemetrySent)[-1].telemetry
     return telemetry.mission_id, telemetry.reached
 
 
-def test_progress_rises_and_belongs_to_the_mission_started_last(talk: Operated) -> None:
-    ask = talk.ask
-    assert progress(ask(Request.PROGRESS, mission_id=ID, reached=3)) == (0, 0)
-    assert progress(ask(Request.START, 1, mission_id=ID)) == (ID, 0)
-    assert progress(ask(Request.PROGRESS, mission_id=ID, reached=2)) == (ID, 2)
-    assert progress(ask(Request.PROGRESS, mission_id=ID, reached=1)) == (ID, 2)
-    assert progress(ask(Request.PROGRESS, mission_id=ID + 1, reached=9)) == (ID, 2)
-    assert progress(ask(Request.END, 2)) == (ID, 2)
-    assert progress(ask(Request.START, 3, mission_id=ID)) == (ID, 2)  # the same mission continues
-    assert progress(ask(Request.START, 4, mission_id=ID + 1)) == (ID + 1, 0)
-
-
-def test_from_the_spawn_a_mission_begins_anew(talk: Operated) -> None:
-    """The old progress must not count, because the mission restarts at the spawn."""
-    talk.ask(Request.START, 1, mission_id=ID)
-    talk.ask(Request.PROGRESS, mission_id=ID, reached=2)
-    again = OperatorRequest(2, Request.START, Start.SPAWN, ID)
-    talk.say(Kind.OPERATOR, codec.encode_operator(again))
-    talk.wait(talk.now_ns + 20_000_000)
-    assert progress(talk.take(TelemetrySent)[-1].telemetry) == (ID, 0)
-
-
-def test_progress_on_board_survives_a_restart_of_cloud(talk: Operated) -> None:
-    talk.ask(Request.START, 1, mission_id=ID)
-    talk.ask(Request.PROGRESS, mission_id=ID, reached=2)
-    talk.wait(talk.now_ns + 2_000_000_000)  # the first one is not fresh any more
+def test_progress_rises_and_belongs_to_the_mission_started_last() -> None:
+    talk = Talk()
+    talk.hello(b"cloud")
+    for expected, request, number, fields in (
+        ((0, 0), Request.PROGRESS, 0, {"mission_id": ID, "reached": 3}),
+        ((ID, 0), Request.START, 1, {"mission_id": ID}),
+        ((ID, 2), Request.PROGRESS, 0, {"mission_id": ID, "reached": 2}),
+        ((ID, 2), Request.PROGRESS, 0, {"mission_id": ID, "reached": 1}),
+        ((ID, 2), Request.PROGRESS, 0, {"mission_id": ID + 1, "reached": 9}),
+        ((ID, 2), Request.END, 2, {}),
+        ((ID, 2), Request.START, 3, {"mission_id": ID}),  # the same mission continues
+    ):
+        assert ask(talk, request, number, **fields) == expected
+    talk.wait(talk.now_ns + 2_000 * MS)  # the first cloud is not fresh any more
     talk.hello(b"another cloud")
-    assert progress(talk.ask(Request.END, 1)) == (ID, 2)
-
-
-def test_an_alarm_gets_a_number_that_world_acts_on() -> None:
-    ends = join(load_experiment("hover", ["link.profile=ideal"]))
-    world = []
-    ends.run.fly(lambda: ends.run.now_ns >= 5_000_000_000, 6_000_000_000, lambda w, c: None)
-    ends.cloud.teleop.outputs.append(ALARM)
-    ends.run.fly(
-        lambda: ends.run.now_ns >= 6_000_000_000, 7_000_000_000, lambda w, c: world.extend(w)
-    )
-    changes = [r.state for r in world if isinstance(r, GuardChange)]
-    assert changes[0] is GuardState.ESTOP
+    assert ask(talk, Request.END, 1) == (ID, 2)
+    assert ask(talk, Request.START, 2, mission_id=ID + 1) == (ID + 1, 0)
+    ask(talk, Request.PROGRESS, mission_id=ID + 1, reached=2)
+    # From the spawn a mission begins anew.
+    assert ask(talk, Request.START, 3, mission_id=ID + 1, start=Start.SPAWN) == (ID + 1, 0)
 
 
 def test_a_leg_that_takes_three_times_too_long_fails() -> None:
@@ -120,18 +83,15 @@ def test_a_leg_that_takes_three_times_too_long_fails() -> None:
     assert states[-1] is GuardState.HOLD
 
 
-def limits(mission: Mission, **options: float) -> list[float]:
-    return [leg.time_limit for leg in assembly.mission_plan(mission, 60.0, **options).legs]
-
-
 def test_the_limit_of_a_leg_defaults_to_three_times_its_time() -> None:
-    points = [
+    points = (
         Waypoint(position_m=(0.0, 0.0, 1.0), dwell_s=0.0),
         Waypoint(position_m=(3.0, 4.0, 1.0), dwell_s=2.0),
         Waypoint(position_m=(3.0, 4.0, 1.0), dwell_s=0.0, time_limit_s=7.5),
-    ]
-    mission = Mission(start="here", waypoints=tuple(points))
-    span = assembly.FENCE_SPAN
-    assert limits(mission) == [round(3 * (span + 4.0), 1), 33.0, 7.5]
-    assert limits(mission, speed_max=0.5)[1] == 48.0
-    assert limits(mission, speed_max=9.0)[1] == 33.0
+    )
+    mission = Mission(start="here", waypoints=points)
+    first = round(3 * (assembly.FENCE_SPAN + 4.0), 1)
+    for options, second in (({}, 33.0), ({"speed_max": 0.5}, 48.0), ({"speed_max": 9.0}, 33.0)):
+        legs = assembly.mission_plan(mission, 60.0, **options).legs
+        assert [leg.time_limit for leg in legs][1:] == [second, 7.5]
+    assert assembly.mission_plan(mission, 60.0).legs[0].time_limit == first

@@ -6,135 +6,93 @@ from itertools import pairwise
 
 import pytest
 
-from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudIdentity
-from cloudrc.config.load import load_experiment
-from cloudrc.drivers.virtual import VirtualRun
+from cloudrc.faults.flight import SECRET, Flight
+from cloudrc.faults.measures import epochs
 from cloudrc.messages import GuardState
-from cloudrc.records import Counted, GuardChange, Record, SessionOpened
-from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.world.endpoint import WorldIdentity
-from tests.flights.conftest import SHARED_CLOCK
+from cloudrc.tunnel.keys import Key, KeySet
 
-S = 1_000_000_000
-OLD, NEW = KeySet(Key(b"o" * 32)), KeySet(Key(b"n" * 32), Key(b"o" * 32))
-ORDERS = (("world", "cloud"), ("cloud", "world"))
+NEW = KeySet(Key(b"n" * 32), SECRET.current)
+ONLY = KeySet(NEW.current)
 DELAY = 0.05
 """One-way delay of the link in both directions [s]."""
 HOLD_MAX = 2 * DELAY + 1.1
 """Longest HOLD of a change of keys [s]: a round trip, and the guard's settling time."""
-CHANGES = {
-    "link.profile": "ideal",
-    "link.uplink.delay_ms": DELAY * 1e3,
-    "link.downlink.delay_ms": DELAY * 1e3,
-    "mission.waypoints.0.dwell_s": 400,
-    "mission.waypoints.0.time_limit_s": 500,
-    "criteria.time_limit_s": 500,
-}
-EXPERIMENT = load_experiment("hover", [f"{name}={value}" for name, value in CHANGES.items()])
+HOVER = (
+    "mission.waypoints=[{position_m: [0.5, 0, 0.8], dwell_s: 400, time_limit_s: 500}]",
+    *("criteria.time_limit_s=500", "criteria.contact=false", "link.profile=ideal"),
+    *(f"link.{way}.delay_ms={DELAY * 1e3}" for way in ("uplink", "downlink")),
+)
+ENDS = ("world", "cloud")
 
 
-class Flight:
-    """Fly with one key file per end."""
+def key(flight: Flight) -> Key:
+    """The key with which both ends talk in one epoch."""
+    world, cloud = (process.inner._session for process in (flight.world, flight.cloud))
+    assert world.epoch == cloud.epoch != 0
+    assert world.epoch_key == cloud.epoch_key
+    return world.epoch_key
 
-    def __init__(self, **keys: KeySet) -> None:
-        self.rings = {end: KeyRing(keys.get(end, OLD)) for end in ("world", "cloud")}
-        self.records: list[Record] = []
-        world = WorldIdentity(SHARED_CLOCK, b"world".ljust(16), ring=self.rings["world"])
-        cloud = CloudIdentity(SHARED_CLOCK, b"cloud".ljust(16), self.rings["cloud"])
-        self.world = assembly.build_world(EXPERIMENT, world)
-        self.cloud = assembly.build_cloud(EXPERIMENT, cloud)
-        self.run = VirtualRun(self.world, self.cloud, *assembly.build_links(EXPERIMENT))
 
-    def fly(self, seconds: float) -> None:
-        def sink(of_world: list[Record], of_cloud: list[Record]) -> None:
-            self.records += of_world
+def held(flight: Flight) -> list[float]:
+    """How long each HOLD lasted [s]."""
+    pairs = pairwise(flight.changes)
+    return [(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in pairs if a.state is GuardState.HOLD]
 
-        self.run.fly(lambda: False, self.run.now_ns + round(seconds * S), sink)
 
-    def of(self, kind: type) -> list[Record]:
-        return [record for record in self.records if isinstance(record, kind)]
-
-    def held(self) -> list[float]:
-        """How long each HOLD lasted [s]."""
-        changes = [r for r in self.records if isinstance(r, GuardChange)]
-        pairs = pairwise(changes)
-        return [
-            (then.stamp_ns - now.stamp_ns) * 1e-9
-            for now, then in pairs
-            if now.state is GuardState.HOLD
-        ]
-
-    def key(self) -> Key:
-        """The key with which both ends talk in one epoch."""
-        world, cloud = self.world._session, self.cloud._session
-        assert world.epoch == cloud.epoch != 0
-        assert world.epoch_key == cloud.epoch_key
-        return world.epoch_key
-
-    def refused(self) -> int:
-        totals = [r.total for r in self.records if isinstance(r, Counted) and r.name == "tag"]
-        return totals[-1] if totals else 0
+def rotated(*steps: tuple[str, KeySet, float]) -> Flight:
+    """Fly 5 s; then an end reads keys and the flight goes on for some seconds, again and again."""
+    flight = Flight(*HOVER).fly(5.0)
+    for end, keys, seconds in steps:
+        flight.replace_key(end, keys)
+        flight.fly(flight.now + seconds)
+    return flight
 
 
 @pytest.mark.promise("keys-change-in-flight")
 @pytest.mark.parametrize("apart", [0.0, 0.02, 60.0])
-@pytest.mark.parametrize("order", ORDERS)
-def test_a_rotation_costs_one_short_hold_at_most(order: tuple[str, str], apart: float) -> None:
-    flight = Flight()
-    flight.fly(5.0)
-    epochs = len(flight.of(SessionOpened))
-    for end in order:
-        flight.rings[end].keys = NEW
-        flight.fly(apart)
-    flight.fly(6.0)
-    assert flight.key() == NEW.current
-    for end in order:  # and once the old key is dropped, nothing happens
-        flight.rings[end].keys = KeySet(NEW.current)
-        flight.fly(1.0)
-    assert flight.key() == NEW.current
-    assert len(flight.of(SessionOpened)) == epochs + 1
-    (held,) = flight.held()
-    assert held < HOLD_MAX
-    assert flight.refused() <= 12 * apart / 60 + 2, "no alert"
+@pytest.mark.parametrize(("first", "second"), [ENDS, ENDS[::-1]])
+def test_a_rotation_costs_one_short_hold_at_most(first: str, second: str, apart: float) -> None:
+    flight = rotated((first, NEW, apart), (second, NEW, apart + 6.0))
+    assert key(flight) == NEW.current
+    for end in ENDS:  # and once the old key is dropped, nothing happens
+        flight.replace_key(end, ONLY)
+        flight.fly(flight.now + 1.0)
+    assert key(flight) == NEW.current
+    assert epochs(flight) == [1, 2, 3], "a session, the start from the spawn, the new key"
+    (hold,) = held(flight)
+    assert hold < HOLD_MAX
+    assert flight.count("tag") <= 12 * apart / 60 + 2, "no alert"
 
 
-@pytest.mark.parametrize("ends", [{"world": NEW}, {"cloud": NEW}, {"world": NEW, "cloud": NEW}])
-def test_ends_that_start_amid_a_rotation_find_their_key(ends: dict[str, KeySet]) -> None:
-    flight = Flight(**ends)
+@pytest.mark.parametrize("ends", [("world",), ("cloud",), ENDS])
+def test_ends_that_start_amid_a_rotation_find_their_key(ends: tuple[str, ...]) -> None:
+    flight = Flight(*HOVER)
+    for end in ends:
+        flight.replace_key(end, NEW)
     flight.fly(2.0)
-    assert flight.key() == (NEW if len(ends) == 2 else OLD).current
-    assert flight.held() == []
+    assert key(flight) == (NEW if len(ends) == 2 else SECRET).current
+    assert held(flight) == []
 
 
 @pytest.mark.promise("old-keys-end")
-@pytest.mark.parametrize("first", ["world", "cloud"])
+@pytest.mark.parametrize("first", ENDS)
 def test_a_dropped_key_ends_its_session_at_once(first: str) -> None:
     """The other end still has the old key alone."""
-    flight, only = Flight(), KeySet(NEW.current)
-    flight.fly(5.0)
-    flight.rings[first].keys = only
-    flight.fly(3.0)
-    ends = {"world": flight.world, "cloud": flight.cloud}
-    assert ends[first]._session.epoch == 0
-    assert flight.world.robot.guard.state is GuardState.HOLD
-    for end in ends:
-        flight.rings[end].keys = only
-    flight.fly(2.0)
-    assert flight.key() == NEW.current
-    assert flight.world.robot.guard.state is GuardState.TRACK
+    flight = rotated((first, ONLY, 3.0))
+    process = flight.world if first == "world" else flight.cloud
+    assert process.inner.epoch == 0
+    assert flight.guard_now()[0] is GuardState.HOLD
+    for end in ENDS:
+        flight.replace_key(end, ONLY)
+    flight.fly(flight.now + 2.0)
+    assert key(flight) == NEW.current
+    assert flight.guard_now()[0] is GuardState.TRACK
 
 
-@pytest.mark.parametrize("first", ["world", "cloud"])
-def test_a_key_dropped_before_the_change_costs_one_hold(first: str) -> None:
+@pytest.mark.parametrize(("first", "second"), [ENDS, ENDS[::-1]])
+def test_a_key_dropped_before_the_change_costs_one_hold(first: str, second: str) -> None:
     """One end has both keys, and their session still has the old one."""
-    flight, only = Flight(), KeySet(NEW.current)
-    other = "cloud" if first == "world" else "world"
-    flight.fly(5.0)
-    flight.rings[other].keys = KeySet(OLD.current, NEW.current)
-    flight.fly(1.0)
-    flight.rings[first].keys = only
-    flight.fly(3.0)
-    assert flight.key() == NEW.current
-    (held,) = flight.held()
-    assert held < HOLD_MAX + 1.0
+    flight = rotated((second, KeySet(SECRET.current, NEW.current), 1.0), (first, ONLY, 3.0))
+    assert key(flight) == NEW.current
+    (hold,) = held(flight)
+    assert hold < HOLD_MAX + 1.0

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import time
 import urllib.request
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -22,19 +20,15 @@ from tests.drivers.conftest import KEY, TOKEN, Release
 
 SECRET_FILES = ("operator", "key")
 """The files that contain the token and the key."""
-
-
-def encodings(secret: bytes) -> Iterator[bytes]:
-    """Give the forms in which a secret could appear."""
-    yield secret
-    yield secret.hex().encode()
-    yield secret.hex().upper().encode()
-    yield base64.b64encode(secret).rstrip(b"=")
-    yield base64.urlsafe_b64encode(secret).rstrip(b"=")
-    yield repr(secret)[2:-1].encode()
-
-
-CANARIES = [form for secret in (KEY, TOKEN.encode()) for form in encodings(secret)]
+FORMS = (
+    lambda secret: secret,
+    lambda secret: secret.hex().encode(),
+    lambda secret: secret.hex().upper().encode(),
+    lambda secret: base64.b64encode(secret).rstrip(b"="),
+    lambda secret: base64.urlsafe_b64encode(secret).rstrip(b"="),
+    lambda secret: repr(secret)[2:-1].encode(),
+)
+CANARIES = [form(secret) for secret in (KEY, TOKEN.encode()) for form in FORMS]
 
 
 def found_in(data: bytes) -> list[bytes]:
@@ -44,10 +38,8 @@ def found_in(data: bytes) -> list[bytes]:
 def content_of(path: Path) -> bytes:
     """Read a file's bytes, and the decompressed records of a recording."""
     data = path.read_bytes()
-    if path.suffix != ".mcap":
-        return data
-    with path.open("rb") as stream:  # a truncated recording ends early
-        with suppress(McapError):
+    if path.suffix == ".mcap":
+        with path.open("rb") as stream, suppress(McapError):  # a truncated recording ends early
             for record in StreamReader(stream).records:
                 data += bytes(getattr(record, "data", b"")) + repr(record).encode()
     return data
@@ -99,7 +91,6 @@ def test_a_flight_exposes_no_secret(tmp_path: Path) -> None:
                 shown[f"metrics {address}"] = answer.read()
         release.post("/v1/estop")
         release.until(lambda: release.ask("/v1/state")["seen"]["guard"] == "ESTOP")
-        time.sleep(0.5)
     finally:
         for process in release.all:
             process.terminate()

@@ -1,14 +1,15 @@
-"""Files from somebody else: no waiting for pipes, size limits, errors in one line."""
+"""Files from somebody else: no waiting for pipes, size limits, no link is followed."""
 
 from __future__ import annotations
 
 import json
 import os
 import signal
+import stat
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from math import nan
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import pytest
@@ -17,70 +18,68 @@ from cloudrc.cli.main import main
 from cloudrc.config import document
 from cloudrc.config.load import load_profile, read_experiment
 from cloudrc.errors import BadInputError
-from cloudrc.files import open_file
+from cloudrc.files import atomic_file, open_file, write_atomically
 from cloudrc.link import traces
+from cloudrc.link.state import publish
 from cloudrc.link.traces import read_trace
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
+from cloudrc.record.columns import Recording
+from cloudrc.record.merge import merge
 from cloudrc.record.reader import read_contents
+from cloudrc.record.recover import recover
 from cloudrc.records import GroundTruth
+from cloudrc.report.document import write_json
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
 from tests.metrics.conftest import flown
-from tests.record.conftest import write_mission
+from tests.record.conftest import cloud_records, world_records, write, write_mission
 
 
 @pytest.fixture(autouse=True)
 def no_waiting() -> Iterator[None]:
     """Fail a test that waits for a pipe."""
 
-    def give_up(number: int, frame: FrameType | None) -> None:
+    def give_up(number: int, frame: object) -> None:
         raise TimeoutError("it waits")
 
-    before = signal.signal(signal.SIGALRM, give_up)
+    before, mask = signal.signal(signal.SIGALRM, give_up), os.umask(0o022)
     signal.alarm(30)
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)
+    os.umask(mask)
 
 
 READERS: list[Callable[[Path], object]] = [read_experiment, load_profile, read_trace, read_contents]
 
 
-@pytest.mark.parametrize("what", ["pipe", "/dev/zero"])
 @pytest.mark.parametrize("read", READERS)
 def test_a_pipe_or_device_is_refused_at_once(
-    tmp_path: Path, read: Callable[[Path], object], what: str
+    tmp_path: Path, read: Callable[[Path], object]
 ) -> None:
-    path = tmp_path / what
-    if what == "pipe":
-        os.mkfifo(path)
-    with pytest.raises(BadInputError, match=r"^[^\n]*not a file; (give|name) a [^\n]*$"):
-        read(path)
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(BadInputError, match=r"^[^\n]*not a file; (give|name) a [^\n]*$"):
+            read(path)
+    before = os.listdir("/proc/self/fd")
+    with pytest.raises(ValueError, match="not a file"):
+        open_file(Path("/dev/null"))
+    assert len(os.listdir("/proc/self/fd")) == len(before)
 
 
-@pytest.mark.parametrize("key", ["trace", "table"])
-@pytest.mark.parametrize("named", ["./pipe", "/dev/zero", "./loop", "~nobody/x.csv", "x" * 300])
-def test_one_named_by_a_configuration_is_refused(tmp_path: Path, key: str, named: str) -> None:
+@pytest.mark.parametrize(
+    "named", ["./pipe", "/dev/zero", "./loop", "~nobody/x.csv", "x" * 300, "a\\0/b.py"]
+)
+def test_one_named_by_a_configuration_is_refused(tmp_path: Path, named: str) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "loop").symlink_to("loop")
-    for where in (f"link: {{uplink: {{{key}: '{named}'}}}}", f"mission: ./{named}.yaml"):
-        (tmp_path / "config.yaml").write_text(where)
+    for where in ("mission: ", "link: {uplink: {trace: ", "link: {uplink: {table: "):
+        (tmp_path / "config.yaml").write_text(f'{where}"{named}"' + "}" * where.count("{"))
         with pytest.raises(BadInputError, match=r"^[^\n]*config\.yaml:1: [^\n]*$"):
             read_experiment(tmp_path / "config.yaml")
 
 
-def test_a_path_with_nul_is_refused(tmp_path: Path) -> None:
-    for key in ("mission", "cloud: {predictor", "link: {profile", "link: {uplink: {trace"):
-        (tmp_path / "c.yaml").write_text(key + ': "a\\0/b.py"' + "}" * key.count("{"))
-        with pytest.raises(BadInputError, match=r"c\.yaml:1: text with the character NUL"):
-            read_experiment(tmp_path / "c.yaml")
-
-
-@pytest.mark.parametrize(
-    ("module", "read"),
-    [(document, read_experiment), (traces, read_trace)],
-    ids=["yaml", "csv"],
-)
+@pytest.mark.parametrize(("module", "read"), [(document, read_experiment), (traces, read_trace)])
 def test_no_file_is_read_beyond_its_size_limit(tmp_path: Path, module: Any, read: Any) -> None:
     path = tmp_path / "long.yaml"
     with path.open("wb") as file:
@@ -95,13 +94,6 @@ def test_too_many_values_are_refused(tmp_path: Path) -> None:
         read_experiment(tmp_path / "many.yaml")
 
 
-def test_a_refused_device_is_closed(tmp_path: Path) -> None:
-    before = os.listdir("/proc/self/fd")
-    with pytest.raises(ValueError, match="not a file"):
-        open_file(Path("/dev/null"))
-    assert len(os.listdir("/proc/self/fd")) == len(before)
-
-
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """A run without a report."""
@@ -113,25 +105,19 @@ def run(tmp_path: Path) -> Path:
 
 
 GOOD = {"mode": "local", "shaper": "netem", "notes": ["seen"], "records_sha256": "f" * 64}
+WRONG = [
+    *({"notes": notes} for notes in ([1], 7, "text", None)),
+    *({"mode": mode} for mode in (1, "elsewhere", ["local"])),
+    *({"records_sha256": {"a": 1}}, {"verdict": ["interrupted"]}),
+]
 
 
-@pytest.mark.parametrize(
-    "before",
-    [
-        json.dumps(GOOD | wrong)
-        for wrong in (
-            *({"notes": notes} for notes in ([1], 7, "text", {"a": 1}, None)),
-            *({"mode": mode} for mode in (1, "elsewhere", None, ["local"])),
-            {"records_sha256": {"a": 1}},
-            {"verdict": ["interrupted"]},
-        )
-    ]
-    + ["[" * 100_000, "null", "7", '{"mode":', "\udcff", '["mode"]'],
-)
-def test_an_old_report_is_used_completely_or_not_at_all(run: Path, before: str) -> None:
+def test_an_old_report_is_used_completely_or_not_at_all(run: Path) -> None:
     _, _, anew = read_run(run)
-    (run / "report.json").write_text(before, errors="surrogateescape")
-    assert read_run(run)[2] == anew
+    broken = ["[" * 100_000, "null", '{"mode":', "\udcff", '["mode"]']
+    for before in (*(json.dumps(GOOD | wrong) for wrong in WRONG), *broken):
+        (run / "report.json").write_text(before, errors="surrogateescape")
+        assert read_run(run)[2] == anew, before[:99]
     (run / "report.json").write_text(json.dumps(GOOD))
     assert read_run(run)[2].notes == ("seen",)
 
@@ -151,18 +137,117 @@ def test_undrawable_data_gives_one_line_of_error(run: Path) -> None:
     assert json.loads((run / "report.json").read_text())["verdict"] == "failure"
 
 
+@pytest.mark.parametrize("name", ["config.yaml", "mission.mcap"])
 def test_a_report_does_not_wait_for_pipes(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *words: None)
-    os.mkfifo(run / "pipe")
-    for name in ("config.yaml", "mission.mcap"):
-        kept = (run / name).read_bytes()
-        (run / name).unlink()
-        os.mkfifo(run / name)
-        (run / "world.mcap").write_bytes(b"")
-        assert main(["report", str(run)]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("cloudrc: error: ")
-        (run / name).unlink()
-        (run / name).write_bytes(kept)
+    (run / name).unlink()
+    os.mkfifo(run / name)
+    (run / "world.mcap").write_bytes(b"")
+    assert main(["report", str(run)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("cloudrc: error: ")
+
+
+# Links.
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """A file of the user that must not change."""
+    path = tmp_path / "mine"
+    path.write_text("mine")
+    return path
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> Path:
+    """A folder from somebody else."""
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    return folder
+
+
+def merged(path: Path) -> None:
+    ends = (write(path.with_name(f"{n}.mcap"), world_records(20)) for n in range(2))
+    merge(*ends).write(path)
+
+
+WRITERS: list[Callable[[Path], object]] = [
+    lambda path: write_atomically(path, b"new"),
+    lambda path: publish(path, "new"),
+    lambda path: write_json(path, {}),
+    lambda path: recover(write(path.with_name("torn.mcap"), world_records(20)), path),
+    merged,
+]
+
+
+@pytest.mark.parametrize("writes", WRITERS)
+def test_a_link_is_replaced_and_its_target_kept(
+    theirs: Path, mine: Path, monkeypatch: pytest.MonkeyPatch, writes: Callable[[Path], object]
+) -> None:
+    path = theirs / "file"
+    path.symlink_to(mine)
+    writes(path)
+    assert mine.read_text() == "mine"
+    assert not path.is_symlink()
+    assert path.stat().st_size
+    # Even a link with the name of the temporary file is refused, not followed.
+    monkeypatch.setattr(os, "urandom", lambda size: b"\xab" * 8)
+    (theirs / f".file.{'ab' * 8}").symlink_to(mine)
+    with pytest.raises(FileExistsError):
+        writes(path)
+    assert mine.read_text() == "mine"
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o644])
+def test_a_secret_file_has_its_mode_from_the_start(theirs: Path, mode: int) -> None:
+    path = theirs / "key"
+    path.touch(0o644)
+    with atomic_file(path, mode) as file:
+        assert stat.S_IMODE(os.fstat(file.fileno()).st_mode) == mode
+    assert stat.S_IMODE(path.stat().st_mode) == mode
+    assert main(["key", "new", str(theirs / "new")]) == 0
+    assert stat.S_IMODE((theirs / "new").stat().st_mode) == 0o600
+
+
+def test_a_failed_write_leaves_no_trace(theirs: Path) -> None:
+    write_atomically(theirs / "file", b"old")
+    with suppress(KeyboardInterrupt), atomic_file(theirs / "file") as file:
+        file.write(b"half")
+        raise KeyboardInterrupt
+    assert os.listdir(theirs) == ["file"]
+    assert (theirs / "file").read_bytes() == b"old"
+
+
+def test_recover_refuses_a_broken_link(theirs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    torn = write(theirs / "run.mcap", world_records(20))
+    (theirs / "run.recovered.mcap").symlink_to(theirs / "nothing")
+    assert main(["recover", str(torn)]) == 2
+    assert "already there; name another file with --to" in capsys.readouterr().err
+    assert not (theirs / "nothing").exists()
+
+
+def test_a_report_follows_no_link(
+    theirs: Path, mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
+    (theirs / "config.yaml").write_text("seed: 1")
+    write(theirs / "world.mcap", world_records(20))
+    write(theirs / "cloud.mcap", cloud_records(20))
+    names = ("report.json", "environment.json", "report.html")
+    for name in names:
+        (theirs / name).symlink_to(mine)
+    (theirs / "mission.mcap").symlink_to(tmp_path / "nothing")
+    (theirs / "figures").symlink_to(tmp_path)
+    with pytest.raises(BadInputError, match="figures: is a link; remove it"):
+        write_report(theirs, *read_run(theirs))
+    (theirs / "figures").unlink()
+    (theirs / "figures").mkdir()
+    (theirs / "figures" / "error.png").symlink_to(mine)
+    write_report(theirs, *read_run(theirs))
+    assert mine.read_text() == "mine"
+    assert sorted(os.listdir(tmp_path)) == ["mine", "theirs"]
+    assert not any((theirs / name).is_symlink() for name in (*names, "mission.mcap"))
+    assert (theirs / "figures" / "error.png").read_bytes().startswith(b"\x89PNG")
+    assert Recording.read(theirs / "mission.mcap").complete

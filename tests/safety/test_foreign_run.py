@@ -6,6 +6,7 @@ import argparse
 import ast
 import json
 import os
+import re
 import subprocess
 from pathlib import Path
 
@@ -14,7 +15,8 @@ import pytest
 from cloudrc.cli import runtime
 from cloudrc.cli.link_verify import find_experiment
 from cloudrc.cli.main import main
-from cloudrc.config.load import dump, load_experiment, read_experiment
+from cloudrc.cluster.link import APPLY_SCRIPT
+from cloudrc.config.load import dump, read_experiment
 from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
 from tests.metrics.conftest import flown
@@ -71,21 +73,14 @@ def test_a_report_executes_nothing_of_the_run(
 
 
 def test_link_verify_executes_nothing_of_the_run(run: Path, trace: Path) -> None:
+    controller = PlugIn.model_validate({"name": str(run / "spy.py"), "share": 2.5})
+    assert read_experiment(run / "config.yaml").cloud.controller == controller
     experiment = find_experiment(str(run / "config.yaml"), ["link.uplink.delay_ms=200"])
     assert experiment.uplink.delay_ms == 200
     # Its processes get a file that names the same program, and read it in the same way.
     (run / "again.yaml").write_text(dump(experiment))
     assert read_experiment(run / "again.yaml") == experiment
     assert not trace.exists()
-
-
-def test_an_experiment_is_read_as_the_file_says(run: Path) -> None:
-    spy = str(run / "spy.py")
-    controller = PlugIn.model_validate({"name": spy, "share": 2.5})
-    assert read_experiment(run / "config.yaml").cloud.controller == controller
-    flown = load_experiment("paper")
-    (run / "config.yaml").write_text(dump(flown))
-    assert read_experiment(run / "config.yaml") == flown, "a run's file names all parameters"
 
 
 @pytest.mark.parametrize(
@@ -145,10 +140,17 @@ def test_a_sweep_worker_imports_nothing_from_there_either(
 
 
 def test_every_process_is_started_by_the_safe_function() -> None:
-    """Except in the fault suite, which flies in new folders."""
     starts = {
         path.relative_to(PACKAGE).as_posix()
         for path in PACKAGE.rglob("*.py")
         if "sys.executable" in path.read_text()
     }
-    assert {name for name in starts if not name.startswith("faults/")} == {"drivers/machine.py"}
+    assert starts == {"drivers/machine.py"}
+
+
+def test_a_shell_splits_no_foreign_text() -> None:
+    """It comes in as arguments of the one program that a shell runs."""
+    shells = re.compile(r"""["'](/bin/)?(ba|da)?sh["'], *["']-c["'],(?! *APPLY_SCRIPT)""")
+    assert [path for path in PACKAGE.rglob("*.py") if shells.search(path.read_text())] == []
+    quoted = re.sub(r'"(?:\\.|[^"\\])*"', "", APPLY_SCRIPT)
+    assert not re.search(r"\$[0-9@*]", quoted), "an argument stays one word"

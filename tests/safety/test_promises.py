@@ -11,43 +11,29 @@ NIGHTLY = {"full", "e2e", "netem"}
 """Marks of tests that do not run before a landing."""
 
 
-def promised() -> list[str]:
-    """Read the names from the table of promises."""
-    page = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
-    table = page.partition("\n## Promises\n")[2].partition("\n## ")[0]
-    return re.findall(r"^\| `([a-z-]+)` \|", table, re.MULTILINE)
-
-
-def marks(nodes: list[ast.expr]) -> list[ast.expr]:
-    """Give the expressions below `nodes` that are marks, without their calls' arguments."""
-    flat = [each for node in nodes for each in getattr(node, "elts", [node])]
-    return [each for each in flat if ast.unparse(each).startswith("pytest.mark.")]
-
-
 def promises_of(path: Path) -> list[tuple[str, bool]]:
     """List the promise marks of a file's tests, and whether they run before a landing."""
     body = ast.parse(path.read_text(encoding="utf-8")).body
-    shared = [
-        mark
-        for node in body
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "pytestmark"
-        for mark in marks([node.value])
-    ]
+    shared = [each.value for each in body if isinstance(each, ast.Assign)]
     found = []
     for test in body:
         if isinstance(test, ast.FunctionDef) and test.name.startswith("test_"):
-            own = [*shared, *marks(test.decorator_list)]
-            daily = not {ast.unparse(mark).split(".")[2] for mark in own} & NIGHTLY
-            for mark in own:
-                if isinstance(mark, ast.Call) and ast.unparse(mark.func).endswith(".promise"):
-                    found.append((ast.literal_eval(mark.args[0]), daily))
+            nodes = [flat for each in (*shared, *test.decorator_list)
+                     for flat in getattr(each, "elts", [each])]  # fmt: skip
+            marks = [
+                text for each in nodes if (text := ast.unparse(each)).startswith("pytest.mark.")
+            ]
+            daily = not {re.split(r"\W", mark)[2] for mark in marks} & NIGHTLY
+            names = (re.match(r"pytest\.mark\.promise\('(.*)'\)", mark) for mark in marks)
+            found += [(name[1], daily) for name in names if name]
     return found
 
 
 def test_promises_and_their_marks_match() -> None:
-    files = (ROOT / "tests").rglob("test_*.py")
-    found = [each for path in files for each in promises_of(path)]
-    names = promised()
+    found = [each for path in (ROOT / "tests").rglob("test_*.py") for each in promises_of(path)]
+    page = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
+    table = page.partition("\n## Promises\n")[2].partition("\n## ")[0]
+    names = re.findall(r"^\| `([a-z-]+)` \|", table, re.MULTILINE)
     assert 15 <= len(names) == len(set(names)) <= 25
     assert {name for name, _ in found} - set(names) == set()
     assert set(names) - {name for name, daily in found if daily} == set()

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from cloudrc.errors import BadInputError
 from cloudrc.faults.scenario import Scenario
-from cloudrc.faults.scenarios import clouds, combined, ends, intruder, losses, missions, timing
+from cloudrc.faults.scenarios import ends, intruder, losses, missions, timing
 from cloudrc.plugins import suggest_name
 
-MODULES = (losses, timing, ends, intruder, clouds, missions, combined)
-SCENARIOS: tuple[Scenario, ...] = tuple(
-    sorted((each for module in MODULES for each in module.SCENARIOS), key=lambda each: each.number)
-)
+MODULES = (ends, intruder, losses, missions, timing)
+_FOUND = [each for part in MODULES for each in vars(part).values() if isinstance(each, Scenario)]
+SCENARIOS = tuple(sorted(_FOUND, key=lambda each: each.number))
 """All scenarios, by number."""
 
 

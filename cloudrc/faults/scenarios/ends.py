@@ -1,19 +1,33 @@
-"""Faults F13, F15 and F17: cloud is killed or frozen, world restarts."""
+"""Faults F13, F15, F17, F25 and F40: cloud is killed, frozen or rivalled, world restarts."""
 
 from __future__ import annotations
 
+from functools import partial
 from math import hypot, nan
 
+import numpy as np
+
 from cloudrc.faults import measures
-from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import Outcome, Scenario
-from cloudrc.records import CommandApplied
+from cloudrc.faults.flight import Flight, silent
+from cloudrc.faults.models import EndpointGroup
+from cloudrc.faults.scenario import Outcome, generator, scenario
+from cloudrc.messages import GuardState
+from cloudrc.records import CommandApplied, Fault
+from cloudrc.tunnel.handshake import BUSY_TEXT
 
 
-def _cloud_killed(seed: int) -> Outcome:
-    outcome, at, down = Outcome(), measures.instant(seed), 0.8
+@scenario(
+    13,
+    "cloud-killed",
+    injects="SIGKILL of the cloud process, a new one 0.8 s later",
+    expects="HOLD by 252 ms; the new process commands in <= 2 s; the same waypoint goes on",
+    loses="cloud's memory only",
+    shows="a new session, cloudrc_session_epoch",
+)
+def _cloud_killed(outcome: Outcome, seed: int) -> None:
+    at, down = measures.instant(seed), 0.8
     flight = Flight(seed=seed)
-    flight.cloud.at(at, lambda now_ns: flight.kill_cloud(now_ns, down))
+    flight.cloud.at(at, partial(flight.cloud.restart, down=down))
     flight.fly_mission()
     measures.safe_and_done(outcome, flight)
     measures.held_in_time(outcome, flight)
@@ -25,34 +39,45 @@ def _cloud_killed(seed: int) -> Outcome:
     outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
     measures.moves(outcome, flight, "world", "session_epoch", since=at)
     outcome.least("epochs opened", len(opened), 3)
-    return outcome
 
 
-def _cloud_paused(seed: int) -> Outcome:
-    outcome, at = Outcome(), measures.instant(seed)
+@scenario(
+    15,
+    "cloud-paused",
+    injects="SIGSTOP of the cloud process for 5 s",
+    expects="HOLD; of what it computed before nothing is applied",
+    shows="guard HOLD with its cause, cloudrc_guard_transitions_total, then "
+    "cloudrc_loop_missed_periods_total",
+)
+def _cloud_paused(outcome: Outcome, seed: int) -> None:
+    at, missed = measures.instant(seed), "loop_missed_periods_total"
     flight = Flight(seed=seed, separate=True)
-    flight.cloud.at(at, lambda now_ns: flight.cloud.freeze(now_ns, 5.0))
-    shown = measures.look(flight, at + 4.0)
+    flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
     flight.fly_mission()
     measures.safe_and_done(outcome, flight)
     measures.held_in_time(outcome, flight)
-    measures.silence_told(outcome, shown, 4.0, cloud=False, what="cloud stalled")
     measures.causes_told(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
     outcome.same("commands applied that were too old", len(old), 0)
     measures.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
-    missed_by = ("cloud", "loop_missed_periods_total")
-    measures.moves(outcome, flight, *missed_by, since=at, over=at + 5.0)
-    missed = measures.metric(flight, "cloud", "loop_missed_periods_total")
-    outcome.least("metric loop_missed_periods_total at the end", missed, 490)
-    return outcome
+    measures.moves(outcome, flight, "cloud", missed, since=at, over=at + 5.0)
+    outcome.least(f"metric {missed} at the end", measures.reading(flight, "cloud", missed), 490)
 
 
-def _world_restarted(seed: int) -> Outcome:
-    outcome, at = Outcome(), measures.instant(seed)
-    flight = Flight(seed=seed)
-    flight.world.at(at, lambda now_ns: flight.kill_world(now_ns, 2.0))
+@scenario(
+    17,
+    "world-restarted",
+    injects="the world pod restarts within 2 s",
+    expects="back on the ground, never airborne without power; a new epoch, commands of the old "
+    "one are refused; nothing resumes alone",
+    loses="the flight in progress",
+    shows="mission failed: world_restarted; cloudrc_missions_total, cloudrc_session_epoch",
+)
+def _world_restarted(outcome: Outcome, seed: int) -> None:
+    at = measures.instant(seed)
+    flight, back = Flight(seed=seed), at + 2.0
+    flight.world.at(at, partial(flight.world.restart, down=2.0))
     flight.fly(at + 12.0)
     measures.safe(outcome, flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
@@ -67,42 +92,90 @@ def _world_restarted(seed: int) -> Outcome:
     outcome.true("with the code world_restarted", "world_restarted" in verdict)
     opened = measures.epochs(flight)
     outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
-    back = at + 2.0
     # What cloud still says to the world before.
     measures.moves(outcome, flight, "world", "datagrams_total", "downlink", "old_epoch", since=back)
     measures.moves(outcome, flight, "world", "session_epoch", since=back)
     measures.moves(outcome, flight, "cloud", "missions_total", "world_restarted", since=back)
-    return outcome
 
 
-SCENARIOS = (
-    Scenario(
-        13,
-        "cloud-killed",
-        "SIGKILL of the cloud process, a new one 0.8 s later",
-        "HOLD by 252 ms; the new process commands in <= 2 s; the same waypoint goes on",
-        "cloud's memory only",
-        "a new session, cloudrc_session_epoch",
-        _cloud_killed,
-    ),
-    Scenario(
-        15,
-        "cloud-paused",
-        "SIGSTOP of the cloud process for 5 s",
-        "HOLD; of what it computed before nothing is applied",
-        "none",
-        "guard HOLD with its cause; in the status: cloud not heard, nor the robot; "
-        "cloudrc_guard_transitions_total, then cloudrc_loop_missed_periods_total",
-        _cloud_paused,
-    ),
-    Scenario(
-        17,
-        "world-restarted",
-        "the world pod restarts within 2 s",
-        "back on the ground, never airborne without power; a new epoch, commands of the old one "
-        "are refused; nothing resumes alone",
-        "the flight in progress",
-        "mission failed: world_restarted; cloudrc_missions_total, cloudrc_session_epoch",
-        _world_restarted,
-    ),
+@scenario(
+    25,
+    "two-clouds",
+    injects="a second cloud with the same key; later the first one leaves",
+    expects="the first keeps authority while fresh; after HOLD the second gets a higher epoch; "
+    "commands never interleave",
+    shows="fault 'busy' in the second: another cloud controls the robot; "
+    "cloudrc_datagrams_total{outcome=busy}, cloudrc_sessions_refused_total",
 )
+def _two_clouds(outcome: Outcome, seed: int) -> None:
+    at = measures.instant(seed, 4.0, 12.0)
+    flight = Flight(seed=seed, second=at)
+    group = flight.cloud.inner
+    assert isinstance(group, EndpointGroup)
+    flight.fly(at + 5.0)
+    opened = max(measures.epochs(flight), default=-1)
+    outcome.same("epochs while both are there", opened, 2)
+    flight.fly(at + 6.0)
+    group.members = group.members[1:]  # the first leaves
+    flight.fly(at + 14.0)
+    measures.safe(outcome, flight)
+    held = measures.changes_into(flight, GuardState.HOLD, at + 6.0)
+    outcome.same("HOLDs while both are there", len(held), 0)
+    measures.moves(outcome, flight, "world", "datagrams_total", "downlink", "busy", since=at)
+    measures.moves(outcome, flight, "world", "sessions_refused_total", since=at)
+    told = measures.told(group.others, "busy")
+    outcome.true("the second says why it waits, once", [r.text for r in told] == [BUSY_TEXT])
+    said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
+    outcome.most("it says so after", said - at, 1.0, "s")
+    by_first = [r for r in measures.seen_by(flight, "cloud", at + 6.0) if isinstance(r, Fault)]
+    outcome.same("faults that the first tells of", len(by_first), 0)
+    measures.held_in_time(outcome, flight, "HOLD once the first is gone")
+    later = [epoch for epoch in measures.epochs(flight) if epoch > 2]
+    outcome.true("then the second gets a higher epoch", bool(later))
+    outcome.true("commands applied in order, none twice", measures.applied_in_order(flight))
+
+
+@scenario(
+    40,
+    "swizzle-clog",
+    injects="uplink, downlink, cloud, world and teleop freeze one by one and return in random "
+    "order",
+    expects="always a safe state; the mission goes on",
+    loses="as above",
+    shows="guard HOLD with its cause, cloudrc_guard_transitions_total; of each that was frozen: "
+    "fault 'late' of both ends, "
+    "cloudrc_datagrams_lost_total both ways, cloudrc_loop_missed_periods_total, "
+    "cloudrc_world_slip_seconds_total, mission restarted",
+)
+def _swizzle(outcome: Outcome, seed: int) -> None:
+    """A direction freezes before its sender, so that datagrams are lost.
+
+    Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
+    """
+    rng = generator(seed, 40)
+    starts = measures.instant(seed) + np.cumsum(rng.uniform(0.1, 1.0, 5))
+    ends = rng.permutation(starts[-1] + np.cumsum(rng.uniform(0.1, 1.5, 5)))
+    spans = zip(starts.tolist(), (ends - starts).tolist(), strict=True)
+    uplink, downlink, cloud, world, teleop = spans
+    limit, links = "criteria.time_limit_s=120", (silent(*uplink), silent(*downlink))
+    flight = Flight(limit, seed=seed, uplink=links[0], downlink=links[1])
+    for process, (start, duration) in ((flight.cloud, cloud), (flight.world, world)):
+        process.at(start, partial(process.freeze, duration=duration))
+    flight.cloud.at(teleop[0], lambda _: flight.teleop.kill())
+    flight.cloud.at(sum(teleop), lambda _: flight.teleop.start())
+    flight.fly_mission()
+    measures.safe_and_done(outcome, flight)
+    measures.held_in_time(outcome, flight)
+    measures.causes_told(outcome, flight)
+    for role, *metric in (
+        ("cloud", "datagrams_lost_total", "uplink"),
+        ("world", "datagrams_lost_total", "downlink"),
+        ("cloud", "loop_missed_periods_total"),
+        ("world", "world_slip_seconds_total"),
+        ("world", "guard_transitions_total", "hold"),
+    ):
+        measures.moves(outcome, flight, role, *metric, since=uplink[0], over=max(ends))
+    for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
+        outcome.least(f"times that {end} tells: late", len(measures.told(records, "late")), 1)
+    restarted = measures.events_of_missions(flight, "restarted")
+    outcome.least("the log tells: restarted", len(restarted), 1)

@@ -1,64 +1,115 @@
-"""Faults F27 and F28: a mission that cannot be flown, and a waypoint that is not reached."""
+"""Faults F23, F27 and F28: impossible commands and missions; a waypoint that is not reached."""
 
 from __future__ import annotations
 
-import re
 from math import inf, nan
 from typing import Any
 
 from cloudrc import assembly
 from cloudrc.config.mission_check import check_mission
-from cloudrc.config.schema import Mission as MissionSchema
+from cloudrc.config.schema import Mission
 from cloudrc.faults import measures
+from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import Outcome, Scenario
+from cloudrc.faults.scenario import Outcome, scenario
 from cloudrc.geometry import fence
-from cloudrc.geometry.scene import Pipe, Scene, load_scene
+from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.messages import Command, GuardState, Vector
 from cloudrc.records import Control
 
+IMPOSSIBLE: dict[str, dict[str, Any]] = {
+    "NaN": {"velocity": (nan, 0.0, 0.0)},
+    "yaw infinite": {"yaw_rate": inf},
+    "1e308": {"velocity": (1e308, -1e308, 1e308)},
+}
+EXCESSIVE: dict[str, dict[str, Any]] = {
+    "speed": {"velocity": (100.0, 0.0, 0.0)},
+    "yaw_rate": {"yaw_rate": 100.0},
+}
+"""Commands of 100 m/s and 100 rad/s, by the limit of the guard that they meet."""
 
-def _impossible(seed: int) -> Outcome:
-    outcome, scene, first = Outcome(), load_scene("pipes"), (0.5, 0.0, 0.8)
+
+@scenario(
+    23,
+    "invalid-values",
+    injects="NaN, infinite, huge and over-limit values with a valid seal",
+    expects="refused or clamped; 5 refused in 1 s: LAND, latched",
+    loses="those commands",
+    shows="guard LAND with its cause, cloudrc_datagrams_total{outcome=range}, "
+    "cloudrc_guard_limited_total",
+)
+def _invalid_values(outcome: Outcome, seed: int) -> None:
+    at = measures.instant(seed)
+    for name, changes in IMPOSSIBLE.items():
+        flight = Flight(seed=seed, lies=[_for_a_while(at, 1.0, changes)]).fly(40.0)
+        measures.safe(outcome, flight)
+        landed = next(iter(measures.changes_into(flight, GuardState.LAND)), nan)
+        outcome.most(f"{name}: LAND after", landed - at, 1.0, "s")
+        again = [t for t in measures.changes_into(flight, GuardState.TRACK) if t > landed]
+        outcome.same(f"{name}: flown again without the operator", len(again), 0)
+        causes = " ".join(c.cause for c in flight.changes if c.state is GuardState.LAND)
+        outcome.true(f"{name}: the cause is told", "impossible commands" in causes)
+        metric = ("datagrams_total", "downlink", "range")
+        measures.moves(outcome, flight, "world", *metric, since=at)
+    for limit, changes in EXCESSIVE.items():
+        lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a pipe
+        flight = Flight(seed=seed, honest=harmless, lies=[lie]).fly(40.0)
+        measures.safe(outcome, flight)
+        refused = sum("impossible" in change.cause for change in flight.changes)
+        outcome.same(f"100 times {limit}: taken for impossible", refused, 0)
+        outcome.least(f"100 times {limit}: clamped", flight.count(f"limited_{limit}"), 20)
+        measures.moves(outcome, flight, "world", "guard_limited_total", limit, since=at)
+    one = Flight(seed=seed, lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
+    measures.safe_and_done(outcome, one)
+    outcome.same("a single NaN: LAND", len(measures.changes_into(one, GuardState.LAND)), 0)
+
+
+def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
+    """Change the commands from `at` on for `duration` [s]."""
+
+    def lie(command: Command, control: Control) -> Command:
+        now = control.stamp_ns * 1e-9
+        return command._replace(**changes) if at <= now < at + duration else command
+
+    return lie
+
+
+@scenario(
+    27,
+    "impossible-mission",
+    injects="waypoints of NaN, in a wall, behind one, beyond the fence, 10,001 of them",
+    expects="refused as a whole, before anything is flown",
+    loses="nothing",
+    shows="index, value, reason and the nearest legal point; no metric, nothing was ordered",
+)
+def _impossible(outcome: Outcome, seed: int) -> None:
+    scene, first = load_scene("pipes"), (0.5, 0.0, 0.8)
     points: dict[str, Vector] = {
-        "outside the fence": (100.0, 0.0, 1.0),
         "1 m behind a wall of the fence": (fence.HIGH[0] + 1.0, 0.0, 1.0),
         "far below the floor": (0.0, 0.0, -5.0),
         "in a pipe's wall": _wall_of(scene.pipes[0]),
     }
-    for name, point in points.items():
-        problems = _problems([first, point], scene)
-        outcome.true(f"{name}: refused", bool(problems))
-        told = bool(problems) and "1" in problems[0].path
-        told = told and all(f"{value:g}" in problems[0].value for value in point)
-        outcome.true(f"{name}: names the waypoint's index and value", told)
-        offer = re.search(r"nearest legal point found: \[([^\]]*)\]", " ".join(map(str, problems)))
-        offered = [tuple(map(float, offer[1].split(", ")))] if offer else []
-        ways = [offered, [first, *offered]]  # a straight way to it may lead through a wall
-        legal = bool(offered) and not all(_problems(way, scene) for way in ways)
-        outcome.true(f"{name}: offers another point, which is legal", legal)
-    bore = scene.pipes[0].centre
     others: dict[str, list[Any]] = {
         "NaN": [(0.0, 0.0, nan)],
-        "infinite": [(0.0, 0.0, inf)],
         "a word": [(0.0, 0.0, "high")],
-        "behind a wall": [bore, first],
+        "behind a wall": [scene.pipes[0].centre, first],
         "none at all": [],
         "10,001 waypoints": [first] * 10_001,
     }
-    for name, way in others.items():
-        outcome.true(f"{name}: refused", bool(_problems(way, scene)))
-    return outcome
-
-
-def _problems(way: list[Any], scene: Scene) -> list[Any]:
-    """Return why a mission with these waypoints [m] is refused; nothing if it is not."""
-    try:
-        waypoints = tuple({"position_m": point} for point in way)
-        mission = MissionSchema.model_validate({"waypoints": waypoints})
-    except ValueError as error:
-        return [error]
-    return list(check_mission(mission, scene))
+    for name, way in ({name: [first, point] for name, point in points.items()} | others).items():
+        try:
+            waypoints = tuple({"position_m": point} for point in way)
+            mission = Mission.model_validate({"waypoints": waypoints})
+            problems = [str(each) for each in check_mission(mission, scene)]
+        except ValueError as error:
+            problems = [str(error)]
+        outcome.true(f"{name}: refused", bool(problems))
+        if name in points:
+            values = (f"{value:g}" in problems[0] for value in points[name])
+            told = "waypoints.1" in problems[0] and all(values)
+            outcome.true(f"{name}: names the waypoint's index and value", told)
+            offered = "nearest legal point found: [" in problems[0]
+            outcome.true(f"{name}: offers another point", offered)
 
 
 def _wall_of(pipe: Pipe) -> Vector:
@@ -67,9 +118,17 @@ def _wall_of(pipe: Pipe) -> Vector:
     return (x - ay * radius, y + ax * radius, z)
 
 
-def _unreachable(seed: int) -> Outcome:
+@scenario(
+    28,
+    "waypoint-not-reached",
+    injects="what the cloud commands comes to nothing",
+    expects="HOLD; the leg ends by its limit of time",
+    loses="that leg",
+    shows="mission failed: leg_timed_out, with the waypoint; cloudrc_missions_total",
+)
+def _unreachable(outcome: Outcome, seed: int) -> None:
     """Command the robot to stay where it is."""
-    outcome, at, stays = Outcome(), measures.instant(seed, 12.0, 20.0), list[Vector]()
+    at, stays = measures.instant(seed, 12.0, 20.0), list[Vector]()
 
     def stalled(command: Command, control: Control) -> Command:
         if control.stamp_ns * 1e-9 < at:
@@ -87,35 +146,11 @@ def _unreachable(seed: int) -> Outcome:
     outcome.true("it says which waypoint", "waypoint" in verdict and "not reached" in verdict)
     ended = max(event.stamp_ns for event in flight.events("leg_timed_out")) * 1e-9
     reached = flight.events("reached")
-    leg = assembly.build_plan(flight.experiment).legs[len(reached)]
-    began = reached[-1].stamp_ns * 1e-9
-    outcome.most("the leg ends off its limit by", abs(ended - began - leg.time_limit), 0.05, "s")
+    leg, began = assembly.build_plan(flight.experiment).legs[len(reached)], reached[-1].stamp_ns
+    off = abs(ended - began * 1e-9 - leg.time_limit)
+    outcome.most("the leg ends off its limit by", off, 0.05, "s")
     measures.moves(outcome, flight, "teleop", "missions_total", "leg_timed_out", since=ended - 0.01)
     flight.fly(flight.now + 10.0)
     outcome.true("the robot holds", flight.guard_now()[0] is GuardState.HOLD)
-    outcome.most(
-        "drift from where the leg ended", measures.drift(flight, ended, flight.now), 0.10, "m"
-    )
-    return outcome
-
-
-SCENARIOS = (
-    Scenario(
-        27,
-        "impossible-mission",
-        "waypoints of NaN, in a wall, behind one, beyond the fence, 10,001 of them",
-        "refused as a whole, before anything is flown",
-        "nothing",
-        "index, value, reason and the nearest legal point; no metric, nothing was ordered",
-        _impossible,
-    ),
-    Scenario(
-        28,
-        "waypoint-not-reached",
-        "what the cloud commands comes to nothing",
-        "HOLD; the leg ends by its limit of time",
-        "that leg",
-        "mission failed: leg_timed_out, with the waypoint; cloudrc_missions_total",
-        _unreachable,
-    ),
-)
+    drift = measures.drift(flight, ended, flight.now)
+    outcome.most("drift from where the leg ended", drift, 0.10, "m")

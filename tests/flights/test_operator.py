@@ -1,0 +1,167 @@
+"""What teleop says reaches the robot in its own session only; an emergency stop in any."""
+
+from __future__ import annotations
+
+import pytest
+
+from cloudrc import assembly
+from cloudrc.cloud.endpoint import CloudIdentity
+from cloudrc.cloud.operator import Operator
+from cloudrc.config.load import load_experiment
+from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.records import Fault, GuardChange
+from cloudrc.teleop.wire import ALARM, Output, RobotStatus
+from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
+from cloudrc.world.endpoint import WorldIdentity
+from tests.flights.conftest import SHARED_CLOCK, Ends, fly_on, join
+
+HOVER = load_experiment("hover", ["link.profile=ideal"])
+S = 1_000_000_000
+LAG_NS = 2 * S
+ELSEWHERE = (5.0, 5.0, 1.0)
+ESTOP = GuardState.ESTOP
+
+
+def states(ends: Ends, seconds: float) -> list[GuardState]:
+    """Fly on for some time [s]; return the new states of the guard."""
+    of_world, _ = fly_on(ends.run, ends.run.now_ns + round(seconds * S))
+    return [record.state for record in of_world if isinstance(record, GuardChange)]
+
+
+@pytest.fixture
+def ends() -> Ends:
+    """Provide ends in flight."""
+    ends = join(HOVER)
+    fly_on(ends.run, 4 * S)
+    ends.cloud.take_datagrams()
+    return ends
+
+
+def say(ends: Ends, *words: Setpoint | OperatorRequest) -> list[int]:
+    """Return the kinds of the datagrams that cloud sends at once."""
+    ends.cloud.teleop.outputs.extend(words)
+    ends.cloud._take_from_teleop()
+    return [peek(data)[0] for data in ends.cloud.take_datagrams()]
+
+
+def test_setpoints_and_starts_are_for_their_own_session(ends: Ends) -> None:
+    """Teleop is slow; in the meantime another cloud may have moved the robot."""
+    epoch, before = ends.cloud._session.epoch, ends.cloud._setpoint
+    setpoint, start = Setpoint(ELSEWHERE), OperatorRequest(99, Request.START)
+    for said in (setpoint, start, start._replace(start=Start.SPAWN)):
+        assert say(ends, said._replace(epoch=epoch - 1), said._replace(epoch=epoch + 1)) == []
+    assert ends.cloud._setpoint is before
+    assert ends.cloud._counts["words_dropped"] == 6
+    for said in (start, start._replace(epoch=epoch)):
+        assert say(ends, said) == [Kind.OPERATOR]
+    for said in (setpoint, setpoint._replace(epoch=epoch)):
+        say(ends, said)
+        assert ends.cloud._setpoint == said
+
+
+@pytest.mark.parametrize("request_", [each for each in Request if each is not Request.START])
+def test_requests_that_arm_nothing_are_always_passed_on(ends: Ends, request_: Request) -> None:
+    epoch = ends.cloud._session.epoch
+    said = OperatorRequest(99, request_, epoch=epoch - 1)
+    assert say(ends, said, said._replace(epoch=epoch)) == [Kind.OPERATOR] * 2
+
+
+def test_nothing_starts_before_the_first_telemetry(ends: Ends) -> None:
+    ends.cloud._loop.reset()  # as a new session does
+    assert say(ends, OperatorRequest(99, Request.START)) == []
+    assert say(ends, OperatorRequest(99, Request.END)) == [Kind.OPERATOR]
+
+
+def test_used_up_numbers_last_until_the_next_session(ends: Ends) -> None:
+    """A sender with the keys has used the highest number of all."""
+    said = OperatorRequest(NUMBER_MAX, Request.END)
+    assert say(ends, said) == [Kind.OPERATOR]
+    assert say(ends, said._replace(number=NUMBER_MAX + 1), ALARM) == []
+    fly_on(ends.run, 5 * S)
+    assert ends.cloud._counts["words_dropped"] > 2
+    identity = WorldIdentity(SHARED_CLOCK, b"another".ljust(16))
+    world = ends.run._world = assembly.build_world(HOVER, identity, lambda: ends.run.now_ns)
+    fly_on(ends.run, 7 * S)
+    assert world.robot.guard.state is ESTOP
+
+
+class Lagging:
+    """A teleop in its own process whose messages are late."""
+
+    outcome, settled = None, True
+
+    def __init__(self, teleop: Operator) -> None:
+        self._teleop = teleop
+        self._late: list[tuple[int, Output | Fault]] = []
+        self.outputs: list[Output | Fault] = []
+        self.epochs: dict[int, int] = {}  # epochs seen, and when first [ns]
+
+    def see(self, seen: RobotStatus, now_ns: int) -> None:
+        self.epochs.setdefault(seen.epoch, now_ns)
+        self._teleop.see(seen, now_ns)
+
+    def handle_deadline(self, now_ns: int) -> None:
+        self._teleop.handle_deadline(now_ns)
+        self._late += [(now_ns + LAG_NS, said) for said in self._teleop.take_outputs()]
+        while self._late and self._late[0][0] <= now_ns:
+            self.outputs.append(self._late.pop(0)[1])
+
+    def take_outputs(self) -> list[Output | Fault]:
+        outputs, self.outputs = self.outputs, []
+        return outputs
+
+
+def test_a_slow_teleop_starts_missions_in_the_session_it_saw() -> None:
+    """Its first start is under way while cloud restarts, and arrives in the next session."""
+    ends = join(HOVER)
+    teleop = ends.cloud.teleop = Lagging(ends.cloud.teleop)
+    assert states(ends, 1.5) == []
+    ends.run._cloud = assembly.build_cloud(
+        HOVER, CloudIdentity(SHARED_CLOCK, b"another".ljust(16)), lambda: ends.run.now_ns, teleop
+    )
+    of_world, _ = fly_on(ends.run, 4 * LAG_NS)
+    changes = [record for record in of_world if isinstance(record, GuardChange)]
+    _, second, _ = teleop.epochs.values()  # the third is that of the start from the spawn
+    assert changes[0].stamp_ns >= second + LAG_NS
+    assert changes[-1].state is GuardState.TRACK
+
+
+def test_without_a_session_only_an_alarm_waits() -> None:
+    cloud = assembly.build_cloud(HOVER, CloudIdentity(SHARED_CLOCK, b"cloud".ljust(16)))
+    cloud.teleop.outputs += [OperatorRequest(3, Request.START), ALARM]
+    for now_ns in range(0, S, 10_000_000):
+        cloud.handle_deadline(now_ns)
+    assert {peek(data)[0] for data in cloud.take_datagrams()} == {Kind.HELLO}
+
+
+def test_an_early_alarm_keeps_the_robot_on_the_ground() -> None:
+    ends = join(HOVER)
+    ends.cloud.teleop.outputs.append(ALARM)
+    assert [each for each in states(ends, 3) if each is not GuardState.GROUND] == [ESTOP]
+
+
+@pytest.mark.promise("emergency-stop-gets-through")
+@pytest.mark.parametrize("seed", range(1, 6))
+def test_a_link_that_loses_most_loses_no_alarm(seed: int) -> None:
+    ends = join(load_experiment("hover", ["link.profile=ideal", f"seed={seed}"]))
+    fly_on(ends.run, 4 * S)
+    lossy = ["link.profile=ideal", "link.downlink.loss=0.8", "link.uplink.loss=0.8", f"seed={seed}"]
+    ends.run._uplink, ends.run._downlink = assembly.build_links(load_experiment("hover", lossy))
+    ends.cloud.teleop.outputs.append(ALARM)
+    assert states(ends, 4)[-1] is ESTOP
+
+
+def test_an_acknowledgement_ends_the_alarm_and_a_later_stop_holds(ends: Ends) -> None:
+    teleop = ends.cloud.teleop
+    teleop.outputs.append(ALARM)
+    assert states(ends, 1) == [ESTOP]
+    teleop.acknowledge(5 * S)
+    teleop.handle_deadline(5 * S)
+    teleop.stop(5 * S)  # the robot still shows the first stop
+    assert states(ends, 1)[-1] is ESTOP
+    teleop.stop(6 * S)  # of a robot that is stopped
+    assert states(ends, 1) == []
+    assert teleop.settled
+    teleop.outputs.append(ALARM)  # late, of before
+    teleop.requests.ask(Request.ACKNOWLEDGE)
+    assert states(ends, 2)[-1] is GuardState.GROUND
