@@ -1,13 +1,8 @@
 """Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
 
-The service drives the state machine `Teleop`. Both are pure; the service writes all events to a
-store. Each mission has an id. A mission also has a key if the sender gives one: a second order with
-the same key returns the existing mission. After a restart of teleop, a mission under way continues
-at the same waypoint, if world has not restarted.
-
-An emergency stop also survives a restart of teleop. The store contains the stop and, once the robot
-has acted on an acknowledgement, this acknowledgement. A new teleop that finds only the stop sends
-it again, unless the robot has flown another mission since then or is a different robot.
+After a restart of teleop, a mission under way continues at the same waypoint, if world has not
+restarted. An emergency stop survives, too: a new teleop that finds a stop without acknowledgement
+in the store sends it again, unless the robot has flown another mission since then.
 """
 
 from __future__ import annotations
@@ -18,11 +13,18 @@ from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
-from cloudrc.metrics.verdict import Ending, Observations, finite_or_none, judge
+from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop import store
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError, busy
+from cloudrc.teleop.store import (
+    HELD,
+    QUEUED,
+    ConflictError,
+    Mission,
+    MissionStore,
+    Order,
+    UnavailableError,
+)
 from cloudrc.teleop.wire import Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -30,6 +32,11 @@ LATCHED = (LAND, ESTOP)
 """States of the guard that end only when the operator acknowledges them."""
 SILENCE = 1.0
 """Age above which telemetry or the last message of cloud counts as too old [s]."""
+SETPOINT_PERIOD_NS = 100_000_000
+"""Time between two copies of the setpoint [ns], for a cloud or teleop that restarts."""
+QUEUE_MAX = 16
+"""Limit of the missions that wait for the one under way."""
+NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
 BY_ITSELF = "without commands the robot holds its position, then lands, by itself"
 NOT_HEARD = f"cloud has no telemetry from the robot: check the link and world; {BY_ITSELF}"
@@ -51,62 +58,54 @@ IN_MISSION = {
     "none arrive within guard.hold_max_s",
 }
 """State of the guard -> next step while a mission is under way."""
-HELD = "the operator holds the mission; to continue: cloudrc mission resume"
+OPERATOR_HOLDS = "the operator holds the mission; to continue: cloudrc mission resume"
+
+
+def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
+    """Describe what the robot does next, or what the operator has to do.
+
+    Args:
+        guard: State of the guard.
+        age: Age of the newest telemetry [s].
+        cloud_age: Time since the last message from cloud [s].
+        mission: State of the mission under way; None if there is none.
+    """
+    if age > SILENCE:
+        return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
+    if mission == HELD and guard is TRACK:
+        return OPERATOR_HOLDS
+    return (ALONE if mission is None else IN_MISSION)[guard]
 
 
 class RobotView:
-    """The robot as shown by its newest telemetry.
-
-    Attributes:
-        seen: The newest telemetry; None before the first.
-    """
+    """The robot as shown by its newest telemetry; `seen` is None before the first."""
 
     def __init__(self) -> None:
         self.seen: RobotStatus | None = None
         self._seen_ns = self._guard_ns = 0
         self._heard_ns: int | None = None
 
-    @property
-    def latched(self) -> str:
-        """Why the guard needs an acknowledgement before the robot can fly; "" if none is needed."""
-        seen = self.seen
-        if seen is None or seen.guard not in LATCHED:
-            return ""
-        return f"the guard is in {seen.guard.name} ({seen.cause.words}) and lets nothing fly"
-
     def hear(self, now_ns: int) -> None:
         """Note a message from cloud at `now_ns` [ns]."""
         self._heard_ns = now_ns
 
     def cloud_age(self, now_ns: int) -> float | None:
-        """Return the time since the last message from cloud [s]; None before the first message.
-
-        Args:
-            now_ns: Own clock [ns].
-        """
+        """Return the time since the last message from cloud [s]; None before the first."""
         return None if self._heard_ns is None else (now_ns - self._heard_ns) * 1e-9
 
     def see(self, seen: RobotStatus, now_ns: int) -> bool:
-        """Note new telemetry at `now_ns` [ns].
-
-        Returns:
-            Whether this telemetry is the first of a new session with the same robot.
-        """
+        """Note telemetry; return whether it is the first of a new session with the same robot."""
         before, self.seen, self._seen_ns = self.seen, seen, now_ns
         self.hear(now_ns)
-        if before is None or before.world != seen.world:
+        same = before is not None and before.world == seen.world
+        if before is None or not same or before.guard is not seen.guard:
             self._guard_ns = now_ns
-            return False
-        if before.guard is not seen.guard:
-            self._guard_ns = now_ns
-        return before.epoch != seen.epoch
+        return before is not None and same and before.epoch != seen.epoch
 
     def show(self, now_ns: int, mission: str | None) -> dict[str, Any] | None:
         """Return the robot's state for the API; None before the first telemetry.
 
-        Args:
-            now_ns: Own clock [ns].
-            mission: State of the mission under way; None if there is none.
+        `mission` is the state of the mission under way, or None.
         """
         seen, age, cloud_age = self.seen, (now_ns - self._seen_ns) * 1e-9, self.cloud_age(now_ns)
         if seen is None or cloud_age is None:
@@ -128,41 +127,11 @@ class RobotView:
         }
 
 
-def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
-    """Describe what the robot does next, or what the operator has to do.
-
-    Args:
-        guard: State of the guard.
-        age: Age of the newest telemetry [s].
-        cloud_age: Time since the last message from cloud [s].
-        mission: State of the mission under way; None if there is none.
-    """
-    if age > SILENCE:
-        return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
-    if mission == "held" and guard is TRACK:
-        return HELD
-    return (ALONE if mission is None else IN_MISSION)[guard]
-
-
-def describe_session(mission: Mission) -> str:
-    """Describe the event that the controller has a new session with the same robot."""
-    where = f"waypoint {mission.waypoint + 1} of {len(mission.order.plan.legs)}"
-    is_held = mission.state == store.HELD
-    goes_on = f"is held on the way to {where}" if is_held else f"goes on to {where}"
-    return f"the controller has a new session, as after a restart; the mission {goes_on}"
-
-
-def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
-    return seen.pipe_contacts, seen.touch_speed, seen.slip_ns
-
-
-SETPOINT_PERIOD_NS = 100_000_000
-"""Time between two copies of the setpoint [ns]. Because of the copies, cloud or teleop may restart
-at any time."""
-
-
 class MissionService:
     """Keep and fly all missions of one robot, one after the other.
+
+    Each verb takes the time `now_ns` of the own clock [ns]. It raises ConflictError if the state of
+    mission or robot forbids it, and UnavailableError if the store refuses or this process ends.
 
     Attributes:
         sight: The robot's state.
@@ -178,13 +147,13 @@ class MissionService:
         """
         self._contact_speed_max = contact_speed_max
         self._outputs: list[Output | Fault] = []
-        self.sight = RobotView()
+        self.sight, self.book = RobotView(), book
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next one starts the queued missions
-        self.book = book
-        self._teleop = Teleop(self.book.has_ended)
+        self._teleop = Teleop(book.has_ended)
+        self._trouble = ""  # of the store, as last reported
         # Whether an earlier teleop has sent a stop; until this process is asked for one.
         self._inherits_stop = book.stopped() is not None
         self._acknowledges = False  # whether the robot has still to act on an acknowledgement
@@ -192,19 +161,18 @@ class MissionService:
     @property
     def over(self) -> bool:
         """Whether at least one mission is known, all have ended, and no request is pending."""
-        return bool(self.book.missions) and not self.book.open() and self._teleop.settled
+        return bool(self.book.missions) and not self.book.open() and self.settled
+
+    @property
+    def settled(self) -> bool:
+        """Whether telemetry shows that the robot has acted on the last request."""
+        return self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission from an order; the mission starts at once or waits in the queue.
+        """Create a mission, which starts at once or waits in the queue.
 
         Returns:
             The mission, and whether it is new. An order with a known key returns the known mission.
-
-        Raises:
-            ConflictError: If the key belongs to another order, if another mission is under way and
-                the order may not wait, if the queue is full, or if the operator has to acknowledge
-                first.
-            UnavailableError: If the mission cannot be stored, or if this process is ending.
         """
         known = self.book.with_key(order.key)
         if known is not None:
@@ -212,7 +180,11 @@ class MissionService:
                 text = f"the key '{order.key}' is that of mission {known.id}, with another plan"
                 raise ConflictError(f"{text}; take a new key", known.id)
             return known, False
-        waiting = self.book.waits_for(order)
+        waiting = self.book.open()
+        if waiting and not order.queue:
+            raise _busy(waiting[0], "cancel it first, or queue the new one")
+        if len(waiting) > QUEUE_MAX:
+            raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
         self._check_can_fly()
         mission = self.book.add(order)
         if waiting:
@@ -220,67 +192,47 @@ class MissionService:
         else:
             self._current = mission
             self._teleop.start(now_ns, order.plan, mission.number)
-            self._note_start(mission, now_ns)
+            self._note(mission, "starting", ASKED, now_ns)
+            self._collect(now_ns)
         return mission, True
 
     def cancel(self, mission_id: str, now_ns: int) -> Mission:
-        """End a mission, or remove it from the queue.
-
-        Raises:
-            UnknownMissionError: If no mission has this id.
-            ConflictError: If the mission has ended.
-            UnavailableError: If the mission is in the queue and its end cannot be stored.
-        """
+        """End a mission, or remove it from the queue; raise UnknownMissionError for a wrong id."""
         mission = self.book.find(mission_id)
         if not mission.ended and mission is self._start_next(now_ns):
             return self._operate(self._teleop.cancel, now_ns)
         if mission.ended:  # also if it has just failed, because world restarted
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
-        self.book.cancel(mission)
+        verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
+        self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
         return mission
 
     def hold(self, now_ns: int) -> Mission:
-        """Hold the robot at its position; raise ConflictError unless it flies a mission."""
+        """Hold the robot at its position; it must fly a mission."""
         return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
-        """Continue the held mission.
-
-        Raises:
-            ConflictError: If no mission is held, or if the operator has to acknowledge first.
-            UnavailableError: If this process is ending.
-        """
+        """Continue the held mission."""
         self._check_can_fly()
         return self._operate(self._teleop.resume, now_ns)
 
     def go_to(self, position: Vector, yaw: float, now_ns: int) -> Mission:
-        """Fly to a point.
-
-        If a mission is held, the point is the new place to hold. Otherwise the point is a new
-        mission.
+        """Fly to a point: the new place of a held mission, else a new mission.
 
         Args:
             position: The point [m], world frame, shape (3,).
             yaw: Heading to hold [rad].
             now_ns: Own clock [ns].
-
-        Raises:
-            ConflictError: If a mission is under way and not held, or if the operator has to
-                acknowledge first.
-            UnavailableError: If the mission cannot be stored, or if this process is ending.
         """
         self._check_can_fly()
         waiting = self.book.open()
-        if waiting and waiting[0].state != store.HELD:
-            raise busy(waiting[0], "hold or cancel it first")
+        if waiting and waiting[0].state != HELD:
+            raise _busy(waiting[0], "hold or cancel it first")
         if waiting:
             return self._operate(partial(self._teleop.go_to, position=position, yaw=yaw), now_ns)
         leg = Leg(position, yaw)
-        mission = self.book.add(Order(Plan((leg,), Start.HERE, leg.time_limit), "goto"))
-        self._current = mission
-        self._teleop.go_to(now_ns, position, yaw, mission.number)
-        self._note_start(mission, now_ns)
-        return mission
+        order = Order(Plan((leg,), Start.HERE, leg.time_limit), "goto")
+        return self.create(order, now_ns)[0]
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state; return the mission that this ends, if any."""
@@ -291,13 +243,9 @@ class MissionService:
         return mission
 
     def acknowledge(self, now_ns: int) -> None:
-        """Allow the robot to fly again after a landing or a stop.
-
-        Raises:
-            ConflictError: If a mission is under way.
-        """
+        """Allow the robot to fly again after a landing or a stop; no mission may be under way."""
         if self._current is not None:
-            raise busy(self._current, "there is nothing to acknowledge")
+            raise _busy(self._current, "there is nothing to acknowledge")
         self._teleop.acknowledge(now_ns)
         self._acknowledges = True
         self._collect(now_ns)
@@ -308,17 +256,12 @@ class MissionService:
         if self._start_next(now_ns) is not None:
             self._operate(self._teleop.pause, now_ns)
 
-    @property
-    def settled(self) -> bool:
-        """Whether telemetry shows that the robot has acted on the last request."""
-        return self._teleop.settled
-
     def hear(self, now_ns: int) -> None:
-        """Note a message from cloud at `now_ns` [ns]."""
+        """Note a message from cloud."""
         self.sight.hear(now_ns)
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Process new telemetry at `now_ns` [ns]."""
+        """Process new telemetry."""
         mission = self._current
         if self._inherits_stop:
             self._repeat_stop(seen, now_ns)
@@ -326,7 +269,7 @@ class MissionService:
         if mission is not None and mission.world and mission.world == seen.world:
             self._note_contacts(mission, seen, now_ns)
             if is_new_session:
-                self._note(mission, "new_session", describe_session(mission), now_ns)
+                self._note(mission, "new_session", _describe_session(mission), now_ns)
         self._teleop.see(seen, now_ns)
         if self._acknowledges and self._teleop.settled:
             self._acknowledges = False
@@ -335,21 +278,8 @@ class MissionService:
                 self._note(stopped, "acknowledged", text, now_ns)
         self._collect(now_ns)
 
-    def _repeat_stop(self, seen: RobotStatus, now_ns: int) -> None:
-        """Repeat the stop of an earlier teleop if the first telemetry shows the stopped mission.
-
-        Telemetry shows another mission if the robot has flown since the stop, or if it is a
-        different robot.
-        """
-        self._inherits_stop = False
-        stopped = self.book.stopped()
-        if stopped is not None and seen.mission_id == stopped.number:
-            self._teleop.stop(now_ns)
-            if self._acknowledges:  # meanwhile
-                self._teleop.acknowledge(now_ns)
-
     def handle_deadline(self, now_ns: int) -> None:
-        """Start a waiting mission, check time limits, and repeat messages due at `now_ns` [ns]."""
+        """Start a waiting mission, check time limits, and repeat the messages that are due."""
         self.book.catch_up(now_ns)
         if not self._ends:
             in_sight = self.sight.seen is not None
@@ -366,7 +296,7 @@ class MissionService:
         return outputs
 
     def state(self, now_ns: int) -> dict[str, Any]:
-        """Return the state of missions and robot for the API at `now_ns` [ns]."""
+        """Return the state of missions and robot for the API."""
         mission = self._current
         return {
             "mission": mission.summary() if mission is not None else None,
@@ -380,7 +310,10 @@ class MissionService:
         """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
         if self._teleop.stopping or self._inherits_stop:
             return "an emergency stop is on its way to the robot"
-        return self.sight.latched
+        seen = self.sight.seen
+        if seen is None or seen.guard not in LATCHED:
+            return ""
+        return f"the guard is in {seen.guard.name} ({seen.cause.words}) and lets nothing fly"
 
     def _check_can_fly(self) -> None:
         if self._ends:
@@ -401,32 +334,40 @@ class MissionService:
         self._collect(now_ns)
         return mission
 
+    def _repeat_stop(self, seen: RobotStatus, now_ns: int) -> None:
+        """Repeat the stop of an earlier teleop if the first telemetry shows the stopped mission.
+
+        Telemetry shows another mission if the robot has flown since, or if it is another robot.
+        """
+        self._inherits_stop = False
+        stopped = self.book.stopped()
+        if stopped is not None and seen.mission_id == stopped.number:
+            self._teleop.stop(now_ns)
+            if self._acknowledges:  # meanwhile
+                self._teleop.acknowledge(now_ns)
+
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
         """Make the first open mission the current one; return the current mission, if any.
 
         If the mission has begun, it continues. If it waits, it starts only with `queued`.
         """
         if self._current is None and (waiting := self.book.open()):
-            if queued and waiting[0].state == store.QUEUED:
-                self.book.begin(waiting[0], now_ns)
-            if waiting[0].state != store.QUEUED:
+            if queued and waiting[0].state == QUEUED:
+                self._note(waiting[0], "starting", ASKED, now_ns)
+            if waiting[0].state != QUEUED:
                 self._take_over(waiting[0], now_ns)
         return self._current
 
     def _take_over(self, mission: Mission, now_ns: int) -> None:
         """Fly a mission that this or an earlier teleop has begun."""
-        self._current, before = mission, mission.before()
-        if before is None:
-            self._teleop.start(now_ns, mission.order.plan, mission.number, again=True)
+        self._current = mission
+        if not mission.world:  # it has not started
+            self._teleop.start(now_ns, mission.order.plan, mission.number)
         else:
-            self._teleop.continue_mission(now_ns, before)
+            self._teleop.continue_mission(now_ns, mission)
             mission.witness = mission.witness.after_restart()
             text = "teleop has restarted; the robot is asked to go on"
             self._note(mission, "restarted", text, now_ns)
-        self._collect(now_ns)
-
-    def _note_start(self, mission: Mission, now_ns: int) -> None:
-        self._note(mission, "starting", "the robot is asked to start", now_ns)
         self._collect(now_ns)
 
     def _note_contacts(self, mission: Mission, seen: RobotStatus, now_ns: int) -> None:
@@ -443,8 +384,9 @@ class MissionService:
             elif isinstance(output, MissionEvent):
                 self._process_event(output, now_ns)
             self._outputs.append(output)
-        if trouble := self.book.news():
-            self._outputs.append(Fault(now_ns, "journal", trouble))
+        told, self._trouble = self._trouble, self.book.trouble
+        if self._trouble not in ("", told):
+            self._outputs.append(Fault(now_ns, "journal", self._trouble))
 
     def _process_event(self, event: MissionEvent, now_ns: int) -> None:
         mission, seen = self._current, self.sight.seen
@@ -471,3 +413,17 @@ class MissionService:
         if mission is self._current:
             changed["elapsed"] = round(self._teleop.elapsed(now_ns), 3)
         self.book.note(mission, event, text, **changed)
+
+
+def _busy(mission: Mission, advice: str) -> ConflictError:
+    return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)
+
+
+def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
+    return seen.pipe_contacts, seen.touch_speed, seen.slip_ns
+
+
+def _describe_session(mission: Mission) -> str:
+    where = f"waypoint {mission.waypoint + 1} of {len(mission.order.plan.legs)}"
+    goes_on = f"is held on the way to {where}" if mission.state == HELD else f"goes on to {where}"
+    return f"the controller has a new session, as after a restart; the mission {goes_on}"

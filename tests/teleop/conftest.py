@@ -13,6 +13,7 @@ import time
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,12 +26,10 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
-from cloudrc.teleop.api import ApiServer, create_app
-from cloudrc.teleop.audit import Audit
-from cloudrc.teleop.auth import Gate, Tokens
-from cloudrc.teleop.bridge import STARTING, Bridge
+from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
+from cloudrc.teleop.auth import Audit, Gate, Tokens
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.models import Surroundings
+from cloudrc.teleop.models import read_order
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import MissionStore, Order
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
@@ -315,11 +314,12 @@ class Running:
         self.flight, self.bridge = ServiceFlight(), Bridge()
         self.alarms, self.complaints = [], []
         self.bridge.alarm = self.note_alarm
-        surroundings = Surroundings(load_scene("pipes"), 60.0, True, assembly.mission_plan)
-        app = create_app(self.bridge, surroundings, self.complaints.append)
+        scene, plan = load_scene("pipes"), assembly.mission_plan
+        read = partial(read_order, scene=scene, time_limit=60.0, contact=True, plan=plan)
+        app = create_app(self.bridge, scene, read, self.complaints.append)
         self.audit_file = folder / "audit.jsonl"
         audit = Audit(self.audit_file, self.complaints.append)
-        self.gate = Gate(app, None if unix else Tokens(folder), audit)
+        self.gate = Gate(app, None if unix else Tokens(folder, self.complaints.append), audit)
         self.address = folder / "api.sock" if unix else (host, 0)
         self.server = ApiServer(self.gate, self.bridge, self.address)
         self.token_file = folder / "operator"
@@ -339,8 +339,7 @@ class Running:
 
     def reset(self):
         """Begin again with another robot and service, and keep the server."""
-        for replaced in ("take", "submit"):
-            vars(self.bridge).pop(replaced, None)
+        vars(self.bridge).pop("take", None)
         self.bridge.alarm, self.bridge.overtakings = self.note_alarm, 0
         self.until(lambda: not self.gate._in_flight.total())
         for kept in (self.alarms, self.complaints, self.gate.counts):

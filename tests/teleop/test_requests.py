@@ -12,7 +12,7 @@ from cloudrc.teleop.wire import (
     RobotStatus,
 )
 from cloudrc.tunnel.codec import NUMBER_MAX
-from tests.teleop.conftest import FROM_SPAWN, ID, PLAN, A, B, Flight, asked, flying
+from tests.teleop.conftest import FROM_SPAWN, ID, PLAN, THREE, A, Flight, asked, flying
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -54,7 +54,7 @@ def test_numbers_go_on_well_above_what_the_robot_shows():
     flight = Flight()
     flight.mission = 41  # a cloud that has been restarted since has asked for these
     flight.step()
-    flight.operate("go_to", B)
+    flight.operate("start", THREE)
     flight.step(seconds=0.05)
     assert flight.requests[0].number == 41 + PREDECESSORS
     assert flight.state == "FLYING"
@@ -156,7 +156,7 @@ def test_nothing_supersedes_a_stop():
     flight.operate("stop")
     flight.step(seconds=0.2)
     count = len(flight.requests)
-    flight.operate("go_to", (1.0, 0.0, 1.0))
+    flight.operate("start", THREE)
     flight.step(seconds=1.0)
     assert {r.request for r in flight.requests[count:]} == {Request.ESTOP}
     flight.downlink = True

@@ -17,7 +17,8 @@ from cloudrc.messages import (
     Start,
 )
 from cloudrc.teleop import wire
-from cloudrc.teleop.bridge import Bridge
+from cloudrc.teleop.api import Bridge
+from cloudrc.teleop.service import QUEUE_MAX
 from cloudrc.teleop.store import ENDED, SHOWN, STATES, ConflictError, Order
 from cloudrc.teleop.wire import Leg, Plan
 from tests.teleop.conftest import (
@@ -73,6 +74,15 @@ def test_a_key_is_that_of_one_order_for_ever():
                 flight.teleop.create(order, flight.now_ns)
         flight.restart_teleop()
     assert flight.create(key="another") == "m2"
+
+
+def test_the_queue_of_missions_is_bounded():
+    flight, _ = service_flying()
+    for _ in range(QUEUE_MAX):
+        flight.create(queue=True)
+    with pytest.raises(ConflictError, match=f"{QUEUE_MAX} missions wait already") as refused:
+        flight.create(queue=True)
+    assert refused.value.mission == "m1"
 
 
 def test_a_second_mission_is_refused_or_waits_for_the_first():
@@ -402,7 +412,7 @@ def test_after_a_stall_the_stop_belongs_to_the_stopped_mission(stops):
     flight.guard = ESTOP
     cloud = SimpleNamespace(receive=lambda: [wire.encode(flight.seen)])
     blind = {"blind": 2, "late_ns": 0, "now_ns": flight.now_ns + 5_000_000_000}
-    turn(flight.teleop, cloud, wire.decode, bridge.take, stops=bridge.take_urgent, **blind)
+    turn(flight.teleop, cloud, wire.decode, bridge.take, stops=bridge.take_stop, **blind)
     assert {each.result().id for each in urgent} == {mission_id}, "all are one stop"
     assert looked.result() == "ESTOP", "what is no stop is asked of the present"
     flight.step(seconds=0.1)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cloudrc.cli.teleop import _Ending
+from cloudrc.cli.teleop import ending
 from cloudrc.drivers.teleop import serve_teleop
 from cloudrc.messages import (
     Cause,
@@ -162,7 +162,7 @@ def test_a_slow_disk_does_not_delay_the_pause_at_shutdown(monkeypatch, fsync_ns)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
     cloud, service = Neighbour(flight.teleop.sight.seen), flight.teleop
-    how = {"calls": list, "tell": lambda told: None, "stop": _Ending(service, lambda: True)}
+    how = {"calls": list, "tell": lambda told: None, "stop": ending(service, lambda: True)}
     serve_teleop(service, cloud, wire.encode, wire.decode, **how)
     said = [each.request for each in cloud.said if isinstance(each, OperatorRequest)]
     assert said.count(Request.END) >= 3
