@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.config.schema import Mission
     from cloudrc.drivers.exporter import Exporter
+    from cloudrc.geometry.scene import Scene
     from cloudrc.records import Record
     from cloudrc.teleop.api import ApiServer
     from cloudrc.teleop.service import MissionService
@@ -95,6 +96,7 @@ def execute(options: argparse.Namespace) -> int:
     """Run teleop until its mission has ended or a signal stops the process."""
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.process import StopSignal
+    from cloudrc.geometry.scene import load_scene
     from cloudrc.teleop.service import MissionService
 
     if options.api:
@@ -104,13 +106,14 @@ def execute(options: argparse.Namespace) -> int:
     if exporter is not None:
         exporter.runs(fingerprint(experiment))
     with ExitStack() as opened:
-        server = serve_api(options, experiment) if options.api else None
+        scene = load_scene(experiment.world.scene)
+        server = serve_api(options, experiment, scene) if options.api else None
         if server is not None:
             opened.callback(server.stop)
         book = _open_store(options.journal, stop, server)
         if book is not None:  # else stopped while another teleop held the journal
             opened.callback(book.close)
-            service = MissionService(experiment.criteria.contact_speed_max_mps, book)
+            service = MissionService(experiment.criteria.contact_speed_max_mps, book, scene)
             single_mission = _start(options, experiment, service)
             may_end = ending(service, stop)
             over = lambda: may_end() or (single_mission and service.over)  # noqa: E731
@@ -118,31 +121,30 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-def serve_api(options: argparse.Namespace, experiment: ResolvedExperiment) -> ApiServer:
+def serve_api(
+    options: argparse.Namespace, experiment: ResolvedExperiment, scene: Scene
+) -> ApiServer:
     """Start the API; until its bridge is opened, the API answers that teleop is not ready."""
     from cloudrc import assembly
-    from cloudrc.geometry.scene import load_scene
     from cloudrc.link.state import publish
     from cloudrc.teleop.api import ApiServer, Bridge, create_app
     from cloudrc.teleop.auth import Audit, Gate, Tokens
-    from cloudrc.teleop.models import read_order
+    from cloudrc.teleop.models import read_goto, read_order
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)
-    criteria, scene = experiment.criteria, load_scene(experiment.world.scene)
+    criteria = experiment.criteria
     plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
-    read = partial(
-        read_order,
-        scene=scene,
-        time_limit=criteria.time_limit_s,
-        contact=criteria.contact,
+    order = partial(
+        read_order, scene=scene, time_limit=criteria.time_limit_s, contact=criteria.contact,
         plan=plan,
-    )
+    )  # fmt: skip
+    goto = partial(read_goto, scene=scene)
     tokens = Tokens(options.tokens, log_line) if options.tokens else None
     audit = Audit(options.audit, log_line) if options.audit else None
     bridge = Bridge()
-    gate = Gate(create_app(bridge, scene, read, log_line), tokens, audit)
-    server = ApiServer(gate, bridge, options.api)
+    app = create_app(bridge, order, goto, log_line)
+    server = ApiServer(Gate(app, tokens, audit), bridge, options.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
     resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))

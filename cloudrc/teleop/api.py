@@ -14,7 +14,6 @@ import threading
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from functools import partial
-from math import radians
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -27,17 +26,18 @@ from starlette.requests import ClientDisconnect
 from cloudrc import __version__
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.geometry.scene import Scene
 from cloudrc.teleop import models
 from cloudrc.teleop.auth import BEARER, IN_FLIGHT_MAX, Gate
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import (
     ConflictError,
     Event,
+    Mission,
     Order,
     UnavailableError,
     UnknownMissionError,
 )
+from cloudrc.teleop.wire import Leg
 
 LOOK_PERIOD = 0.1
 """Time between two checks for new events [s]."""
@@ -51,27 +51,25 @@ BODY_MAX, BODY_LIMIT = 256 * 1024, 5.0
 """Longest body of a request [bytes], and time limit for it to arrive [s]."""
 HEAD_MAX = 4_096
 """Longest head of a request [bytes]."""
-KEEP_ALIVE, STOP_LIMIT = 5, 1
-"""Limits for an idle connection, and for open requests when the server stops [s]."""
-BACKLOG = 1_024
-"""Limit of the connections that the server has not accepted yet."""
+STOP_LIMIT = 1
+"""Time limit for open requests when the server stops [s]."""
 STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
 """Error -> HTTP status of the answer."""
+REASONS = {
+    401: "There is no valid token in the request",
+    403: "The token is a reader's",
+    404: "There is no such mission",
+    408: f"The body did not arrive within {BODY_LIMIT:g} s",
+    409: "The state does not allow it; `id` names the mission in the way",
+    413: f"The body is longer than {BODY_MAX // 1024} KiB",
+    422: "A value cannot be used; `problems` has every one",
+    429: "Too many requests at the same time; try again in a second",
+    503: "Not now: teleop starts or ends, another has the journal, it cannot be written, or "
+    "too much waits: try again. Or teleop did not answer within 2 s, and may do it yet: look. "
+    "An emergency stop is told all the same, unless another teleop flies the robot",
+}
 REFUSALS: dict[int | str, dict[str, Any]] = {
-    code: {"model": models.Refusal, "description": text}
-    for code, text in {
-        401: "There is no valid token in the request",
-        403: "The token is a reader's",
-        404: "There is no such mission",
-        408: f"The body did not arrive within {BODY_LIMIT:g} s",
-        409: "The state does not allow it; `id` names the mission in the way",
-        413: f"The body is longer than {BODY_MAX // 1024} KiB",
-        422: "A value cannot be used; `problems` has every one",
-        429: "Too many requests at the same time; try again in a second",
-        503: "Not now: teleop starts or ends, another has the journal, it cannot be written, or "
-        "too much waits: try again. Or teleop did not answer within 2 s, and may do it yet: look. "
-        "An emergency stop is told all the same, unless another teleop flies the robot",
-    }.items()
+    code: {"model": models.Refusal, "description": text} for code, text in REASONS.items()
 }
 ABOUT = """\
 Fly missions, or steer by hand. One mission is flown at a time; a second one is refused with the
@@ -84,7 +82,7 @@ other requests are refused as too many.
 """
 STARTING = "teleop is starting"
 Call: TypeAlias = Callable[[MissionService, int], Any]
-"""Function that takes the service and the current time [ns] and returns the answer."""
+"""Function that takes the service and the time [ns] and returns the answer, or a mission."""
 Urgent: TypeAlias = Literal["stop", "hold"]
 Address: TypeAlias = tuple[str, int] | Path
 """Host and port, or the path of a Unix socket."""
@@ -184,23 +182,24 @@ class Bridge:
         assert self._service is not None, "calls are taken after `open` only"
         if future.set_running_or_notify_cancel():
             try:
-                future.set_result(call(self._service, now_ns))
+                result = call(self._service, now_ns)
+                future.set_result(result.as_json() if isinstance(result, Mission) else result)
             except Exception as error:  # the client has to get it
                 future.set_exception(error)
 
 
 def create_app(
     bridge: Bridge,
-    scene: Scene,
     read_order: Callable[[bytes], Order],
+    read_goto: Callable[[bytes], Leg],
     complain: Callable[[str], None],
 ) -> FastAPI:
     """Make the ASGI application; it must run behind a `Gate`.
 
     Args:
         bridge: Bridge to the mission service.
-        scene: Scene for the check of ways.
         read_order: Reads and checks the body of a mission.
+        read_goto: Reads and checks the body of a point.
         complain: Receives one line about each internal error.
     """
     app = FastAPI(
@@ -211,7 +210,7 @@ def create_app(
         redoc_url=None,
         redirect_slashes=False,
     )
-    app.state.bridge, app.state.scene, app.state.read_order = bridge, scene, read_order
+    app.state.bridge, app.state.read_order, app.state.read_goto = bridge, read_order, read_goto
 
     @app.exception_handler(CloudrcError)
     async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
@@ -245,9 +244,9 @@ async def _body(request: Request) -> bytes:
             async for chunk in request.stream():
                 body += chunk
                 if len(body) > BODY_MAX:
-                    raise HTTPException(413, REFUSALS[413]["description"])
+                    raise HTTPException(413, REASONS[413])
     except TimeoutError:
-        raise HTTPException(408, REFUSALS[408]["description"]) from None
+        raise HTTPException(408, REASONS[408]) from None
     return body
 
 
@@ -274,11 +273,9 @@ router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUS
 )
 async def fly_mission(body: Body, bridge: Bridged, request: Request, response: Response) -> Any:
     """Fly a mission, or queue it."""
-    state = request.app.state
-    order = await run_in_threadpool(state.read_order, body)
+    order = await run_in_threadpool(request.app.state.read_order, body)
 
     def call(service: MissionService, now_ns: int) -> tuple[dict[str, Any], bool]:
-        models.check_first_way(service, order, state.scene)
         mission, new = service.create(order, now_ns)
         return mission.as_json(), new
 
@@ -290,39 +287,38 @@ async def fly_mission(body: Body, bridge: Bridged, request: Request, response: R
 @router.get("/missions", response_model=models.MissionList)
 async def list_missions(bridge: Bridged) -> Any:
     """List all missions, oldest first."""
-    return await bridge.ask(lambda service, now_ns: {"missions": service.book.summaries()})
+
+    def call(service: MissionService, now_ns: int) -> list[dict[str, Any]]:
+        return [mission.summary() for mission in service.book.missions.values()]
+
+    return {"missions": await bridge.ask(call)}
 
 
 @router.get("/missions/{id}", response_model=models.MissionView)
 async def show_mission(id: str, bridge: Bridged) -> Any:
     """Show one mission as it is."""
-    return await bridge.ask(lambda service, now_ns: service.book.find(id).as_json())
+    return await bridge.ask(lambda service, now_ns: service.book.find(id))
 
 
 @router.post("/missions/{id}/cancel", response_model=models.MissionView)
 async def cancel_mission(id: str, bridge: Bridged) -> Any:
     """End a mission."""
-    return await bridge.ask(lambda service, now_ns: service.cancel(id, now_ns).as_json())
+    return await bridge.ask(lambda service, now_ns: service.cancel(id, now_ns))
 
 
 @router.post("/hold", response_model=models.MissionView)
 async def hold(bridge: Bridged) -> Any:
     """Stop where the robot is, 0.35 m up at least."""
-    return await bridge.ask(lambda service, now_ns: service.hold(now_ns).as_json(), "hold")
+    return await bridge.ask(MissionService.hold, "hold")
 
 
 @router.post("/resume", response_model=models.MissionView)
-async def resume(bridge: Bridged, request: Request) -> Any:
+async def resume(bridge: Bridged) -> Any:
     """Go on with what is held, straight to its next waypoint.
 
     A pipe's wall in the way is refused (409).
     """
-
-    def call(service: MissionService, now_ns: int) -> Any:
-        models.check_way(service, None, request.app.state.scene)
-        return service.resume(now_ns).as_json()
-
-    return await bridge.move(call)
+    return await bridge.move(MissionService.resume)
 
 
 @router.post("/goto", response_model=models.MissionView, openapi_extra=_takes(models.GoToRequest))
@@ -331,14 +327,8 @@ async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
 
     A pipe's wall in the way is refused (409).
     """
-    scene = request.app.state.scene
-    point = await run_in_threadpool(models.read_goto, body, scene)
-
-    def call(service: MissionService, now_ns: int) -> Any:
-        models.check_way(service, point.position_m, scene)
-        return service.go_to(point.position_m, radians(point.yaw_deg), now_ns).as_json()
-
-    return await bridge.move(call)
+    leg = await run_in_threadpool(request.app.state.read_goto, body)
+    return await bridge.move(lambda service, now_ns: service.go_to(leg, now_ns))
 
 
 @router.post("/estop", response_model=models.Stopped)
@@ -348,7 +338,7 @@ async def stop_rotors(bridge: Bridged) -> Any:
     It falls, and stays off until acknowledged.
     """
     mission = await bridge.ask(MissionService.stop_rotors, "stop")
-    return {"id": mission.id if mission else None, "state": "stopping"}
+    return {"id": mission["id"] if mission else None, "state": "stopping"}
 
 
 @router.post("/acknowledge", response_model=models.Acknowledged)
@@ -405,7 +395,7 @@ async def _stream(request: Request, bridge: Bridge, number: int) -> AsyncIterato
         await asyncio.sleep(LOOK_PERIOD)
 
 
-class ApiServer:
+class ApiServer(uvicorn.Server):
     """Serve the API in a separate thread, from `start` to `stop`.
 
     Attributes:
@@ -426,12 +416,9 @@ class ApiServer:
                 "--api HOST:PORT needs --tokens DIR, with a file 'operator' in it; "
                 "without tokens only a socket file is served: --api unix:PATH"
             )
-        self.gate, self.bridge = gate, bridge
-        self._socket, self.url = _bind(address)
-        self._server = uvicorn.Server(
+        super().__init__(
             uvicorn.Config(
                 gate,
-                loop="asyncio",
                 http="h11",
                 ws="none",
                 lifespan="off",
@@ -440,15 +427,14 @@ class ApiServer:
                 server_header=False,
                 proxy_headers=False,  # the audit log names whoever connects
                 # No limit_concurrency: uvicorn would refuse an emergency stop, too.
-                backlog=BACKLOG,
                 h11_max_incomplete_event_size=HEAD_MAX,
-                timeout_keep_alive=KEEP_ALIVE,
                 timeout_graceful_shutdown=STOP_LIMIT,
             )
         )
+        self.gate, self.bridge = gate, bridge
+        self._socket, self.url = _bind(address)
         # A daemon, so that a client that hangs cannot keep the process from ending.
-        run = self._server.run
-        self._thread = threading.Thread(target=run, args=([self._socket],), daemon=True)
+        self._thread = threading.Thread(target=self.run, args=([self._socket],), daemon=True)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -465,7 +451,7 @@ class ApiServer:
     def stop(self) -> None:
         """Answer the open requests, end the streams, and stop."""
         self.bridge.closed = "teleop ends"
-        self._server.should_exit = True
+        self.should_exit = True
         self._thread.join(STOP_LIMIT)
         self._socket.close()
         if self.gate.audit is not None:
@@ -482,15 +468,12 @@ def _bind(address: Address) -> tuple[socket.socket, str]:
                 address.unlink()
             os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
             unix.bind(str(address))
-            unix.listen(BACKLOG)
             return unix, url
         host, port = address[0].strip("[]"), address[1]
         is_6 = ":" in host
         url = f"http://[{host}]:{port}" if is_6 else f"http://{host}:{port}"
         family = socket.AF_INET6 if is_6 else socket.AF_INET
-        server = socket.create_server(  # [::] serves IPv4, too
-            (host, port), family=family, backlog=BACKLOG, dualstack_ipv6=is_6
-        )
+        server = socket.create_server((host, port), family=family, dualstack_ipv6=is_6)
     except (OSError, UnicodeError) as error:  # no host has a name with an empty label
         unix.close()
         reason = getattr(error, "strerror", None) or error

@@ -45,6 +45,16 @@ ORDERS = ("/v1/missions", "/v1/goto")
 """Commands whose refusals are counted: orders to fly a mission or to fly to a point."""
 COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
 """HTTP status of a refused order -> name under which it is counted."""
+REFUSED = {
+    401: (
+        "token",
+        "a valid token is needed: Authorization: Bearer TOKEN",
+        {"WWW-Authenticate": "Bearer"},
+    ),
+    403: ("role", "this token may look, not command: an operator's is needed", None),
+    429: ("busy", "too many requests; try again in a second", {"Retry-After": "1"}),
+}
+"""HTTP status of a refused request -> name under which it is counted, text and headers."""
 IN_FLIGHT_MAX = 32
 """Limit of the requests of one role that are answered at the same time, including streams."""
 AUDIT_MAX = 8 << 20
@@ -181,27 +191,27 @@ class Gate:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request; ignore a slash at the end of its path."""
-        scope["path"] = path = scope["path"].rstrip("/") or "/"
-        caller, is_command = await self.caller(scope), scope["method"] not in READS
-        refusal: tuple[int, str, str] | None = None
-        if caller is None:
-            refusal = 401, "token", "a valid token is needed: Authorization: Bearer TOKEN"
-        elif is_command and caller.role != OPERATOR:
-            refusal = 403, "role", "this token may look, not command: an operator's is needed"
-        elif self._in_flight[caller.role] >= IN_FLIGHT_MAX and not (is_command and path in URGENT):
-            refusal = 429, "busy", "too many requests; try again in a second"
-        if caller is None or refusal is not None:
-            assert refusal is not None
-            status, reason, detail = refusal
+        scope["path"] = scope["path"].rstrip("/") or "/"
+        # For a stream, which may outlive its token.
+        caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)
+        status = self._refusal(caller, scope)
+        if caller is None or status:
+            reason, detail, headers = REFUSED[status]
             self.counts[reason] += 1
-            headers = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}}.get(status)
             await JSONResponse({"detail": detail}, status, headers)(scope, receive, send)
             return
+        answer: Message = {"status": 500}
+
+        async def keep(message: Message) -> None:
+            answer.update(message)
+            await send(message)
+
         self._in_flight[caller.role] += 1
         try:
-            await self._serve(caller, scope, receive, send)
+            await self._app(scope, receive, keep)
         finally:
             self._in_flight[caller.role] -= 1
+            self._note(caller, scope, answer)
 
     async def caller(self, scope: Scope) -> Caller | None:
         """Return the caller of a request; None if the caller is unknown."""
@@ -210,21 +220,22 @@ class Gate:
         sent = await BEARER(Request(scope))
         return None if sent is None else self.tokens.caller(sent.credentials)
 
-    async def _serve(self, caller: Caller, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, count it, and log the result if it is a command."""
-        answer: Message = {"status": 500}
+    def _refusal(self, caller: Caller | None, scope: Scope) -> int:
+        """Return the status with which a request is refused; 0 if it is served."""
+        is_command = scope["method"] not in READS
+        if caller is None:
+            return 401
+        if is_command and caller.role != OPERATOR:
+            return 403
+        is_urgent = is_command and scope["path"] in URGENT
+        return 429 if self._in_flight[caller.role] >= IN_FLIGHT_MAX and not is_urgent else 0
 
-        async def keep(message: Message) -> None:
-            answer.update(message)
-            await send(message)
-
-        scope["caller"] = lambda: self.caller(scope)  # for a stream, which may outlive its token
-        try:
-            await self._app(scope, receive, keep)
-        finally:
-            self.counts["served"] += 1
-            self.counts["slow"] += answer["status"] == 408
-            if scope["path"] in ORDERS and answer["status"] in COUNTED:
-                self.counts[COUNTED[answer["status"]]] += 1
-            if self.audit is not None and scope["method"] not in READS:
-                self.audit.note(caller, scope, answer)
+    def _note(self, caller: Caller, scope: Scope, answer: Message) -> None:
+        """Count a request, and log it if it is a command."""
+        status = answer["status"]
+        self.counts["served"] += 1
+        self.counts["slow"] += status == 408
+        if scope["path"] in ORDERS and status in COUNTED:
+            self.counts[COUNTED[status]] += 1
+        if self.audit is not None and scope["method"] not in READS:
+            self.audit.note(caller, scope, answer)

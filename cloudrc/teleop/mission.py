@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
-from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start, Vector
+from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start
 from cloudrc.records import MissionEvent
 from cloudrc.teleop.requests import REPEAT_NS, RequestSender
 from cloudrc.teleop.wire import ALARM, NO_PLAN, Leg, Outcome, Output, Plan, RobotStatus, State
@@ -38,21 +38,9 @@ NO_WAYPOINT = -1
 """Waypoint index of a setpoint or event without a waypoint."""
 UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
 """States of a mission that has begun and not ended."""
-INACTIVE = tuple(state for state in State if state not in UNDER_WAY)
 ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
 """Code of an outcome -> state of the mission at its end; all other codes lead to FAILED."""
 END_LOST = "end_lost", "the robot reports that the mission is over, but its outcome is lost;"
-RULES: dict[str, tuple[tuple[State, ...], str]] = {
-    "start": (INACTIVE, "cancel it first"),
-    "continue": ((State.IDLE,), "teleop has already flown a mission"),
-    "hold": ((State.FLYING,), "it must be flying"),
-    "resume": ((State.HELD,), "it must be held"),
-    "cancel": (UNDER_WAY, "no mission is under way"),
-    "goto": ((State.HELD,), "hold or cancel it first"),
-    "acknowledge": (INACTIVE, "the robot flies a mission"),
-    "pause": (UNDER_WAY, "no mission is under way"),
-}
-"""Verb -> states that allow it, and the reason for the refusal in other states."""
 GAP_MAX_NS = 500_000_000
 """Limit of the time of flight that counts between two telemetry messages [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
@@ -109,8 +97,7 @@ class Teleop:
 
     Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, a verb for each wish of the
     operator, and `take_outputs` after each of them. A setpoint is valid until the next one, within
-    its session. All times `now_ns` are of the caller's clock [ns]. A verb raises BadInputError, and
-    changes nothing, if the state of the mission does not allow it.
+    its session. All times `now_ns` are of the caller's clock [ns].
 
     Attributes:
         state: State of the mission.
@@ -156,7 +143,6 @@ class Teleop:
 
     def start(self, now_ns: int, plan: Plan, mission_id: int = 0) -> None:
         """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0."""
-        self._check("start")
         self._order(plan, mission_id, now_ns)
         here = None if plan.start is Start.SPAWN else self._seen
         self._world = here.world if here else ANY_WORLD
@@ -168,7 +154,6 @@ class Teleop:
 
     def continue_mission(self, now_ns: int, mission: Mission) -> None:
         """Take over a mission of an earlier teleop at its current waypoint; do not reset world."""
-        self._check("continue")
         self._order(mission.order.plan, mission.number, now_ns - round(mission.elapsed * 1e9))
         self.leg, self._world, self._expected = mission.waypoint, mission.world, (mission.number,)
         self._continued, self._was_held = True, mission.state == "held"
@@ -178,29 +163,28 @@ class Teleop:
         if self._seen:
             self.see(self._seen, now_ns)  # the mission may be over, or the world another one
 
-    def go_to(self, now_ns: int, position: Vector, yaw: float = 0.0) -> None:
-        """Move the held robot to a point: `position` [m], world frame, shape (3,); `yaw` [rad]."""
-        self._check("goto")
-        x, y, z = position
+    def go_to(self, now_ns: int, leg: Leg) -> None:
+        """Move the robot to a point; raise BadInputError unless the mission is held."""
+        self._check("goto", State.HELD)
+        x, y, z = leg.position
         self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
-        self._select(Setpoint(position, yaw, NO_WAYPOINT))
+        self._select(Setpoint(leg.position, leg.yaw, NO_WAYPOINT))
 
     def hold(self, now_ns: int) -> None:
-        """Hold the robot at its position and interrupt the mission."""
-        self._check("hold")
+        """Hold the robot at its position; raise BadInputError unless it flies a mission."""
+        self._check("hold", FLYING)
         self._hold(now_ns)
 
     def resume(self, now_ns: int) -> None:
-        """Continue the held leg."""
-        self._check("resume")
+        """Continue the held leg; raise BadInputError unless the mission is held."""
+        self._check("resume", State.HELD)
         self.state = FLYING
         self._watch.pause()
         self._select_leg(self.leg)
         self._report("resumed", self.leg, f"resumed {self._where()}", now_ns)
 
     def cancel(self, now_ns: int) -> None:
-        """End the mission."""
-        self._check("cancel")
+        """End the mission under way."""
         self._end("cancelled", "mission cancelled", now_ns)
 
     def stop(self, now_ns: int) -> None:
@@ -219,12 +203,10 @@ class Teleop:
 
     def acknowledge(self, now_ns: int) -> None:
         """Allow the robot to fly again after a landing or a stop."""
-        self._check("acknowledge")
         self.requests.ask(Request.ACKNOWLEDGE, after=True)
 
     def pause(self, now_ns: int) -> None:
         """Ask the robot to hold until the next teleop continues the mission."""
-        self._check("pause")
         self._report("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
         self.requests.ask(Request.END)
         self._select_here()  # cloud keeps this setpoint if the request is lost
@@ -271,10 +253,10 @@ class Teleop:
         elif (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
 
-    def _check(self, verb: str) -> None:
-        allowed, why = RULES[verb]
-        if self.state not in allowed:
-            raise BadInputError(f"{verb}: the mission is {self.state.name}; {why}")
+    def _check(self, verb: str, needed: State) -> None:
+        if self.state is not needed:
+            text = f"{verb}: the mission is {self.state.name}; it must be {needed.name.lower()}"
+            raise BadInputError(text)
 
     def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
         """Find a failure in telemetry that ends the mission; return its code and its text."""

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from math import cos, radians, sin
 from typing import Annotated, Any, Literal, TypeVar
 
-import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
@@ -19,13 +18,10 @@ from cloudrc.config.problems import Problem as ConfigProblem
 from cloudrc.config.problems import from_pydantic
 from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeLimit, Waypoint
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.placement import find_crossed_pipe
 from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import Start, Vector
-from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import HELD, SHOWN, ConflictError, Order
-from cloudrc.teleop.wire import Plan
+from cloudrc.teleop.store import SHOWN, Order
+from cloudrc.teleop.wire import Leg, Plan
 
 PROBLEMS_MAX = 50
 """Limit of the problems of one request that the answer describes."""
@@ -122,7 +118,7 @@ class Event(_Answer):
         description="queued, starting, started, reached, held, resumed, goto, restarted, "
         "new_session, board_touched, pipe_touched, paused; at the end done, cancelled, timed_out, "
         "leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over or "
-        "end_lost; acknowledged after emergency_stopped"
+        "end_lost"
     )
     waypoint: int = Field(description="Index of the waypoint concerned")
     text: str = Field(description="The same in words")
@@ -247,12 +243,8 @@ def read_order(
 ) -> Order:
     """Read a mission, check it, and plan it; raise RefusedError with all its problems.
 
-    Args:
-        body: The mission, JSON.
-        scene: The scene for the check of waypoints.
-        time_limit: Time limit of a mission without its own [s].
-        contact: Whether a mission that leads to the board has to touch it, if it does not say so.
-        plan: Makes a plan from a checked mission and its time limit [s].
+    `time_limit` [s] and `contact` (the board has to be touched if the mission leads there) are for
+    missions that do not say so; `plan` makes a plan from a mission and its time limit [s].
     """
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # an experiment's mission may have steps in their place
@@ -266,46 +258,14 @@ def read_order(
     return Order(planned, request.name, request.key, contact, request.queue)
 
 
-def read_goto(body: bytes, scene: Scene) -> GoToRequest:
+def read_goto(body: bytes, scene: Scene) -> Leg:
     """Read a point and check it; raise RefusedError with all its problems."""
     request = _parse(body, GoToRequest)
     waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
     problems = check_mission(Mission(start="here", waypoints=(waypoint,)), scene)
     if problems:
         raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
-    return request
-
-
-def check_way(service: MissionService, target: Vector | None, scene: Scene) -> None:
-    """Raise ConflictError if the straight way from the robot to a point crosses a pipe's wall.
-
-    Args:
-        service: The service; call this function in its thread.
-        target: End of the way [m], world frame, shape (3,); None: the next waypoint of the held
-            mission.
-        scene: Scene with the pipes.
-    """
-    seen, waiting = service.sight.seen, service.book.open()
-    mission = waiting[0] if waiting else None
-    if target is None and mission is not None:
-        target = mission.order.plan.legs[mission.waypoint].position
-    if seen is None or target is None or (mission is not None and mission.state != HELD):
-        return  # the service refuses it for another reason, or there is nothing to check
-    through = int(find_crossed_pipe(scene, np.array([seen.position]), np.array([target]))[0])
-    if through >= 0:
-        here, there = (f"[{', '.join(f'{v:.2f}' for v in p)}]" for p in (seen.position, target))
-        reason = (
-            f"the straight way from where the robot is, {here}, to {there} leads through the wall "
-            f"of {scene.pipes[through].name}; go round it first, by 'cloudrc mission goto'"
-        )
-        raise ConflictError(reason, mission.id if mission else "")
-
-
-def check_first_way(service: MissionService, order: Order, scene: Scene) -> None:
-    """Check the way to the first waypoint of a mission that begins at once, where the robot is."""
-    begins = not service.book.open() and service.book.with_key(order.key) is None
-    if begins and order.plan.start is Start.HERE:
-        check_way(service, order.plan.legs[0].position, scene)
+    return Leg(request.position_m, radians(request.yaw_deg))
 
 
 def leads_to_board(mission: Mission, scene: Scene) -> bool:

@@ -1,18 +1,21 @@
 """Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
 
 After a restart of teleop, a mission under way continues at the same waypoint, if world has not
-restarted. An emergency stop survives, too: a new teleop that finds a stop without acknowledgement
-in the store sends it again, unless the robot has flown another mission since then.
+restarted. An emergency stop survives, too: a new teleop that finds the robot in flight although the
+store says that its mission was stopped sends the stop again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
+import numpy as np
+
 from cloudrc.errors import BadInputError
-from cloudrc.messages import GuardState, Setpoint, Start, Vector
+from cloudrc.geometry.placement import find_crossed_pipe
+from cloudrc.geometry.scene import Scene
+from cloudrc.messages import GuardState, Setpoint, Start
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.mission import Teleop
@@ -28,8 +31,8 @@ from cloudrc.teleop.store import (
 from cloudrc.teleop.wire import Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-LATCHED = (LAND, ESTOP)
-"""States of the guard that end only when the operator acknowledges them."""
+LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
+"""States of the guard that only an acknowledgement ends, and those in which rotors may turn."""
 SILENCE = 1.0
 """Age above which telemetry or the last message of cloud counts as too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
@@ -78,53 +81,52 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 
 
 class RobotView:
-    """The robot as shown by its newest telemetry; `seen` is None before the first."""
+    """The robot as shown by its newest telemetry.
+
+    Attributes:
+        seen: The newest telemetry; None before the first.
+        heard_ns: Time of the last message from cloud [ns]; None before the first.
+    """
 
     def __init__(self) -> None:
         self.seen: RobotStatus | None = None
+        self.heard_ns: int | None = None
         self._seen_ns = self._guard_ns = 0
-        self._heard_ns: int | None = None
-
-    def hear(self, now_ns: int) -> None:
-        """Note a message from cloud at `now_ns` [ns]."""
-        self._heard_ns = now_ns
-
-    def cloud_age(self, now_ns: int) -> float | None:
-        """Return the time since the last message from cloud [s]; None before the first."""
-        return None if self._heard_ns is None else (now_ns - self._heard_ns) * 1e-9
 
     def see(self, seen: RobotStatus, now_ns: int) -> bool:
         """Note telemetry; return whether it is the first of a new session with the same robot."""
-        before, self.seen, self._seen_ns = self.seen, seen, now_ns
-        self.hear(now_ns)
+        before, self.seen, self._seen_ns, self.heard_ns = self.seen, seen, now_ns, now_ns
         same = before is not None and before.world == seen.world
         if before is None or not same or before.guard is not seen.guard:
             self._guard_ns = now_ns
         return before is not None and same and before.epoch != seen.epoch
 
-    def show(self, now_ns: int, mission: str | None) -> dict[str, Any] | None:
-        """Return the robot's state for the API; None before the first telemetry.
-
-        `mission` is the state of the mission under way, or None.
-        """
-        seen, age, cloud_age = self.seen, (now_ns - self._seen_ns) * 1e-9, self.cloud_age(now_ns)
-        if seen is None or cloud_age is None:
-            return None
-        return {
-            "age_s": age,
-            "epoch": seen.epoch,
-            "world": seen.world,
-            "position_m": [finite_or_none(value) for value in seen.position],
-            "guard": seen.guard.name,
-            "cause": seen.cause.words,
-            "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
-            "next_step": next_step(seen.guard, age, cloud_age, mission),
-            "pipe_contacts": seen.pipe_contacts,
-            "touch_speed_mps": finite_or_none(seen.touch_speed),
-            "horizon_s": finite_or_none(seen.horizon),
-            "rtt_s": finite_or_none(seen.rtt),
-            "loop_delay_s": finite_or_none(seen.loop_delay),
-        }
+    def show(self, now_ns: int, mission: str | None) -> dict[str, Any]:
+        """Return the state of robot and cloud for the API; `mission` is that of the mission."""
+        if self.heard_ns is None:
+            return {"cloud_age_s": None, "seen": None}
+        seen, age = self.seen, (now_ns - self._seen_ns) * 1e-9
+        cloud_age = (now_ns - self.heard_ns) * 1e-9
+        shown = (
+            None
+            if seen is None
+            else {
+                "age_s": age,
+                "epoch": seen.epoch,
+                "world": seen.world,
+                "position_m": [finite_or_none(value) for value in seen.position],
+                "guard": seen.guard.name,
+                "cause": seen.cause.words,
+                "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
+                "next_step": next_step(seen.guard, age, cloud_age, mission),
+                "pipe_contacts": seen.pipe_contacts,
+                "touch_speed_mps": finite_or_none(seen.touch_speed),
+                "horizon_s": finite_or_none(seen.horizon),
+                "rtt_s": finite_or_none(seen.rtt),
+                "loop_delay_s": finite_or_none(seen.loop_delay),
+            }
+        )
+        return {"cloud_age_s": cloud_age, "seen": shown}
 
 
 class MissionService:
@@ -138,14 +140,17 @@ class MissionService:
         book: The missions.
     """
 
-    def __init__(self, contact_speed_max: float, book: MissionStore) -> None:
+    def __init__(
+        self, contact_speed_max: float, book: MissionStore, scene: Scene | None = None
+    ) -> None:
         """Begin with the missions of a store; nothing flies before the first deadline.
 
         Args:
             contact_speed_max: Speed limit for the arm's tip when it touches the board [m/s].
             book: Missions of this teleop and of earlier ones.
+            scene: Scene with the pipes that may be in the way; None if ways are not checked.
         """
-        self._contact_speed_max = contact_speed_max
+        self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
         self.sight, self.book = RobotView(), book
         self._setpoint: Setpoint | None = None
@@ -154,9 +159,8 @@ class MissionService:
         self._ends = False  # whether this process ends; the next one starts the queued missions
         self._teleop = Teleop(book.has_ended)
         self._trouble = ""  # of the store, as last reported
-        # Whether an earlier teleop has sent a stop; until this process is asked for one.
+        # Whether an earlier teleop may have sent a stop that the robot has not heard of.
         self._inherits_stop = book.stopped() is not None
-        self._acknowledges = False  # whether the robot has still to act on an acknowledgement
 
     @property
     def over(self) -> bool:
@@ -186,14 +190,13 @@ class MissionService:
         if len(waiting) > QUEUE_MAX:
             raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
         self._check_can_fly()
+        if order.plan.start is Start.HERE and not waiting:
+            self._check_way(order.plan.legs[0])
         mission = self.book.add(order)
         if waiting:
             self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
         else:
-            self._current = mission
-            self._teleop.start(now_ns, order.plan, mission.number)
-            self._note(mission, "starting", ASKED, now_ns)
-            self._collect(now_ns)
+            self._start_next(now_ns, queued=True)
         return mission, True
 
     def cancel(self, mission_id: str, now_ns: int) -> Mission:
@@ -212,32 +215,28 @@ class MissionService:
         return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
-        """Continue the held mission."""
+        """Continue the held mission, straight to its next waypoint."""
         self._check_can_fly()
+        if (mission := self._current) is not None and mission.state == HELD:
+            self._check_way(mission.order.plan.legs[mission.waypoint])
         return self._operate(self._teleop.resume, now_ns)
 
-    def go_to(self, position: Vector, yaw: float, now_ns: int) -> Mission:
-        """Fly to a point: the new place of a held mission, else a new mission.
-
-        Args:
-            position: The point [m], world frame, shape (3,).
-            yaw: Heading to hold [rad].
-            now_ns: Own clock [ns].
-        """
+    def go_to(self, leg: Leg, now_ns: int) -> Mission:
+        """Fly straight to a point: the new place of a held mission, else a new mission."""
         self._check_can_fly()
         waiting = self.book.open()
-        if waiting and waiting[0].state != HELD:
+        if not waiting:
+            plan = Plan((leg,), Start.HERE, leg.time_limit)
+            return self.create(Order(plan, "goto"), now_ns)[0]
+        if waiting[0].state != HELD:
             raise _busy(waiting[0], "hold or cancel it first")
-        if waiting:
-            return self._operate(partial(self._teleop.go_to, position=position, yaw=yaw), now_ns)
-        leg = Leg(position, yaw)
-        order = Order(Plan((leg,), Start.HERE, leg.time_limit), "goto")
-        return self.create(order, now_ns)[0]
+        self._check_way(leg)
+        return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state; return the mission that this ends, if any."""
         mission = self._start_next(now_ns)
-        self._inherits_stop = self._acknowledges = False
+        self._inherits_stop = False
         self._teleop.stop(now_ns)
         self._collect(now_ns)
         return mission
@@ -247,7 +246,6 @@ class MissionService:
         if self._current is not None:
             raise _busy(self._current, "there is nothing to acknowledge")
         self._teleop.acknowledge(now_ns)
-        self._acknowledges = True
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
@@ -258,24 +256,22 @@ class MissionService:
 
     def hear(self, now_ns: int) -> None:
         """Note a message from cloud."""
-        self.sight.hear(now_ns)
+        self.sight.heard_ns = now_ns
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry."""
         mission = self._current
         if self._inherits_stop:
-            self._repeat_stop(seen, now_ns)
+            self._inherits_stop, stopped = False, self.book.stopped()
+            same = stopped is not None and seen.mission_id == stopped.number
+            if same and seen.guard in AIRBORNE:  # it has not heard of the stop
+                self._teleop.stop(now_ns)
         is_new_session = self.sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
             self._note_contacts(mission, seen, now_ns)
             if is_new_session:
                 self._note(mission, "new_session", _describe_session(mission), now_ns)
         self._teleop.see(seen, now_ns)
-        if self._acknowledges and self._teleop.settled:
-            self._acknowledges = False
-            if (stopped := self.book.stopped()) is not None:
-                text = "the operator has acknowledged the stop"
-                self._note(stopped, "acknowledged", text, now_ns)
         self._collect(now_ns)
 
     def handle_deadline(self, now_ns: int) -> None:
@@ -301,8 +297,7 @@ class MissionService:
         return {
             "mission": mission.summary() if mission is not None else None,
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
-            "cloud_age_s": self.sight.cloud_age(now_ns),
-            "seen": self.sight.show(now_ns, None if mission is None else mission.state),
+            **self.sight.show(now_ns, None if mission is None else mission.state),
         }
 
     @property
@@ -323,6 +318,20 @@ class MissionService:
                 f"{self._blocked}; find the cause, then: cloudrc mission acknowledge"
             )
 
+    def _check_way(self, leg: Leg) -> None:
+        """Raise ConflictError if the straight way from the robot to a leg crosses a pipe's wall."""
+        seen, scene = self.sight.seen, self._scene
+        if seen is None or scene is None:
+            return
+        ways = np.array([seen.position]), np.array([leg.position])
+        through = int(find_crossed_pipe(scene, *ways)[0])
+        if through >= 0:
+            here, there = (f"[{', '.join(f'{v:.2f}' for v in way[0])}]" for way in ways)
+            text = f"the straight way from where the robot is, {here}, to {there} leads through "
+            text += f"the wall of {scene.pipes[through].name}"
+            mission_id = self._current.id if self._current else ""
+            raise ConflictError(f"{text}; go round it first, by 'cloudrc mission goto'", mission_id)
+
     def _operate(self, verb: Callable[[int], None], now_ns: int) -> Mission:
         mission = self._current
         if mission is None:
@@ -333,18 +342,6 @@ class MissionService:
             raise ConflictError(str(error), mission.id) from None
         self._collect(now_ns)
         return mission
-
-    def _repeat_stop(self, seen: RobotStatus, now_ns: int) -> None:
-        """Repeat the stop of an earlier teleop if the first telemetry shows the stopped mission.
-
-        Telemetry shows another mission if the robot has flown since, or if it is another robot.
-        """
-        self._inherits_stop = False
-        stopped = self.book.stopped()
-        if stopped is not None and seen.mission_id == stopped.number:
-            self._teleop.stop(now_ns)
-            if self._acknowledges:  # meanwhile
-                self._teleop.acknowledge(now_ns)
 
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
         """Make the first open mission the current one; return the current mission, if any.

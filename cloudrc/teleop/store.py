@@ -39,6 +39,9 @@ STATES = {
     **dict.fromkeys(FAILURES, "failed"),
 }
 """State of a mission after an event; other events do not change the state."""
+STOP = "emergency_stopped"
+FLOWN = {"started", STOP}
+"""Events of a mission that the robot may have flown."""
 SHOWN = 100
 """Limit of the events that are kept per mission; the newest are kept."""
 
@@ -278,18 +281,10 @@ class MissionStore:
         """Return the missions that have not ended; the first is the one to fly."""
         return [mission for mission in self.missions.values() if not mission.ended]
 
-    def summaries(self) -> list[dict[str, Any]]:
-        """Return all missions as the API lists them."""
-        return [mission.summary() for mission in self.missions.values()]
-
     def stopped(self) -> Mission | None:
-        """Return the mission whose emergency stop the operator has not acknowledged yet, if any."""
-        for mission in reversed(self.missions.values()):
-            events = mission.happened
-            if "started" in events or "emergency_stopped" in events:
-                waits = "emergency_stopped" in events and "acknowledged" not in events
-                return mission if waits else None
-        return None
+        """Return the mission that was flown last, if it ended by an emergency stop."""
+        flown = [each for each in self.missions.values() if each.happened.keys() & FLOWN]
+        return flown[-1] if flown and STOP in flown[-1].happened else None
 
     def find(self, mission_id: str) -> Mission:
         """Return a mission; raise UnknownMissionError if none has this id."""

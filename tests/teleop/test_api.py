@@ -17,6 +17,7 @@ from cloudrc.cli.teleop import api_address, serve_api
 from cloudrc.config.load import load_experiment, load_mission
 from cloudrc.errors import BadInputError
 from cloudrc.exposition.live import LiveMetrics
+from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.records import Counted
 from cloudrc.teleop import api as api_module
@@ -26,9 +27,9 @@ from cloudrc.teleop.auth import LOCAL
 from cloudrc.teleop.store import Order, UnavailableError
 from tests.teleop.conftest import (
     DIRECT,
+    FROM_SPAWN,
     OPERATOR,
     READER,
-    SERVICE_PLAN,
     A,
     B,
     C,
@@ -212,7 +213,7 @@ def test_an_open_stream_does_not_keep_the_server_from_ending():
 @pytest.mark.promise("emergency-stop-gets-through")
 @pytest.mark.parametrize("path", ["/v1/estop", "/v1/estop/"])
 def test_a_stop_stops_the_robot_with_or_without_a_slash(api, path):
-    api.flight.teleop.create(Order(SERVICE_PLAN), 0)
+    api.flight.teleop.create(Order(FROM_SPAWN), 0)
     assert api.post(path) == (200, {"id": "m1", "state": "stopping"})
     assert len(api.alarms) == 1
     api.until(lambda: api.flight.guard is GuardState.ESTOP)
@@ -369,10 +370,13 @@ def test_a_long_head_and_what_is_not_http_are_refused(api):
 
 
 def test_an_internal_error_is_one_line_and_500(api):
-    api.flight.teleop.hold = None
-    assert api.post("/v1/hold") == (500, {"detail": "the API failed; see teleop's log"})
+    api.flight.teleop.book.find = None
+    assert api.post("/v1/missions/m1/cancel") == (
+        500,
+        {"detail": "the API failed; see teleop's log"},
+    )
     (line,) = api.complaints
-    assert line.startswith("the API failed at /v1/hold: TypeError")
+    assert line.startswith("the API failed at /v1/missions/m1/cancel: TypeError")
 
 
 # The server
@@ -382,7 +386,7 @@ def test_accepted_connections_have_tcp_nodelay(api):
     """Without it a kept connection waits for delayed acknowledgements: 40 ms for each answer."""
     with connect(api) as one:
         ask(one, "GET", "/v1/state")
-        transports = [each.transport for each in api.server._server.server_state.connections]
+        transports = [each.transport for each in api.server.server_state.connections]
         sockets = [each.get_extra_info("socket") for each in transports]
         assert {each.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) for each in sockets} == {1}
 
@@ -410,7 +414,7 @@ def test_a_network_address_needs_tokens(where, host, warns, capsys):
     options = argparse.Namespace(api=api_address(where), tokens=None, audit=None, api_file=None)
     assert options.api == (host, 0)
     with pytest.raises(BadInputError, match="needs --tokens DIR"):
-        serve_api(options, load_experiment("hover"))
+        serve_api(options, load_experiment("hover"), load_scene("empty"))
     assert ("can be reached from outside" in capsys.readouterr().err) is warns
 
 

@@ -99,7 +99,7 @@ def test_hold_freezes_the_setpoint_and_resume_continues():
     assert (flight.state, flight.setpoints[-1]) == ("HELD", Setpoint(AWAY, 0.0, -1))
     flight.step(position=B, seconds=1.0)
     assert last_event(flight) == "held"
-    flight.operate("go_to", AWAY, yaw=0.5)
+    flight.operate("go_to", Leg(AWAY, 0.5))
     assert (flight.state, flight.setpoints[-1]) == ("HELD", Setpoint(AWAY, 0.5, -1))
     flight.operate("resume")
     assert flight.setpoints[-1] == Setpoint(B, 0.0, 1)
@@ -122,8 +122,8 @@ def test_cancel_ends_the_mission_in_a_hold(moment):
     flight.step(seconds=0.05)
     assert flight.requests[-1].request is Request.END
     assert flight.mission == flight.requests[-1].number
-    with pytest.raises(BadInputError, match="cancel: the mission is CANCELLED; no mis"):
-        flight.operate("cancel")
+    with pytest.raises(BadInputError, match="hold: the mission is CANCELLED; it must be flying"):
+        flight.operate("hold")
 
 
 @pytest.mark.parametrize("state", ["flying", "starting"])
@@ -302,7 +302,7 @@ def test_cloud_is_told_the_setpoint_again_in_every_session():
     flight.step(seconds=0.02)
     assert flight.setpoints.count(told) == 2
     flight.operate("hold")
-    flight.operate("go_to", C)
+    flight.operate("go_to", Leg(C))
     flight.restart_cloud()
     flight.step(position=A)
     assert [setpoint.position for setpoint in flight.setpoints[-2:]] == [C, C]

@@ -5,29 +5,24 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.cli.teleop import _start
+from cloudrc.cli.teleop import _start, ending
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.teleop import turn
+from cloudrc.drivers.teleop import serve_teleop, turn
 from cloudrc.exposition.table import MISSION_OUTCOMES
-from cloudrc.messages import (
-    MISSION_OVER,
-    GuardState,
-    Request,
-    Setpoint,
-    Start,
-)
+from cloudrc.messages import MISSION_OVER, Cause, GuardState, Request, Setpoint, Start
 from cloudrc.teleop import wire
 from cloudrc.teleop.api import Bridge
-from cloudrc.teleop.service import QUEUE_MAX
-from cloudrc.teleop.store import ENDED, SHOWN, STATES, ConflictError, Order
+from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, SILENCE, next_step
+from cloudrc.teleop.store import ENDED, SHOWN, STATES, ConflictError, Order, UnavailableError
 from cloudrc.teleop.wire import Leg, Plan
 from tests.teleop.conftest import (
     AWAY,
+    FROM_SPAWN,
     ID,
-    SERVICE_PLAN,
     A,
     B,
     C,
+    Disk,
     ServiceFlight,
     asked,
     finish,
@@ -46,6 +41,17 @@ def first_failure(flight, mission_id="m1"):
     return flight.view(mission_id)["verdict"]["failures"][0]["code"]
 
 
+def reached(flight, mission_id="m1"):
+    return [each["waypoint"] for each in flight.view(mission_id)["reached"]]
+
+
+def go_to(flight, position=AWAY, yaw=0.0):
+    flight.teleop.go_to(Leg(position, yaw), flight.now_ns)
+
+
+# Orders
+
+
 def test_a_mission_is_flown_and_every_waypoint_noted_once():
     flight, mission_id = service_flying(name="round")
     assert not flight.teleop.over
@@ -53,7 +59,7 @@ def test_a_mission_is_flown_and_every_waypoint_noted_once():
     view = flight.view(mission_id)
     assert (view["id"], view["name"], view["state"]) == ("m1", "round", "done")
     assert flight.names(mission_id) == ["starting", "started", *["reached"] * 3, "done"]
-    assert [reached["waypoint"] for reached in view["reached"]] == [0, 1, 2]
+    assert reached(flight) == [0, 1, 2]
     assert [event["id"] for event in view["events"]] == [1, 2, 3, 4, 5, 6]
     assert view["verdict"] == {"outcome": "success", "exit_code": 0, "failures": []}
     assert flight.teleop.over
@@ -69,20 +75,11 @@ def test_a_key_is_that_of_one_order_for_ever():
     finish(flight)
     for _ in range(2):
         assert flight.create(key="uid") == mission_id
-        for order in (Order(QUICK, key="uid"), Order(SERVICE_PLAN, key="uid", contact=True)):
+        for order in (Order(QUICK, key="uid"), Order(FROM_SPAWN, key="uid", contact=True)):
             with pytest.raises(ConflictError, match="'uid' is that of mission m1, with another"):
                 flight.teleop.create(order, flight.now_ns)
         flight.restart_teleop()
     assert flight.create(key="another") == "m2"
-
-
-def test_the_queue_of_missions_is_bounded():
-    flight, _ = service_flying()
-    for _ in range(QUEUE_MAX):
-        flight.create(queue=True)
-    with pytest.raises(ConflictError, match=f"{QUEUE_MAX} missions wait already") as refused:
-        flight.create(queue=True)
-    assert refused.value.mission == "m1"
 
 
 def test_a_second_mission_is_refused_or_waits_for_the_first():
@@ -101,6 +98,15 @@ def test_a_second_mission_is_refused_or_waits_for_the_first():
     flight.step(position=A, seconds=0.2)
     assert [state(flight, mission) for mission in (first, second, third)] == ["done"] * 3
     assert flight.names(second) == ["queued", "starting", "started", "reached", "done"]
+
+
+def test_the_queue_of_missions_is_bounded():
+    flight, _ = service_flying()
+    for _ in range(QUEUE_MAX):
+        flight.create(queue=True)
+    with pytest.raises(ConflictError, match=f"{QUEUE_MAX} missions wait already") as refused:
+        flight.create(queue=True)
+    assert refused.value.mission == "m1"
 
 
 def test_between_two_missions_the_robot_is_seen_to_hold():
@@ -142,7 +148,7 @@ def test_the_operator_holds_moves_and_resumes():
     flight, mission_id = service_flying()
     flight.teleop.hold(flight.now_ns)
     assert state(flight) == "held"
-    flight.teleop.go_to(AWAY, 0.5, flight.now_ns)
+    go_to(flight, AWAY, 0.5)
     flight.step()
     assert flight.setpoints[-1] == Setpoint(AWAY, 0.5, -1)
     flight.teleop.resume(flight.now_ns)
@@ -156,12 +162,13 @@ def test_the_operator_holds_moves_and_resumes():
 def test_go_to_is_a_mission_of_its_own_if_none_is_under_way():
     flight = ServiceFlight()
     flight.step()
-    flight.teleop.go_to(A, 0.0, flight.now_ns)
+    epoch = flight.epoch
+    go_to(flight, A)
     flight.step(seconds=0.05)
     with pytest.raises(ConflictError, match="hold or cancel"):
-        flight.teleop.go_to(B, 0.0, flight.now_ns)
+        go_to(flight, B)
     flight.step(position=A, seconds=0.6)
-    assert (flight.view("m1")["name"], state(flight)) == ("goto", "done")
+    assert (flight.view("m1")["name"], state(flight), flight.epoch) == ("goto", "done", epoch)
 
 
 def test_the_setpoint_is_repeated_at_10_hz():
@@ -183,8 +190,7 @@ def test_the_setpoint_is_repeated_at_10_hz():
 )
 def test_what_the_robot_touched_decides(seen, codes, exit_code):
     flight, mission_id = service_flying(contact=True)
-    for name, value in seen.items():
-        setattr(flight, name, value)
+    vars(flight).update(seen)
     flight.step()
     assert ("board_touched" in flight.names(mission_id)) == ("touch_speed" in seen)
     finish(flight)
@@ -212,19 +218,21 @@ def test_the_robot_is_told_of_every_waypoint_reached_until_it_knows():
     assert len(flight.requests) == told
 
 
+# Restarts
+
+
 def test_with_a_full_disk_the_robot_remembers_its_waypoints():
     flight, _ = service_flying(key="uid")
     flight.full = True
     flight.step(position=B, seconds=0.1)
     flight.restart_teleop()  # what was not written is gone
     flight.full = False
-    assert [each["waypoint"] for each in flight.view("m1")["reached"]] == [0]
+    assert reached(flight) == [0]
     flight.step(position=AWAY, seconds=0.1)
     flight.step(position=C, seconds=0.1)
-    view = flight.view("m1")
-    assert [each["waypoint"] for each in view["reached"]] == [0, 1, 2]
-    assert "reached, as the robot reports," in str(view["events"])
-    assert view["verdict"]["exit_code"] == 0
+    assert reached(flight) == [0, 1, 2]
+    assert "reached, as the robot reports," in str(flight.view("m1")["events"])
+    assert flight.view("m1")["verdict"]["exit_code"] == 0
 
 
 def test_a_cancelled_mission_whose_end_is_lost_is_not_flown_again():
@@ -240,33 +248,24 @@ def test_a_cancelled_mission_whose_end_is_lost_is_not_flown_again():
     assert (flight.guard, first_failure(flight)) == (HOLD, "end_lost")
 
 
-def test_after_a_restart_the_mission_continues_at_its_waypoint():
+@pytest.mark.parametrize("guard", [TRACK, GROUND])
+def test_after_a_restart_the_mission_continues_at_its_waypoint(guard):
+    """Also of a robot that has not taken off yet."""
     flight, mission_id = service_flying(key="uid")
     flight.step(position=AWAY, seconds=5.0)
-    flight.slip_ns = 900_000_000  # while teleop is away it does not count
+    flight.slip_ns, flight.guard = 900_000_000, guard  # while teleop is away it does not count
+    count = len(flight.requests)
     flight.restart_teleop()
+    flight.see()
     flight.step(seconds=0.05)
-    assert state(flight) == "flying"
-    assert (flight.requests[-1].request, flight.requests[-1].start) == (Request.START, Start.HERE)
+    assert (state(flight), set(asked(flight, count))) == ("flying", {Request.START})
+    assert flight.requests[-1].start is Start.HERE
     assert flight.setpoints[-1].position == B
     assert flight.create(key="uid") == mission_id
     finish(flight)
-    view = flight.view(mission_id)
-    assert [reached["waypoint"] for reached in view["reached"]] == [0, 1, 2]
-    assert view["verdict"]["exit_code"] == 0
+    assert reached(flight) == [0, 1, 2]
+    assert flight.view(mission_id)["verdict"]["exit_code"] == 0
     assert flight.names(mission_id).count("started") == 1
-
-
-def test_a_mission_before_take_off_survives_a_teleop_restart():
-    """The new teleop sees a robot that stands, told of a mission, before it takes that up."""
-    flight, _ = service_flying()
-    flight.guard = GROUND
-    before = len(flight.requests)
-    flight.restart_teleop()
-    flight.see()
-    flight.step(seconds=0.3)
-    assert state(flight) == "flying"
-    assert set(asked(flight, before)) == {Request.START}
 
 
 def test_a_cancel_right_after_a_restart_is_a_cancel_in_flight():
@@ -289,19 +288,39 @@ def test_a_cancel_does_not_hide_a_failure_by_world_restart():
     assert first_failure(flight) == "world_restarted"
 
 
+@pytest.mark.parametrize("is_held", [False, True])
 @pytest.mark.parametrize("teleop_too", [False, True])
-def test_a_restart_of_cloud_asks_nothing_of_the_robot_unless_teleop_is_new(teleop_too):
+def test_a_restart_of_cloud_is_told_once_and_asks_nothing_of_the_robot(teleop_too, is_held):
+    """Unless teleop is new, too: it knows no other session."""
     flight, mission_id = service_flying()
+    if is_held:
+        flight.teleop.hold(flight.now_ns)
     before = len(flight.requests)
     flight.restart_cloud()
     if teleop_too:
         flight.restart_teleop()
-    flight.step(seconds=0.2)
-    assert (state(flight), flight.view(mission_id)["waypoint"]) == ("flying", 1)
+    flight.step(seconds=1.0)
+    assert (state(flight), flight.view(mission_id)["waypoint"]) == (
+        "held" if is_held else "flying",
+        1,
+    )
     assert set(asked(flight, before)) == ({Request.START} if teleop_too else set())
-    names = flight.names(mission_id)
-    assert names[-1] == ("resumed" if teleop_too else "new_session")
-    assert ("new_session" in names) is not teleop_too, "a new teleop knows no other session"
+    texts = [e["text"] for e in flight.view("m1")["events"] if e["event"] == "new_session"]
+    goes_on = "is held on the way to" if is_held else "goes on to"
+    text = "the controller has a new session, as after a restart; the mission"
+    assert texts == ([] if teleop_too else [f"{text} {goes_on} waypoint 2 of 3"])
+
+
+def test_sessions_at_mission_start_or_between_are_not_reported():
+    flight, mission_id = service_flying()
+    flight.teleop.cancel(mission_id, flight.now_ns)
+    flight.step(seconds=0.2)
+    flight.restart_cloud()
+    flight.step(seconds=0.2)
+    second = flight.create()
+    flight.step(seconds=0.2)
+    assert "started" in flight.names(second)
+    assert "new_session" not in flight.names(mission_id) + flight.names(second)
 
 
 def test_an_unstarted_mission_starts_in_the_new_world():
@@ -384,6 +403,9 @@ def test_a_restart_with_the_same_options_continues_the_mission():
     assert len(flight.teleop.book.missions) == 2
 
 
+# Stops and landings
+
+
 @pytest.mark.parametrize("flies", [True, False])
 def test_a_stop_fails_the_mission_if_there_is_one(flies):
     flight = service_flying()[0] if flies else ServiceFlight()
@@ -399,21 +421,19 @@ def test_a_stop_fails_the_mission_if_there_is_one(flies):
         assert "emergency stop on the way to waypoint 2 of 3" in str(flight.view("m1")["events"])
 
 
-@pytest.mark.parametrize("stops", [1, 2])
-def test_after_a_stall_the_stop_belongs_to_the_stopped_mission(stops):
+def test_after_a_stall_the_stop_belongs_to_the_stopped_mission():
     """Past teleop's loop: it saw the robot stopped, and that was why the mission had failed."""
     (flight, mission_id), bridge = service_flying(), Bridge()
     bridge.open(flight.teleop)
     urgent = [
-        bridge.submit(lambda service, now_ns: service.stop_rotors(now_ns), "stop")
-        for _ in range(stops)
+        bridge.submit(lambda service, now_ns: service.stop_rotors(now_ns), "stop") for _ in range(2)
     ]
     looked = bridge.submit(lambda service, now_ns: service.state(now_ns)["seen"]["guard"])
     flight.guard = ESTOP
     cloud = SimpleNamespace(receive=lambda: [wire.encode(flight.seen)])
     blind = {"blind": 2, "late_ns": 0, "now_ns": flight.now_ns + 5_000_000_000}
     turn(flight.teleop, cloud, wire.decode, bridge.take, stops=bridge.take_stop, **blind)
-    assert {each.result().id for each in urgent} == {mission_id}, "all are one stop"
+    assert {each.result()["id"] for each in urgent} == {mission_id}, "all are one stop"
     assert looked.result() == "ESTOP", "what is no stop is asked of the present"
     flight.step(seconds=0.1)
     assert flight.names(mission_id)[-1] == "emergency_stopped"
@@ -442,7 +462,6 @@ def test_no_mission_starts_before_the_stop_is_acknowledged(restarted):
     assert state(flight, queued) == "queued"
     flight.teleop.acknowledge(flight.now_ns)
     flight.step(seconds=0.5)
-    assert flight.names(mission_id)[-1] == "acknowledged"
     assert (state(flight, mission_id), state(flight, queued)) == ("failed", "flying")
     with pytest.raises(ConflictError, match="m2 is flying; there is nothing to acknowledge"):
         flight.teleop.acknowledge(flight.now_ns)
@@ -456,6 +475,7 @@ def test_an_early_stop_stops_the_current_mission():
     assert flight.teleop.stop_rotors(flight.now_ns).id == mission_id
     flight.step(seconds=0.2)
     flight.restart_teleop()
+    flight.teleop.acknowledge(flight.now_ns)  # before the robot is seen, which flies
     flight.downlink = True
     flight.step(seconds=0.5)
     assert flight.guard is ESTOP
@@ -485,7 +505,6 @@ def test_a_stop_is_not_repeated_after_a_later_flight_or_acknowledgement(since):
 
 @pytest.mark.parametrize("since", ["other mission", "other world"])
 def test_a_stop_before_first_telemetry_stops_any_flight(since):
-    """It is not one of the teleop before, which is not asked again of another robot."""
     flight, mission_id = service_flying()
     if since == "other world":
         flight.restart()
@@ -494,21 +513,6 @@ def test_a_stop_before_first_telemetry_stops_any_flight(since):
     assert flight.teleop.stop_rotors(flight.now_ns).id == mission_id
     flight.step(seconds=0.2)
     assert flight.guard is ESTOP
-
-
-def test_a_stop_is_acknowledged_once_the_robot_is_released():
-    """Written down before, it would count for a stop that has yet to act."""
-    flight, mission_id = service_flying()
-    flight.downlink = False
-    for ask in (flight.teleop.stop_rotors, flight.teleop.acknowledge):
-        ask(flight.now_ns)
-        flight.step(seconds=0.2)
-    assert flight.names(mission_id)[-1] == "emergency_stopped"
-    flight.restart_teleop()
-    flight.teleop.acknowledge(flight.now_ns)  # before the robot is seen
-    flight.downlink = True
-    flight.step(seconds=0.5)
-    assert (flight.guard, flight.names(mission_id)[-1]) == (GROUND, "acknowledged")
 
 
 def test_a_stop_after_an_acknowledgement_counts():
@@ -527,7 +531,7 @@ def test_a_landed_robot_flies_again_once_acknowledged():
     flight.guard = LAND
     flight.step(seconds=0.05)
     assert first_failure(flight) == "guard_stopped"
-    for order in (flight.create, lambda: flight.teleop.go_to(AWAY, 0.0, flight.now_ns)):
+    for order in (flight.create, lambda: go_to(flight)):
         with pytest.raises(ConflictError, match="the guard is in LAND"):
             order()
     flight.teleop.acknowledge(flight.now_ns)
@@ -544,11 +548,192 @@ def test_a_landing_without_teleop_fails_the_mission(guard, begun):
     flight.downlink = bool(begun)
     mission_id = flight.create()
     flight.step(seconds=0.1)
-    assert state(flight) == ("flying" if begun else "starting")
     waits = flight.create(queue=True)
     flight.guard = guard
     flight.restart_teleop()
     flight.see()  # before teleop does anything
     flight.step(seconds=0.2)
-    assert first_failure(flight, mission_id) == "guard_stopped"
-    assert state(flight, waits) == "queued"
+    assert (first_failure(flight, mission_id), state(flight, waits)) == ("guard_stopped", "queued")
+
+
+# The end of teleop
+
+
+def at(moment):
+    """A flight with a mission that is idle, starting, flying, held or done."""
+    flight = ServiceFlight() if moment in ("idle", "starting") else service_flying()[0]
+    flight.step()
+    if moment == "starting":
+        flight.downlink = False
+        flight.create()
+        flight.downlink = True
+    elif moment == "done":
+        finish(flight)
+    elif moment == "held":
+        flight.teleop.hold(flight.now_ns)
+    return flight
+
+
+@pytest.mark.parametrize(
+    ("before", "say"),
+    [
+        ("idle", ServiceFlight.create),
+        ("done", ServiceFlight.create),
+        ("held", lambda flight: flight.create(queue=True)),
+        *((before, go_to) for before in ("idle", "done", "held")),
+        ("held", lambda flight: flight.teleop.resume(flight.now_ns)),
+    ],
+)
+def test_nothing_is_begun_while_teleop_ends(before, say):
+    """It is refused, for its sender to say it again to the next teleop; nothing is kept of it."""
+    flight = at(before)
+    flight.teleop.pause(flight.now_ns)
+    flight.step(seconds=0.2)
+    kept, count = flight.kept, len(flight.requests)
+    with pytest.raises(UnavailableError, match="teleop ends; repeat this when teleop runs again"):
+        say(flight)
+    flight.step(seconds=0.5)
+    assert flight.kept == kept
+    assert Request.START not in asked(flight, count)
+    assert AWAY not in {setpoint.position for setpoint in flight.setpoints}
+
+
+def test_what_is_known_stays_known_and_what_waits_waits_for_the_next_teleop():
+    flight, first = service_flying(key="uid")
+    second = flight.create(queue=True)
+    flight.step(position=B, seconds=0.05)
+    flight.teleop.pause(flight.now_ns)
+    assert flight.create(key="uid") == first
+    flight.step(position=C, seconds=0.5)
+    assert (state(flight, first), state(flight, second)) == ("done", "queued")
+    flight.restart_teleop()
+    assert flight.create(key="uid") == first
+    flight.step(seconds=0.3)
+    assert state(flight, second) == "flying"
+
+
+@pytest.mark.parametrize("before", ["flying", "restarted", "held", "starting"])
+def test_a_shutdown_pauses_the_current_mission(before):
+    """The robot stays where it is seen; the next teleop goes on."""
+    flight = at(before)
+    flight.step(position=(0.5, 0.0, 1.0), seconds=0.0 if before == "starting" else 0.1)
+    count = len(flight.requests)
+    if before != "flying":
+        flight.restart_teleop()
+    flight.teleop.pause(flight.now_ns)
+    assert flight.kept[-1]["text"].startswith("paused by shutdown on the way to waypoint")
+    flight.step(seconds=0.5)
+    assert flight.guard in (HOLD, GROUND)
+    assert set(asked(flight, count)) == {Request.END}
+    if before == "flying":
+        assert flight.setpoints[-1].position == (0.5, 0.0, 1.0)
+    assert flight.teleop.settled
+    flight.restart_teleop()
+    flight.step(seconds=0.5)
+    assert state(flight) == ("held" if before == "held" else "flying")
+
+
+def test_during_shutdown_teleop_still_stops_and_releases():
+    flight, _ = service_flying()
+    flight.teleop.pause(flight.now_ns)
+    flight.step(seconds=0.1)
+    for ask, guard in ((flight.teleop.stop_rotors, ESTOP), (flight.teleop.acknowledge, GROUND)):
+        ask(flight.now_ns)
+        flight.step(seconds=0.1)
+        assert flight.guard is guard
+
+
+@pytest.mark.parametrize("fsync_ns", [0, 600_000_000, 1_000_000_000])
+def test_a_slow_disk_does_not_delay_the_pause_at_shutdown(monkeypatch, fsync_ns):
+    """The time for that was over before: the robot flew on to its waypoint."""
+    flight, _ = service_flying()
+    clock, commit, said = [flight.now_ns], Disk.commit, []
+
+    def sleep(seconds):
+        clock[0] += round(seconds * 1e9)
+
+    def fsync(disk):
+        clock[0] += fsync_ns
+        commit(disk)
+
+    monkeypatch.setattr(Disk, "commit", fsync)
+    monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
+    monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
+    seen = wire.encode(flight.seen)
+    cloud = SimpleNamespace(receive=lambda: [seen], send=lambda data: not said.append(data))
+    how = {"calls": list, "tell": lambda told: None, "stop": ending(flight.teleop, lambda: True)}
+    serve_teleop(flight.teleop, cloud, wire.encode, wire.decode, **how)
+    requests = [getattr(wire.decode(each), "request", None) for each in said]
+    assert requests.count(Request.END) >= 3
+    assert clock[0] - flight.now_ns < 2_000_000_000
+
+
+# What is shown
+
+
+def shown(flight):
+    return flight.teleop.state(flight.now_ns)["seen"]
+
+
+@pytest.mark.parametrize(
+    ("guard", "mission", "said"),
+    [
+        (GROUND, None, "waits for a mission; it takes off, after a stop or a landing only when"),
+        (GROUND, "flying", "takes off with the mission's first commands, after a stop"),
+        (TRACK, None, "is telling the robot that its mission is over"),
+        (TRACK, "flying", "flies its mission"),
+        (TRACK, "held", "cloudrc mission resume"),
+        (HOLD, None, "waits for a mission"),
+        (HOLD, "flying", "continues by itself when they arrive"),
+        (HOLD, "held", "continues by itself when they arrive"),
+        *((stop, how, "find the cause, then: cloudrc mission acknowledge")
+          for stop in (LAND, ESTOP) for how in (None, "flying", "held")),
+    ],
+)  # fmt: skip
+def test_what_comes_next_follows_from_the_guard_and_the_mission(guard, mission, said):
+    past = SILENCE + 0.01
+    assert said in next_step(guard, 0.01, 0.01, mission)
+    assert said in next_step(guard, SILENCE, SILENCE, mission)
+    assert next_step(guard, past, SILENCE, mission) == NOT_HEARD
+    assert next_step(guard, past, past, mission) == NO_CLOUD
+
+
+def test_the_state_is_shown_with_cause_and_since_when_in_this_world():
+    flight, _ = service_flying()
+    flight.step(seconds=0.5)
+    assert shown(flight)["guard_for_s"] > 0.5
+    assert shown(flight)["next_step"] == "the robot flies its mission"
+    flight.guard, flight.cause, flight.downlink = HOLD, Cause.SILENCE, False
+    flight.step()
+    assert (shown(flight)["guard"], shown(flight)["guard_for_s"]) == ("HOLD", 0.0)
+    flight.step(seconds=0.5)
+    flight.uplink = False
+    flight.step(seconds=2.0)
+    assert (shown(flight)["guard_for_s"], shown(flight)["cause"]) == (None, "no fresh commands")
+    assert shown(flight)["age_s"] == pytest.approx(2.0)
+    flight.uplink = True
+    flight.restart_cloud()
+    flight.step()
+    assert shown(flight)["guard_for_s"] == pytest.approx(2.51)
+    flight.restart()
+    flight.guard = HOLD
+    flight.step()
+    assert shown(flight)["guard_for_s"] == 0.0
+
+
+def test_a_silent_robot_is_told_from_a_silent_cloud():
+    flight = ServiceFlight()
+    assert flight.teleop.state(0)["cloud_age_s"] is None
+    flight.teleop.hear(1_000_000_000)  # before the robot is seen
+    assert flight.teleop.state(3_000_000_000) == {
+        **{"mission": None, "queue": [], "cloud_age_s": 2.0, "seen": None},
+    }
+    for cloud in (True, False):
+        flight.step()
+        for _ in range(10):
+            flight.now_ns += 200_000_000
+            if cloud:
+                flight.teleop.hear(flight.now_ns)
+        age = flight.teleop.state(flight.now_ns + 50_000_000)["cloud_age_s"]
+        assert age == pytest.approx(0.05 if cloud else 2.05)
+        assert shown(flight)["next_step"] == (NOT_HEARD if cloud else NO_CLOUD)
