@@ -468,6 +468,7 @@ def _bind(address: Address) -> tuple[socket.socket, str]:
                 address.unlink()
             os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
             unix.bind(str(address))
+            unix.listen()
             return unix, url
         host, port = address[0].strip("[]"), address[1]
         is_6 = ":" in host
