@@ -26,7 +26,7 @@ from cloudrc.teleop.auth import Audit, Gate, Tokens
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.models import read_goto, read_order
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import MissionStore, Order
+from cloudrc.teleop.store import ConflictError, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
 
 PERIOD_NS = 10_000_000
@@ -201,6 +201,7 @@ class ServiceFlight(Flight):
     def __init__(self, scene=None):
         super().__init__()
         self.scene, self.images, self.full, self.commits = scene, [], False, 0
+        self.mark = 0
         self.restart_teleop()
 
     def restart_teleop(self, image=None):
@@ -251,10 +252,47 @@ def service_flying(**order):
     return flight, mission_id
 
 
+PLACES = {"A": A, "B": B, "C": C, "away": AWAY}
+SWITCHES = {
+    **{guard.name: {"guard": guard} for guard in GuardState},
+    **{"full": {"full": True}, "free": {"full": False}, "foreign": {"onboard": (ID, 1)}},
+    **{"deaf": {"uplink": False}, "mute": {"downlink": False}},
+    "link": {"uplink": True, "downlink": True},
+}
+VERBS = ("hold", "resume", "stop_rotors", "acknowledge", "pause", "handle_deadline")
+
+
+def play(flight, script):
+    """Carry out a script of actions: places, times [s], verbs, faults; "!" expects a refusal."""
+    for action in script.split():
+        if action.startswith("!"):
+            with pytest.raises((ConflictError, UnavailableError)):
+                play(flight, action[1:])
+        elif action in PLACES:
+            flight.step(position=PLACES[action], seconds=0.05)
+        elif action[0].isdecimal():
+            flight.step(seconds=float(action))
+        elif action in SWITCHES:
+            vars(flight).update(SWITCHES[action])
+        elif action in ("create", "queue"):
+            flight.create(queue=action == "queue")
+        elif action == "goto":
+            flight.teleop.go_to(Leg(AWAY, 0.5), flight.now_ns)
+        elif action.startswith("cancel"):
+            newest = next(reversed(flight.teleop.book.missions))
+            flight.teleop.cancel(action.removeprefix("cancel") or newest, flight.now_ns)
+        elif action in VERBS:
+            getattr(flight.teleop, action)(flight.now_ns)
+        elif action == "mark":
+            flight.mark = len(flight.said)
+        else:
+            do = {"cloud": "restart_cloud", "world": "restart", "restart": "restart_teleop"}
+            getattr(flight, do.get(action, action))()
+
+
 def finish(flight):
     """Fly to all waypoints of `FROM_SPAWN`."""
-    for point in (A, B, C):
-        flight.step(position=point, seconds=0.05)
+    play(flight, "A B C")
 
 
 def asked(flight, since=0):

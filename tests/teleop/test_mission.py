@@ -2,8 +2,7 @@
 
 import pytest
 
-from cloudrc.errors import BadInputError
-from cloudrc.messages import MISSION_OVER, Cause, GuardState, Request, Setpoint, Start
+from cloudrc.messages import Cause, GuardState, Request, Setpoint, Start
 from cloudrc.teleop.mission import HELD_LOWEST, Teleop
 from cloudrc.teleop.store import Mission, Order
 from cloudrc.teleop.wire import Leg, Plan
@@ -59,17 +58,6 @@ def test_a_mission_flies_its_legs_in_order_and_ends_in_a_hold():
     assert (flight.state, flight.guard) == ("DONE", HOLD)
 
 
-@pytest.mark.parametrize("away", [(1.11, 0.0, 1.0), (1.07, 0.07, 1.07)])
-def test_dwell_starts_again_outside_of_the_tolerance(away):
-    flight = flying()
-    flight.step(position=A, seconds=0.45)
-    flight.step(position=away)
-    flight.step(position=A, seconds=0.45)
-    assert last_event(flight) == "started"
-    flight.step(position=A, seconds=0.06)
-    assert last_event(flight) == "reached"
-
-
 def test_time_in_hold_or_unseen_is_no_dwell():
     flight = flying()
     flight.guard = HOLD
@@ -81,63 +69,6 @@ def test_time_in_hold_or_unseen_is_no_dwell():
     assert last_event(flight) == "started"
     flight.step(seconds=0.6)
     assert last_event(flight) == "reached"
-
-
-def test_legs_of_infinite_tolerance_last_their_dwell_time():
-    flight = flying(Plan(tuple(Leg(at, tolerance=float("inf"), dwell=0.4) for at in (A, B, C))))
-    flight.step(position=AWAY, seconds=1.3)
-    first, second, third = (e.stamp_ns for e in flight.events if e.event == "reached")
-    assert (second - first, third - second) == (400_000_000, 400_000_000)
-    assert flight.state == "DONE"
-
-
-def test_hold_freezes_the_setpoint_and_resume_continues():
-    flight = flying()
-    flight.step(position=A, seconds=0.6)
-    flight.step(position=AWAY)
-    flight.operate("hold")
-    assert (flight.state, flight.setpoints[-1]) == ("HELD", Setpoint(AWAY, 0.0, -1))
-    flight.step(position=B, seconds=1.0)
-    assert last_event(flight) == "held"
-    flight.operate("go_to", Leg(AWAY, 0.5))
-    assert (flight.state, flight.setpoints[-1]) == ("HELD", Setpoint(AWAY, 0.5, -1))
-    flight.operate("resume")
-    assert flight.setpoints[-1] == Setpoint(B, 0.0, 1)
-    flight.step()
-    assert [event.event for event in flight.events[-2:]] == ["resumed", "reached"]
-    assert set(asked(flight)) == {Request.START}
-
-
-@pytest.mark.parametrize("moment", ["starting", "flying", "held"])
-def test_cancel_ends_the_mission_in_a_hold(moment):
-    flight = Flight()
-    flight.step(position=A)
-    flight.operate("start", PLAN)
-    flight.step(seconds=0.0 if moment == "starting" else 0.05)
-    if moment == "held":
-        flight.operate("hold")
-    flight.operate("cancel")
-    assert (flight.state, flight.teleop.outcome.code) == ("CANCELLED", "cancelled")
-    assert flight.setpoints[-1].waypoint == -1
-    flight.step(seconds=0.05)
-    assert flight.requests[-1].request is Request.END
-    assert flight.mission == flight.requests[-1].number
-    with pytest.raises(BadInputError, match="hold: the mission is CANCELLED; it must be flying"):
-        flight.operate("hold")
-
-
-@pytest.mark.parametrize("state", ["flying", "starting"])
-def test_while_pausing_no_waypoint_becomes_the_setpoint(state):
-    flight = Flight()
-    flight.step()
-    flight.downlink = state == "flying"
-    flight.operate("start", THREE if state == "flying" else FROM_SPAWN, ID)
-    flight.step(seconds=0.05)
-    flight.downlink = False
-    flight.operate("pause")
-    for point in (A, B):
-        flight.step(position=point, seconds=0.1)
-    assert flight.setpoints[-1].waypoint == -1
 
 
 # Early ends
@@ -200,19 +131,6 @@ def test_no_robot_is_held_where_it_would_scrape_along_the_floor():
     for verb in ("hold", "cancel"):
         flight.operate(verb)
         assert flight.setpoints[-1].position == (0.2, 0.1, HELD_LOWEST)
-
-
-@pytest.mark.parametrize("state", ["flying", "held", "starting"])
-def test_a_world_that_restarts_fails_the_mission(state):
-    flight = Flight() if state == "starting" else flying()
-    if state == "starting":
-        flight.step(position=A)
-        flight.operate("start", THREE)
-    if state == "held":
-        flight.operate("hold")
-    flight.restart()
-    flight.step()
-    assert_failed(flight, "world_restarted", "world restarted on the way to waypoint 1 of 3")
 
 
 @pytest.mark.parametrize("guard", [LAND, ESTOP])
@@ -400,17 +318,6 @@ def test_a_mission_from_here_fails_if_another_client_moved_it(in_sight):
     assert flight.setpoints[-1].position == B
 
 
-@pytest.mark.parametrize("verb", ["cancel", "stop"])
-def test_the_robot_learns_that_a_mission_ended_early(verb):
-    flight = started()
-    flight.downlink = False
-    flight.operate(verb)
-    flight.step(seconds=0.5)
-    flight.downlink = True
-    flight.step(seconds=0.2)
-    assert flight.onboard == (ID, MISSION_OVER)
-
-
 def continued(reached, *, leg=0, held=False, mission=ID, downlink=True):
     """A teleop that has forgotten, and a robot that has not."""
     flight = Flight()
@@ -447,42 +354,6 @@ def test_the_robot_never_flies_back_to_a_reached_waypoint(onboard, aims):
     flight = continued(onboard, downlink=False)
     assert flight.state == "STARTING"
     assert [s.position for s in flight.setpoints if s.waypoint >= 0] == aims
-
-
-def test_a_mission_goes_on_with_its_robot_only_and_until_its_end():
-    flight = continued(0, mission=ID + 1)
-    assert (flight.teleop.outcome.code, flight.requests) == ("taken_over", [])
-    flight = continued(MISSION_OVER, leg=1)
-    assert (flight.teleop.outcome.code, flight.teleop.outcome.reached) == ("end_lost", 1)
-    assert set(asked(flight)) == {Request.END}
-    assert {setpoint.position for setpoint in flight.setpoints} == {AWAY}
-
-
-@pytest.mark.parametrize("reached", [2, 3])
-def test_a_mission_started_again_begins_at_its_first_waypoint(reached):
-    flight = Flight()
-    flight.onboard, flight.guard = (ID, reached), HOLD
-    flight.step(position=B)
-    flight.operate("start", FROM_SPAWN, ID)
-    flight.step(seconds=0.1)
-    assert (flight.state, flight.teleop.leg, flight.onboard) == ("FLYING", 0, (ID, 0))
-    assert {s.waypoint for s in flight.setpoints} == {-1, 0}
-
-
-def test_without_a_number_nothing_is_kept_on_board():
-    flight = Flight()
-    for _ in range(2):
-        flight.step(position=AWAY)
-        flight.operate("start", THREE)
-        flight.step(seconds=0.05)
-        flight.onboard = (0, 3)
-        flight.step(seconds=0.3)
-        assert (flight.state, flight.teleop.leg) == ("FLYING", 0)
-        flight.onboard = (0, 0)
-        flight.operate("cancel")
-        flight.step(seconds=0.3)
-    assert flight.onboard == (0, 0)
-    assert Request.PROGRESS not in {request.request for request in flight.requests}
 
 
 @pytest.mark.parametrize("first_sight", [True, False])
@@ -546,15 +417,3 @@ def test_a_robot_that_waits_during_its_mission_is_started_again(guard):
     flight.step(seconds=3.2)
     assert flight.requests[-1][1:3] == (Request.START, Start.HERE)
     assert (flight.guard, flight.state) == (TRACK, "FLYING")
-
-
-@pytest.mark.parametrize("verb", ["cancel", "stop", "pause"])
-def test_who_has_ended_its_mission_does_not_start_again(verb):
-    flight = started()
-    flight.operate(verb)
-    flight.step(seconds=0.2)
-    count = len(flight.requests)
-    flight.mission += 1
-    flight.guard = HOLD
-    flight.step(seconds=0.3)
-    assert flight.requests[count:] == []

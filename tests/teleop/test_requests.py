@@ -39,17 +39,6 @@ def test_a_request_repeats_at_10_hz_until_acknowledged():
     assert len(flight.requests) == count
 
 
-def test_a_mission_may_be_asked_for_before_the_robot_is_in_sight():
-    flight = Flight()
-    flight.uplink = False
-    flight.operate("start", PLAN)
-    flight.step(seconds=1.0)
-    assert flight.requests == []
-    flight.uplink = True
-    flight.step(seconds=0.03)
-    assert flight.state == "FLYING"
-
-
 def test_numbers_go_on_well_above_what_the_robot_shows():
     flight = Flight()
     flight.mission = 41  # a cloud that has been restarted since has asked for these
@@ -75,16 +64,6 @@ def test_whoever_begins_later_begins_higher_and_numbers_last():
     for _ in range(1_000):
         seen = seen._replace(mission=first_request(seen, 10 * 365 * 86_400 * 10**9).number)
     assert seen.mission < NUMBER_MAX / 10
-
-
-def test_a_predecessors_request_does_not_acknowledge_our_start():
-    """It asked for the mission's end, was gone at once, and the robot shows that only now."""
-    sender, seen = RequestSender(), RobotStatus(1, A, TRACK, 41)
-    sender.see(seen, 0)
-    sender.ask(Request.START, Start.HERE)
-    own = sender.due(0).number
-    assert sender.see(seen._replace(mission=42), 0) is None
-    assert sender.see(seen._replace(mission=own), 0) is Request.START
 
 
 def held_back(flight, number):
@@ -201,13 +180,3 @@ def test_an_acknowledgement_waits_for_the_stop_before_and_not_for_one_after(
     assert flight.teleop.settled
     if guard is GROUND:
         assert asked(flight)[-2:] == [Request.ESTOP, Request.ACKNOWLEDGE]
-
-
-@pytest.mark.parametrize("verb", ["stop", "acknowledge"])
-def test_an_operators_word_precedes_ending_a_lost_mission(verb):
-    flight = Flight()
-    flight.operate(verb)
-    flight.onboard = (ID, 0)
-    flight.step(seconds=0.3)
-    stops = verb == "stop"  # a stop ends it, too
-    assert asked(flight) == ([Request.ESTOP] if stops else [Request.ACKNOWLEDGE, Request.END])
