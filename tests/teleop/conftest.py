@@ -274,8 +274,8 @@ def play(flight, script):
             flight.step(seconds=float(action))
         elif action in SWITCHES:
             vars(flight).update(SWITCHES[action])
-        elif action in ("create", "queue"):
-            flight.create(queue=action == "queue")
+        elif action in ("create", "queue", "here"):
+            flight.create(THREE if action == "here" else FROM_SPAWN, queue=action == "queue")
         elif action == "goto":
             flight.teleop.go_to(Leg(AWAY, 0.5), flight.now_ns)
         elif action.startswith("cancel"):

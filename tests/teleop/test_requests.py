@@ -2,8 +2,6 @@
 
 from itertools import pairwise
 
-import pytest
-
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, RequestSender
@@ -12,7 +10,7 @@ from cloudrc.teleop.wire import (
     RobotStatus,
 )
 from cloudrc.tunnel.codec import NUMBER_MAX
-from tests.teleop.conftest import FROM_SPAWN, ID, PLAN, THREE, A, Flight, asked, flying
+from tests.teleop.conftest import FROM_SPAWN, ID, PLAN, THREE, A, Flight, flying
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -128,22 +126,6 @@ def test_a_stop_leaves_at_once_and_is_told_until_it_is_seen():
     assert flight.guard is ESTOP
 
 
-@pytest.mark.promise("emergency-stop-gets-through")
-def test_nothing_supersedes_a_stop():
-    flight = flying()
-    flight.downlink = False
-    flight.operate("stop")
-    flight.step(seconds=0.2)
-    count = len(flight.requests)
-    flight.operate("start", THREE)
-    flight.step(seconds=1.0)
-    assert {r.request for r in flight.requests[count:]} == {Request.ESTOP}
-    flight.downlink = True
-    flight.step(seconds=0.3)
-    assert flight.guard is ESTOP  # and the mission that wanted to start has failed
-    assert flight.teleop.outcome.code == "guard_stopped"
-
-
 def test_a_start_with_the_stops_number_does_not_confirm_the_stop():
     flight = Flight()
     flight.step()
@@ -157,26 +139,3 @@ def test_a_start_with_the_stops_number_does_not_confirm_the_stop():
     flight.step(seconds=0.2)
     assert flight.guard is ESTOP
     assert flight.teleop.settled
-
-
-@pytest.mark.parametrize("in_sight", [True, False])
-@pytest.mark.parametrize(
-    ("verbs", "guard"),
-    [
-        (["stop", "acknowledge", "acknowledge"], GROUND),
-        (["stop", "acknowledge", "stop"], ESTOP),
-    ],
-)
-def test_an_acknowledgement_waits_for_the_stop_before_and_not_for_one_after(
-    verbs, guard, in_sight
-):  # fmt: skip
-    flight = flying() if in_sight else Flight()
-    flight.downlink = False
-    for verb in verbs:
-        flight.operate(verb)
-    flight.downlink = True
-    flight.step(seconds=0.5)
-    assert flight.guard is guard
-    assert flight.teleop.settled
-    if guard is GROUND:
-        assert asked(flight)[-2:] == [Request.ESTOP, Request.ACKNOWLEDGE]

@@ -12,6 +12,7 @@ from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.messages import MISSION_OVER, Cause, GuardState, Request, Setpoint, Start
 from cloudrc.teleop import wire
 from cloudrc.teleop.api import Bridge
+from cloudrc.teleop.mission import HELD_LOWEST
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, SILENCE, next_step
 from cloudrc.teleop.store import ENDED, STATES, ConflictError, Order
 from cloudrc.teleop.wire import Leg, Plan
@@ -82,6 +83,56 @@ SCRIPTS = {
     "held too long": ("create 0.05 hold 60", {"failure": "timed_out", "guard": HOLD}),
     "unseen too long": ("create 0.05 deaf 60", {"failure": "timed_out"}),
     "the guard holds": ("create 0.05 A HOLD 20 TRACK B", {"states": ["flying"], "reached": [0, 1]}),
+    "a stop by somebody else is not undone": (
+        "create 0.05 A mark ESTOP 0.3",
+        {"failure": "guard_stopped", "guard": ESTOP, "asked": {"END"}},
+    ),
+    # The first setpoint: an armed robot flies to it at once
+    "idle it is where the robot is": ("world A cloud away", {"setpoint": Setpoint(AWAY)}),
+    "a robot told to start may fly": (
+        "create mute cancel 0.2 create 0.2",
+        {"states": ["cancelled", "starting"], "waypoint": -1},
+    ),
+    "until it is seen to have heard of the end": (
+        "create mute cancel 0.2 create 0.2 link 0.2",
+        {"states": ["cancelled", "flying"], "waypoint": 0},
+    ),
+    "in a new session a start keeps it in place": (
+        "mute create 0.05 cloud TRACK foreign away 0.3",
+        {"states": ["starting"], "setpoint": Setpoint(AWAY)},
+    ),
+    "and leads it away once it starts": (
+        "mute create 0.05 cloud TRACK foreign away 0.3 link 0.3",
+        {"states": ["flying"], "setpoint": Setpoint(A, 0.0, 0)},
+    ),
+    # Another mission on board: who finds it does not fly on
+    "taken over in flight": (
+        "create 0.05 A foreign mark 0.3",
+        {"failure": "taken_over", "waypoint": -1, "asked": set()},
+    ),
+    "taken over on the ground": (
+        "create 0.05 A foreign GROUND mark 0.3",
+        {"failure": "taken_over", "waypoint": -1, "asked": {"END"}},
+    ),
+    "not before the start": ("foreign HOLD mute create 0.3", {"states": ["starting"]}),
+    "from here before the start": (
+        "HOLD away mute here 0.1 cloud foreign TRACK B",
+        {"failure": "taken_over", "setpoint": Setpoint(B)},
+    ),
+    "also if ordered before it was seen": (
+        "HOLD away restart mute here 0.1 cloud foreign TRACK B",
+        {"failure": "taken_over", "setpoint": Setpoint(B)},
+    ),
+    "a lost mission does not take off": (
+        "foreign mark 0.05",
+        {"asked": {"END"}, "setpoint": Setpoint((0.0, 0.0, HELD_LOWEST)), "settled": True},
+    ),
+    "one that flies is left alone": ("away TRACK foreign mark 0.05", {"asked": set()}),
+    "one that holds as well": ("away HOLD foreign mark restart 0.05", {"asked": set()}),
+    "a finished one is ended": (
+        "create 0.05 A B mute C restart mark link 0.1",
+        {"states": ["done"], "asked": {"END"}, "guard": HOLD},
+    ),
     # Restarts of teleop
     "it continues at its waypoint": (
         "create 0.05 A away 5 mark restart see 0.05",
@@ -98,6 +149,10 @@ SCRIPTS = {
     "with a full disk the robot remembers": (
         "create 0.05 A full B 0.1 restart free away C 0.1",
         {"states": ["done"], "reached": [0, 1, 2], "failure": ""},
+    ),
+    "it never flies back": (
+        "create 0.05 A full B 0.1 mute restart free away",
+        {"states": ["flying"], "waypoint": 2},
     ),
     "a lost cancel is not flown again": (
         "create 0.05 A full cancel 0.3 free mark restart away 1.0",
@@ -201,6 +256,10 @@ SCRIPTS = {
     "a stop after an acknowledgement counts": (
         "create 0.05 A stop_rotors acknowledge stop_rotors 0.3",
         {"guard": ESTOP, "last": "emergency_stopped"},
+    ),
+    "an acknowledgement waits for the stop": (
+        "create 0.05 mute stop_rotors acknowledge acknowledge link 0.5",
+        {"guard": GROUND, "settled": True},
     ),
     # The end of teleop
     "in flight it holds": (
