@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint
@@ -93,22 +93,6 @@ class UnixPeer:
     def close(self) -> None:
         """Close the socket; its path stays, since a successor may already have bound it."""
         self._socket.close()
-
-
-class Machine(Protocol):
-    """The state machine that teleop's process runs."""
-
-    def hear(self, now_ns: int) -> None:
-        """Note that cloud runs."""
-
-    def see(self, seen: Any, now_ns: int) -> None:
-        """Note the newest robot state."""
-
-    def handle_deadline(self, now_ns: int) -> None:
-        """Do what is due at `now_ns` [ns]."""
-
-    def take_outputs(self) -> Sequence[Any]:
-        """Return the machine's outputs since the last call."""
 
 
 class RemoteTeleop:
@@ -201,7 +185,7 @@ class LastWord:
 
 
 def serve_teleop(
-    machine: Machine,
+    machine: Any,
     peer: UnixPeer,
     encode: Encode,
     decode: Decode,
@@ -211,17 +195,11 @@ def serve_teleop(
     tell: Callable[[list[MissionEvent | Fault]], None],
     stop: Callable[[], bool],
 ) -> None:
-    """Run teleop's machine at 50 Hz in real time until `stop()` is true.
+    """Run teleop's machine at 50 Hz in real time until `stop()`, which is called at every wake.
 
-    Args:
-        machine: Gets before each deadline the newest robot state.
-        peer: The socket to cloud.
-        encode: Encodes a message for cloud.
-        decode: Decodes a message from cloud.
-        calls: Returns the queued calls.
-        stops: Returns the queued emergency stops.
-        tell: Gets the events and faults of each wake; must not block.
-        stop: Called at every wake.
+    The machine is a `MissionService` or acts like one: it has hear, see, handle_deadline and
+    take_outputs. `tell` gets the events and faults of each wake, and must not block. For `calls`
+    and `stops` see `turn`.
     """
     unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
     deadline_ns, blind = time.monotonic_ns(), 0
@@ -239,7 +217,7 @@ def serve_teleop(
 
 
 def turn(
-    machine: Machine,
+    machine: Any,
     peer: UnixPeer,
     decode: Decode,
     calls: Calls,
@@ -252,18 +230,18 @@ def turn(
     """Run one wake of teleop: receive states, make the queued calls, handle the deadline.
 
     Args:
-        machine: Gets states, calls and its deadline.
+        machine: See `serve_teleop`.
         peer: The socket to cloud.
         decode: Decodes a message from cloud.
         calls: Returns the queued calls.
-        stops: Returns the queued emergency stops, which are made first.
+        stops: Returns the queued emergency stops.
         blind: Return value of the last wake; 0 at first.
         late_ns: Lateness of this wake [ns].
         now_ns: Now [ns].
 
     Returns:
-        Number of further wakes that wait, after a stall, for a new datagram. If it is above 0, this
-        wake has only received datagrams.
+        Number of further wakes that wait, after a stall, for a new datagram; 0 if this wake has
+        done all its work.
     """
     arrived, was_blind = peer.receive(), blind
     states = [data for data in arrived if data]  # an empty datagram carries no state
