@@ -48,7 +48,7 @@ ALWAYS = {"errors", "messages", "records", "__version__"}
 
 # Parts that run in real time besides the drivers: link shapers and teleop's API.
 SHAPERS = ("link/relay", "link/verify/probe", "link/verify/monitor")
-API = ("teleop/api", "teleop/auth", "teleop/bridge")
+API = ("teleop/api", "teleop/auth")
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it.
 RESERVED: dict[str, tuple[str, ...]] = {

@@ -8,10 +8,11 @@ import os
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
@@ -25,72 +26,24 @@ from cloudrc.cli.runtime import (
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.schema import Mission
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.records import Counted
+    from cloudrc.geometry.scene import Scene
+    from cloudrc.records import Record
     from cloudrc.teleop.api import ApiServer
-    from cloudrc.teleop.bridge import Bridge
     from cloudrc.teleop.service import MissionService
     from cloudrc.teleop.store import MissionStore
-
 
 LOOPBACK = "127.0.0.1"
 FILES_MAX = 8_192
 """Limit of open files. It is high enough that idle connections leave room for an emergency stop.
 Idle connections use at most 64 MB of memory."""
-
-
-def serve_api(
-    options: argparse.Namespace, experiment: ResolvedExperiment, bridge: Bridge
-) -> ApiServer:
-    """Start the API; until the bridge is opened, the API answers that teleop is not ready."""
-    from cloudrc import assembly
-    from cloudrc.geometry.scene import load_scene
-    from cloudrc.link.state import publish
-    from cloudrc.teleop.api import ApiServer, create_app
-    from cloudrc.teleop.audit import Audit
-    from cloudrc.teleop.auth import Gate, Tokens
-    from cloudrc.teleop.models import Surroundings
-
-    if not isinstance(options.api, Path):
-        warn_if_exposed(options.api)
-    criteria, scene = experiment.criteria, load_scene(experiment.world.scene)
-    plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
-    surroundings = Surroundings(scene, criteria.time_limit_s, criteria.contact, plan)
-    tokens = Tokens(options.tokens, log_line) if options.tokens else None
-    audit = Audit(options.audit, log_line) if options.audit else None
-    gate = Gate(create_app(bridge, surroundings, log_line), tokens, audit)
-    server = ApiServer(gate, bridge, options.api)
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
-    server.start()
-    if options.api_file is not None:
-        publish(options.api_file, json.dumps({"schemaVersion": 1, "url": server.url}) + "\n")
-    return server
-
-
-def api_counts(server: ApiServer, service: MissionService) -> list[Counted]:
-    """Return the counts of the API for the metrics."""
-    from cloudrc.records import Counted
-
-    counts, now_ns = {**server.counts, "events_dropped": service.book.dropped}, time.monotonic_ns()
-    return [Counted(now_ns, "teleop", f"api_{name}", number) for name, number in counts.items()]
-
-
-def log_line(text: str) -> None:
-    """Write a line to the log, from any thread."""
-    print_line(f"cloudrc teleop: {text}", sys.stderr)
-
-
-def api_address(text: str) -> Address | Path:
-    """Parse [HOST:]PORT, where PORT may be 0, or unix:PATH."""
-    if text.startswith("unix:") and len(text) > len("unix:"):
-        return Path(text.removeprefix("unix:"))
-    host, colon, port = text.rpartition(":")
-    host = host if colon else LOOPBACK
-    return (host.strip("[]"), 0) if host and port == "0" else read_address(f"{host}:{port}")
-
-
+LOCK_PERIOD = 0.2
+"""Pause between two attempts to open a journal that another teleop process has locked [s]."""
+PAUSE_LIMIT_NS = 500_000_000
+"""Longest time that teleop, before it ends, waits for the robot to hold [ns]."""
+SALT_SIZE = 16
+"""Size of the random salt of mission numbers [bytes]."""
 EPILOG = """\
 teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
 --start or --mission it ends after that mission; otherwise on SIGTERM, on Ctrl-C
@@ -101,12 +54,6 @@ with the same --journal resumes the mission.
 file, which only its owner can open. To make a token that only you can read:
 (umask 077; openssl rand -hex 32 > DIR/operator). A token in DIR/reader may only
 read."""
-LOCK_PERIOD = 0.2
-"""Pause between two attempts to open a journal that another teleop process has locked [s]."""
-PAUSE_LIMIT_NS = 500_000_000
-"""Longest time that teleop, before it ends, waits for the robot to hold [ns]."""
-SALT_SIZE = 16
-"""Size of the random salt of mission numbers [bytes]."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -122,24 +69,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="serve the API here: [HOST:]PORT (default HOST: 127.0.0.1; PORT 0: any free port) or "
         "unix:PATH, for your user only (default: no API)",
     )
-    parser.add_argument(
-        "--tokens",
-        type=Path,
-        metavar="DIR",
-        help="folder of the token files 'operator' and 'reader'",
-    )
-    parser.add_argument(
-        "--audit", type=Path, metavar="FILE", help="log all commands and their callers (JSON lines)"
-    )
-    parser.add_argument(
-        "--api-file", type=Path, metavar="FILE", help="write the API's URL to this file"
-    )
-    parser.add_argument(
-        "--journal",
-        type=Path,
-        metavar="FILE",
-        help="store missions in this file (default: not stored)",
-    )
+    for flag, metavar, text in (
+        ("--tokens", "DIR", "folder of the token files 'operator' and 'reader'"),
+        ("--audit", "FILE", "log all commands and their callers (JSON lines)"),
+        ("--api-file", "FILE", "write the API's URL to this file"),
+        ("--journal", "FILE", "store missions in this file (default: not stored)"),
+    ):
+        parser.add_argument(flag, type=Path, metavar=metavar, help=text)
     first = parser.add_mutually_exclusive_group()
     first.add_argument("--mission", metavar="FILE", help="fly this mission, then exit")
     first.add_argument(
@@ -147,12 +83,20 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def api_address(text: str) -> Address | Path:
+    """Parse [HOST:]PORT, where PORT may be 0, or unix:PATH."""
+    if text.startswith("unix:") and len(text) > len("unix:"):
+        return Path(text.removeprefix("unix:"))
+    host, colon, port = text.rpartition(":")
+    host = host if colon else LOOPBACK
+    return (host.strip("[]"), 0) if host and port == "0" else read_address(f"{host}:{port}")
+
+
 def execute(options: argparse.Namespace) -> int:
     """Run teleop until its mission has ended or a signal stops the process."""
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.process import StopSignal
-    from cloudrc.records import Counted
-    from cloudrc.teleop.bridge import Bridge
+    from cloudrc.geometry.scene import load_scene
     from cloudrc.teleop.service import MissionService
 
     if options.api:
@@ -161,94 +105,124 @@ def execute(options: argparse.Namespace) -> int:
     experiment = read_experiment(str(options.config))
     if exporter is not None:
         exporter.runs(fingerprint(experiment))
-    bridge = Bridge()
-    server = serve_api(options, experiment, bridge) if options.api else None
-    book = None
-    try:
-        book = _open_store(options.journal, stop, bridge)
-        if book is None:
-            return 0  # stopped while another teleop held the journal
-        service = MissionService(experiment.criteria.contact_speed_max_mps, book)
-        single_mission = _start(options, experiment, service)
-        ending = _Ending(service, stop)
-        over = lambda: ending() or (single_mission and service.over)  # noqa: E731
-        if exporter is not None and book.damaged:
-            exporter.see([Counted(0, "teleop", "journal_repaired", 1)])
-        _fly(options, service, bridge, server, exporter, over)
-    finally:
+    with ExitStack() as opened:
+        scene = load_scene(experiment.world.scene)
+        server = serve_api(options, experiment, scene) if options.api else None
         if server is not None:
-            server.stop()
-        if book is not None:
-            book.close()
+            opened.callback(server.stop)
+        book = _open_store(options.journal, stop, server)
+        if book is not None:  # else stopped while another teleop held the journal
+            opened.callback(book.close)
+            service = MissionService(experiment.criteria.contact_speed_max_mps, book, scene)
+            single_mission = _start(options, experiment, service)
+            may_end = ending(service, stop)
+            over = lambda: may_end() or (single_mission and service.over)  # noqa: E731
+            _fly(options, service, server, exporter, over)
     return 0
 
 
-class _Ending:
-    """Pause the mission after a stop signal; return True once the robot holds.
+def serve_api(
+    options: argparse.Namespace, experiment: ResolvedExperiment, scene: Scene
+) -> ApiServer:
+    """Start the API; until its bridge is opened, the API answers that teleop is not ready."""
+    from cloudrc import assembly
+    from cloudrc.link.state import publish
+    from cloudrc.teleop.api import ApiServer, Bridge, create_app
+    from cloudrc.teleop.auth import Audit, Gate, Tokens
+    from cloudrc.teleop.models import read_goto, read_order
 
-    It also returns True after `PAUSE_LIMIT_NS`.
+    if not isinstance(options.api, Path):
+        warn_if_exposed(options.api)
+    criteria = experiment.criteria
+    plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
+    order = partial(
+        read_order, scene=scene, time_limit=criteria.time_limit_s, contact=criteria.contact,
+        plan=plan,
+    )  # fmt: skip
+    goto = partial(read_goto, scene=scene)
+    tokens = Tokens(options.tokens, log_line) if options.tokens else None
+    audit = Audit(options.audit, log_line) if options.audit else None
+    bridge = Bridge()
+    app = create_app(bridge, order, goto, log_line)
+    server = ApiServer(Gate(app, tokens, audit), bridge, options.api)
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
+    server.start()
+    if options.api_file is not None:
+        publish(options.api_file, json.dumps({"schemaVersion": 1, "url": server.url}) + "\n")
+    return server
+
+
+def log_line(text: str) -> None:
+    """Write a line to the log, from any thread."""
+    print_line(f"cloudrc teleop: {text}", sys.stderr)
+
+
+def ending(service: MissionService, asked: Callable[[], bool]) -> Callable[[], bool]:
+    """Return a function that pauses the mission once `asked()`, and says when teleop may end.
+
+    It may end when the robot holds, or after `PAUSE_LIMIT_NS`.
     """
+    until_ns: list[int] = []
 
-    def __init__(self, service: MissionService, asked: Callable[[], bool]) -> None:
-        self._service, self._stop_asked = service, asked
-        self._since_ns: int | None = None
-
-    def __call__(self) -> bool:
-        if not self._stop_asked():
+    def may_end() -> bool:
+        if not asked():
             return False
-        if self._since_ns is None:
-            self._service.pause(time.monotonic_ns())
-            self._since_ns = time.monotonic_ns()  # the disk may have taken long
-        return self._service.settled or time.monotonic_ns() - self._since_ns > PAUSE_LIMIT_NS
+        if not until_ns:
+            service.pause(time.monotonic_ns())
+            until_ns.append(time.monotonic_ns() + PAUSE_LIMIT_NS)  # the disk may have taken long
+        return service.settled or time.monotonic_ns() > until_ns[0]
+
+    return may_end
 
 
 def _fly(
     options: argparse.Namespace,
     service: MissionService,
-    bridge: Bridge,
     server: ApiServer | None,
     exporter: Exporter | None,
-    stop: Callable[[], bool],
+    over: Callable[[], bool],
 ) -> None:
-    """Run the service until `stop()`."""
+    """Run the service until `over()`."""
     from cloudrc.drivers.feed import Feed
     from cloudrc.drivers.teleop import UnixPeer, serve_teleop
-    from cloudrc.records import Fault
+    from cloudrc.records import Counted, Fault
     from cloudrc.teleop import wire
 
     feed = Feed.on_stdout(watched=options.feed)
     peer = UnixPeer(options.socket / "teleop.sock", options.socket / "cloud.sock")
-    bridge.alarm = lambda: peer.send(wire.encode(wire.ALARM))
-    bridge.open(service)
+    if server is not None:
+        server.bridge.alarm = lambda: peer.send(wire.encode(wire.ALARM))
+        server.bridge.open(service)
     feed.ready()
 
-    def publish(records: list[Any]) -> None:
+    def tell(records: Sequence[Record]) -> None:
         feed.tell(record for record in records if isinstance(record, Fault))  # cloud has events
         if exporter is not None:
             exporter.see(records)
 
-    def update_and_check() -> bool:
+    def is_over() -> bool:
         if exporter is not None:
             exporter.ready(service.sight.seen is not None)
-            if server is not None:
-                exporter.see(api_counts(server, service))
-        return stop()
+            counts = {"events_dropped": service.book.dropped, **(server.counts if server else {})}
+            exporter.see([Counted(0, "teleop", name, count) for name, count in counts.items()])
+        return over()
 
     if notice := service.book.notice:
-        publish([Fault(0, "journal", notice)])
+        tell([Fault(0, "journal", notice), Counted(0, "teleop", "journal_repaired", 1)])
     serve_teleop(
-        service,
-        peer,
-        wire.encode,
-        wire.decode,
-        calls=bridge.take,
-        stops=bridge.take_urgent,
-        tell=publish,
-        stop=feed.alive_while(update_and_check),
+        *(service, peer, wire.encode, wire.decode),
+        calls=server.bridge.take if server else list,
+        stops=server.bridge.take_stop if server else list,
+        tell=tell,
+        stop=feed.alive_while(is_over),
     )
 
 
-def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> MissionStore | None:
+def _open_store(
+    path: Path | None, stop: Callable[[], bool], server: ApiServer | None
+) -> MissionStore | None:
     """Open the store once no other teleop has locked it; return None if stopped before."""
     from cloudrc.teleop.store import MissionStore, StoreLockedError, connect, open_store
 
@@ -257,17 +231,14 @@ def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> 
         return MissionStore(connect(), salt)
     while not stop():
         try:
-            book = open_store(path, salt)
+            return open_store(path, salt)
         except StoreLockedError as error:
             if not reported:
                 log_line(str(error))
                 reported = True
-            bridge.close(str(error))
+            if server is not None:
+                server.bridge.close(str(error))
             time.sleep(LOCK_PERIOD)
-            continue
-        if book.notice:
-            log_line(book.notice)
-        return book
     return None
 
 
@@ -282,7 +253,7 @@ def _start(
         return False
     criteria, mission, name = experiment.criteria, experiment.mission, experiment.name
     if options.mission:
-        mission, name = _load(options.mission, experiment), Path(options.mission).stem
+        mission, name = _load_mission(options.mission, experiment), Path(options.mission).stem
     plan = assembly.mission_plan(mission, criteria.time_limit_s, experiment.seed)
     if any(each.order.plan == plan for each in service.book.open()):
         return True  # the previous process started it with the same options: it resumes
@@ -296,7 +267,7 @@ def _start(
     return True
 
 
-def _load(name: str, experiment: ResolvedExperiment) -> Any:
+def _load_mission(name: str, experiment: ResolvedExperiment) -> Mission:
     from cloudrc.config.load import load_mission
     from cloudrc.config.mission_check import check_mission
     from cloudrc.errors import BadInputError

@@ -41,15 +41,10 @@ class Operator(Protocol):
 
 
 def is_for_session(epoch: int, output: Output | Fault) -> bool:
-    """Whether a message from teleop is valid in a session.
+    """Return whether a message from teleop is valid in the session with this epoch.
 
-    A setpoint and a start are valid only in the session for which teleop made them: another cloud
-    may have moved the robot in the meantime. Teleop repeats both for the new session. All other
-    messages are always valid, because they cannot make the robot fly.
-
-    Args:
-        epoch: Epoch of the session.
-        output: Message from teleop.
+    Setpoints and starts are valid only in the session for which teleop made them, because another
+    cloud may have moved the robot since. Teleop repeats both. No other message makes it fly.
     """
     if isinstance(output, Setpoint) or (
         isinstance(output, OperatorRequest) and output.request is Request.START
@@ -63,35 +58,20 @@ def make_robot_status(
 ) -> RobotStatus:
     """Make the message that tells teleop of new telemetry.
 
-    Args:
-        telemetry: The newest telemetry.
-        epoch: Epoch of the telemetry's session.
-        world: Text that identifies world's process.
-        delays: Horizon, round trip and loop delay of the last command [s]; NaN before the first.
+    `delays` are horizon, round trip and loop delay of the last command [s]; NaN before the first.
     """
     fields = (
-        epoch,
-        telemetry.odometry.position,
-        telemetry.guard,
-        telemetry.mission,
-        world,
-        telemetry.pipe_contacts,
-        telemetry.touch_speed,
-        telemetry.slip_ns,
-        *delays,
-        telemetry.mission_id,
-        telemetry.reached,
-        telemetry.cause,
+        *(epoch, telemetry.odometry.position, telemetry.guard, telemetry.mission, world),
+        *(telemetry.pipe_contacts, telemetry.touch_speed, telemetry.slip_ns, *delays),
+        *(telemetry.mission_id, telemetry.reached, telemetry.cause),
     )
     return _new(RobotStatus, fields)
 
 
 class EmergencyStopRepeater:
-    """Repeats an emergency stop until telemetry shows that the robot has acted on the stop.
+    """Numbers an emergency stop, and repeats it until telemetry shows that the robot obeyed.
 
-    Only this class numbers the stop and repeats it towards the robot. Teleop's loop, or teleop's
-    API without the loop, may ask for the stop any number of times. Without a session the stop waits
-    for the next session.
+    Teleop may ask for it any number of times. Without a session it waits for the next session.
 
     Attributes:
         sounds: Whether the stop is being repeated.
@@ -102,7 +82,7 @@ class EmergencyStopRepeater:
         self._number = self._acted_on = self._due_ns = 0
 
     def sound(self) -> None:
-        """Start to repeat the stop, unless it is being repeated already."""
+        """Start to repeat the stop."""
         if not self.sounds:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
@@ -121,13 +101,9 @@ class EmergencyStopRepeater:
         self.sounds = self.sounds and not self._stopped
 
     def due(self, asked: int, now_ns: int) -> OperatorRequest | None:
-        """Return a copy of the emergency stop if one is due, else None.
+        """Return a copy of the emergency stop if one is due at `now_ns` [ns], else None.
 
-        World acts on rising numbers only, so the stop needs a number above all others.
-
-        Args:
-            asked: Highest number of all requests so far.
-            now_ns: Cloud's monotonic clock [ns].
+        World acts on rising numbers only: the stop's is above `asked`, the highest so far.
         """
         if not self.sounds or now_ns < self._due_ns:
             return None

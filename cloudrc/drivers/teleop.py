@@ -2,9 +2,8 @@
 
     cloud process: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  serve_teleop - machine
 
-No call blocks. A datagram is lost, as on a network, if the socket of the other process is full or
-missing. Either process may restart: the socket's path is looked up for each datagram, setpoint and
-requests are repeated, and events wait until cloud is back.
+No call blocks. A datagram is lost if the socket of the other process is full or missing. Either
+process may restart: setpoint and requests are repeated, and events wait until cloud is back.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint
@@ -24,19 +23,37 @@ from cloudrc.records import Fault, MissionEvent
 DATAGRAM_MAX = 8_192
 """Size limit of a datagram [bytes]; all our messages are smaller."""
 DRAIN_MAX = 1024
-"""Largest number of datagrams per wake; with this limit, a flood cannot delay a loop's deadlines.
-The limit is above the socket's queue (513 under systemd), so that one wake after a stall takes all
-waiting datagrams."""
+"""Limit of the datagrams per wake, above the socket's queue (513 under systemd): a flood cannot
+delay a loop's deadlines."""
 PATH_MAX = 107
 """Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
+PERIOD_NS = 20_000_000
+"""Period of teleop's state machine [ns]."""
+TELL_NS = PERIOD_NS - 5_000_000
+"""Shortest time between two robot states sent to teleop [ns]: every second telemetry message."""
+ALIVE_NS = 200_000_000
+"""Time between two empty datagrams that tell teleop that cloud runs, without telemetry [ns]."""
+STALL_NS = 100_000_000
+"""If a wake is later than this, the socket holds only old datagrams [ns]: its queue has been full
+since the start of the stall."""
+BLIND_WAKES = 5
+"""Limit of the wakes that wait for a new datagram after a stall."""
+SILENCE_NS = 1_000_000_000
+"""Time without a datagram from teleop after which teleop counts as away [ns]; it sends at 10 Hz."""
+EVENTS_KEPT = 256
+"""Limit of the events that wait while cloud is away."""
+LAST_WORD_NS = 800_000_000
+"""How long cloud, while it ends, still forwards teleop's last hold request [ns]. This is longer
+than teleop repeats the request, and shorter than the 1.5 s that a process has to end."""
+Encode = Callable[[Any], bytes]
+Decode = Callable[[bytes], Any]
+"""Function that decodes a message; it raises a ValueError if the bytes are not a message."""
+Calls = Callable[[], Iterable[Callable[[int], None]]]
+"""Function that returns the calls that other threads have queued; each takes the time [ns]."""
 
 
 class UnixPeer:
-    """Our Unix datagram socket and the path of the other process's socket.
-
-    Attributes:
-        unsent: Number of datagrams that the other socket refused.
-    """
+    """Our Unix datagram socket and the path of the other process's socket."""
 
     def __init__(self, own: Path, other: Path) -> None:
         """Bind `own` and replace a socket that an earlier process left there.
@@ -44,8 +61,7 @@ class UnixPeer:
         Raises:
             BadInputError: If the path cannot be bound.
         """
-        self._own, self._other = own, str(other)
-        self.unsent = 0
+        self._other = str(other)
         if len(bytes(own)) > PATH_MAX:
             raise BadInputError(f"--socket: {own} is longer than {PATH_MAX} bytes; choose another")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -61,11 +77,9 @@ class UnixPeer:
     def receive(self) -> list[bytes]:
         """Return the datagrams that wait in the socket."""
         datagrams: list[bytes] = []
-        while len(datagrams) < DRAIN_MAX:
-            try:
+        with suppress(BlockingIOError):
+            while len(datagrams) < DRAIN_MAX:
                 datagrams.append(self._socket.recv(DATAGRAM_MAX))
-            except BlockingIOError:
-                break
         return datagrams
 
     def send(self, data: bytes) -> bool:
@@ -73,7 +87,6 @@ class UnixPeer:
         try:
             self._socket.sendto(data, self._other)
         except OSError:  # missing, restarting, or its queue is full
-            self.unsent += 1
             return False
         return True
 
@@ -82,87 +95,34 @@ class UnixPeer:
         self._socket.close()
 
 
-PERIOD_NS = 20_000_000
-"""Period of teleop's state machine [ns]."""
-TELL_NS = PERIOD_NS - 5_000_000
-"""Shortest time between two robot states sent to teleop [ns]. With this value teleop gets every
-second telemetry message."""
-ALIVE_NS = 200_000_000
-"""Time between two empty datagrams to teleop while there is no telemetry [ns]. Empty datagrams tell
-teleop that cloud runs."""
-STALL_NS = 100_000_000
-"""If a wake is later than this, the socket holds only old datagrams [ns]: the queue has been full
-since the start of the stall. New datagrams arrive within the next wakes."""
-BLIND_WAKES = 5
-"""Largest number of wakes that wait for a new datagram after a stall [1]. Then teleop continues
-without a new datagram."""
-SILENCE_NS = 1_000_000_000
-"""Time without a datagram from teleop after which teleop counts as away [ns]; teleop sends at 10
-Hz."""
-EVENTS_KEPT = 256
-"""Largest number of events that wait while cloud is away [1]."""
-LAST_WORD_NS = 800_000_000
-"""How long cloud, while it ends, still forwards teleop's last hold request [ns]. This is longer
-than teleop repeats the request, and shorter than the 1.5 s that a process has to end."""
-
-Encode = Callable[[Any], bytes]
-Decode = Callable[[bytes], Any]
-"""Function that decodes a message; it raises a ValueError if the bytes are not a message."""
-Calls = Callable[[], Iterable[Callable[[int], None]]]
-"""Function that returns the calls that other threads have queued. Each call takes the current time
-[ns] and must not block."""
-
-
-class Machine(Protocol):
-    """The state machine that teleop's process runs."""
-
-    def hear(self, now_ns: int) -> None:
-        """Note that cloud runs."""
-
-    def see(self, seen: Any, now_ns: int) -> None:
-        """Note the newest robot state."""
-
-    def handle_deadline(self, now_ns: int) -> None:
-        """Do what is due at `now_ns` [ns]."""
-
-    def take_outputs(self) -> Sequence[Any]:
-        """Return the machine's outputs since the last call."""
-
-
 class RemoteTeleop:
-    """Represents teleop in cloud's process.
+    """Represents teleop in cloud's process, which does not end when a mission ends.
 
     Attributes:
-        outcome: Always None, because cloud does not end when a mission ends.
-        settled: Always True.
         outputs: Teleop's outputs since the last call of `take_outputs`.
-        malformed: Number of datagrams that were no messages.
     """
 
     outcome = None
     settled = True
 
     def __init__(self, peer: UnixPeer, encode: Encode, decode: Decode, start_ns: int) -> None:
-        """Connect to teleop at `start_ns` [ns].
-
-        From then on teleop has one second to send its first datagram.
-        """
+        """Connect to teleop at `start_ns` [ns]."""
         self._peer, self._encode, self._decode = peer, encode, decode
-        self._heard_ns, self._silent, self._stalled = start_ns, False, False
+        self._heard_ns: int | None = None  # or when teleop was told of the first telemetry
+        self._silent = self._stalled = False
         self._tell_ns = self._looked_ns = self._alive_ns = start_ns
         self.outputs: list[Any] = []
-        self.malformed = 0
 
     def see(self, seen: Any, now_ns: int) -> None:
         """Send the robot's state to teleop, at most every `TELL_NS`."""
         if now_ns >= self._tell_ns:
             self._tell_ns, self._alive_ns = now_ns + TELL_NS, now_ns + ALIVE_NS
             self._peer.send(self._encode(seen))
+            if self._heard_ns is None:
+                self._heard_ns = now_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Receive teleop's outputs; report a fault once teleop is silent for a second.
-
-        Without telemetry an empty datagram tells teleop that cloud runs.
+        """Receive teleop's outputs; report a fault once teleop, with telemetry, is silent for 1 s.
 
         After a stall, starts and waypoints are dropped: teleop may have withdrawn them in a
         datagram that was lost because the socket was full. Teleop repeats the outputs that are
@@ -175,15 +135,13 @@ class RemoteTeleop:
         self._stalled = not self._stalled and now_ns - self._looked_ns > STALL_NS
         self._looked_ns = now_ns
         for data in self._peer.receive():
-            try:
+            with suppress(ValueError):
                 output = self._decode(data)
-            except ValueError:
-                self.malformed += 1
-                continue
-            self._heard_ns, self._silent = now_ns, False
-            if not (self._stalled and _moves_robot(output)):
-                self.outputs.append(output)
-        if not self._silent and now_ns - self._heard_ns > SILENCE_NS:
+                self._heard_ns, self._silent = now_ns, False
+                if not (self._stalled and _moves_robot(output)):
+                    self.outputs.append(output)
+        heard_ns = now_ns if self._heard_ns is None else self._heard_ns
+        if not self._silent and now_ns - heard_ns > SILENCE_NS:
             self._silent = True
             text = "no word from teleop for 1 s: the last setpoint is kept; see teleop's log"
             self.outputs.append(Fault(now_ns, "teleop_silent", text))
@@ -192,6 +150,13 @@ class RemoteTeleop:
         """Return teleop's outputs since the last call."""
         outputs, self.outputs = self.outputs, []
         return outputs
+
+
+def _moves_robot(output: Any) -> bool:
+    """Check whether an output starts a mission or leads to a waypoint."""
+    if isinstance(output, OperatorRequest):
+        return output.request is Request.START
+    return isinstance(output, Setpoint) and output.waypoint >= 0
 
 
 class LastWord:
@@ -206,13 +171,7 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Set the functions; nobody has asked cloud to end yet.
-
-        Args:
-            asked: Whether somebody has asked cloud to end.
-            flies: Whether telemetry shows that the robot follows commands.
-            clock: Own clock [ns].
-        """
+        """Note who says whether cloud has to end and whether the robot flies; `clock` is in ns."""
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
 
@@ -226,7 +185,7 @@ class LastWord:
 
 
 def serve_teleop(
-    machine: Machine,
+    machine: Any,
     peer: UnixPeer,
     encode: Encode,
     decode: Decode,
@@ -236,17 +195,11 @@ def serve_teleop(
     tell: Callable[[list[MissionEvent | Fault]], None],
     stop: Callable[[], bool],
 ) -> None:
-    """Run teleop's machine in real time until `stop()` is true.
+    """Run teleop's machine at 50 Hz in real time until `stop()`, which is called at every wake.
 
-    Args:
-        machine: Gets 50 deadlines a second, and before each deadline the newest robot state.
-        peer: The socket to cloud.
-        encode: Encodes a message for cloud.
-        decode: Decodes a message from cloud.
-        calls: Returns the queued calls.
-        stops: Returns the queued emergency stops, which are made first.
-        tell: Gets the events and faults of each wake; must not block.
-        stop: Called at every wake.
+    The machine is a `MissionService` or acts like one: it has hear, see, handle_deadline and
+    take_outputs. `tell` gets the events and faults of each wake, and must not block. For `calls`
+    and `stops` see `turn`.
     """
     unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
     deadline_ns, blind = time.monotonic_ns(), 0
@@ -264,7 +217,7 @@ def serve_teleop(
 
 
 def turn(
-    machine: Machine,
+    machine: Any,
     peer: UnixPeer,
     decode: Decode,
     calls: Calls,
@@ -277,32 +230,37 @@ def turn(
     """Run one wake of teleop: receive states, make the queued calls, handle the deadline.
 
     Args:
-        machine: Gets states, calls and its deadline.
+        machine: See `serve_teleop`.
         peer: The socket to cloud.
         decode: Decodes a message from cloud.
         calls: Returns the queued calls.
-        stops: Returns the queued emergency stops, which are made first.
+        stops: Returns the queued emergency stops.
         blind: Return value of the last wake; 0 at first.
         late_ns: Lateness of this wake [ns].
         now_ns: Now [ns].
 
     Returns:
-        Number of further wakes that wait for a new datagram. If the number is above 0, this wake
-        has only received datagrams.
+        Number of further wakes that wait, after a stall, for a new datagram; 0 if this wake has
+        done all its work.
     """
     arrived, was_blind = peer.receive(), blind
     states = [data for data in arrived if data]  # an empty datagram carries no state
-    blind = blind_for(was_blind, late_ns, bool(states))
+    if blind:  # lateness does not count, so that a loop that is always late still continues
+        blind = 0 if states else blind - 1
+    elif late_ns > STALL_NS:
+        blind = BLIND_WAKES
     if blind:
         return blind
     if arrived:
         machine.hear(now_ns)
-    for stop in stops():  # before the state, which may already show the effect of their alarm
+    # Calls come before the state, which may already show the effect of a call or of its alarm.
+    # After a stall other calls than stops come later, because they may depend on the robot's place.
+    for stop in stops():
         stop(now_ns)
     seen = _newest(states, decode)
-    if was_blind and seen is not None:  # before the calls, which may depend on the robot's place
+    if was_blind and seen is not None:
         machine.see(seen, now_ns)
-    for call in calls():  # before the state, which may already show the effect of a call
+    for call in calls():
         call(now_ns)
     if not was_blind and seen is not None:
         machine.see(seen, now_ns)
@@ -310,51 +268,20 @@ def turn(
     return 0
 
 
-def blind_for(before: int, late_ns: int, arrived: bool) -> int:
-    """Return how many further wakes wait for a new datagram after a stall.
-
-    Lateness does not count during the wait, so that a loop that is always late still continues.
-
-    Args:
-        before: Return value of the last wake.
-        late_ns: Lateness of this wake [ns].
-        arrived: Whether a datagram with a state has arrived.
-    """
-    if before:
-        return 0 if arrived else before - 1
-    return BLIND_WAKES if late_ns > STALL_NS else 0
-
-
 def send(
     outputs: Sequence[Any], unsent: deque[bytes], peer: UnixPeer, encode: Encode
 ) -> list[MissionEvent | Fault]:
-    """Send outputs to cloud; the events that wait in `unsent` are sent first.
-
-    Returns:
-        The events and faults among the outputs.
-    """
-    reports: list[MissionEvent | Fault] = []
+    """Send outputs to cloud, after the events that wait in `unsent`; return events and faults."""
     while unsent and peer.send(unsent[0]):
         unsent.popleft()
     for output in outputs:
-        if isinstance(output, MissionEvent | Fault):
-            reports.append(output)
-        if isinstance(output, Fault):
-            continue
-        data = encode(output)
-        is_event = isinstance(output, MissionEvent)
-        # Events keep their order; everything else is repeated anyway.
-        if (is_event and unsent) or not peer.send(data):
-            if is_event:
+        if isinstance(output, MissionEvent):  # events keep their order
+            data = encode(output)
+            if unsent or not peer.send(data):
                 unsent.append(data)
-    return reports
-
-
-def _moves_robot(output: Any) -> bool:
-    """Check whether an output starts a mission or leads to a waypoint."""
-    if isinstance(output, OperatorRequest):
-        return output.request is Request.START
-    return isinstance(output, Setpoint) and output.waypoint >= 0
+        elif not isinstance(output, Fault):  # everything else is repeated anyway
+            peer.send(encode(output))
+    return [output for output in outputs if isinstance(output, MissionEvent | Fault)]
 
 
 def _newest(arrived: list[bytes], decode: Decode) -> Any:

@@ -1,8 +1,7 @@
 """Serve teleop's API over HTTP: carry requests to the mission service, and answer in JSON.
 
-The handlers call the service through the bridge. A refusal has one line of `detail`. The refusal
-names the mission in conflict, or each value that cannot be used. Events are sent as they happen, as
-server-sent events; each event has a number, so that a client can resume.
+Only the thread of teleop's loop may use the service. The API queues a call on the `Bridge`, and the
+loop makes the call between two deadlines.
 """
 
 from __future__ import annotations
@@ -14,82 +13,214 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
-from math import radians
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import uvicorn
-from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request
-from fastapi.exceptions import RequestValidationError
+from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
-from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from cloudrc import __version__
-from cloudrc.config.problems import Problem, in_words
+from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.teleop import models
-from cloudrc.teleop.auth import BEARER, Gate
-from cloudrc.teleop.bridge import Bridge, Call
-from cloudrc.teleop.models import (
-    RefusedError,
-    Surroundings,
-    check_first_way,
-    check_way,
-    read_goto,
-    read_order,
-)
+from cloudrc.teleop.auth import BEARER, IN_FLIGHT_MAX, Gate
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import ConflictError, UnavailableError, UnknownMissionError
+from cloudrc.teleop.store import (
+    ConflictError,
+    Event,
+    Mission,
+    Order,
+    UnavailableError,
+    UnknownMissionError,
+)
+from cloudrc.teleop.wire import Leg
 
 LOOK_PERIOD = 0.1
 """Time between two checks for new events [s]."""
 ALIVE_PERIOD = 10.0
-"""Time without an event after which the stream sends a comment [s], so that no proxy closes the
-connection."""
+"""Time without an event after which the stream sends a comment [s]: no proxy closes it."""
 ANSWER_LIMIT = 2.0
 """Time limit for the mission service to answer [s]."""
-ALARM_PERIOD, ALARM_REPEATS = 0.02, 100
-"""Time between two attempts to send an emergency stop to a blocked cloud [s], and the number of
-attempts."""
+WAITING_MAX = 2 * IN_FLIGHT_MAX
+"""Limit of the calls that wait at the same time."""
+BODY_MAX, BODY_LIMIT = 256 * 1024, 5.0
+"""Longest body of a request [bytes], and time limit for it to arrive [s]."""
 HEAD_MAX = 4_096
 """Longest head of a request [bytes]."""
-KEEP_ALIVE = 5
-"""Time after which a connection without a request is closed [s]."""
-BACKLOG = 1_024
-"""Limit of the connections that the server has not accepted yet."""
 STOP_LIMIT = 1
 """Time limit for open requests when the server stops [s]."""
 STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
 """Error -> HTTP status of the answer."""
+REASONS = {
+    401: "There is no valid token in the request",
+    403: "The token is a reader's",
+    404: "There is no such mission",
+    408: f"The body did not arrive within {BODY_LIMIT:g} s",
+    409: "The state does not allow it; `id` names the mission in the way",
+    413: f"The body is longer than {BODY_MAX // 1024} KiB",
+    422: "A value cannot be used; `problems` has every one",
+    429: "Too many requests at the same time; try again in a second",
+    503: "Not now: teleop starts or ends, another has the journal, it cannot be written, or "
+    "too much waits: try again. Or teleop did not answer within 2 s, and may do it yet: look. "
+    "An emergency stop is told all the same, unless another teleop flies the robot",
+}
+REFUSALS: dict[int | str, dict[str, Any]] = {
+    code: {"model": models.Refusal, "description": text} for code, text in REASONS.items()
+}
+ABOUT = """\
+Fly missions, or steer by hand. One mission is flown at a time; a second one is refused with the
+id of the first, or waits if it says `queue`. A mission posted again under the same `key` is not
+made again. Positions are in metres, x forward, y left, z up.
+
+Every request needs a token: `Authorization: Bearer TOKEN`. A reader's may look, an operator's may
+command. `POST /v1/estop` stops the rotors at once. It and `POST /v1/hold` are served even while
+other requests are refused as too many.
+"""
+STARTING = "teleop is starting"
+Call: TypeAlias = Callable[[MissionService, int], Any]
+"""Function that takes the service and the time [ns] and returns the answer, or a mission."""
+Urgent: TypeAlias = Literal["stop", "hold"]
+Address: TypeAlias = tuple[str, int] | Path
+"""Host and port, or the path of a Unix socket."""
 
 
-def _handle_errors(app: FastAPI, complain: Callable[[str], None]) -> None:
-    """Make an application answer every error with a `Refusal`."""
+class Bridge:
+    """Queue the API's calls for teleop's loop.
+
+    Attributes:
+        closed: Why no call is accepted, in words; "" if calls are accepted.
+        alarm: Sends an emergency stop to cloud, past teleop's loop; it does not block.
+        overtakings: Number of stops and holds so far.
+    """
+
+    def __init__(self) -> None:
+        self.closed, self.overtakings = STARTING, 0
+        self.alarm: Callable[[], Any] = lambda: None
+        self._urgent: dict[Urgent, tuple[Call, Future[Any]]] = {}
+        self._waiting: list[tuple[Call, Future[Any]]] = []
+        self._lock = threading.Lock()
+        self._service: MissionService | None = None
+
+    def open(self, service: MissionService) -> None:
+        """Accept calls for `service`."""
+        self._service, self.closed = service, ""
+
+    def close(self, why: str) -> None:
+        """Refuse calls from now on, also a stop that waits."""
+        with self._lock:
+            self.closed = why
+            while self._urgent:
+                self._urgent.popitem()[1][1].set_exception(UnavailableError(why))
+
+    def submit(self, call: Call, urgent: Urgent | None = None) -> Future[Any]:
+        """Queue a call; urgent ones of one kind are one call, and always have room.
+
+        While teleop starts, the bridge accepts only a stop.
+
+        Raises:
+            UnavailableError: If no call is accepted, or if too many calls wait.
+        """
+        future: Future[Any] = Future()
+        with self._lock:
+            if self.closed and not (urgent == "stop" and self.closed == STARTING):
+                raise UnavailableError(self.closed)
+            if urgent is not None:
+                self.overtakings += 1
+                return self._urgent.setdefault(urgent, (call, future))[1]
+            if len(self._waiting) >= WAITING_MAX:
+                raise UnavailableError(f"{WAITING_MAX} requests wait already; try again")
+            self._waiting.append((call, future))
+        return future
+
+    async def ask(self, call: Call, urgent: Urgent | None = None) -> Any:
+        """Queue a call and return its result; a stop also sends the alarm.
+
+        Raises:
+            UnavailableError: As `submit`, or if there is no result within `ANSWER_LIMIT`. Then an
+                urgent call stays queued, and any other is withdrawn.
+        """
+        try:  # a stop is queued before the robot can be seen to have stopped
+            asked = asyncio.wrap_future(self.submit(call, urgent))
+        finally:
+            if urgent == "stop":
+                self.alarm()
+        try:
+            return await asyncio.wait_for(asyncio.shield(asked) if urgent else asked, ANSWER_LIMIT)
+        except TimeoutError:
+            text = "teleop did not answer in time, but may do it yet: look before you try again"
+            raise UnavailableError(text) from None
+
+    async def move(self, call: Call) -> Any:
+        """Make a call that may set the robot in motion, unless a stop or a hold overtakes it."""
+        known = self.overtakings
+
+        def checked(service: MissionService, now_ns: int) -> Any:
+            if self.overtakings != known:
+                raise ConflictError("a stop or a hold was asked for since; look, then ask again")
+            return call(service, now_ns)
+
+        return await self.ask(checked)
+
+    def take(self) -> list[Callable[[int], None]]:
+        """Return all queued calls for the loop: first a stop, then a hold, then the others."""
+        with self._lock:
+            taken = [self._urgent.pop(each) for each in ("stop", "hold") if each in self._urgent]
+            taken, self._waiting = taken + self._waiting, []
+        return [partial(self._make, *each) for each in taken]
+
+    def take_stop(self) -> list[Callable[[int], None]]:
+        """Return only a queued stop, which the loop makes before it processes new telemetry."""
+        with self._lock:
+            stop = self._urgent.pop("stop", None)
+        return [] if stop is None else [partial(self._make, *stop)]
+
+    def _make(self, call: Call, future: Future[Any], now_ns: int) -> None:
+        assert self._service is not None, "calls are taken after `open` only"
+        if future.set_running_or_notify_cancel():
+            try:
+                result = call(self._service, now_ns)
+                future.set_result(result.as_json() if isinstance(result, Mission) else result)
+            except Exception as error:  # the client has to get it
+                future.set_exception(error)
+
+
+def create_app(
+    bridge: Bridge,
+    read_order: Callable[[bytes], Order],
+    read_goto: Callable[[bytes], Leg],
+    complain: Callable[[str], None],
+) -> FastAPI:
+    """Make the ASGI application; it must run behind a `Gate`.
+
+    Args:
+        bridge: Bridge to the mission service.
+        read_order: Reads and checks the body of a mission.
+        read_goto: Reads and checks the body of a point.
+        complain: Receives one line about each internal error.
+    """
+    app = FastAPI(
+        title="cloudrc teleop",
+        version=__version__,
+        description=ABOUT,
+        docs_url=None,  # the pages load scripts from elsewhere
+        redoc_url=None,
+        redirect_slashes=False,
+    )
+    app.state.bridge, app.state.read_order, app.state.read_goto = bridge, read_order, read_goto
 
     @app.exception_handler(CloudrcError)
     async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
         status = next((code for kind, code in STATUSES.items() if isinstance(error, kind)), 500)
         body: dict[str, Any] = {"detail": str(error)}
-        if isinstance(error, RefusedError):
+        if isinstance(error, models.RefusedError):
             body["problems"] = [models.as_json(problem) for problem in error.problems]
         if isinstance(error, ConflictError):
             body["id"] = error.mission or None
         return JSONResponse(body, status, {"Retry-After": "1"} if status == 503 else None)
-
-    @app.exception_handler(RequestValidationError)
-    async def refuse_query(request: Request, error: RequestValidationError) -> JSONResponse:
-        found = [
-            Problem(tuple(map(str, each["loc"][1:])), in_words(each["input"]), each["msg"])
-            for each in error.errors()
-        ]
-        return await refuse(request, RefusedError(found))
-
-    @app.exception_handler(TimeoutError)
-    async def answer_late(request: Request, error: TimeoutError) -> JSONResponse:
-        text = "teleop did not answer in time, but may do it yet: look before you try again"
-        return JSONResponse({"detail": text}, 503)
 
     @app.exception_handler(Exception)
     async def fail(request: Request, error: Exception) -> JSONResponse:
@@ -97,255 +228,179 @@ def _handle_errors(app: FastAPI, complain: Callable[[str], None]) -> None:
             complain(f"the API failed at {request.url.path}: {error!r}")
         return JSONResponse({"detail": "the API failed; see teleop's log"}, 500)
 
-
-def create_app(
-    bridge: Bridge, surroundings: Surroundings, complain: Callable[[str], None]
-) -> FastAPI:
-    """Make the ASGI application; it must run behind a `Gate`.
-
-    Args:
-        bridge: Bridge to the mission service.
-        surroundings: Facts about the experiment.
-        complain: Receives one line about each internal error.
-    """
-    app = FastAPI(
-        title="cloudrc teleop",
-        version=__version__,
-        description=models.ABOUT,
-        docs_url=None,  # the pages load scripts from elsewhere
-        redoc_url=None,
-        redirect_slashes=False,
-    )
-    _handle_errors(app, complain)
-    router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=models.REFUSALS)
-    _add_missions(router, bridge, surroundings)
-    _add_operator(router, bridge, surroundings)
-    _add_stop(router, bridge)
-    _add_views(router, bridge)
     app.include_router(router)
     return app
 
 
-async def _ask(bridge: Bridge, call: Call) -> Any:
-    return await asyncio.wait_for(asyncio.wrap_future(bridge.submit(call)), ANSWER_LIMIT)
-
-
-async def _move(bridge: Bridge, call: Call) -> Any:
-    """Make a call that may set the robot in motion, unless a stop or a hold overtakes it."""
-    return await _ask(bridge, bridge.unless_overtaken(call))
-
-
-async def _urgent_answer(asked: Future[Any]) -> Any:
-    """Wait for the answer to an urgent call, at most `ANSWER_LIMIT`.
-
-    After the limit the call stays queued; other requests may wait for the same call.
-    """
-    return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(asked)), ANSWER_LIMIT)
+def _bridge(request: Request) -> Any:
+    return request.app.state.bridge
 
 
 async def _body(request: Request) -> bytes:
     """Read the body of a request; stop reading if the body is too long or arrives too slowly."""
-    too_long = HTTPException(413, models.REFUSALS[413]["description"])
-    if (
-        int(request.headers.get("content-length", "0")) > models.BODY_MAX
-    ):  # h11 knows it is a number
-        raise too_long
     body = b""
     try:
-        async with asyncio.timeout(models.BODY_LIMIT):
+        async with asyncio.timeout(BODY_LIMIT):
             async for chunk in request.stream():
                 body += chunk
-                if len(body) > models.BODY_MAX:
-                    raise too_long
+                if len(body) > BODY_MAX:
+                    raise HTTPException(413, REASONS[413])
     except TimeoutError:
-        raise HTTPException(408, models.REFUSALS[408]["description"]) from None
+        raise HTTPException(408, REASONS[408]) from None
     return body
 
 
-def _takes(model: type[BaseModel], example: dict[str, Any]) -> dict[str, Any]:
+def _takes(model: type[Section]) -> dict[str, Any]:
     """Describe a request body that `_body` reads, for the OpenAPI document."""
-    content = {"application/json": {"schema": models.inlined(model), "example": example}}
+    schema = model.model_json_schema()
+    if parts := schema.pop("$defs", None):
+        schema["properties"]["waypoints"]["items"] = parts["Waypoint"]
+    content = {"application/json": {"schema": schema, "example": models.EXAMPLES[model]}}
     return {"requestBody": {"required": True, "content": content}}
 
 
-def _gives(model: type[BaseModel], text: str) -> dict[str, Any]:
-    return {"response_model": None, "responses": {200: {"model": model, "description": text}}}
+Body = Annotated[bytes, Depends(_body)]
+Bridged = Annotated[Bridge, Depends(_bridge)]
+router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUSALS)
 
 
-def _add_missions(router: APIRouter, bridge: Bridge, surroundings: Surroundings) -> None:
-    @router.post(
-        "/missions",
-        status_code=201,
-        summary="Fly a mission",
-        openapi_extra=_takes(models.MissionRequest, models.MISSION_EXAMPLE),
-        response_model=None,
-        responses={
-            201: {"model": models.MissionView, "description": "It flies, or waits if queued"},
-            200: {"model": models.MissionView, "description": "The mission of this key"},
-        },
-    )
-    async def create(request: Request) -> JSONResponse:
-        body = await _body(request)
-        order = await run_in_threadpool(read_order, body, surroundings)
+@router.post(
+    "/missions",
+    status_code=201,
+    response_model=models.MissionView,
+    responses={200: {"model": models.MissionView, "description": "The mission of this key"}},
+    openapi_extra=_takes(models.MissionRequest),
+)
+async def fly_mission(body: Body, bridge: Bridged, request: Request, response: Response) -> Any:
+    """Fly a mission, or queue it."""
+    order = await run_in_threadpool(request.app.state.read_order, body)
 
-        def call(service: MissionService, now_ns: int) -> tuple[dict[str, Any], bool]:
-            check_first_way(service, order, surroundings.scene)
-            mission, new = service.create(order, now_ns)
-            return mission.as_json(), new
+    def call(service: MissionService, now_ns: int) -> tuple[dict[str, Any], bool]:
+        mission, new = service.create(order, now_ns)
+        return mission.as_json(), new
 
-        view, new = await _move(bridge, call)
-        return JSONResponse(view, 201 if new else 200)
-
-    @router.get("/missions", summary="All missions", **_gives(models.MissionList, "Oldest first"))
-    async def show_all() -> JSONResponse:
-        def call(service: MissionService, now_ns: int) -> list[dict[str, Any]]:
-            return [mission.summary() for mission in service.book.missions.values()]
-
-        return JSONResponse({"missions": await _ask(bridge, call)})
-
-    @router.get("/missions/{id}", summary="One mission", **_gives(models.MissionView, "As it is"))
-    async def show(id: str) -> JSONResponse:
-        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.book.find(id).as_json()))
-
-    @router.post(
-        "/missions/{id}/cancel", summary="End a mission", **_gives(models.MissionView, "Ended")
-    )
-    async def cancel(id: str) -> JSONResponse:
-        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.cancel(id, now_ns).as_json()))
+    view, new = await bridge.move(call)
+    response.status_code = 201 if new else 200
+    return view
 
 
-def _add_operator(router: APIRouter, bridge: Bridge, surroundings: Surroundings) -> None:
-    @router.post("/hold", summary="Stop, 0.35 m up at least", **_gives(models.MissionView, "Held"))
-    async def hold() -> JSONResponse:
-        asked = bridge.submit(lambda s, now_ns: s.hold(now_ns).as_json(), "hold")
-        return JSONResponse(await _urgent_answer(asked))
+@router.get("/missions", response_model=models.MissionList)
+async def list_missions(bridge: Bridged) -> Any:
+    """List all missions, oldest first."""
 
-    @router.post(
-        "/resume",
-        summary="Go on with what is held",
-        description="Straight on to its next waypoint: a pipe's wall in the way is refused (409).",
-        **_gives(models.MissionView, "It flies"),
-    )
-    async def resume() -> JSONResponse:
-        def call(service: MissionService, now_ns: int) -> Any:
-            check_way(service, None, surroundings.scene)
-            return service.resume(now_ns).as_json()
+    def call(service: MissionService, now_ns: int) -> list[dict[str, Any]]:
+        return [mission.summary() for mission in service.book.missions.values()]
 
-        return JSONResponse(await _move(bridge, call))
-
-    @router.post(
-        "/goto",
-        summary="Fly to a point",
-        description="A mission of its own, or another place for a mission that is held. The way "
-        "there is straight: a pipe's wall in it is refused (409).",
-        openapi_extra=_takes(models.GoToRequest, models.GOTO_EXAMPLE),
-        **_gives(models.MissionView, "On its way"),
-    )
-    async def go_to(request: Request) -> JSONResponse:
-        body = await _body(request)
-        point = await run_in_threadpool(read_goto, body, surroundings.scene)
-
-        def call(service: MissionService, now_ns: int) -> Any:
-            check_way(service, point.position_m, surroundings.scene)
-            return service.go_to(point.position_m, radians(point.yaw_deg), now_ns).as_json()
-
-        return JSONResponse(await _move(bridge, call))
+    return {"missions": await bridge.ask(call)}
 
 
-def _add_stop(router: APIRouter, bridge: Bridge) -> None:
-    repeating: list[asyncio.Task[None]] = []
-
-    async def repeat_alarm() -> None:
-        for _ in range(ALARM_REPEATS):
-            await asyncio.sleep(ALARM_PERIOD)
-            if bridge.alarm():
-                return
-
-    @router.post(
-        "/estop",
-        summary="Stop the rotors at once",
-        description="Whatever the robot does. It falls, and stays off until acknowledged.",
-        **_gives(models.Stopped, "The robot is told until it obeys"),
-    )
-    async def stop() -> JSONResponse:
-        try:  # the call is queued before the robot can be seen to have stopped
-            asked = bridge.submit(lambda s, now_ns: s.stop_rotors(now_ns), "stop")
-        finally:
-            while repeating:
-                repeating.pop().cancel()
-            if not bridge.alarm():  # cloud is blocked
-                repeating.append(asyncio.create_task(repeat_alarm()))
-        mission = await _urgent_answer(asked)
-        return JSONResponse({"id": mission.id if mission else None, "state": "stopping"})
-
-    @router.post(
-        "/acknowledge",
-        summary="Release a robot that was stopped or has landed",
-        description="It arms nothing: the next mission does.",
-        **_gives(models.Acknowledged, "The robot is told until it obeys"),
-    )
-    async def acknowledge() -> JSONResponse:
-        await _move(bridge, lambda s, now_ns: s.acknowledge(now_ns))
-        return JSONResponse({"state": "acknowledged"})
+@router.get("/missions/{id}", response_model=models.MissionView)
+async def show_mission(id: str, bridge: Bridged) -> Any:
+    """Show one mission as it is."""
+    return await bridge.ask(lambda service, now_ns: service.book.find(id))
 
 
-def _add_views(router: APIRouter, bridge: Bridge) -> None:
-    @router.get("/state", summary="How things are", **_gives(models.StateView, "Now"))
-    async def state() -> JSONResponse:
-        return JSONResponse(await _ask(bridge, lambda s, now_ns: s.state(now_ns)))
-
-    @router.get(
-        "/events",
-        summary="What happens, as it happens",
-        description="Server-sent events, one for each event of all missions, from the oldest that "
-        "is known. Resume with the header Last-Event-ID, or with `?after=ID`.",
-        response_class=StreamingResponse,
-        responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
-    )
-    async def events(request: Request, after: int = 0) -> StreamingResponse:
-        last = request.headers.get("last-event-id", "")
-        if last.isdecimal() and len(last) < 16:
-            after = max(after, int(last))
-        await _ask(bridge, lambda s, now_ns: None)  # refuse now what cannot be served
-        stream = _stream(request, bridge, after)
-        headers = {"Cache-Control": "no-store"}
-        return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
+@router.post("/missions/{id}/cancel", response_model=models.MissionView)
+async def cancel_mission(id: str, bridge: Bridged) -> Any:
+    """End a mission."""
+    return await bridge.ask(lambda service, now_ns: service.cancel(id, now_ns))
 
 
-async def _stream(request: Request, bridge: Bridge, after: int) -> AsyncIterator[str]:
-    """Yield events until the client disconnects, its token becomes invalid, or teleop ends."""
+@router.post("/hold", response_model=models.MissionView)
+async def hold(bridge: Bridged) -> Any:
+    """Stop where the robot is, 0.35 m up at least."""
+    return await bridge.ask(MissionService.hold, "hold")
+
+
+@router.post("/resume", response_model=models.MissionView)
+async def resume(bridge: Bridged) -> Any:
+    """Go on with what is held, straight to its next waypoint.
+
+    A pipe's wall in the way is refused (409).
+    """
+    return await bridge.move(MissionService.resume)
+
+
+@router.post("/goto", response_model=models.MissionView, openapi_extra=_takes(models.GoToRequest))
+async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
+    """Fly straight to a point: a mission of its own, or another place for one that is held.
+
+    A pipe's wall in the way is refused (409).
+    """
+    leg = await run_in_threadpool(request.app.state.read_goto, body)
+    return await bridge.move(lambda service, now_ns: service.go_to(leg, now_ns))
+
+
+@router.post("/estop", response_model=models.Stopped)
+async def stop_rotors(bridge: Bridged) -> Any:
+    """Stop the rotors at once, whatever the robot does.
+
+    It falls, and stays off until acknowledged.
+    """
+    mission = await bridge.ask(MissionService.stop_rotors, "stop")
+    return {"id": mission["id"] if mission else None, "state": "stopping"}
+
+
+@router.post("/acknowledge", response_model=models.Acknowledged)
+async def acknowledge(bridge: Bridged) -> Any:
+    """Release a robot that was stopped or has landed; the next mission arms it."""
+    await bridge.move(MissionService.acknowledge)
+    return {"state": "acknowledged"}
+
+
+@router.get("/state", response_model=models.StateView)
+async def show_state(bridge: Bridged) -> Any:
+    """Show how things are."""
+    return await bridge.ask(MissionService.state)
+
+
+@router.get(
+    "/events",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
+)
+async def stream_events(request: Request, bridge: Bridged, after: str = "") -> StreamingResponse:
+    """Tell what happens, as it happens: server-sent events, one for each event of all missions.
+
+    They begin with the oldest that is known. Resume with the header Last-Event-ID, or with
+    `?after=ID`.
+    """
+    known = (after, request.headers.get("last-event-id", ""))
+    number = max(int(text) if text.isdecimal() and len(text) < 16 else 0 for text in known)
+    await bridge.ask(lambda service, now_ns: None)  # refuse now what cannot be served
+    stream, headers = _stream(request, bridge, number), {"Cache-Control": "no-store"}
+    return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
+
+
+def _events_after(number: int, service: MissionService, now_ns: int) -> list[Event]:
+    return service.book.events_after(number)
+
+
+async def _stream(request: Request, bridge: Bridge, number: int) -> AsyncIterator[str]:
+    """Yield the events after `number` until the client, its token or teleop is gone."""
     looks = 0
     yield ": cloudrc\n\n"
-    while not (bridge.closed or await request.is_disconnected()):
-        if await request.scope["caller"]() is None:
-            return
+    while not bridge.closed and await request.scope["caller"]() is not None:
         try:
-            events = await _ask(bridge, _events_after(after))
-        except (CloudrcError, TimeoutError):
+            found = await bridge.ask(partial(_events_after, number))
+        except CloudrcError:
             return
-        for event in events:
-            after = event["id"]
-            yield f"id: {after}\nevent: mission\ndata: {json.dumps(event)}\n\n"
-        looks = 0 if events else looks + 1
+        for event in found:
+            number = event["id"]
+            yield f"id: {number}\nevent: mission\ndata: {json.dumps(event)}\n\n"
+        looks = 0 if found else looks + 1
         if looks * LOOK_PERIOD >= ALIVE_PERIOD:
             looks = 0
             yield ": alive\n\n"
         await asyncio.sleep(LOOK_PERIOD)
 
 
-def _events_after(number: int) -> Call:
-    return lambda service, now_ns: service.book.events_after(number)
-
-
-Address: TypeAlias = tuple[str, int] | Path
-"""Host and port, or the path of a Unix socket."""
-
-
-class ApiServer:
+class ApiServer(uvicorn.Server):
     """Serve the API in a separate thread, from `start` to `stop`.
 
     Attributes:
         url: "http://HOST:PORT", or "unix:PATH" for a Unix socket.
+        bridge: Bridge to the mission service.
         gate: Admits the callers, and counts their requests.
     """
 
@@ -361,12 +416,9 @@ class ApiServer:
                 "--api HOST:PORT needs --tokens DIR, with a file 'operator' in it; "
                 "without tokens only a socket file is served: --api unix:PATH"
             )
-        self.gate, self._bridge = gate, bridge
-        self._socket, self.url = _bind(address)
-        self._server = uvicorn.Server(
+        super().__init__(
             uvicorn.Config(
                 gate,
-                loop="asyncio",
                 http="h11",
                 ws="none",
                 lifespan="off",
@@ -375,15 +427,14 @@ class ApiServer:
                 server_header=False,
                 proxy_headers=False,  # the audit log names whoever connects
                 # No limit_concurrency: uvicorn would refuse an emergency stop, too.
-                backlog=BACKLOG,
                 h11_max_incomplete_event_size=HEAD_MAX,
-                timeout_keep_alive=KEEP_ALIVE,
                 timeout_graceful_shutdown=STOP_LIMIT,
             )
         )
+        self.gate, self.bridge = gate, bridge
+        self._socket, self.url = _bind(address)
         # A daemon, so that a client that hangs cannot keep the process from ending.
-        run = self._server.run
-        self._thread = threading.Thread(target=run, args=([self._socket],), daemon=True)
+        self._thread = threading.Thread(target=self.run, args=([self._socket],), daemon=True)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -392,14 +443,15 @@ class ApiServer:
         return {**self.gate.counts, "audit_dropped": audit.dropped if audit else 0}
 
     def start(self) -> None:
-        """Start serving; clients can connect from now on."""
-        self._socket.listen(BACKLOG)
+        """Start serving."""
         self._thread.start()
+        if self.gate.tokens is not None:
+            threading.Thread(target=self.gate.tokens.follow, daemon=True).start()
 
     def stop(self) -> None:
         """Answer the open requests, end the streams, and stop."""
-        self._bridge.closed = "teleop ends"
-        self._server.should_exit = True
+        self.bridge.closed = "teleop ends"
+        self.should_exit = True
         self._thread.join(STOP_LIMIT)
         self._socket.close()
         if self.gate.audit is not None:
@@ -407,36 +459,27 @@ class ApiServer:
 
 
 def _bind(address: Address) -> tuple[socket.socket, str]:
-    """Bind a socket to an address; return socket and URL."""
-    if isinstance(address, Path):
-        return _bind_file(address), f"unix:{address}"
-    host, port = address[0].strip("[]"), address[1]
-    shown = f"[{host}]" if ":" in host else host
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio disables Nagle's algorithm only if the socket names its protocol.
-    tcp = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    if family == socket.AF_INET6:
-        tcp.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # [::] serves IPv4, too
-    try:
-        tcp.bind((host, port))
-    except (OSError, UnicodeError) as error:  # no host has a name with an empty label
-        tcp.close()
-        reason = getattr(error, "strerror", None) or error
-        raise BadInputError(f"--api {shown}:{port}: {reason}; choose another address") from error
-    return tcp, f"http://{shown}:{tcp.getsockname()[1]}"
-
-
-def _bind_file(path: Path) -> socket.socket:
-    """Bind a Unix socket to which, from the start, only its owner can connect."""
+    """Listen at an address; return socket and URL."""
     unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
+    url = f"unix:{address}"
     try:
-        if path.is_socket():  # an earlier server left it there
-            path.unlink()
-        unix.bind(str(path))
-    except OSError as error:
+        if isinstance(address, Path):
+            if address.is_socket():  # an earlier server left it there
+                address.unlink()
+            os.fchmod(unix.fileno(), 0o600)  # Linux gives the file the mode of the socket
+            unix.bind(str(address))
+            unix.listen()
+            return unix, url
+        host, port = address[0].strip("[]"), address[1]
+        is_6 = ":" in host
+        url = f"http://[{host}]:{port}" if is_6 else f"http://{host}:{port}"
+        family = socket.AF_INET6 if is_6 else socket.AF_INET
+        server = socket.create_server((host, port), family=family, dualstack_ipv6=is_6)
+    except (OSError, UnicodeError) as error:  # no host has a name with an empty label
         unix.close()
-        text = f"--api unix:{path}: {error.strerror or error}; choose another path"
-        raise BadInputError(text) from error
-    return unix
+        reason = getattr(error, "strerror", None) or error
+        raise BadInputError(f"--api {url}: {reason}; choose another address") from error
+    unix.close()
+    # The new socket names its protocol: only then does asyncio disable Nagle's algorithm.
+    named = socket.socket(fileno=server.detach())
+    return named, f"{url.rpartition(':')[0]}:{named.getsockname()[1]}"

@@ -1,21 +1,26 @@
-"""Admit callers to the API by bearer token, and count their requests.
+"""Admit callers to the API by bearer token, count their requests, and log their commands.
 
 A caller with an operator's token may do everything; a caller with a reader's token may only read.
-Memory holds only digests of tokens. The limit on simultaneous requests never refuses an operator's
-emergency stop or hold.
 """
 
 from __future__ import annotations
 
 import hashlib
-import hmac
+import json
+import logging
+import os
+import queue
 import re
+import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from datetime import UTC, datetime
+from io import TextIOWrapper
+from logging.handlers import QueueHandler, QueueListener, RotatingFileHandler
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPBearer
@@ -24,8 +29,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import read, readable_by_others
-from cloudrc.teleop.audit import Audit
-from cloudrc.teleop.bridge import WAITING_MAX
 
 OPERATOR, READER = "operator", "reader"
 """Roles; the name of a token file is its role."""
@@ -35,7 +38,6 @@ READ_PERIOD = 1.0
 TOKEN_SIZE_MAX = 4096
 """Largest token file [bytes], including white space around the token."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
-
 READS = ("GET", "HEAD")
 URGENT = ("/v1/estop", "/v1/hold")
 """Commands that the limit on simultaneous requests never refuses."""
@@ -43,9 +45,20 @@ ORDERS = ("/v1/missions", "/v1/goto")
 """Commands whose refusals are counted: orders to fly a mission or to fly to a point."""
 COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
 """HTTP status of a refused order -> name under which it is counted."""
-IN_FLIGHT_MAX = WAITING_MAX // 2
-"""Limit of the requests of one role that are answered at the same time, including streams. So
-readers cannot use up the operators' room on the bridge."""
+REFUSED = {
+    401: (
+        "token",
+        "a valid token is needed: Authorization: Bearer TOKEN",
+        {"WWW-Authenticate": "Bearer"},
+    ),
+    403: ("role", "this token may look, not command: an operator's is needed", None),
+    429: ("busy", "too many requests; try again in a second", {"Retry-After": "1"}),
+}
+"""HTTP status of a refused request -> name under which it is counted, text and headers."""
+IN_FLIGHT_MAX = 32
+"""Limit of the requests of one role that are answered at the same time, including streams."""
+AUDIT_MAX = 8 << 20
+"""Size at which the audit log is renamed to NAME.1 and a new one begins [bytes]."""
 
 
 class Caller(NamedTuple):
@@ -60,7 +73,7 @@ LOCAL = Caller(OPERATOR, "local")
 
 
 class Tokens:
-    """The tokens in a folder: the file `operator` and, if there are readers, the file `reader`."""
+    """Digests of the tokens in a folder: the file `operator` and, if it exists, `reader`."""
 
     def __init__(self, folder: Path, warn: Callable[[str], None] = lambda text: None) -> None:
         """Read the tokens; `warn` receives one line for each file that other users can read.
@@ -68,49 +81,97 @@ class Tokens:
         Raises:
             BadInputError: If a file cannot be used; the text does not contain the token.
         """
-        self._folder, self._read_at = folder, time.monotonic()
+        self._folder = folder
         self._known = self._read()
         for path in (folder / OPERATOR, folder / READER):
             if readable_by_others(path):
                 warn(f"warning: {path} can be read by others: chmod 600 {path}")
 
-    def caller(self, token: str) -> Caller | None:
-        """Return the caller with this token; None for unknown tokens or if a file is unusable."""
-        if time.monotonic() - self._read_at >= READ_PERIOD:
-            self._read_at, self._known = time.monotonic(), {}
-            with suppress(BadInputError):
+    def follow(self) -> None:
+        """Read the files again and again; an unusable file admits nobody."""
+        while True:
+            time.sleep(READ_PERIOD)
+            try:
                 self._known = self._read()
-        given, found = hashlib.sha256(token.encode()).digest(), None
-        for digest, caller in self._known.items():  # all of them, so that the time reveals nothing
-            if hmac.compare_digest(digest, given):
-                found = caller
-        return found
+            except BadInputError:
+                self._known = {}
+
+    def caller(self, token: str) -> Caller | None:
+        """Return the caller with this token, or None."""
+        return self._known.get(hashlib.sha256(token.encode()).digest())
 
     def _read(self) -> dict[bytes, Caller]:
         known: dict[bytes, Caller] = {}
-        for role in (OPERATOR, READER):
+        for role in (READER, OPERATOR):
             path = self._folder / role
             if role == OPERATOR or path.exists():
                 digest = hashlib.sha256(_read_token(path)).digest()
-                if digest in known:
-                    raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
                 known[digest] = Caller(role, f"{role}-{digest.hex()[:8]}")
         return known
 
 
 def _read_token(path: Path) -> bytes:
-    make = f"make one: (umask 077; openssl rand -hex 32 > {path})"
     try:
-        token = read(path, TOKEN_SIZE_MAX).strip()
-    except OSError as error:
-        raise BadInputError(f"--tokens: {path}: {error.strerror}; {make}") from None
-    except ValueError as error:  # names the file
-        raise BadInputError(f"--tokens: {error}; remove it and {make}") from None
+        token, reason = read(path, TOKEN_SIZE_MAX).strip(), ""
+    except (OSError, ValueError) as error:
+        token, reason = b"", getattr(error, "strerror", None) or str(error)
     if not _TOKEN.fullmatch(token):
-        raise BadInputError(
-            f"--tokens: {path}: a token is 16 to 512 visible ASCII characters; {make}"
-        )
+        reason = reason or "a token is 16 to 512 visible ASCII characters"
+        make = f"(umask 077; openssl rand -hex 32 > {path})"
+        raise BadInputError(f"--tokens: {path}: {reason}; make one: {make}")
     return token
+
+
+class Audit(RotatingFileHandler):
+    """Log commands as lines of JSON, in a thread of its own; only the owner can read the files.
+
+    Attributes:
+        dropped: Number of lines that could not be written.
+    """
+
+    def __init__(self, path: Path, complain: Callable[[str], None]) -> None:
+        """Start the thread; `complain` receives one line if the file cannot be written."""
+        super().__init__(path, maxBytes=AUDIT_MAX, backupCount=1, encoding="utf-8", delay=True)
+        self.dropped, self._complain = 0, complain
+        waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._queue, self._listener = QueueHandler(waiting), QueueListener(waiting, self)
+        self._listener.start()
+
+    def note(self, caller: Caller, scope: Mapping[str, Any], answer: Mapping[str, Any]) -> None:
+        """Queue a line about a command and the status and body of its answer."""
+        said: Any = None
+        with suppress(ValueError):
+            said = json.loads(answer.get("body", b""))
+        said = said if isinstance(said, dict) else {}
+        line = {
+            "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "role": caller.role,
+            "token": caller.name,
+            "client": ":".join(map(str, scope.get("client") or ("local",))),
+            "action": f"{scope['method']} {scope['path']}"[:200],
+            "mission": said.get("id"),
+            "status": answer["status"],
+            "outcome": said.get("detail") or said.get("state") or "",
+        }
+        text = json.dumps(line, separators=(",", ":"))
+        self._queue.handle(logging.makeLogRecord({"msg": text}))
+
+    def stop(self) -> None:
+        """Write the queued lines, and close the file."""
+        self._listener.stop()
+        with suppress(OSError):
+            self.close()
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
+        """Count a lost line."""
+        if not self.dropped:
+            reason = sys.exception()
+            self._complain(f"the audit log {self.baseFilename} cannot be written: {reason}")
+        self.dropped += 1
+
+    def _open(self) -> TextIOWrapper:
+        private = lambda path, flags: os.open(path, flags, 0o600)  # noqa: E731
+        return open(self.baseFilename, "a", encoding="utf-8", opener=private)
 
 
 class Gate:
@@ -130,25 +191,27 @@ class Gate:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request; ignore a slash at the end of its path."""
-        scope["path"] = path = scope["path"].rstrip("/") or "/"
-        caller, is_command = await self.caller(scope), scope["method"] not in READS
-        if caller is None:
-            detail = "a valid token is needed: Authorization: Bearer TOKEN"
-            await self._refuse("token", 401, detail)(scope, receive, send)
-        elif is_command and caller.role != OPERATOR:
-            detail = "this token may look, not command: an operator's is needed"
-            await self._refuse("role", 403, detail)(scope, receive, send)
-        elif is_command and path in URGENT:
-            await self._serve(caller, scope, receive, send)
-        elif self._in_flight[caller.role] >= IN_FLIGHT_MAX:
-            detail = "too many requests; try again in a second"
-            await self._refuse("busy", 429, detail)(scope, receive, send)
-        else:
-            self._in_flight[caller.role] += 1
-            try:
-                await self._serve(caller, scope, receive, send)
-            finally:
-                self._in_flight[caller.role] -= 1
+        scope["path"] = scope["path"].rstrip("/") or "/"
+        # For a stream, which may outlive its token.
+        caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)
+        status = self._refusal(caller, scope)
+        if caller is None or status:
+            reason, detail, headers = REFUSED[status]
+            self.counts[reason] += 1
+            await JSONResponse({"detail": detail}, status, headers)(scope, receive, send)
+            return
+        answer: Message = {"status": 500}
+
+        async def keep(message: Message) -> None:
+            answer.update(message)
+            await send(message)
+
+        self._in_flight[caller.role] += 1
+        try:
+            await self._app(scope, receive, keep)
+        finally:
+            self._in_flight[caller.role] -= 1
+            self._note(caller, scope, answer)
 
     async def caller(self, scope: Scope) -> Caller | None:
         """Return the caller of a request; None if the caller is unknown."""
@@ -157,26 +220,22 @@ class Gate:
         sent = await BEARER(Request(scope))
         return None if sent is None else self.tokens.caller(sent.credentials)
 
-    def _refuse(self, reason: str, status: int, detail: str) -> JSONResponse:
-        self.counts[reason] += 1
-        headers = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}}.get(status)
-        return JSONResponse({"detail": detail}, status, headers)
+    def _refusal(self, caller: Caller | None, scope: Scope) -> int:
+        """Return the status with which a request is refused; 0 if it is served."""
+        is_command = scope["method"] not in READS
+        if caller is None:
+            return 401
+        if is_command and caller.role != OPERATOR:
+            return 403
+        is_urgent = is_command and scope["path"] in URGENT
+        return 429 if self._in_flight[caller.role] >= IN_FLIGHT_MAX and not is_urgent else 0
 
-    async def _serve(self, caller: Caller, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, count it, and log the result if it is a command."""
-        answer: Message = {"status": 500}
-
-        async def keep(message: Message) -> None:
-            answer.update(message)
-            await send(message)
-
-        scope["caller"] = lambda: self.caller(scope)  # for a stream, which may outlive its token
-        try:
-            await self._app(scope, receive, keep)
-        finally:
-            self.counts["served"] += 1
-            self.counts["slow"] += answer["status"] == 408
-            if scope["path"] in ORDERS and answer["status"] in COUNTED:
-                self.counts[COUNTED[answer["status"]]] += 1
-            if self.audit is not None and scope["method"] not in READS:
-                self.audit.note(*caller, scope, answer)
+    def _note(self, caller: Caller, scope: Scope, answer: Message) -> None:
+        """Count a request, and log it if it is a command."""
+        status = answer["status"]
+        self.counts["served"] += 1
+        self.counts["slow"] += status == 408
+        if scope["path"] in ORDERS and status in COUNTED:
+            self.counts[COUNTED[status]] += 1
+        if self.audit is not None and scope["method"] not in READS:
+            self.audit.note(caller, scope, answer)

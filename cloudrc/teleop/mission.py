@@ -1,17 +1,4 @@
-"""Fly missions: turn the operator's verbs and telemetry into setpoints and requests.
-
-`Teleop` is a pure state machine (`State`) that exchanges only messages with controller and robot:
-
-    teleop.see(seen, now_ns)            for every new telemetry
-    teleop.start(now_ns, plan), ...     for every verb of the operator
-    teleop.handle_deadline(now_ns)      regularly, at 10 Hz or faster
-    teleop.take_outputs()               after each of them: Setpoint, OperatorRequest, MissionEvent
-
-A `Setpoint` is valid until the next one, within its session. An `OperatorRequest` is repeated at
-10 Hz until telemetry shows that the robot has acted on it. Each `MissionEvent` is sent once.
-
-An emergency stop is the request `ALARM` without a number; cloud numbers the request and repeats it.
-Teleop sends `ALARM` to cloud at 10 Hz, before all other messages, until telemetry shows the stop.
+"""Fly missions: turn the operator's verbs and telemetry into setpoints, requests and events.
 
               start                    start seen             every waypoint reached
         IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
@@ -21,37 +8,24 @@ Teleop sends `ALARM` to cloud at 10 Hz, before all other messages, until telemet
 
 Cancel leads from STARTING, FLYING and HELD to CANCELLED. A time limit, a restart of world, a guard
 in LAND or an emergency stop lead to FAILED. At every end teleop asks the robot to hold and leaves
-the setpoint at the robot's position. For a teleop that restarts, the robot stores the number of
-reached waypoints and whether the mission is over. Times are on the caller's clock [ns].
-
-As soon as anybody arms the robot, it flies to the last setpoint. So teleop sends the first waypoint
-before telemetry shows the start only if the robot cannot fly to a wrong place.
-
-The time of a leg counts only while the robot flies on cloud's commands. It does not count while the
-link is silent, while the guard holds, or while the robot stands on the ground.
+the setpoint at the robot's position, because an armed robot flies to the last setpoint.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from math import dist
+from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
-from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start, Vector
+from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start
 from cloudrc.records import MissionEvent
 from cloudrc.teleop.requests import REPEAT_NS, RequestSender
-from cloudrc.teleop.wire import (
-    ALARM,
-    NO_PLAN,
-    Continue,
-    Leg,
-    Outcome,
-    Output,
-    Plan,
-    RobotStatus,
-    State,
-)
+from cloudrc.teleop.wire import ALARM, NO_PLAN, Leg, Outcome, Output, Plan, RobotStatus, State
+
+if TYPE_CHECKING:
+    from cloudrc.teleop.store import Mission
 
 WORST_GUARD = GuardState.HOLD
 """Last state of the guard, in the order of `GuardState`, in which a mission continues."""
@@ -67,157 +41,20 @@ UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
 ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
 """Code of an outcome -> state of the mission at its end; all other codes lead to FAILED."""
 END_LOST = "end_lost", "the robot reports that the mission is over, but its outcome is lost;"
-INACTIVE = tuple(state for state in State if state not in UNDER_WAY)
-
-_RULES: dict[str, tuple[tuple[State, ...], str]] = {
-    "start": (INACTIVE, "cancel it first"),
-    "continue": ((State.IDLE,), "teleop has already flown a mission"),
-    "hold": ((State.FLYING,), "it must be flying"),
-    "resume": ((State.HELD,), "it must be held"),
-    "cancel": (UNDER_WAY, "no mission is under way"),
-    "goto": ((State.HELD, *INACTIVE), "hold or cancel it first"),
-    "acknowledge": (INACTIVE, "the robot flies a mission"),
-    "pause": (UNDER_WAY, "no mission is under way"),
-}
-"""Verb -> states that allow the verb, and the reason for the refusal in other states. An emergency
-stop is always allowed."""
-
-
-def reached_on_board(seen: RobotStatus, mission_id: int) -> int:
-    """Return how many waypoints of a mission the robot has stored as reached."""
-    return seen.reached if seen.mission_id == mission_id != 0 else 0
-
-
-class SetpointSelector:
-    """Choose the setpoint: a waypoint of the mission, a point, or the robot's position.
-
-    Attributes:
-        setpoint: The last setpoint; None before the first.
-        is_pending: Whether the mission's first setpoint has not been sent yet.
-    """
-
-    def __init__(self, requests: RequestSender, send: Callable[[Setpoint], None]) -> None:
-        """Begin without a mission.
-
-        Args:
-            requests: The requests to the robot; their `waits` tells whether the robot waits.
-            send: Sends a setpoint.
-        """
-        self.setpoint: Setpoint | None = None
-        self.is_pending = False
-        self._requests = requests
-        self._send = send
-        self._seen: RobotStatus | None = None
-        self._plan = NO_PLAN
-        self._mission_id = 0
-        self._continued = False
-        self._stays = False  # whether waypoints are ignored
-
-    def see(self, seen: RobotStatus) -> bool:
-        """Note the newest telemetry.
-
-        Returns:
-            Whether this telemetry is the first of its session.
-        """
-        before, self._seen = self._seen, seen
-        return before is None or (before.epoch, before.world) != (seen.epoch, seen.world)
-
-    def begin(self, plan: Plan, mission_id: int, before: Continue | None = None) -> None:
-        """Begin a mission; if it is continued and held, send no setpoint before it is resumed.
-
-        Args:
-            plan: Plan of the mission.
-            mission_id: Number of the mission on board; 0 if it has none.
-            before: State before the restart of teleop; None for a new mission.
-        """
-        self._plan = plan
-        self._mission_id = mission_id
-        self._continued = before is not None
-        self.is_pending = before is None or not before.held
-
-    def select_early(self, leg: int) -> None:
-        """Select the waypoint before telemetry shows the start, so that the first command is right.
-
-        The method does nothing yet if the mission begins at the spawn and the robot may still fly
-        an earlier mission whose end request was lost: the robot would fly to the waypoint at once.
-
-        Args:
-            leg: Index of the current waypoint as known to teleop; the robot may have reached later
-                waypoints.
-        """
-        seen, from_spawn = self._seen, self._from_spawn
-        if not self.is_pending or seen is None or (from_spawn and not self._requests.waits):
-            return
-        self.is_pending = False
-        onboard = reached_on_board(seen, self._mission_id)
-        leg = 0 if from_spawn else max(leg, onboard)
-        if leg < len(self._plan.legs):
-            self.select_leg(leg)
-
-    def repeat(self, *, starting: bool) -> None:
-        """Send the setpoint again in a new session, because cloud forgets it with the old session.
-
-        A mission that begins at the spawn and has not started yet gets the robot's position as
-        setpoint, unless the robot waits.
-
-        Args:
-            starting: Whether teleop still waits for the start of the mission.
-        """
-        if starting and self._from_spawn and not self._requests.waits:
-            self.is_pending = True
-            self.select_here()
-        elif self.setpoint is not None:
-            self._select(self.setpoint)
-
-    def confirm_start(self, leg: int) -> None:
-        """Select the waypoint with this index after the start, unless it has been sent already."""
-        if self.is_pending:
-            self.is_pending = False
-            self.select_leg(leg)
-
-    def select_leg(self, leg: int) -> None:
-        """Select the waypoint with this index, unless the robot has to stay."""
-        to = self._plan.legs[leg]
-        if not self._stays:
-            self._select(Setpoint(to.position, to.yaw, leg))
-
-    def select_point(self, position: Vector, yaw: float) -> None:
-        """Select a point: `position` [m], world frame, shape (3,); `yaw` [rad]."""
-        self._select(Setpoint(position, yaw, NO_WAYPOINT))
-
-    def select_here(self) -> None:
-        """Select the robot's position, if telemetry has arrived."""
-        if self._seen is not None:
-            x, y, z = self._seen.position
-            yaw = 0.0 if self.setpoint is None else self.setpoint.yaw
-            self.select_point((x, y, max(z, HELD_LOWEST)), yaw)
-
-    def stay(self) -> None:
-        """Select the robot's position and ignore all waypoints from now on."""
-        self.select_here()
-        self._stays = True
-
-    @property
-    def _from_spawn(self) -> bool:
-        """Whether the mission begins at the spawn; a continued mission does not."""
-        return self._plan.start is Start.SPAWN and not self._continued
-
-    def _select(self, setpoint: Setpoint) -> None:
-        epoch = 0 if self._seen is None else self._seen.epoch
-        self.setpoint = setpoint._replace(epoch=epoch)
-        self._send(self.setpoint)
-
-
 GAP_MAX_NS = 500_000_000
 """Limit of the time of flight that counts between two telemetry messages [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
-"""Longest gap between two telemetry messages [ns] after which the time near the waypoint still
-continues; after a longer gap this time starts at zero."""
-GROUND, HOLD = GuardState.GROUND, GuardState.HOLD  # looked up with every telemetry
+"""Longest gap between two telemetry messages [ns] that does not restart the dwell time."""
+# Looking up an enum's member is slow, and these are used in every period.
+GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
+FLYING, STARTING = State.FLYING, State.STARTING
 
 
 class LegWatch:
-    """Measure the time of a leg and detect when its waypoint is reached."""
+    """Measure the time of a leg and detect when its waypoint is reached.
+
+    The time counts only while the robot flies on cloud's commands.
+    """
 
     def __init__(self) -> None:
         self.begin()
@@ -228,7 +65,7 @@ class LegWatch:
         self.pause()
 
     def pause(self) -> None:
-        """Interrupt the leg: keep the time of flight, but reset the time near the waypoint."""
+        """Interrupt the leg: keep the time of flight, but restart the dwell time."""
         self._seen_ns = self._near_since_ns = NEVER_NS
 
     @property
@@ -237,13 +74,7 @@ class LegWatch:
         return self._flown_ns * 1e-9
 
     def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
-        """Return whether the robot has been near the waypoint for the leg's dwell time.
-
-        Args:
-            leg: The current leg.
-            seen: The newest telemetry.
-            now_ns: Arrival of the telemetry [ns].
-        """
+        """Return whether the robot, seen at `now_ns` [ns], has been at the waypoint long enough."""
         before_ns, self._seen_ns = self._seen_ns, now_ns
         if seen.guard is HOLD:
             self._near_since_ns = NEVER_NS
@@ -261,12 +92,12 @@ class LegWatch:
         return now_ns - self._near_since_ns >= leg.dwell * 1e9
 
 
-# Looking up an enum's member is slow, and these are used in every period.
-FLYING, STARTING = State.FLYING, State.STARTING
-
-
 class Teleop:
-    """Fly missions one after the other.
+    """State machine that flies missions one after the other.
+
+    Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, a verb for each wish of the
+    operator, and `take_outputs` after each of them. A setpoint is valid until the next one, within
+    its session. All times `now_ns` are of the caller's clock [ns].
 
     Attributes:
         state: State of the mission.
@@ -279,28 +110,22 @@ class Teleop:
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
         """Begin without a mission; `ended` returns whether the mission with a number is over."""
-        self.state = State.IDLE
+        self.state, self.leg = State.IDLE, 0
         self.outcome: Outcome | None = None
-        self.requests = RequestSender()
-        self.stopping = False
-        self._stop_ns = 0
-        self._stopped_before: tuple[int, int] | None = None  # see `stop`
         self.outputs: list[Output] = []
-        self.leg = 0
+        self.requests = RequestSender()
+        self.stopping, self._stop_ns = False, 0
+        self._stopped_before: tuple[int, int] | None = None  # see `stop`
         self._is_ended = ended
         self._seen: RobotStatus | None = None
-        self._plan = NO_PLAN
-        self._mission_id = 0
-        self._may_be_flown = False  # whether an earlier teleop may have flown this mission
-        self._continued: Continue | None = None  # state before a restart of teleop
+        self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
+        self._continued = self._was_held = False  # whether an earlier teleop began or held it
         self._world = ANY_WORLD  # in which it was started
         self._expected: tuple[int, ...] = ()  # missions that may be on board; empty: any
-        self._began_ns = 0
         self._watch = LegWatch()
-        # A lambda, because every `take_outputs` replaces the list.
-        self._setpoints = SetpointSelector(
-            self.requests, lambda setpoint: self.outputs.append(setpoint)
-        )
+        self._setpoint: Setpoint | None = None
+        self._is_pending = False  # whether the mission's first setpoint has not been sent yet
+        self._stays = False  # whether waypoints are ignored
 
     @property
     def settled(self) -> bool:
@@ -316,127 +141,84 @@ class Teleop:
         outputs, self.outputs = self.outputs, []
         return outputs
 
-    # The operator's verbs: each raises a BadInputError, and changes nothing, if the state of the
-    # mission does not allow it.
-
-    def start(self, now_ns: int, plan: Plan, mission_id: int = 0, *, again: bool = False) -> None:
-        """Fly a plan.
-
-        Args:
-            now_ns: Own clock [ns].
-            plan: Plan of the mission.
-            mission_id: Number under which the robot stores the progress; 0 to store none.
-            again: Whether an earlier teleop may have flown the mission. If it is over, teleop does
-                not fly it again.
-        """
-        self._check("start")
+    def start(self, now_ns: int, plan: Plan, mission_id: int = 0) -> None:
+        """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0."""
         self._order(plan, mission_id, now_ns)
-        # A mission from here keeps the waypoints that were reached.
-        self._may_be_flown = again and plan.start is Start.SPAWN
         here = None if plan.start is Start.SPAWN else self._seen
         self._world = here.world if here else ANY_WORLD
         self._expected = (here.mission_id, mission_id) if here else ()
-        if self._seen and again and reached_on_board(self._seen, mission_id) >= self._over:
-            code, text = END_LOST
-            self._end(code, f"{text} {self._where()}", now_ns)
-            return
         self.requests.report(mission_id, 0)
         self.requests.ask(Request.START, plan.start, after=True)
-        self._setpoints.begin(plan, mission_id)
-        self._setpoints.select_early(0)
+        self._is_pending = True
+        self._select_early()
 
-    def continue_mission(self, now_ns: int, before: Continue) -> None:
+    def continue_mission(self, now_ns: int, mission: Mission) -> None:
         """Take over a mission of an earlier teleop at its current waypoint; do not reset world."""
-        self._check("continue")
-        self._order(before.plan, before.mission_id, now_ns - round(before.elapsed * 1e9))
-        self.leg, self._continued, self._world = before.leg, before, before.world
-        self._expected = (before.mission_id,)
-        self.requests.report(self._mission_id, self.leg)
+        self._order(mission.order.plan, mission.number, now_ns - round(mission.elapsed * 1e9))
+        self.leg, self._world, self._expected = mission.waypoint, mission.world, (mission.number,)
+        self._continued, self._was_held = True, mission.state == "held"
+        self.requests.report(mission.number, self.leg)
         self.requests.ask(Request.START, Start.HERE)
-        self._setpoints.begin(before.plan, before.mission_id, before)
+        self._is_pending = not self._was_held
         if self._seen:
             self.see(self._seen, now_ns)  # the mission may be over, or the world another one
 
-    def go_to(self, now_ns: int, position: Vector, yaw: float = 0.0, mission_id: int = 0) -> None:
-        """Fly to a point.
-
-        If a mission is held, the point is the new place to hold. Otherwise the point is a mission
-        with one waypoint that starts at the robot's position.
-
-        Args:
-            now_ns: Own clock [ns].
-            position: The point [m], world frame, shape (3,).
-            yaw: Heading to hold [rad].
-            mission_id: See `start`.
-        """
-        self._check("goto")
-        leg, (x, y, z) = Leg(position, yaw), position
+    def go_to(self, now_ns: int, leg: Leg) -> None:
+        """Move the robot to a point; raise BadInputError unless the mission is held."""
+        self._check("goto", State.HELD)
+        x, y, z = leg.position
         self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
-        if self.state is State.HELD:
-            self._setpoints.select_point(position, yaw)
-        else:
-            self.start(now_ns, Plan((leg,), Start.HERE, leg.time_limit), mission_id)
+        self._select(Setpoint(leg.position, leg.yaw, NO_WAYPOINT))
 
     def hold(self, now_ns: int) -> None:
-        """Hold the robot at its position and interrupt the mission, at `now_ns` [ns]."""
-        self._check("hold")
+        """Hold the robot at its position; raise BadInputError unless it flies a mission."""
+        self._check("hold", FLYING)
         self._hold(now_ns)
 
     def resume(self, now_ns: int) -> None:
-        """Continue the held leg, at `now_ns` [ns]."""
-        self._check("resume")
-        self.state = State.FLYING
+        """Continue the held leg; raise BadInputError unless the mission is held."""
+        self._check("resume", State.HELD)
+        self.state = FLYING
         self._watch.pause()
-        self._setpoints.select_leg(self.leg)
+        self._select_leg(self.leg)
         self._report("resumed", self.leg, f"resumed {self._where()}", now_ns)
 
     def cancel(self, now_ns: int) -> None:
-        """End the mission, at `now_ns` [ns]."""
-        self._check("cancel")
+        """End the mission under way."""
         self._end("cancelled", "mission cancelled", now_ns)
 
     def stop(self, now_ns: int) -> None:
-        """Stop the rotors at once, and drop all earlier requests to the robot.
+        """Stop the rotors at once in any state, and drop all earlier requests to the robot.
 
-        If the robot is already stopped, it may be about to act on an acknowledgement. So its state
-        ESTOP alone is no proof of the new stop: telemetry has to show a new request, too.
-
-        Args:
-            now_ns: Own clock [ns].
+        `ALARM` is sent until telemetry shows the stop. A robot that is already stopped may be about
+        to act on an acknowledgement: then telemetry has to show a new request, too.
         """
         if self.state in UNDER_WAY:
-            self._end("emergency_stopped", f"emergency stop {self._where()}", now_ns)
+            self._end("emergency_stopped", "emergency stop", now_ns, where=True)
         self.requests.forget()
         seen = self._seen
-        stopped = seen is not None and seen.guard is GuardState.ESTOP
+        stopped = seen is not None and seen.guard is ESTOP
         self._stopped_before = (seen.epoch, seen.mission) if seen and stopped else None
         self.stopping, self._stop_ns = True, 0
 
     def acknowledge(self, now_ns: int) -> None:
-        """Allow the robot to fly again after a landing or a stop, at `now_ns` [ns]."""
-        self._check("acknowledge")
+        """Allow the robot to fly again after a landing or a stop."""
         self.requests.ask(Request.ACKNOWLEDGE, after=True)
 
     def pause(self, now_ns: int) -> None:
-        """Ask the robot to hold, at `now_ns` [ns], until the next teleop continues the mission."""
-        self._check("pause")
+        """Ask the robot to hold until the next teleop continues the mission."""
         self._report("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
         self.requests.ask(Request.END)
-        self._setpoints.stay()  # cloud keeps this setpoint if the request is lost
-
-    def _check(self, verb: str) -> None:
-        allowed, why = _RULES[verb]
-        if self.state not in allowed:
-            raise BadInputError(f"{verb}: the mission is {self.state.name}; {why}")
+        self._select_here()  # cloud keeps this setpoint if the request is lost
+        self._stays = True
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Process new telemetry at its arrival `now_ns` [ns]."""
+        """Process new telemetry at its arrival."""
         before, self._seen = self._seen, seen
-        if seen.guard is GuardState.ESTOP and (seen.epoch, seen.mission) != self._stopped_before:
+        if seen.guard is ESTOP and (seen.epoch, seen.mission) != self._stopped_before:
             self.stopping = False
-        new_session = self._setpoints.see(seen)
-        last = self._setpoints.setpoint
-        onboard, legs = reached_on_board(seen, self._mission_id), self._plan.legs
+        new_session = not before or (before.epoch, before.world) != (seen.epoch, seen.world)
+        last, onboard, legs = self._setpoint, self._reached_on_board(seen), self._plan.legs
         started = self.requests.see(seen, now_ns) is Request.START and self.state is STARTING
         if self.state is STARTING and not self._expected and self._plan.start is Start.HERE:
             # The order came before the first telemetry.
@@ -445,12 +227,11 @@ class Teleop:
             if new_session or (before and before.mission_id != seen.mission_id):
                 self._stop_foreign_mission(seen)
         elif failure := self._find_failure(seen):
-            code, text = failure
-            self._end(code, f"{text} {self._where()}", now_ns)
+            self._end(*failure, now_ns, where=True)
         elif started:
             self._begin(seen, now_ns)
-        elif self._setpoints.is_pending:
-            self._setpoints.select_early(self.leg)
+        elif self._is_pending:
+            self._select_early()
         while self.leg < onboard and self.state in (FLYING, State.HELD):
             # The robot kept what teleop lost. Only the last waypoint is selected, because cloud's
             # socket might not have room for all setpoints at once.
@@ -458,11 +239,11 @@ class Teleop:
             self._advance(how, now_ns, select=self.leg + 1 == onboard)
         while self.state is FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
-        if new_session and last is self._setpoints.setpoint:
-            self._setpoints.repeat(starting=self.state is STARTING)
+        if new_session and last is self._setpoint:
+            self._repeat_setpoint()
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Check the time limits and repeat the request that is due at `now_ns` [ns]."""
+        """Check the time limits and repeat the request that is due."""
         if self.state in UNDER_WAY and (timeout := self._find_timeout(now_ns)):
             self._end(*timeout, now_ns)
         if self.stopping:
@@ -472,20 +253,25 @@ class Teleop:
         elif (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
 
+    def _check(self, verb: str, needed: State) -> None:
+        if self.state is not needed:
+            text = f"{verb}: the mission is {self.state.name}; it must be {needed.name.lower()}"
+            raise BadInputError(text)
+
     def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
         """Find a failure in telemetry that ends the mission; return its code and its text."""
         if self._world not in (ANY_WORLD, seen.world):
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
             return "taken_over", "somebody else has started another mission"
-        if reached_on_board(seen, self._mission_id) >= self._over:
+        if self._reached_on_board(seen) >= MISSION_OVER:
             return END_LOST
         if seen.guard > WORST_GUARD:
             return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
         return None
 
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
-        """Find an exceeded time limit; return its code and its text, or None."""
+        """Find an exceeded time limit; return its code and its text."""
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
         if self.elapsed(now_ns) >= limit and self.state is STARTING:
             return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
@@ -502,37 +288,34 @@ class Teleop:
         mission has ended, teleop also asks the robot to end the mission.
         """
         mission_id = seen.mission_id
-        may_take_off = seen.guard is GROUND and mission_id != 0
-        over = self._is_ended(mission_id) or may_take_off
+        over = self._is_ended(mission_id) or (seen.guard is GROUND and mission_id != 0)
         if mission_id != self._mission_id and over and not self.stopping:
             self.requests.ask(Request.END, after=True)
-        self._setpoints.select_here()
+        self._select_here()
 
     def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
-        """Store a new mission: its plan, its number, and the start of its time."""
+        """Store a new mission: its plan, its number, and the start of its time [ns]."""
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
-        self._continued, self._may_be_flown = None, False
+        self._continued = self._was_held = False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission after telemetry shows its start; start the times of mission and leg."""
-        plan, before = self._plan, self._continued
-        self.state = FLYING
-        self._expected = (self._mission_id,)
-        self._world = seen.world
+        self.state, self._world, self._expected = FLYING, seen.world, (self._mission_id,)
         self._watch.begin()
-        if before is not None:
-            if before.held:
-                self._hold(now_ns)
-                return
+        if not self._continued:
+            self._began_ns = now_ns
+            if self._is_pending:
+                self._is_pending = False
+                self._select_leg(self.leg)
+            place = "the spawn" if self._plan.start is Start.SPAWN else "here"
+            text = f"mission started from {place}, waypoints: {len(self._plan.legs)}"
+            self._report("started", 0, text, now_ns)
+        elif self._was_held:
+            self._hold(now_ns)
+        else:
             text = f"resumed after a restart of teleop {self._where()}"
             self._report("resumed", self.leg, text, now_ns)
-            return
-        self._began_ns = now_ns
-        self._setpoints.confirm_start(self.leg)
-        place = "the spawn" if plan.start is Start.SPAWN else "here"
-        text = f"mission started from {place}, waypoints: {len(plan.legs)}"
-        self._report("started", 0, text, now_ns)
 
     def _advance(self, how: str, now_ns: int, *, select: bool = True) -> None:
         """Go on to the next waypoint or end the mission; with `select`, select the waypoint."""
@@ -543,35 +326,81 @@ class Teleop:
         if self.leg < len(self._plan.legs):
             self._watch.begin()
             if self.state is FLYING and select:
-                self._setpoints.select_leg(self.leg)
+                self._select_leg(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
 
     def _hold(self, now_ns: int) -> None:
         self.state = State.HELD
-        self._setpoints.select_here()
+        self._select_here()
         self._report("held", self.leg, f"held {self._where()}", now_ns)
 
-    def _end(self, code: str, text: str, now_ns: int) -> None:
-        """End the mission, and ask the robot to hold its position."""
+    def _end(self, code: str, text: str, now_ns: int, *, where: bool = False) -> None:
+        """End the mission, and ask the robot to hold its position; `where` adds it to the text."""
+        text = f"{text} {self._where()}" if where else text
         waypoint = min(self.leg, len(self._plan.legs) - 1)
         self.state = ENDS.get(code, State.FAILED)
         self.outcome = Outcome(code, text, reached=self.leg)
         if code != "done" and self._mission_id:
             self.requests.report(self._mission_id, MISSION_OVER)
-        on_ground = self._seen is not None and self._seen.guard is GuardState.GROUND
+        on_ground = self._seen is not None and self._seen.guard is GROUND
         if code != "taken_over" or on_ground:  # on the ground it would scrape along the floor
             self.requests.ask(Request.END)
         else:
             self.requests.forget()  # another teleop's mission must not be ended
-        self._setpoints.select_here()
+        self._select_here()
         self._report(code, waypoint, text, now_ns)
 
+    def _reached_on_board(self, seen: RobotStatus) -> int:
+        """Return how many waypoints of the mission the robot has stored as reached."""
+        return seen.reached if seen.mission_id == self._mission_id != 0 else 0
+
     @property
-    def _over(self) -> int:
-        """Smallest number of waypoints stored on board that means: the mission is over."""
-        may_be_flown = self._may_be_flown and self.state is STARTING
-        return len(self._plan.legs) if may_be_flown else MISSION_OVER
+    def _may_move(self) -> bool:
+        """Whether the robot may still fly an earlier mission while this one begins at the spawn."""
+        from_spawn = self._plan.start is Start.SPAWN and not self._continued
+        return from_spawn and not self.requests.waits
+
+    def _select_early(self) -> None:
+        """Select the waypoint before telemetry shows the start, so that the first command is right.
+
+        Wait while the robot may move: it would fly to the waypoint at once.
+        """
+        if not self._is_pending or self._seen is None or self._may_move:
+            return
+        self._is_pending = False
+        from_spawn = self._plan.start is Start.SPAWN and not self._continued
+        leg = 0 if from_spawn else max(self.leg, self._reached_on_board(self._seen))
+        if leg < len(self._plan.legs):
+            self._select_leg(leg)
+
+    def _repeat_setpoint(self) -> None:
+        """Send the setpoint again in a new session, because cloud forgets it with the old session.
+
+        If the mission still waits for its start, a robot that may move has to stay where it is.
+        """
+        if self.state is STARTING and self._may_move:
+            self._is_pending = True
+            self._select_here()
+        elif self._setpoint is not None:
+            self._select(self._setpoint)
+
+    def _select_leg(self, leg: int) -> None:
+        to = self._plan.legs[leg]
+        if not self._stays:
+            self._select(Setpoint(to.position, to.yaw, leg))
+
+    def _select_here(self) -> None:
+        """Select the robot's position, if telemetry has arrived."""
+        if self._seen is not None:
+            x, y, z = self._seen.position
+            yaw = 0.0 if self._setpoint is None else self._setpoint.yaw
+            self._select(Setpoint((x, y, max(z, HELD_LOWEST)), yaw, NO_WAYPOINT))
+
+    def _select(self, setpoint: Setpoint) -> None:
+        epoch = 0 if self._seen is None else self._seen.epoch
+        self._setpoint = setpoint._replace(epoch=epoch)
+        self.outputs.append(self._setpoint)
 
     def _report(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))

@@ -7,32 +7,22 @@ file: the same code checks them and describes their problems.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import cos, radians, sin
 from typing import Annotated, Any, Literal, TypeVar
 
-import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import PydanticCustomError, from_json
+from pydantic_core import PydanticCustomError
 
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem as ConfigProblem
 from cloudrc.config.problems import from_pydantic
 from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeLimit, Waypoint
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.placement import find_crossed_pipe
 from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import Start, Vector
-from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import HELD, SHOWN, ConflictError, Order
-from cloudrc.teleop.wire import Plan
+from cloudrc.teleop.store import SHOWN, Order
+from cloudrc.teleop.wire import Leg, Plan
 
-Position = tuple[Finite, Finite, Finite]
-BODY_MAX = 256 * 1024
-"""Longest body of a request [bytes]."""
-BODY_LIMIT = 5.0
-"""Time limit for a body to arrive [s]."""
 PROBLEMS_MAX = 50
 """Limit of the problems of one request that the answer describes."""
 
@@ -45,23 +35,13 @@ def _printable(text: str) -> str:
 
 
 Text = Annotated[str, Field(max_length=200), AfterValidator(_printable)]
-
-MISSION_EXAMPLE = {
-    "name": "to the board",
-    "start": "spawn",
-    "time_limit_s": 60.0,
-    "waypoints": [
-        {"position_m": [0.5, 0.0, 0.7], "tolerance_m": 0.15, "dwell_s": 0.2},
-        {"position_m": [0.5, 3.6, 0.7]},
-    ],
-}
-GOTO_EXAMPLE = {"position_m": [0.5, 0.0, 1.2], "yaw_deg": 0.0}
+ONE_LINE = "one line of printable characters"
 
 
 class MissionRequest(Section):
     """Order to fly a mission."""
 
-    name: Text = Field("", description="For people: one line of printable characters")
+    name: Text = Field("", description=f"For people: {ONE_LINE}")
     description: str = Field("", description="One line, not kept")
     start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
     time_limit_s: TimeLimit | None = Field(
@@ -71,14 +51,11 @@ class MissionRequest(Section):
         (), max_length=MAX_WAYPOINTS, description="Points, in order"
     )
     contact: bool | None = Field(
-        None,
-        description="Whether the arm has to touch the board; "
+        None, description="Whether the arm has to touch the board; "
         "default: if the experiment asks for it and the waypoints lead there",
-    )
+    )  # fmt: skip
     key: Text = Field(
-        "",
-        description="A second mission under the same key is not made; "
-        "one line of printable characters",
+        "", description=f"A second mission under the same key is not made; {ONE_LINE}"
     )
     queue: bool = Field(False, description="Wait for the mission under way, if there is one")
 
@@ -86,8 +63,22 @@ class MissionRequest(Section):
 class GoToRequest(Section):
     """Order to fly to a point."""
 
-    position_m: Position = Field(description="Base position [m], world frame")
+    position_m: tuple[Finite, Finite, Finite] = Field(description="Base position [m], world frame")
     yaw_deg: Finite = Field(0.0, description="Heading [deg]")
+
+
+EXAMPLES: dict[type[Section], dict[str, Any]] = {
+    MissionRequest: {
+        "name": "to the board",
+        "start": "spawn",
+        "time_limit_s": 60.0,
+        "waypoints": [
+            {"position_m": [0.5, 0.0, 0.7], "tolerance_m": 0.15, "dwell_s": 0.2},
+            {"position_m": [0.5, 3.6, 0.7]},
+        ],
+    },
+    GoToRequest: {"position_m": [0.5, 0.0, 1.2], "yaw_deg": 0.0},
+}
 
 
 class _Answer(BaseModel):
@@ -127,7 +118,7 @@ class Event(_Answer):
         description="queued, starting, started, reached, held, resumed, goto, restarted, "
         "new_session, board_touched, pipe_touched, paused; at the end done, cancelled, timed_out, "
         "leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over or "
-        "end_lost; acknowledged after emergency_stopped"
+        "end_lost"
     )
     waypoint: int = Field(description="Index of the waypoint concerned")
     text: str = Field(description="The same in words")
@@ -231,71 +222,6 @@ class Refusal(_Answer):
     problems: list[Problem] | None = Field(None, description="Every value that cannot be used")
 
 
-REFUSALS: dict[int | str, dict[str, Any]] = {
-    code: {"model": Refusal, "description": text}
-    for code, text in {
-        401: "There is no valid token in the request",
-        403: "The token is a reader's",
-        404: "There is no such mission",
-        408: f"The body did not arrive within {BODY_LIMIT:g} s",
-        409: "The state does not allow it; `id` names the mission in the way",
-        413: f"The body is longer than {BODY_MAX // 1024} KiB",
-        422: "A value cannot be used; `problems` has every one",
-        429: "Too many requests at the same time; try again in a second",
-        503: "Not now: teleop starts or ends, another has the journal, it cannot be written, or "
-        "too much waits: try again. Or teleop did not answer within 2 s, and may do it yet: look. "
-        "An emergency stop is told all the same, unless another teleop flies the robot",
-    }.items()
-}
-ABOUT = """\
-Fly missions, or steer by hand. One mission is flown at a time; a second one is refused with the
-id of the first, or waits if it says `queue`. A mission posted again under the same `key` is not
-made again. Positions are in metres, x forward, y left, z up.
-
-Every request needs a token: `Authorization: Bearer TOKEN`. A reader's may look, an operator's may
-command. `POST /v1/estop` stops the rotors at once. It and `POST /v1/hold` are served even while
-other requests are refused as too many.
-"""
-
-
-def inlined(model: type[BaseModel]) -> dict[str, Any]:
-    """Return a model's JSON schema without references, as needed for a request body."""
-    schema = model.model_json_schema()
-    parts = schema.pop("$defs", {})
-
-    def resolve(node: Any) -> Any:
-        if isinstance(node, list):
-            return [resolve(item) for item in node]
-        if not isinstance(node, dict):
-            return node
-        if "$ref" in node:
-            return resolve(parts[node["$ref"].rpartition("/")[2]])
-        return {key: resolve(value) for key, value in node.items()}
-
-    return dict(resolve(schema))
-
-
-@dataclass(frozen=True, slots=True)
-class Surroundings:
-    """Facts about the experiment that the check of an order needs.
-
-    Attributes:
-        scene: The scene for the check of waypoints.
-        time_limit: Time limit of missions without their own limit [s].
-        contact: Whether a mission that leads to the board has to touch the board, if the mission
-            itself does not specify this.
-        plan: Makes a plan from a checked mission and its time limit [s].
-    """
-
-    scene: Scene
-    time_limit: float
-    contact: bool
-    plan: Callable[[Mission, float], Plan]
-
-
-_Request = TypeVar("_Request", bound=Section)
-
-
 class RefusedError(BadInputError):
     """Report a request that cannot be used; `problems` say why."""
 
@@ -304,85 +230,42 @@ class RefusedError(BadInputError):
         self.problems = problems
 
 
-def read_mission(body: bytes, scene: Scene) -> tuple[MissionRequest, Mission]:
-    """Read a mission and check it against the scene.
+_Request = TypeVar("_Request", bound=Section)
 
-    Raises:
-        RefusedError: If the mission has problems; contains all of them.
+
+def read_order(
+    body: bytes,
+    scene: Scene,
+    time_limit: float,
+    *,
+    contact: bool,
+    plan: Callable[[Mission, float], Plan],
+) -> Order:
+    """Read a mission, check it, and plan it; raise RefusedError with all its problems.
+
+    `time_limit` [s] and `contact` (the board has to be touched if the mission leads there) are for
+    missions that do not say so; `plan` makes a plan from a mission and its time limit [s].
     """
-    _refuse_too_many(body)
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # an experiment's mission may have steps in their place
-        _refuse([ConfigProblem(("waypoints",), "", "none given; give at least one")])
+        raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
     mission = Mission(start=request.start, waypoints=request.waypoints)
-    _refuse(check_mission(mission, scene))
-    return request, mission
+    if problems := check_mission(mission, scene):
+        raise RefusedError(problems)
+    contact = contact and leads_to_board(mission, scene)
+    contact = contact if request.contact is None else request.contact
+    planned = plan(mission, request.time_limit_s or time_limit)
+    return Order(planned, request.name, request.key, contact, request.queue)
 
 
-def read_order(body: bytes, surroundings: Surroundings) -> Order:
-    """Read a mission, check it, and plan it.
-
-    Raises:
-        RefusedError: If the mission has problems; contains all of them.
-    """
-    request, mission = read_mission(body, surroundings.scene)
-    limit = surroundings.time_limit if request.time_limit_s is None else request.time_limit_s
-    contact = request.contact
-    if contact is None:
-        contact = surroundings.contact and leads_to_board(mission, surroundings.scene)
-    plan = surroundings.plan(mission, limit)
-    return Order(plan, request.name, request.key, contact, request.queue)
-
-
-def read_goto(body: bytes, scene: Scene) -> GoToRequest:
-    """Read a point and check it against the scene.
-
-    Raises:
-        RefusedError: If the point has problems; contains all of them.
-    """
+def read_goto(body: bytes, scene: Scene) -> Leg:
+    """Read a point and check it; raise RefusedError with all its problems."""
     request = _parse(body, GoToRequest)
     waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
     problems = check_mission(Mission(start="here", waypoints=(waypoint,)), scene)
-    _refuse(
-        [ConfigProblem(problem.path[2:], problem.value, problem.reason) for problem in problems]
-    )
-    return request
-
-
-def check_way(service: MissionService, target: Vector | None, scene: Scene) -> None:
-    """Refuse a flight if the straight way from the robot's position crosses the wall of a pipe.
-
-    Args:
-        service: The service; call this function in its thread.
-        target: End of the way [m], world frame, shape (3,); None: the next waypoint of the held
-            mission.
-        scene: Scene with the pipes.
-
-    Raises:
-        ConflictError: If a wall is in the way; the text names the pipe.
-    """
-    seen, waiting = service.sight.seen, service.book.open()
-    mission = waiting[0] if waiting else None
-    if target is None and mission is not None:
-        legs, count = mission.order.plan.legs, len(mission.reached)
-        target = legs[count].position if count < len(legs) else None
-    if seen is None or target is None or (mission is not None and mission.state != HELD):
-        return  # the service refuses it for another reason, or there is nothing to check
-    through = int(find_crossed_pipe(scene, np.array([seen.position]), np.array([target]))[0])
-    if through >= 0:
-        here, there = (f"[{', '.join(f'{v:.2f}' for v in p)}]" for p in (seen.position, target))
-        reason = (
-            f"the straight way from where the robot is, {here}, to {there} leads through the wall "
-            f"of {scene.pipes[through].name}; go round it first, by 'cloudrc mission goto'"
-        )
-        raise ConflictError(reason, mission.id if mission else "")
-
-
-def check_first_way(service: MissionService, order: Order, scene: Scene) -> None:
-    """Check the way to the first waypoint of a mission that begins at once, where the robot is."""
-    begins = not service.book.open() and service.book.with_key(order.key) is None
-    if begins and order.plan.start is Start.HERE:
-        check_way(service, order.plan.legs[0].position, scene)
+    if problems:
+        raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
+    return Leg(request.position_m, radians(request.yaw_deg))
 
 
 def leads_to_board(mission: Mission, scene: Scene) -> bool:
@@ -400,24 +283,15 @@ def leads_to_board(mission: Mission, scene: Scene) -> bool:
 
 def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:
     """Return a problem as the API shows it."""
-    index = next((int(key) for key in problem.path if key.isdecimal()), None)
+    path, index = problem.path, None
+    if path[:1] == ("waypoints",) and len(path) > 1:
+        index = int(path[1])
     return {
-        "path": ".".join(problem.path),
-        "index": index if problem.path[:1] == ("waypoints",) else None,
+        "path": ".".join(path),
+        "index": index,
         "value": problem.value,
         "reason": problem.reason,
     }
-
-
-def _refuse_too_many(body: bytes) -> None:
-    """Refuse too many waypoints before their check: to describe all problems would take long."""
-    try:
-        points = from_json(body)["waypoints"]
-    except (ValueError, TypeError, KeyError):
-        return  # the model words the problem
-    if isinstance(points, list) and len(points) > MAX_WAYPOINTS:
-        reason = f"at most {MAX_WAYPOINTS}; split the mission"
-        _refuse([ConfigProblem(("waypoints",), str(len(points)), reason)])
 
 
 def _parse(body: bytes, model: type[_Request]) -> _Request:
@@ -432,8 +306,3 @@ def _parse(body: bytes, model: type[_Request]) -> _Request:
         else:
             problems = from_pydantic(error, model, limit=PROBLEMS_MAX)
         raise RefusedError(problems) from None
-
-
-def _refuse(problems: list[ConfigProblem]) -> None:
-    if problems:
-        raise RefusedError(problems)

@@ -12,31 +12,22 @@ UNNUMBERED = 0
 NOT_ENDED = (-1, 0)
 """Epoch and number that mean: the robot has acted on no request that ends a mission."""
 IDLE_NS = 3_000_000_000
-"""Longest time for which a started robot may hold or stand while its telemetry arrives [ns].
-
-After a longer time, teleop assumes that another sender has given the robot another request, and
-sends the start again.
-"""
+"""Longest time for which a started robot may hold or stand while its telemetry arrives [ns]; then
+another sender has given it another request, and teleop sends the start again."""
 PREDECESSORS = 1_000
-"""How many numbers are reserved for an earlier teleop process. The last requests of that process
-may not show in telemetry yet, and must not be confused with requests of this process. Every process
-chooses its first number in the same way; therefore the first number also rises with the machine's
-clock."""
+"""How many numbers are reserved for the last requests of an earlier teleop process, which may not
+show in telemetry yet. Since every process reserves as many, the first number also rises with the
+machine's clock."""
 CLOCK_MAX = 65_536
-"""Limit of the part of the first number that comes from the clock. The limit leaves enough numbers
-in a session for many processes."""
+"""Limit of the clock's part of the first number: a session has numbers for many processes."""
 
 
 class RequestSender:
     """Repeat the newest request at 10 Hz until telemetry shows that the robot has acted on it.
 
-    A new request replaces the previous request, acknowledged or not. The number of the new request
-    is higher, and the robot acts only on rising numbers. The first number is far above the number
-    in telemetry, because an earlier teleop may have sent higher numbers. Before the first telemetry
-    nothing is sent. Every copy has the epoch of the newest telemetry. The emergency stop is not
-    among these requests: cloud repeats it.
-
-    Without a request, the class sends the progress of the mission until the robot has stored it.
+    A new request replaces the previous one and has a higher number; the robot acts only on rising
+    numbers. Before the first telemetry nothing is sent. Without a request, the progress of the
+    mission is sent until the robot has stored it. The emergency stop is cloud's to repeat.
     """
 
     def __init__(self) -> None:
@@ -58,23 +49,14 @@ class RequestSender:
 
     @property
     def waits(self) -> bool:
-        """Whether telemetry shows that commands do not move the robot.
-
-        Commands do not move a robot on the ground, or after a request that ends a mission.
-        """
+        """Whether commands move no robot: it is on the ground, or was told to end its mission."""
         seen = self._seen
         if seen is None or self._next is not None:
             return False
         return seen.guard is GuardState.GROUND or (seen.epoch, seen.mission) == self._ended
 
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
-        """Begin to repeat a new request.
-
-        Args:
-            request: The request.
-            start: Place of the start, for Request.START only.
-            after: Whether to wait until the robot has acted on the pending request.
-        """
+        """Begin to repeat a request; with `after`, once the robot has acted on the pending one."""
         asked = self._progress._replace(request=request, start=start)
         self._is_started = False
         if self._pending is not None and self._pending.request is Request.START:
@@ -90,22 +72,13 @@ class RequestSender:
         self._pending = self._next = None
 
     def report(self, mission_id: int, reached: int) -> None:
-        """Set the progress that every request carries.
-
-        Args:
-            mission_id: Number of the mission; 0 if there is none.
-            reached: Number of waypoints of the mission that the robot has reached.
-        """
+        """Set the number of reached waypoints of a mission, which every request carries."""
         self._progress = self._progress._replace(mission_id=mission_id, reached=reached)
         if self._pending is None:
             self._due_ns = 0
 
     def see(self, seen: RobotStatus, now_ns: int) -> Request | None:
-        """Process new telemetry at `now_ns` [ns].
-
-        Returns:
-            The pending request if this telemetry shows that the robot has acted on it, else None.
-        """
+        """Process new telemetry at `now_ns` [ns]; return the request that it acknowledges."""
         self._seen, pending = seen, self._pending
         if pending is None:
             self._repeat_start_if_lost(seen, now_ns)
@@ -120,15 +93,6 @@ class RequestSender:
         elif pending.request is not Request.ACKNOWLEDGE:  # which ends no mission
             self._ended = seen.epoch, seen.mission
         return pending.request
-
-    def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
-        """Send the start again if a request of an earlier teleop or another cloud replaced it."""
-        ours = self._is_started and seen.mission_id == self._progress.mission_id
-        if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
-            self._flies_ns = now_ns
-        if ours and seen.guard <= GuardState.HOLD:
-            if 0 < self._number < seen.mission or now_ns - self._flies_ns >= IDLE_NS:
-                self.ask(Request.START, Start.HERE)
 
     def due(self, now_ns: int) -> OperatorRequest | None:
         """Return the request to send at `now_ns` [ns], or None."""
@@ -149,6 +113,15 @@ class RequestSender:
         self._due_ns = now_ns + REPEAT_NS
         return pending._replace(epoch=seen.epoch)
 
+    def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
+        """Send the start again if a request of an earlier teleop or another cloud replaced it."""
+        ours = self._is_started and seen.mission_id == self._progress.mission_id
+        if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
+            self._flies_ns = now_ns
+        if ours and seen.guard <= GuardState.HOLD:
+            if 0 < self._number < seen.mission or now_ns - self._flies_ns >= IDLE_NS:
+                self.ask(Request.START, Start.HERE)
+
     def _progress_due(self, seen: RobotStatus, now_ns: int) -> OperatorRequest | None:
         """Return the progress of the mission if the robot flies it and lacks this progress."""
         progress = self._progress
@@ -161,7 +134,6 @@ class RequestSender:
     def _is_acknowledged(self, pending: OperatorRequest, seen: RobotStatus) -> bool:
         if pending.number == UNNUMBERED or seen.mission != pending.number:
             return False
-        if pending.request is Request.START and pending.start is Start.SPAWN:
-            # Until the epoch changes, telemetry is from before the reset.
-            return seen.epoch != self._asked_epoch
-        return True
+        # Until the epoch changes, telemetry is from before the reset to the spawn.
+        from_spawn = pending.request is Request.START and pending.start is Start.SPAWN
+        return not from_spawn or seen.epoch != self._asked_epoch

@@ -1,35 +1,45 @@
 """Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
 
-The service drives the state machine `Teleop`. Both are pure; the service writes all events to a
-store. Each mission has an id. A mission also has a key if the sender gives one: a second order with
-the same key returns the existing mission. After a restart of teleop, a mission under way continues
-at the same waypoint, if world has not restarted.
-
-An emergency stop also survives a restart of teleop. The store contains the stop and, once the robot
-has acted on an acknowledgement, this acknowledgement. A new teleop that finds only the stop sends
-it again, unless the robot has flown another mission since then or is a different robot.
+After a restart of teleop, a mission under way continues at the same waypoint, if world has not
+restarted. An emergency stop survives, too: a new teleop that finds the robot in flight although the
+store says that its mission was stopped sends the stop again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
+import numpy as np
+
 from cloudrc.errors import BadInputError
-from cloudrc.messages import GuardState, Setpoint, Start, Vector
-from cloudrc.metrics.verdict import Ending, Observations, finite_or_none, judge
+from cloudrc.geometry.placement import find_crossed_pipe
+from cloudrc.geometry.scene import Scene
+from cloudrc.messages import GuardState, Setpoint, Start
+from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop import store
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError, busy
+from cloudrc.teleop.store import (
+    HELD,
+    QUEUED,
+    ConflictError,
+    Mission,
+    MissionStore,
+    Order,
+    UnavailableError,
+)
 from cloudrc.teleop.wire import Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-LATCHED = (LAND, ESTOP)
-"""States of the guard that end only when the operator acknowledges them."""
+LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
+"""States of the guard that only an acknowledgement ends, and those in which rotors may turn."""
 SILENCE = 1.0
 """Age above which telemetry or the last message of cloud counts as too old [s]."""
+SETPOINT_PERIOD_NS = 100_000_000
+"""Time between two copies of the setpoint [ns], for a cloud or teleop that restarts."""
+QUEUE_MAX = 16
+"""Limit of the missions that wait for the one under way."""
+NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
 BY_ITSELF = "without commands the robot holds its position, then lands, by itself"
 NOT_HEARD = f"cloud has no telemetry from the robot: check the link and world; {BY_ITSELF}"
@@ -51,81 +61,7 @@ IN_MISSION = {
     "none arrive within guard.hold_max_s",
 }
 """State of the guard -> next step while a mission is under way."""
-HELD = "the operator holds the mission; to continue: cloudrc mission resume"
-
-
-class RobotView:
-    """The robot as shown by its newest telemetry.
-
-    Attributes:
-        seen: The newest telemetry; None before the first.
-    """
-
-    def __init__(self) -> None:
-        self.seen: RobotStatus | None = None
-        self._seen_ns = self._guard_ns = 0
-        self._heard_ns: int | None = None
-
-    @property
-    def latched(self) -> str:
-        """Why the guard needs an acknowledgement before the robot can fly; "" if none is needed."""
-        seen = self.seen
-        if seen is None or seen.guard not in LATCHED:
-            return ""
-        return f"the guard is in {seen.guard.name} ({seen.cause.words}) and lets nothing fly"
-
-    def hear(self, now_ns: int) -> None:
-        """Note a message from cloud at `now_ns` [ns]."""
-        self._heard_ns = now_ns
-
-    def cloud_age(self, now_ns: int) -> float | None:
-        """Return the time since the last message from cloud [s]; None before the first message.
-
-        Args:
-            now_ns: Own clock [ns].
-        """
-        return None if self._heard_ns is None else (now_ns - self._heard_ns) * 1e-9
-
-    def see(self, seen: RobotStatus, now_ns: int) -> bool:
-        """Note new telemetry at `now_ns` [ns].
-
-        Returns:
-            Whether this telemetry is the first of a new session with the same robot.
-        """
-        before, self.seen, self._seen_ns = self.seen, seen, now_ns
-        self.hear(now_ns)
-        if before is None or before.world != seen.world:
-            self._guard_ns = now_ns
-            return False
-        if before.guard is not seen.guard:
-            self._guard_ns = now_ns
-        return before.epoch != seen.epoch
-
-    def show(self, now_ns: int, mission: str | None) -> dict[str, Any] | None:
-        """Return the robot's state for the API; None before the first telemetry.
-
-        Args:
-            now_ns: Own clock [ns].
-            mission: State of the mission under way; None if there is none.
-        """
-        seen, age, cloud_age = self.seen, (now_ns - self._seen_ns) * 1e-9, self.cloud_age(now_ns)
-        if seen is None or cloud_age is None:
-            return None
-        return {
-            "age_s": age,
-            "epoch": seen.epoch,
-            "world": seen.world,
-            "position_m": [finite_or_none(value) for value in seen.position],
-            "guard": seen.guard.name,
-            "cause": seen.cause.words,
-            "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
-            "next_step": next_step(seen.guard, age, cloud_age, mission),
-            "pipe_contacts": seen.pipe_contacts,
-            "touch_speed_mps": finite_or_none(seen.touch_speed),
-            "horizon_s": finite_or_none(seen.horizon),
-            "rtt_s": finite_or_none(seen.rtt),
-            "loop_delay_s": finite_or_none(seen.loop_delay),
-        }
+OPERATOR_HOLDS = "the operator holds the mission; to continue: cloudrc mission resume"
 
 
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
@@ -139,72 +75,108 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
-    if mission == "held" and guard is TRACK:
-        return HELD
+    if mission == HELD and guard is TRACK:
+        return OPERATOR_HOLDS
     return (ALONE if mission is None else IN_MISSION)[guard]
 
 
-def describe_session(mission: Mission) -> str:
-    """Describe the event that the controller has a new session with the same robot."""
-    where = f"waypoint {mission.waypoint + 1} of {len(mission.order.plan.legs)}"
-    is_held = mission.state == store.HELD
-    goes_on = f"is held on the way to {where}" if is_held else f"goes on to {where}"
-    return f"the controller has a new session, as after a restart; the mission {goes_on}"
+class RobotView:
+    """The robot as shown by its newest telemetry.
 
+    Attributes:
+        seen: The newest telemetry; None before the first.
+        heard_ns: Time of the last message from cloud [ns]; None before the first.
+    """
 
-def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
-    return seen.pipe_contacts, seen.touch_speed, seen.slip_ns
+    def __init__(self) -> None:
+        self.seen: RobotStatus | None = None
+        self.heard_ns: int | None = None
+        self._seen_ns = self._guard_ns = 0
 
+    def see(self, seen: RobotStatus, now_ns: int) -> bool:
+        """Note telemetry; return whether it is the first of a new session with the same robot."""
+        before, self.seen, self._seen_ns, self.heard_ns = self.seen, seen, now_ns, now_ns
+        same = before is not None and before.world == seen.world
+        if before is None or not same or before.guard is not seen.guard:
+            self._guard_ns = now_ns
+        return before is not None and same and before.epoch != seen.epoch
 
-SETPOINT_PERIOD_NS = 100_000_000
-"""Time between two copies of the setpoint [ns]. Because of the copies, cloud or teleop may restart
-at any time."""
+    def show(self, now_ns: int, mission: str | None) -> dict[str, Any]:
+        """Return the state of robot and cloud for the API; `mission` is that of the mission."""
+        if self.heard_ns is None:
+            return {"cloud_age_s": None, "seen": None}
+        seen, age = self.seen, (now_ns - self._seen_ns) * 1e-9
+        cloud_age = (now_ns - self.heard_ns) * 1e-9
+        shown = (
+            None
+            if seen is None
+            else {
+                "age_s": age,
+                "epoch": seen.epoch,
+                "world": seen.world,
+                "position_m": [finite_or_none(value) for value in seen.position],
+                "guard": seen.guard.name,
+                "cause": seen.cause.words,
+                "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
+                "next_step": next_step(seen.guard, age, cloud_age, mission),
+                "pipe_contacts": seen.pipe_contacts,
+                "touch_speed_mps": finite_or_none(seen.touch_speed),
+                "horizon_s": finite_or_none(seen.horizon),
+                "rtt_s": finite_or_none(seen.rtt),
+                "loop_delay_s": finite_or_none(seen.loop_delay),
+            }
+        )
+        return {"cloud_age_s": cloud_age, "seen": shown}
 
 
 class MissionService:
     """Keep and fly all missions of one robot, one after the other.
+
+    Each verb takes the time `now_ns` of the own clock [ns]. It raises ConflictError if the state of
+    mission or robot forbids it, and UnavailableError if the store refuses or this process ends.
 
     Attributes:
         sight: The robot's state.
         book: The missions.
     """
 
-    def __init__(self, contact_speed_max: float, book: MissionStore) -> None:
+    def __init__(
+        self, contact_speed_max: float, book: MissionStore, scene: Scene | None = None
+    ) -> None:
         """Begin with the missions of a store; nothing flies before the first deadline.
 
         Args:
             contact_speed_max: Speed limit for the arm's tip when it touches the board [m/s].
             book: Missions of this teleop and of earlier ones.
+            scene: Scene with the pipes that may be in the way; None if ways are not checked.
         """
-        self._contact_speed_max = contact_speed_max
+        self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
-        self.sight = RobotView()
+        self.sight, self.book = RobotView(), book
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next one starts the queued missions
-        self.book = book
-        self._teleop = Teleop(self.book.has_ended)
-        # Whether an earlier teleop has sent a stop; until this process is asked for one.
+        self._teleop = Teleop(book.has_ended)
+        self._trouble = ""  # of the store, as last reported
+        # Whether an earlier teleop may have sent a stop that the robot has not heard of.
         self._inherits_stop = book.stopped() is not None
-        self._acknowledges = False  # whether the robot has still to act on an acknowledgement
 
     @property
     def over(self) -> bool:
         """Whether at least one mission is known, all have ended, and no request is pending."""
-        return bool(self.book.missions) and not self.book.open() and self._teleop.settled
+        return bool(self.book.missions) and not self.book.open() and self.settled
+
+    @property
+    def settled(self) -> bool:
+        """Whether telemetry shows that the robot has acted on the last request."""
+        return self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission from an order; the mission starts at once or waits in the queue.
+        """Create a mission, which starts at once or waits in the queue.
 
         Returns:
             The mission, and whether it is new. An order with a known key returns the known mission.
-
-        Raises:
-            ConflictError: If the key belongs to another order, if another mission is under way and
-                the order may not wait, if the queue is full, or if the operator has to acknowledge
-                first.
-            UnavailableError: If the mission cannot be stored, or if this process is ending.
         """
         known = self.book.with_key(order.key)
         if known is not None:
@@ -212,94 +184,68 @@ class MissionService:
                 text = f"the key '{order.key}' is that of mission {known.id}, with another plan"
                 raise ConflictError(f"{text}; take a new key", known.id)
             return known, False
-        waiting = self.book.waits_for(order)
+        waiting = self.book.open()
+        if waiting and not order.queue:
+            raise _busy(waiting[0], "cancel it first, or queue the new one")
+        if len(waiting) > QUEUE_MAX:
+            raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
         self._check_can_fly()
+        if order.plan.start is Start.HERE and not waiting:
+            self._check_way(order.plan.legs[0])
         mission = self.book.add(order)
         if waiting:
             self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
         else:
-            self._current = mission
-            self._teleop.start(now_ns, order.plan, mission.number)
-            self._note_start(mission, now_ns)
+            self._start_next(now_ns, queued=True)
         return mission, True
 
     def cancel(self, mission_id: str, now_ns: int) -> Mission:
-        """End a mission, or remove it from the queue.
-
-        Raises:
-            UnknownMissionError: If no mission has this id.
-            ConflictError: If the mission has ended.
-            UnavailableError: If the mission is in the queue and its end cannot be stored.
-        """
+        """End a mission, or remove it from the queue; raise UnknownMissionError for a wrong id."""
         mission = self.book.find(mission_id)
         if not mission.ended and mission is self._start_next(now_ns):
             return self._operate(self._teleop.cancel, now_ns)
         if mission.ended:  # also if it has just failed, because world restarted
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
-        self.book.cancel(mission)
+        verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
+        self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
         return mission
 
     def hold(self, now_ns: int) -> Mission:
-        """Hold the robot at its position; raise ConflictError unless it flies a mission."""
+        """Hold the robot at its position; it must fly a mission."""
         return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
-        """Continue the held mission.
-
-        Raises:
-            ConflictError: If no mission is held, or if the operator has to acknowledge first.
-            UnavailableError: If this process is ending.
-        """
+        """Continue the held mission, straight to its next waypoint."""
         self._check_can_fly()
+        if (mission := self._current) is not None and mission.state == HELD:
+            self._check_way(mission.order.plan.legs[mission.waypoint])
         return self._operate(self._teleop.resume, now_ns)
 
-    def go_to(self, position: Vector, yaw: float, now_ns: int) -> Mission:
-        """Fly to a point.
-
-        If a mission is held, the point is the new place to hold. Otherwise the point is a new
-        mission.
-
-        Args:
-            position: The point [m], world frame, shape (3,).
-            yaw: Heading to hold [rad].
-            now_ns: Own clock [ns].
-
-        Raises:
-            ConflictError: If a mission is under way and not held, or if the operator has to
-                acknowledge first.
-            UnavailableError: If the mission cannot be stored, or if this process is ending.
-        """
+    def go_to(self, leg: Leg, now_ns: int) -> Mission:
+        """Fly straight to a point: the new place of a held mission, else a new mission."""
         self._check_can_fly()
         waiting = self.book.open()
-        if waiting and waiting[0].state != store.HELD:
-            raise busy(waiting[0], "hold or cancel it first")
-        if waiting:
-            return self._operate(partial(self._teleop.go_to, position=position, yaw=yaw), now_ns)
-        leg = Leg(position, yaw)
-        mission = self.book.add(Order(Plan((leg,), Start.HERE, leg.time_limit), "goto"))
-        self._current = mission
-        self._teleop.go_to(now_ns, position, yaw, mission.number)
-        self._note_start(mission, now_ns)
-        return mission
+        if not waiting:
+            plan = Plan((leg,), Start.HERE, leg.time_limit)
+            return self.create(Order(plan, "goto"), now_ns)[0]
+        if waiting[0].state != HELD:
+            raise _busy(waiting[0], "hold or cancel it first")
+        self._check_way(leg)
+        return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state; return the mission that this ends, if any."""
         mission = self._start_next(now_ns)
-        self._inherits_stop = self._acknowledges = False
+        self._inherits_stop = False
         self._teleop.stop(now_ns)
         self._collect(now_ns)
         return mission
 
     def acknowledge(self, now_ns: int) -> None:
-        """Allow the robot to fly again after a landing or a stop.
-
-        Raises:
-            ConflictError: If a mission is under way.
-        """
+        """Allow the robot to fly again after a landing or a stop; no mission may be under way."""
         if self._current is not None:
-            raise busy(self._current, "there is nothing to acknowledge")
+            raise _busy(self._current, "there is nothing to acknowledge")
         self._teleop.acknowledge(now_ns)
-        self._acknowledges = True
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
@@ -308,48 +254,28 @@ class MissionService:
         if self._start_next(now_ns) is not None:
             self._operate(self._teleop.pause, now_ns)
 
-    @property
-    def settled(self) -> bool:
-        """Whether telemetry shows that the robot has acted on the last request."""
-        return self._teleop.settled
-
     def hear(self, now_ns: int) -> None:
-        """Note a message from cloud at `now_ns` [ns]."""
-        self.sight.hear(now_ns)
+        """Note a message from cloud."""
+        self.sight.heard_ns = now_ns
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Process new telemetry at `now_ns` [ns]."""
+        """Process new telemetry."""
         mission = self._current
         if self._inherits_stop:
-            self._repeat_stop(seen, now_ns)
+            self._inherits_stop, stopped = False, self.book.stopped()
+            same = stopped is not None and seen.mission_id == stopped.number
+            if same and seen.guard in AIRBORNE:  # it has not heard of the stop
+                self._teleop.stop(now_ns)
         is_new_session = self.sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
             self._note_contacts(mission, seen, now_ns)
             if is_new_session:
-                self._note(mission, "new_session", describe_session(mission), now_ns)
+                self._note(mission, "new_session", _describe_session(mission), now_ns)
         self._teleop.see(seen, now_ns)
-        if self._acknowledges and self._teleop.settled:
-            self._acknowledges = False
-            if (stopped := self.book.stopped()) is not None:
-                text = "the operator has acknowledged the stop"
-                self._note(stopped, "acknowledged", text, now_ns)
         self._collect(now_ns)
 
-    def _repeat_stop(self, seen: RobotStatus, now_ns: int) -> None:
-        """Repeat the stop of an earlier teleop if the first telemetry shows the stopped mission.
-
-        Telemetry shows another mission if the robot has flown since the stop, or if it is a
-        different robot.
-        """
-        self._inherits_stop = False
-        stopped = self.book.stopped()
-        if stopped is not None and seen.mission_id == stopped.number:
-            self._teleop.stop(now_ns)
-            if self._acknowledges:  # meanwhile
-                self._teleop.acknowledge(now_ns)
-
     def handle_deadline(self, now_ns: int) -> None:
-        """Start a waiting mission, check time limits, and repeat messages due at `now_ns` [ns]."""
+        """Start a waiting mission, check time limits, and repeat the messages that are due."""
         self.book.catch_up(now_ns)
         if not self._ends:
             in_sight = self.sight.seen is not None
@@ -366,13 +292,12 @@ class MissionService:
         return outputs
 
     def state(self, now_ns: int) -> dict[str, Any]:
-        """Return the state of missions and robot for the API at `now_ns` [ns]."""
+        """Return the state of missions and robot for the API."""
         mission = self._current
         return {
             "mission": mission.summary() if mission is not None else None,
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
-            "cloud_age_s": self.sight.cloud_age(now_ns),
-            "seen": self.sight.show(now_ns, None if mission is None else mission.state),
+            **self.sight.show(now_ns, None if mission is None else mission.state),
         }
 
     @property
@@ -380,7 +305,10 @@ class MissionService:
         """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
         if self._teleop.stopping or self._inherits_stop:
             return "an emergency stop is on its way to the robot"
-        return self.sight.latched
+        seen = self.sight.seen
+        if seen is None or seen.guard not in LATCHED:
+            return ""
+        return f"the guard is in {seen.guard.name} ({seen.cause.words}) and lets nothing fly"
 
     def _check_can_fly(self) -> None:
         if self._ends:
@@ -389,6 +317,20 @@ class MissionService:
             raise ConflictError(
                 f"{self._blocked}; find the cause, then: cloudrc mission acknowledge"
             )
+
+    def _check_way(self, leg: Leg) -> None:
+        """Raise ConflictError if the straight way from the robot to a leg crosses a pipe's wall."""
+        seen, scene = self.sight.seen, self._scene
+        if seen is None or scene is None:
+            return
+        ways = np.array([seen.position]), np.array([leg.position])
+        through = int(find_crossed_pipe(scene, *ways)[0])
+        if through >= 0:
+            here, there = (f"[{', '.join(f'{v:.2f}' for v in way[0])}]" for way in ways)
+            text = f"the straight way from where the robot is, {here}, to {there} leads through "
+            text += f"the wall of {scene.pipes[through].name}"
+            mission_id = self._current.id if self._current else ""
+            raise ConflictError(f"{text}; go round it first, by 'cloudrc mission goto'", mission_id)
 
     def _operate(self, verb: Callable[[int], None], now_ns: int) -> Mission:
         mission = self._current
@@ -407,26 +349,22 @@ class MissionService:
         If the mission has begun, it continues. If it waits, it starts only with `queued`.
         """
         if self._current is None and (waiting := self.book.open()):
-            if queued and waiting[0].state == store.QUEUED:
-                self.book.begin(waiting[0], now_ns)
-            if waiting[0].state != store.QUEUED:
+            if queued and waiting[0].state == QUEUED:
+                self._note(waiting[0], "starting", ASKED, now_ns)
+            if waiting[0].state != QUEUED:
                 self._take_over(waiting[0], now_ns)
         return self._current
 
     def _take_over(self, mission: Mission, now_ns: int) -> None:
         """Fly a mission that this or an earlier teleop has begun."""
-        self._current, before = mission, mission.before()
-        if before is None:
-            self._teleop.start(now_ns, mission.order.plan, mission.number, again=True)
+        self._current = mission
+        if not mission.world:  # it has not started
+            self._teleop.start(now_ns, mission.order.plan, mission.number)
         else:
-            self._teleop.continue_mission(now_ns, before)
+            self._teleop.continue_mission(now_ns, mission)
             mission.witness = mission.witness.after_restart()
             text = "teleop has restarted; the robot is asked to go on"
             self._note(mission, "restarted", text, now_ns)
-        self._collect(now_ns)
-
-    def _note_start(self, mission: Mission, now_ns: int) -> None:
-        self._note(mission, "starting", "the robot is asked to start", now_ns)
         self._collect(now_ns)
 
     def _note_contacts(self, mission: Mission, seen: RobotStatus, now_ns: int) -> None:
@@ -443,8 +381,9 @@ class MissionService:
             elif isinstance(output, MissionEvent):
                 self._process_event(output, now_ns)
             self._outputs.append(output)
-        if trouble := self.book.news():
-            self._outputs.append(Fault(now_ns, "journal", trouble))
+        told, self._trouble = self._trouble, self.book.trouble
+        if self._trouble not in ("", told):
+            self._outputs.append(Fault(now_ns, "journal", self._trouble))
 
     def _process_event(self, event: MissionEvent, now_ns: int) -> None:
         mission, seen = self._current, self.sight.seen
@@ -471,3 +410,17 @@ class MissionService:
         if mission is self._current:
             changed["elapsed"] = round(self._teleop.elapsed(now_ns), 3)
         self.book.note(mission, event, text, **changed)
+
+
+def _busy(mission: Mission, advice: str) -> ConflictError:
+    return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)
+
+
+def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
+    return seen.pipe_contacts, seen.touch_speed, seen.slip_ns
+
+
+def _describe_session(mission: Mission) -> str:
+    where = f"waypoint {mission.waypoint + 1} of {len(mission.order.plan.legs)}"
+    goes_on = f"is held on the way to {where}" if mission.state == HELD else f"goes on to {where}"
+    return f"the controller has a new session, as after a restart; the mission {goes_on}"

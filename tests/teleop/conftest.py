@@ -1,9 +1,4 @@
-"""The real API on a free port, over a service whose robot is flown by a thread of the test.
-
-A robot and a lossy link for teleop to talk to: no world, no tunnel, no clock.
-
-A robot, a lossy link and a store in memory for the mission service to fly with.
-"""
+"""A robot and a lossy link for teleop, a store that may fail, and the real API on a free port."""
 
 import json
 import socket
@@ -13,6 +8,7 @@ import time
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,14 +21,12 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
-from cloudrc.teleop.api import ApiServer, create_app
-from cloudrc.teleop.audit import Audit
-from cloudrc.teleop.auth import Gate, Tokens
-from cloudrc.teleop.bridge import STARTING, Bridge
+from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
+from cloudrc.teleop.auth import Audit, Gate, Tokens
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.models import Surroundings
+from cloudrc.teleop.models import read_goto, read_order
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import MissionStore, Order
+from cloudrc.teleop.store import ConflictError, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
 
 PERIOD_NS = 10_000_000
@@ -49,17 +43,14 @@ class Flight:
 
     def __init__(self):
         self.teleop = Teleop()
-        self.now_ns = 0
-        self.position = (0.0, 0.0, 0.1)
-        self.epoch = 1
-        self.world = "world 1"
-        self.mission = 0
+        self.now_ns, self.position = 0, (0.0, 0.0, 0.1)
+        self.epoch, self.world, self.mission = 1, "world 1", 0
         self.onboard = (0, 0)  # mission's number and waypoints reached, as world keeps them
         self.guard, self.cause = GuardState.GROUND, Cause.SPAWN
+        self.pipe_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
         self.uplink = self.downlink = True
         self.first_shown_ns = {}  # number of a request -> when telemetry first showed it
-        self.said = []
-        self.said_at = []
+        self.said, self.said_at = [], []
         self.stop = EmergencyStopRepeater()  # cloud's
 
     def step(self, position=None, seconds=0.01):
@@ -76,16 +67,17 @@ class Flight:
             if stop is not None and self.downlink:
                 self._obey(stop)
 
-    def see(self):
-        seen = RobotStatus(
-            self.epoch, self.position, self.guard, self.mission, self.world, **self.progress()
-        )
-        self.first_shown_ns.setdefault(self.mission, self.now_ns)
-        self.teleop.see(seen, self.now_ns)
+    @property
+    def seen(self):
+        return RobotStatus(
+            *(self.epoch, self.position, self.guard, self.mission, self.world),
+            *(self.pipe_contacts, self.touch_speed, self.slip_ns),
+            mission_id=self.onboard[0], reached=self.onboard[1], cause=self.cause,
+        )  # fmt: skip
 
-    def progress(self):
-        told = (*self.onboard, self.cause)
-        return dict(zip(("mission_id", "reached", "cause"), told, strict=True))
+    def see(self):
+        self.first_shown_ns.setdefault(self.mission, self.now_ns)
+        self.teleop.see(self.seen, self.now_ns)
 
     def operate(self, verb, *words, **more):
         try:
@@ -95,18 +87,14 @@ class Flight:
 
     def restart(self):
         """World loses everything it knew."""
-        self.world = f"world {self.epoch + 1}"
         self.epoch += 1
-        self.mission = 0
-        self.onboard = (0, 0)
-        self.guard = GuardState.GROUND
-        self.position = (0.0, 0.0, 0.1)
+        self.world, self.mission, self.onboard = f"world {self.epoch}", 0, (0, 0)
+        self.guard, self.position = GuardState.GROUND, (0.0, 0.0, 0.1)
 
     def restart_cloud(self):
         """A new cloud opens a new epoch in the same world, and counts requests from 1 again."""
         self.epoch += 1
-        self.mission = 0
-        self.guard = GuardState.HOLD
+        self.mission, self.guard = 0, GuardState.HOLD
         self.stop = EmergencyStopRepeater()
 
     @property
@@ -146,23 +134,22 @@ class Flight:
         if request.number <= self.mission:
             return
         self.mission = request.number
-        if request.request is not Request.START:
-            stopped = self.guard in (GuardState.LAND, GuardState.ESTOP)
-            if request.request is Request.ESTOP:
-                self.guard, self.cause = GuardState.ESTOP, Cause.STOPPED
-            elif request.request is Request.ACKNOWLEDGE:
-                self.guard = GuardState.GROUND if stopped else self.guard
-            elif not stopped:
-                self.guard = GuardState.HOLD
-            return
-        if request.mission_id != self.onboard[0] or request.start is Start.SPAWN:
-            self.onboard = (request.mission_id, 0)
-        self._keep(request)
-        if request.start is Start.SPAWN:
-            self.epoch += 1
-            self.position = (0.0, 0.0, 0.1)
-        if self.guard not in (GuardState.LAND, GuardState.ESTOP):
-            self.guard, self.cause = GuardState.TRACK, Cause.COMMAND
+        stopped = self.guard in (GuardState.LAND, GuardState.ESTOP)
+        if request.request is Request.ESTOP:
+            self.guard, self.cause = GuardState.ESTOP, Cause.STOPPED
+        elif request.request is Request.ACKNOWLEDGE:
+            self.guard = GuardState.GROUND if stopped else self.guard
+        elif request.request is Request.START:
+            if request.mission_id != self.onboard[0] or request.start is Start.SPAWN:
+                self.onboard = (request.mission_id, 0)
+            self._keep(request)
+            if request.start is Start.SPAWN:
+                self.epoch += 1
+                self.position = (0.0, 0.0, 0.1)
+            if not stopped:
+                self.guard, self.cause = GuardState.TRACK, Cause.COMMAND
+        elif not stopped:
+            self.guard = GuardState.HOLD
 
     def _keep(self, request):
         number, reached = self.onboard
@@ -178,9 +165,6 @@ def flying(plan=PLAN):
     flight.step(seconds=0.03)
     assert flight.state == "FLYING"
     return flight
-
-
-SERVICE_PLAN = Plan((Leg(A, dwell=0.0), Leg(B, dwell=0.0), Leg(C, dwell=0.0)))
 
 
 class KilledError(BaseException):
@@ -205,7 +189,7 @@ class Disk(sqlite3.Connection):
 
 
 class ServiceFlight(Flight):
-    """The harness of the machine, with a service in its place that may be restarted.
+    """A flight with a service in the machine's place, which may be restarted.
 
     Attributes:
         images: What was on the disk after each commit.
@@ -214,17 +198,16 @@ class ServiceFlight(Flight):
         killed_before: Commit before which the process is killed; `killed_after` likewise.
     """
 
-    def __init__(self):
+    def __init__(self, scene=None):
         super().__init__()
-        self.images, self.full, self.commits = [], False, 0
-        self.killed_before = self.killed_after = None
-        self.pipe_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
+        self.scene, self.images, self.full, self.commits = scene, [], False, 0
+        self.mark = 0
         self.restart_teleop()
 
     def restart_teleop(self, image=None):
         """A new process, that has nothing but what is on the disk, or was at a commit."""
         self.killed_before = self.killed_after = None
-        self.teleop = MissionService(0.25, self.stored(image))
+        self.teleop = MissionService(0.25, self.stored(image), self.scene)
 
     def stored(self, image=None):
         """What another process reads from the disk."""
@@ -241,24 +224,7 @@ class ServiceFlight(Flight):
         """Events that the disk has, oldest first."""
         return self.stored().events_after(0)
 
-    def see(self):
-        self.teleop.see(self.seen, self.now_ns)
-
-    @property
-    def seen(self):
-        return RobotStatus(
-            self.epoch,
-            self.position,
-            self.guard,
-            self.mission,
-            self.world,
-            self.pipe_contacts,
-            self.touch_speed,
-            self.slip_ns,
-            **self.progress(),
-        )
-
-    def create(self, plan=SERVICE_PLAN, **order):
+    def create(self, plan=FROM_SPAWN, **order):
         mission, _ = self.teleop.create(Order(plan, **order), self.now_ns)
         self._collect()
         return mission.id
@@ -286,10 +252,47 @@ def service_flying(**order):
     return flight, mission_id
 
 
+PLACES = {"A": A, "B": B, "C": C, "away": AWAY}
+SWITCHES = {
+    **{guard.name: {"guard": guard} for guard in GuardState},
+    **{"full": {"full": True}, "free": {"full": False}, "foreign": {"onboard": (ID, 1)}},
+    **{"deaf": {"uplink": False}, "mute": {"downlink": False}},
+    "link": {"uplink": True, "downlink": True},
+}
+VERBS = ("hold", "resume", "stop_rotors", "acknowledge", "pause", "handle_deadline")
+
+
+def play(flight, script):
+    """Carry out a script of actions: places, times [s], verbs, faults; "!" expects a refusal."""
+    for action in script.split():
+        if action.startswith("!"):
+            with pytest.raises((ConflictError, UnavailableError)):
+                play(flight, action[1:])
+        elif action in PLACES:
+            flight.step(position=PLACES[action], seconds=0.05)
+        elif action[0].isdecimal():
+            flight.step(seconds=float(action))
+        elif action in SWITCHES:
+            vars(flight).update(SWITCHES[action])
+        elif action in ("create", "queue", "here"):
+            flight.create(THREE if action == "here" else FROM_SPAWN, queue=action == "queue")
+        elif action == "goto":
+            flight.teleop.go_to(Leg(AWAY, 0.5), flight.now_ns)
+        elif action.startswith("cancel"):
+            newest = next(reversed(flight.teleop.book.missions))
+            flight.teleop.cancel(action.removeprefix("cancel") or newest, flight.now_ns)
+        elif action in VERBS:
+            getattr(flight.teleop, action)(flight.now_ns)
+        elif action == "mark":
+            flight.mark = len(flight.said)
+        else:
+            do = {"cloud": "restart_cloud", "world": "restart", "restart": "restart_teleop"}
+            getattr(flight, do.get(action, action))()
+
+
 def finish(flight):
-    """Fly to all waypoints of `SERVICE_PLAN`."""
-    for point in (A, B, C):
-        flight.step(position=point, seconds=0.05)
+    """Fly to all waypoints of `FROM_SPAWN`."""
+    play(flight, "A B C")
 
 
 def asked(flight, since=0):
@@ -312,17 +315,18 @@ class Running:
         for role, token in (("operator", OPERATOR), ("reader", READER)):
             (folder / role).write_text(token + "\n")
             (folder / role).chmod(0o600)
-        self.flight, self.bridge = ServiceFlight(), Bridge()
+        self.token_file, self.audit_file = folder / "operator", folder / "audit.jsonl"
+        self.scene, self.bridge = load_scene("pipes"), Bridge()
+        self.flight = ServiceFlight(self.scene)
         self.alarms, self.complaints = [], []
-        self.bridge.alarm = self.note_alarm
-        surroundings = Surroundings(load_scene("pipes"), 60.0, True, assembly.mission_plan)
-        app = create_app(self.bridge, surroundings, self.complaints.append)
-        self.audit_file = folder / "audit.jsonl"
-        audit = Audit(self.audit_file, self.complaints.append)
-        self.gate = Gate(app, None if unix else Tokens(folder), audit)
+        self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
+        how = {"time_limit": 60.0, "contact": True, "plan": assembly.mission_plan}
+        order, goto = (partial(read, scene=self.scene) for read in (read_order, read_goto))
+        app = create_app(self.bridge, partial(order, **how), goto, self.complaints.append)
+        tokens = None if unix else Tokens(folder, self.complaints.append)
+        self.gate = Gate(app, tokens, Audit(self.audit_file, self.complaints.append))
         self.address = folder / "api.sock" if unix else (host, 0)
         self.server = ApiServer(self.gate, self.bridge, self.address)
-        self.token_file = folder / "operator"
         self.url = self.server.url
         self.server.start()
         self._stopping = threading.Event()
@@ -333,20 +337,23 @@ class Running:
         if not unix:
             self.until(self.answers)
 
-    def note_alarm(self):
-        self.alarms.append(time.monotonic())
-        return True
-
     def reset(self):
         """Begin again with another robot and service, and keep the server."""
-        for replaced in ("take", "submit"):
-            vars(self.bridge).pop(replaced, None)
-        self.bridge.alarm, self.bridge.overtakings = self.note_alarm, 0
+        vars(self.bridge).pop("take", None)
+        self.bridge.overtakings = 0
         self.until(lambda: not self.gate._in_flight.total())
         for kept in (self.alarms, self.complaints, self.gate.counts):
             kept.clear()
-        self.flight = ServiceFlight()
+        self.flight = ServiceFlight(self.scene)
         self.bridge.open(self.flight.teleop)
+
+    @contextmanager
+    def stalled(self):
+        """Teleop's loop makes no calls, as while it waits for the disk."""
+        take = self.bridge.take
+        self.bridge.take = list
+        yield
+        self.bridge.take = take
 
     def _fly(self):
         while not self._stopping.wait(0.002):
@@ -379,11 +386,9 @@ class Running:
             headers["Authorization"] = f"Bearer {token}"
         return urllib.request.Request(self.url + path, data, headers, method=method)
 
-    def post(self, path, body=None, token=OPERATOR):
+    def post(self, path, body=b"", token=OPERATOR):
         """Status and answer, whatever it is; `body` may be bytes."""
-        data = (
-            body if isinstance(body, bytes) else b"" if body is None else json.dumps(body).encode()
-        )
+        data = body if isinstance(body, bytes) else json.dumps(body).encode()
         return self.send(self.request(path, data, token, "POST"))
 
     def post_local(self, path, body=None):
@@ -402,8 +407,7 @@ class Running:
         """What the audit log has, once every request is done with; nothing is served after."""
         self.server.stop()
         self.server.stop = lambda: None
-        lines = self.audit_file.read_text().splitlines() if self.audit_file.exists() else []
-        return [json.loads(line) for line in lines]
+        return [json.loads(line) for line in self.audit_file.read_text().splitlines()]
 
     def until(self, condition):
         limit = time.monotonic() + LIMIT

@@ -2,8 +2,6 @@
 
 from itertools import pairwise
 
-import pytest
-
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, RequestSender
@@ -12,7 +10,7 @@ from cloudrc.teleop.wire import (
     RobotStatus,
 )
 from cloudrc.tunnel.codec import NUMBER_MAX
-from tests.teleop.conftest import FROM_SPAWN, ID, PLAN, A, B, Flight, asked, flying
+from tests.teleop.conftest import FROM_SPAWN, ID, PLAN, THREE, A, Flight, flying
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -39,22 +37,11 @@ def test_a_request_repeats_at_10_hz_until_acknowledged():
     assert len(flight.requests) == count
 
 
-def test_a_mission_may_be_asked_for_before_the_robot_is_in_sight():
-    flight = Flight()
-    flight.uplink = False
-    flight.operate("start", PLAN)
-    flight.step(seconds=1.0)
-    assert flight.requests == []
-    flight.uplink = True
-    flight.step(seconds=0.03)
-    assert flight.state == "FLYING"
-
-
 def test_numbers_go_on_well_above_what_the_robot_shows():
     flight = Flight()
     flight.mission = 41  # a cloud that has been restarted since has asked for these
     flight.step()
-    flight.operate("go_to", B)
+    flight.operate("start", THREE)
     flight.step(seconds=0.05)
     assert flight.requests[0].number == 41 + PREDECESSORS
     assert flight.state == "FLYING"
@@ -75,16 +62,6 @@ def test_whoever_begins_later_begins_higher_and_numbers_last():
     for _ in range(1_000):
         seen = seen._replace(mission=first_request(seen, 10 * 365 * 86_400 * 10**9).number)
     assert seen.mission < NUMBER_MAX / 10
-
-
-def test_a_predecessors_request_does_not_acknowledge_our_start():
-    """It asked for the mission's end, was gone at once, and the robot shows that only now."""
-    sender, seen = RequestSender(), RobotStatus(1, A, TRACK, 41)
-    sender.see(seen, 0)
-    sender.ask(Request.START, Start.HERE)
-    own = sender.due(0).number
-    assert sender.see(seen._replace(mission=42), 0) is None
-    assert sender.see(seen._replace(mission=own), 0) is Request.START
 
 
 def held_back(flight, number):
@@ -149,22 +126,6 @@ def test_a_stop_leaves_at_once_and_is_told_until_it_is_seen():
     assert flight.guard is ESTOP
 
 
-@pytest.mark.promise("emergency-stop-gets-through")
-def test_nothing_supersedes_a_stop():
-    flight = flying()
-    flight.downlink = False
-    flight.operate("stop")
-    flight.step(seconds=0.2)
-    count = len(flight.requests)
-    flight.operate("go_to", (1.0, 0.0, 1.0))
-    flight.step(seconds=1.0)
-    assert {r.request for r in flight.requests[count:]} == {Request.ESTOP}
-    flight.downlink = True
-    flight.step(seconds=0.3)
-    assert flight.guard is ESTOP  # and the mission that wanted to start has failed
-    assert flight.teleop.outcome.code == "guard_stopped"
-
-
 def test_a_start_with_the_stops_number_does_not_confirm_the_stop():
     flight = Flight()
     flight.step()
@@ -178,36 +139,3 @@ def test_a_start_with_the_stops_number_does_not_confirm_the_stop():
     flight.step(seconds=0.2)
     assert flight.guard is ESTOP
     assert flight.teleop.settled
-
-
-@pytest.mark.parametrize("in_sight", [True, False])
-@pytest.mark.parametrize(
-    ("verbs", "guard"),
-    [
-        (["stop", "acknowledge", "acknowledge"], GROUND),
-        (["stop", "acknowledge", "stop"], ESTOP),
-    ],
-)
-def test_an_acknowledgement_waits_for_the_stop_before_and_not_for_one_after(
-    verbs, guard, in_sight
-):  # fmt: skip
-    flight = flying() if in_sight else Flight()
-    flight.downlink = False
-    for verb in verbs:
-        flight.operate(verb)
-    flight.downlink = True
-    flight.step(seconds=0.5)
-    assert flight.guard is guard
-    assert flight.teleop.settled
-    if guard is GROUND:
-        assert asked(flight)[-2:] == [Request.ESTOP, Request.ACKNOWLEDGE]
-
-
-@pytest.mark.parametrize("verb", ["stop", "acknowledge"])
-def test_an_operators_word_precedes_ending_a_lost_mission(verb):
-    flight = Flight()
-    flight.operate(verb)
-    flight.onboard = (ID, 0)
-    flight.step(seconds=0.3)
-    stops = verb == "stop"  # a stop ends it, too
-    assert asked(flight) == ([Request.ESTOP] if stops else [Request.ACKNOWLEDGE, Request.END])

@@ -1,66 +1,24 @@
 """Datagrams between cloud and teleop: every message comes back as it was, nothing else does."""
 
-import math
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.errors import BadInputError
-from cloudrc.messages import MISSION_OVER, GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.messages import OperatorRequest, Setpoint
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop.wire import Leg, Plan, RobotStatus, decode, encode
-from cloudrc.tunnel.codec import NUMBER_MAX, encode_operator
-from tests.teleop.conftest import A
+from cloudrc.teleop.wire import RobotStatus, decode, encode
 
-numbers = st.floats(allow_nan=False)
-vectors = st.tuples(numbers, numbers, numbers)
-counts = st.integers(0, 2**62)
-messages = st.one_of(
-    st.builds(
-        RobotStatus,
-        epoch=counts,
-        position=vectors,
-        guard=st.sampled_from(GuardState),
-        mission=counts,
-        world=st.text(max_size=40),
-        pipe_contacts=counts,
-        touch_speed=numbers,
-        slip_ns=counts,
-        horizon=numbers,
-        rtt=numbers,
-        loop_delay=numbers,
-        mission_id=counts,
-        reached=counts,
-    ),
-    st.builds(Setpoint, vectors, numbers, st.integers(-1, 9999), counts),
-    st.builds(
-        OperatorRequest,
-        number=counts,
-        request=st.sampled_from(Request),
-        start=st.sampled_from(Start),
-        mission_id=counts,
-        reached=st.integers(0, MISSION_OVER),
-        basis_stamp_ns=counts,
-        epoch=counts,
-    ),
-    st.builds(MissionEvent, counts, st.text(max_size=20), st.integers(-1, 9999), st.text()),
-)
+messages = st.one_of(*map(st.from_type, (RobotStatus, Setpoint, OperatorRequest, MissionEvent)))
 
 
 @settings(max_examples=200, deadline=None)
 @given(messages)
 def test_a_message_comes_back_as_it_was(message):
     back = decode(encode(message))
-    assert back == message
-    assert type(back) is type(message)
-    assert [type(value) for value in back] == [type(value) for value in message]
-
-
-def test_what_is_not_known_comes_back_unknown():
-    back = decode(encode(RobotStatus(1, (0.0, 0.0, 1.0), GuardState.TRACK, 1)))
-    assert math.isnan(back.touch_speed)
-    assert math.isnan(back.rtt)
+    assert repr(back) == repr(message)  # NaN is not equal to itself
+    assert [type(value) for value in (back, *back)] == [
+        type(value) for value in (message, *message)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -68,63 +26,17 @@ def test_what_is_not_known_comes_back_unknown():
     [
         b"",
         b"{}",
-        b'"Seen"',
+        b'"RobotStatus"',
         b'["Nobody", []]',
-        b'["Seen", [1, [0, 0, 1], 7, 1]]',
+        b'["RobotStatus", [1, [0, 0, 1], 7, 1]]',
         b'["Setpoint", [["a", 0, 0], 0, 0]]',
         b'["Setpoint", [[0, 0], 0, 0]]',
         b'["OperatorRequest", [1, 9, 0]]',
-        b'["OperatorRequest", [-1, 1, 0, 0, 0]]',
-        b'["OperatorRequest", [1, 1, 0, -1, 0]]',
-        b'["OperatorRequest", [1, 1, 0, 9223372036854775808, 0]]',
-        b'["OperatorRequest", [1, 1, 0, 0, -1]]',
-        b'["OperatorRequest", [1, 1, 0, 0, 65536]]',
-        b'["OperatorRequest", [1, 1, 0, 0, 0, 9223372036854775808]]',
-        b'["Setpoint", [[0, 0, 0], 0, 9223372036854775808]]',
-        b'["MissionEvent", [-9223372036854775809, "held", 0, ""]]',
         b"[" * 5000,
         b"\xff\xfe",
         encode(Fault(0, "x", "y")),
-        *(bytes([n]) * 9 for n in range(0, 256, 25)),
     ],
 )
 def test_what_is_no_message_is_refused(data):
     with pytest.raises(ValueError, match="not a message"):
         decode(data)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Leg((math.nan, 0.0, 1.0)), "finite"),
-        (lambda: Leg(A, yaw=math.inf), "finite"),
-        (lambda: Leg(A, tolerance=0.0), "tolerance 0.0 m"),
-        (lambda: Leg(A, tolerance=math.nan), "tolerance nan m"),
-        (lambda: Leg(A, dwell=-1.0), "dwell -1.0 s"),
-        (lambda: Leg(A, dwell=math.nan), "dwell nan s"),
-        (lambda: Leg(A, time_limit=0.0), "limit 0.0 s"),
-        (lambda: Plan(()), "at least one waypoint"),
-        (lambda: Plan((Leg(A),), time_limit=math.inf), "limit inf s"),
-    ],
-)
-def test_a_plan_that_cannot_be_flown_is_refused(make, message):
-    with pytest.raises(BadInputError, match=message):
-        make()
-
-
-integers = st.integers(-(2**70), 2**70)
-
-
-@settings(max_examples=200, deadline=None)
-@given(
-    st.tuples(
-        integers, st.sampled_from(Request), st.sampled_from(Start), integers, integers, integers
-    )
-)
-def test_a_request_that_is_let_pass_fits_in_the_tunnel(fields):
-    """Cloud drops, and counts, what has a number that no datagram has room for."""
-    try:
-        said = decode(encode(OperatorRequest(*fields)))
-    except ValueError:
-        return
-    encode_operator(said._replace(number=min(said.number, NUMBER_MAX)))
