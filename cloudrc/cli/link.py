@@ -6,7 +6,7 @@ import argparse
 import importlib
 from pathlib import Path
 
-from cloudrc.cli.runtime import process_arguments, read_address
+from cloudrc.cli.processes import process_arguments, read_address
 from cloudrc.errors import BadInputError
 
 EPILOG = """\

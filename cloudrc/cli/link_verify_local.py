@@ -32,7 +32,7 @@ from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.config.schema import Profile
 from cloudrc.drivers.machine import interpreter
 from cloudrc.drivers.process import PARENT
-from cloudrc.drivers.realtime import bind, free_ports, parse
+from cloudrc.drivers.realtime import bind, free_ports, split_address
 from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError, TimedOutError
 from cloudrc.link.sidecar import Told, read_told
 from cloudrc.link.state import STATE_FILE, from_text
@@ -133,7 +133,7 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, 
     for name, way in ways.items():
         text = (way.folder / STATE_FILE).read_text(encoding="utf-8")
         state = states[name] = from_text(text)
-        route = parse((way.folder / "route").read_text(encoding="ascii"))
+        route = split_address((way.folder / "route").read_text(encoding="ascii"))
         ends.append(ProbeEnd(way.own, route, plans[name], (state.origin_ns or 0) + since_wall_ns))
     streams = send_probes(ends)
     time.sleep(COUNTS_WAIT)

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cloudrc.drivers.iproute2 import Programs
+from cloudrc.cli.link_run import Programs
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
