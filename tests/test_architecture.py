@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cloud": {"endpoint", "tunnel", "config", "plugins", "teleop"},
     "teleop": {"config", "files", "geometry", "metrics"},
     "exposition": set(),
-    "drivers": {"endpoint", "tunnel", "link", "metrics", "config", "exposition", "files"},
+    "drivers": {"endpoint", "tunnel", "link", "exposition", "files", "record"},
     "record": {"endpoint", "files"},
     "metrics": {"record", "config", "geometry", "plugins"},
     "report": {"record", "metrics", "config", "geometry", "link", "files"},

@@ -6,15 +6,9 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import print_line
 from cloudrc.errors import BadInputError
-
-REMEDY = "name a key file; 'cloudrc key new FILE' makes a new one"
-
-if TYPE_CHECKING:
-    from cloudrc.tunnel.keys import KeySet
 
 EPILOG = """\
 World and cloud read the same key file ('--key FILE'; in a cluster, a Secret)
@@ -42,47 +36,27 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Make a key, or drop the previous key."""
-    return _make(options) if options.verb == "new" else _drop(options.file)
-
-
-def _make(options: argparse.Namespace) -> int:
     from cloudrc.drivers.keyfile import read_keys
-    from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet
-
-    path: Path = options.file
-    if options.overlap is not None:
-        text = "--overlap is ignored: the old key is accepted until 'cloudrc key drop'"
-        print(f"cloudrc: {text}", file=sys.stderr)
-    old = read_keys(path, "", REMEDY).current if path.exists() else None
-    keys = KeySet(Key(os.urandom(KEY_SIZE)), old)
-    _replace(path, keys)
-    beside = f", beside {old.name} until 'cloudrc key drop'" if old else ""
-    print_line(f"key {keys.current.name}{beside}: {path}")
-    return 0
-
-
-def _drop(path: Path) -> int:
-    from cloudrc.drivers.keyfile import read_keys
-    from cloudrc.tunnel.keys import KeySet
-
-    keys = read_keys(path, "", REMEDY)
-    if keys.previous is None:
-        print_line(f"key {keys.current.name} is the only key already: {path}")
-        return 0
-    _replace(path, KeySet(keys.current))
-    print_line(
-        f"key {keys.current.name} is the only key now, {keys.previous.name} is removed: {path}"
-    )
-    return 0
-
-
-def _replace(path: Path, keys: KeySet) -> None:
-    """Write keys to a file; if the path is a symbolic link, write to the target of that link."""
     from cloudrc.files import write_atomically
-    from cloudrc.tunnel.keys import write
+    from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
+    path, makes = options.file, options.verb == "new"
+    old = None if makes and not path.exists() else read_keys(path, "")
+    if makes or old is None:
+        if options.overlap is not None:
+            text = "--overlap is ignored: the old key is accepted until 'cloudrc key drop'"
+            print(f"cloudrc: {text}", file=sys.stderr)
+        keys = KeySet(Key(os.urandom(KEY_SIZE)), old.current if old else None)
+        said = f", beside {keys.previous.name} until 'cloudrc key drop'" if keys.previous else ""
+    elif old.previous:
+        keys, said = KeySet(old.current), f" is the only key now, {old.previous.name} is removed"
+    else:
+        keys, said = old, " is the only key already"
+    target = Path(os.path.realpath(path))  # of a symbolic link
     try:
-        write_atomically(Path(os.path.realpath(path)), write(keys).encode("ascii"), 0o600)
+        write_atomically(target, write(keys).encode("ascii"), 0o600)
     except OSError as error:
         remedy = "name a file in an existing, writable folder"
         raise BadInputError(f"{path}: {error.strerror or error}; {remedy}") from None
+    print_line(f"key {keys.current.name}{said}: {path}")
+    return 0

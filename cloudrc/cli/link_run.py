@@ -7,11 +7,14 @@ tc and ip. Therefore an answer is cached for one second.
 from __future__ import annotations
 
 import argparse
+import os
 import random
+import select
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,25 +22,34 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.output import print_line
-from cloudrc.cli.runtime import (
+from cloudrc.cli.processes import (
     ipv4_addresses,
     open_exporter,
     process_arguments,
     read_address,
     warn_if_exposed,
 )
+from cloudrc.drivers.process import StopSignal
+from cloudrc.link.follow import Load
+from cloudrc.link.netem import NOT_FOUND, Answer
+from cloudrc.link.sidecar import Near, look_near, write_told
+from cloudrc.records import Counted
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.drivers.iproute2 import Programs
-    from cloudrc.link.follow import Load, Profiles
-    from cloudrc.link.sidecar import Machine, Near, Sidecar
+    from cloudrc.link.follow import Profiles
+    from cloudrc.link.sidecar import Machine, Sidecar
 
 EPILOG = ""
 STATUS_PERIOD = 1.0
 """How long an answer of /link.json is cached [s]."""
 EMPTY_STATUS = "{}\n"
 """Answer of /link.json before the shaper works."""
+TOOL_TIMEOUT = 5.0
+"""Time limit of one call of tc or ip [s]."""
+_BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
+_END = "qdisc show dev lo"
+"""Command whose answer of one line marks the end of the answer before."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,10 +77,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Shape one direction of the link until SIGTERM."""
-    from cloudrc.drivers.process import StopSignal
-
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
-    from cloudrc.drivers.iproute2 import Programs
     from cloudrc.link.follow import HANDED_FILE, Profiles
     from cloudrc.link.netem import write_tables
     from cloudrc.link.sidecar import Settings, Sidecar
@@ -197,17 +206,18 @@ class Metrics:
 
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
         """Export the counters of datagrams."""
-        from cloudrc.records import Counted
-
         self._exporter.see([Counted(stamp_ns, "link", name, n) for name, n in counts.items()])
 
 
-def inspect_network(host: str) -> Near | None:
-    """Find the netem qdiscs of this thread's network namespace and its route to an IPv4 address."""
-    from cloudrc.drivers.iproute2 import Programs
-    from cloudrc.link.sidecar import look_near
+def inspect_network(host: str, inside: tuple[str, ...] = ()) -> Near | None:
+    """Find the netem qdiscs of a network namespace and its route to a host.
 
-    programs = Programs()
+    Args:
+        host: IPv4 address.
+        inside: Prefix of commands for another namespace, such as "ip netns exec NAME"; empty for
+            the namespace of this process.
+    """
+    programs = Programs(prefix=inside)
     try:
         return look_near(programs, host)
     finally:
@@ -228,8 +238,6 @@ class LinkStatusSource:
 
     def text(self) -> str:
         """Return the state as JSON; return the previous answer if tc or ip hangs."""
-        from cloudrc.link.sidecar import write_told
-
         if not self._lock.acquire(timeout=STATUS_PERIOD):
             return self._text
         try:
@@ -242,3 +250,83 @@ class LinkStatusSource:
             return self._text
         finally:
             self._lock.release()
+
+
+class Programs:
+    """Runs tc and ip.
+
+    A step of a time line must take effect within milliseconds, and starting a process takes longer.
+    Therefore one lasting `tc -batch -` makes all changes and listings of qdiscs.
+    """
+
+    def __init__(self, tables: str = "", prefix: Sequence[str] = ()) -> None:
+        """Store the settings; start no process.
+
+        Args:
+            tables: Folder with the distribution tables of tc.
+            prefix: Words before each command, such as "ip netns exec NAME".
+        """
+        self._environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
+        self._prefix = tuple(prefix)
+        self._tc: subprocess.Popen[bytes] | None = None
+
+    def __call__(self, words: Sequence[str]) -> Answer:
+        """Run a command and return its answer."""
+        try:
+            match list(words):
+                case ["tc", "qdisc", "change", *_]:
+                    return self._ask(" ".join(words[1:]), lists=False)
+                case ["tc", "-s", "-j", "qdisc", "show", *_]:
+                    return self._ask(" ".join(words[3:]), lists=True)
+        except OSError:  # killed, or too old for -batch: start one for this command
+            self.close()
+        return self._once(words)
+
+    def close(self) -> None:
+        """End the lasting tc process, if there is one."""
+        if self._tc is not None:
+            self._tc.kill()
+            self._tc.communicate()
+            self._tc = None
+
+    def _once(self, words: Sequence[str]) -> Answer:
+        command, environment = (*self._prefix, *words), self._environment
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, env=environment, timeout=TOOL_TIMEOUT
+            )
+        except FileNotFoundError:
+            return Answer(NOT_FOUND, "", "")
+        except OSError as error:  # no permission, or the limit of processes is reached
+            return Answer(1, "", error.strerror or str(error))
+        except subprocess.TimeoutExpired:
+            return Answer(1, "", f"no answer within {TOOL_TIMEOUT:g} s")
+        return Answer(done.returncode, done.stdout, done.stderr)
+
+    def _ask(self, line: str, *, lists: bool) -> Answer:
+        """Send a line to the lasting tc; raise an OSError if tc does not answer."""
+        tc, pipe = self._tc, subprocess.PIPE
+        if tc is None:
+            command, errors = (*self._prefix, *_BATCH), subprocess.STDOUT
+            tc = subprocess.Popen(
+                command, 0, stdin=pipe, stdout=pipe, stderr=errors, env=self._environment
+            )
+            self._tc = tc
+        assert tc.stdin is not None
+        assert tc.stdout is not None
+        tc.stdin.write(f"{line}\n{_END}\n".encode())
+        deadline, text = time.monotonic() + TOOL_TIMEOUT, b""
+        while True:
+            lines = text.decode(errors="replace").splitlines() if text.endswith(b"\n") else []
+            failed = any(one.startswith("Command failed -:") for one in lines)
+            listings = [one for one in lines if one.startswith("[")]
+            if len(listings) == 1 + (lists and not failed):
+                break
+            ready, _, _ = select.select([tc.stdout], [], [], deadline - time.monotonic())
+            data = tc.stdout.read(1 << 16) if ready else b""
+            if not data:
+                raise OSError("no answer of tc")
+            text += data
+        if failed:
+            return Answer(2, "", "\n".join(one for one in lines if one[:1] not in ("[", "C")))
+        return Answer(0, listings[0] if lists else "", "")

@@ -42,7 +42,7 @@ from cloudrc.config.load import ResolvedExperiment, dump, read_experiment
 from cloudrc.config.schema import Experiment, Profile
 from cloudrc.drivers.machine import interpreter
 from cloudrc.drivers.process import PARENT
-from cloudrc.drivers.realtime import bind, free_ports, parse
+from cloudrc.drivers.realtime import bind, free_ports, split_address
 from cloudrc.errors import (
     BadInputError,
     CloudrcError,
@@ -221,7 +221,7 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, 
     states = {name: from_text((way.folder / STATE_FILE).read_text()) for name, way in ways.items()}
     ends = [
         ProbeEnd(
-            *(way.own, parse((way.folder / "route").read_text()), plans[name]),
+            *(way.own, split_address((way.folder / "route").read_text()), plans[name]),
             (states[name].origin_ns or 0) + since_wall_ns,
         )
         for name, way in ways.items()

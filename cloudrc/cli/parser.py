@@ -9,12 +9,12 @@ import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from cloudrc import __version__
 from cloudrc.errors import BadInputError
 
-# Name -> help line, by group. A command's module is `cloudrc/cli/<name>.py`.
+# Name -> help line, by group. A command's module is `cloudrc/cli/<name>.py` but for `PROCESSES`.
 GROUPS: dict[str, dict[str, str]] = {
     "fly": {
         "run": "fly an experiment and write its report",
@@ -38,6 +38,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "relay": "the emulated link between world and cloud",
     },
 }
+PROCESSES = ("world", "cloud", "relay")
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 COUNT_MAX = 100_000
 """Largest number of repeats that a flag accepts."""
@@ -127,7 +128,7 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
     shown = "what to do" if for_completion else argparse.SUPPRESS
     commands = parser.add_subparsers(dest="command", help=shown, prog="cloudrc")
     for name, line in COMMANDS.items():
-        module = importlib.import_module(f"cloudrc.cli.{name}") if name in set(wanted) else None
+        module = _find_command(name) if name in set(wanted) else None
         command = commands.add_parser(
             name,
             help=line,
@@ -141,6 +142,13 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
             module.arguments(command)
             command.set_defaults(execute=module.execute)
     return parser
+
+
+def _find_command(name: str) -> Any:
+    """Import what declares the arguments of a command and executes it."""
+    if name in PROCESSES:
+        return getattr(importlib.import_module("cloudrc.cli.processes"), name)
+    return importlib.import_module(f"cloudrc.cli.{name}")
 
 
 def _groups() -> str:

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.text import Text
 
 from cloudrc.cli.output import console, escape, is_live
-from cloudrc.drivers.feed import in_words
+from cloudrc.drivers.process import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (
     Control,

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
-from cloudrc.cli.runtime import (
-    Address,
+from cloudrc.cli.processes import (
     open_exporter,
     process_arguments,
     read_address,
     warn_if_exposed,
 )
+from cloudrc.drivers.realtime import Address
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -185,7 +185,7 @@ def _fly(
     over: Callable[[], bool],
 ) -> None:
     """Run the service until `over()`."""
-    from cloudrc.drivers.feed import Feed
+    from cloudrc.drivers.process import Feed
     from cloudrc.drivers.teleop import UnixPeer, serve_teleop
     from cloudrc.records import Counted, Fault
     from cloudrc.teleop import wire

@@ -1,11 +1,7 @@
-"""Read the key file of an end, and follow its changes in flight, since a Secret may be rotated.
-
-The loop checks the file twice a second. The check is one system call while nothing changes.
-"""
+"""Read the key file of an end, and follow its changes in flight, since a Secret may be rotated."""
 
 from __future__ import annotations
 
-import stat
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
@@ -14,22 +10,16 @@ from cloudrc.records import Fault
 from cloudrc.tunnel.keys import KeyRing, KeySet, parse
 
 PERIOD_NS = 500_000_000
-"""Time between two checks of the file [ns]."""
+"""Time between two checks of the file [ns]; a check is one system call while nothing changes."""
 SIZE_MAX = 4096
 """Size limit of a key file [bytes]."""
-MAKE = "make one: cloudrc key new FILE"
-"""Advice in the message about a missing or bad key file."""
 
 
 class KeyFile:
     """The keys of one end; `ring` always holds the valid keys."""
 
     def __init__(self, path: Path, now_ns: int) -> None:
-        """Read the file; `now_ns` is the present time [ns, monotonic clock].
-
-        Raises:
-            BadInputError: If the file is missing or holds no key.
-        """
+        """Read the file at `now_ns` [ns, monotonic clock]; raise the errors of `read_keys`."""
         self._path, self._due_ns, self._trouble = path, now_ns, ""
         self._seen = version(path)
         self.ring = KeyRing(read_keys(path))
@@ -61,29 +51,16 @@ class KeyFile:
         return [Fault(now_ns, "key", f"{new}key {keys.current.name}; {also}")]
 
 
-def read_keys(path: Path, named: str = "--key ", remedy: str = MAKE) -> KeySet:
-    """Read a key file without waiting, even if it is a pipe.
-
-    Args:
-        path: The key file.
-        named: Option that names the file, for messages.
-        remedy: What to do if the file holds no key, for messages.
+def read_keys(path: Path, named: str = "--key ") -> KeySet:
+    """Read a key file without waiting, even if it is a pipe; `named` is the option that names it.
 
     Raises:
         BadInputError: If the file holds no key; the message never quotes the content.
     """
     try:
-        data = read(path, SIZE_MAX)
+        return parse(read(path, SIZE_MAX))
     except OSError as error:
-        raise BadInputError(f"{named}{path}: {error.strerror or error}; {remedy}") from None
-    except ValueError as error:  # its text names the file
-        raise BadInputError(f"{named}{error}; {remedy}") from None
-    try:
-        return parse(data)
+        reason = error.strerror or str(error)
     except ValueError as error:
-        raise BadInputError(f"{named}{path}: {error}; {remedy}") from None
-
-
-def is_exposed(path: Path) -> bool:
-    """Check whether other users of this machine can read or write a key file."""
-    return bool(path.stat().st_mode & (stat.S_IROTH | stat.S_IWOTH))
+        reason = str(error).removeprefix(f"{path}: ")
+    raise BadInputError(f"{named}{path}: {reason}; make one: cloudrc key new FILE")

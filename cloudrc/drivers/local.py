@@ -1,13 +1,12 @@
 """Run relay, world, teleop and cloud as processes on this machine and supervise them.
 
 The supervisor starts the processes in the order of their dependencies and reads their feeds. It
-ends all processes when teleop ends after the mission, when another process dies, or when the user
-interrupts.
+ends all processes when teleop ends after the mission, when another process dies or stands still,
+or when the user interrupts.
 
-Each flight has a small file, the flight file, which names the folder of the run and the address of
-the operator's API. The flight file lies in a folder that only this user can write, so other
-programs may trust the file. They cannot trust a run's folder, which may come from elsewhere. The
-flight file is locked during the flight. An unlocked file is from a killed flight, and is removed.
+During a flight, a locked file in a folder of this user, the flight file, names the folder of the
+run and the address of the operator's API. Other programs trust this file, and never a run's folder,
+which may come from somebody else.
 """
 
 from __future__ import annotations
@@ -23,117 +22,16 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from cloudrc.drivers.feed import READY, from_line
 from cloudrc.drivers.machine import Deadline, interpreter
-from cloudrc.drivers.process import PARENT
+from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import PATH_MAX
-from cloudrc.errors import BadInputError, InvalidRunError, TimedOutError, to_one_line
+from cloudrc.errors import BadInputError, InvalidRunError, TimedOutError
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
-
-FOLDER = Path("cloudrc", "flights")
-PRIVATE = 0o700
-
-
-def places() -> list[Path]:
-    """List the folders for flight files; a login has two, a cron job perhaps only the second.
-
-    Source: XDG Base Directory Specification.
-    """
-    roots = []
-    if runtime := os.environ.get("XDG_RUNTIME_DIR"):
-        roots.append(Path(runtime))
-    with contextlib.suppress(RuntimeError):  # a user without a home
-        roots.append(Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"))
-    return [root / FOLDER for root in dict.fromkeys(roots)]
-
-
-@contextlib.contextmanager
-def announced(run: Path, api: str = "") -> Iterator[bool]:
-    """Announce a flight by a flight file while the block runs; yield whether the file was written.
-
-    A flight also runs without the file.
-
-    Args:
-        run: Folder of the run.
-        api: Address of the operator's API; "" without an API.
-    """
-    path, lock = None, -1
-    for place in places():
-        with contextlib.suppress(OSError):
-            path, lock = _write(place, run, api)
-            break
-    try:
-        yield path is not None
-    finally:
-        if path is not None:
-            with contextlib.suppress(OSError):
-                path.unlink()
-            os.close(lock)
-
-
-def under_way() -> dict[Path, str]:
-    """Find this user's current flights.
-
-    Returns:
-        Folder of the run -> address of the operator's API ("" without an API), newest first.
-    """
-    found = []
-    for place in places():
-        if not _is_ours(place):
-            continue
-        for path in place.glob("*.json"):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                begun = path.stat().st_mtime_ns
-                if _is_ours(path) and (flight := _read(path)) is not None:
-                    found.append((begun, *flight))
-    return {run: api for _, run, api in sorted(found, reverse=True)}
-
-
-def _write(place: Path, run: Path, api: str) -> tuple[Path, int]:
-    """Create the flight file, and lock it before it gets its final name."""
-    place.mkdir(mode=PRIVATE, parents=True, exist_ok=True)
-    if not _is_ours(place):
-        raise PermissionError(f"other users can access {place}")
-    path = place / f"{os.getpid()}-{secrets.token_hex(4)}.json"
-    new = path.with_suffix(".new")
-    lock = os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        flight = {"schemaVersion": 1, "run": str(run.resolve()), "api": api}
-        os.write(lock, json.dumps(flight).encode() + b"\n")
-        new.rename(path)
-    except OSError:
-        os.close(lock)
-        new.unlink(missing_ok=True)
-        raise
-    return path, lock
-
-
-def _read(path: Path) -> tuple[Path, str] | None:
-    """Read folder and API address from a flight file; delete a file whose flight is over."""
-    with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            flight = json.loads(file.read())
-            return Path(flight["run"]), str(flight.get("api", ""))
-    path.unlink(missing_ok=True)
-    return None
-
-
-def _is_ours(place: Path) -> bool:
-    """Check that this user owns a path, and that nobody else can read or write it."""
-    try:
-        state = place.stat()
-    except OSError:
-        return False
-    return state.st_uid == os.getuid() and not state.st_mode & 0o077
-
 
 START_LIMIT = 60.0
 """Time limit for a process to become ready [s]; a cold start reads some 100 MB from disk."""
@@ -147,21 +45,81 @@ PAUSE = 1.0
 it was stopped, or this machine is overloaded."""
 SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
 """Longest name of a socket of a run, below the folder for temporary files."""
-LOOPBACK = "127.0.0.1"
 API_FILE = "api.json"
-"""File in a run's folder with the address of the run's API during the flight, for other programs.
-
-cloudrc itself reads the address from the flight file, since it does not trust a run's folder.
-"""
+"""File in a run's folder with the address of the run's API, for programs other than cloudrc."""
 AUDIT_FILE = "audit.jsonl"
-"""File in a run's folder that logs who sent which command over the API. The file is kept after the
-flight."""
+"""File in a run's folder that logs who sent which command over the API."""
+LINK_FOLDER = "link"
+"""Folder in a run's folder for the relay's state and its changed profile during the flight."""
 UNANNOUNCED = (
     "'cloudrc mission' cannot find this run: no folder for its flight file (XDG_STATE_HOME); give "
     "it --api {}"
 )
-LINK_FOLDER = "link"
-"""Folder in a run's folder for the relay's state and its changed profile during the flight."""
+
+
+def places() -> list[Path]:
+    """List the folders for flight files; a login has two, a cron job perhaps only the second.
+
+    Source: XDG Base Directory Specification.
+    """
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    return [Path(root, "cloudrc", "flights") for root in (runtime, state) if os.path.isabs(root)]
+
+
+@contextlib.contextmanager
+def announced(run: Path, api: str = "") -> Iterator[bool]:
+    """Announce a flight while the block runs; yield whether its flight file could be written.
+
+    Args:
+        run: Folder of the run.
+        api: Address of the operator's API; "" without an API.
+    """
+    flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), "api": api})
+    with contextlib.ExitStack() as stack:
+        written = False
+        for place in places():
+            path = place / f"{os.getpid()}-{secrets.token_hex(4)}.json"
+            with contextlib.suppress(OSError):
+                place.mkdir(mode=0o700, parents=True, exist_ok=True)
+                if _is_private(place):
+                    new = path.with_suffix(".new")  # renamed once it is locked
+                    for name in (path, new):
+                        stack.callback(name.unlink, missing_ok=True)
+                    file = stack.enter_context(new.open("xb", buffering=0))
+                    fcntl.flock(file, fcntl.LOCK_EX)
+                    file.write(flight.encode())
+                    new.rename(path)
+                    written = True
+                    break
+        yield written
+
+
+def under_way() -> dict[Path, str]:
+    """Find this user's current flights.
+
+    Returns:
+        Folder of the run -> address of the operator's API ("" without an API).
+    """
+    found = {}
+    for path in (path for place in places() if _is_private(place) for path in place.glob("*.json")):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:  # its flight goes on
+                flight = json.load(file)
+                found[Path(flight["run"])] = str(flight["api"])
+            else:  # left by a flight that was killed
+                path.unlink()
+    return found
+
+
+def _is_private(place: Path) -> bool:
+    """Check that a folder exists, that this user owns it, and that nobody else has access."""
+    with contextlib.suppress(OSError):
+        state = place.stat()
+        return state.st_uid == os.getuid() and not state.st_mode & 0o077
+    return False
 
 
 class ProcessDiedError(InvalidRunError):
@@ -179,16 +137,25 @@ class Child:
         unread: Start of a feed line whose end has not arrived yet.
         heard: When the last line of the feed arrived [s], monotonic clock.
         ready: Whether the process can receive.
-        garbled: Whether the process has written a line that is not a record.
     """
 
     name: str
     process: subprocess.Popen[bytes]
     log: Path
-    unread: bytes = field(default=b"")
-    heard: float = field(default=0.0)
-    ready: bool = field(default=False)
-    garbled: bool = field(default=False)
+    unread: bytes = b""
+    heard: float = 0.0
+    ready: bool = False
+
+    def take(self, data: bytes) -> list[Record]:
+        """Take the next piece of the feed; return the records that it completes."""
+        records: list[Record] = []
+        *lines, self.unread = (self.unread + data).split(b"\n")
+        for line in lines:
+            self.heard = time.monotonic()
+            self.ready |= line == READY.encode()
+            with contextlib.suppress(ValueError):  # a sign of life
+                records.append(from_line(line.decode()))
+        return records
 
     def last_words(self) -> str:
         """Return the last line of the process's log, or a text that says that the log is empty."""
@@ -212,11 +179,9 @@ class LocalRun:
             folder: Folder of the run. It must contain config.yaml; the run adds world.mcap,
                 cloud.mcap and four logs.
             see: Gets the records of the processes' feeds.
-            api: Whether the operator gets an API during the flight; the flight file and api.json
-                hold the API's address.
+            api: Whether the operator gets an API during the flight.
         """
         self._folder, self._see, self._api = folder, see, api
-        self._key = folder  # replaced by the key file in `fly`
         self._children: list[Child] = []
         self._selector = selectors.DefaultSelector()
         self.notes: tuple[str, ...] = ()
@@ -236,78 +201,56 @@ class LocalRun:
         """
         # A Unix socket's path must be short; the path of the run's folder may be long.
         # The folder is private, since it also holds this run's key.
-        with (
-            tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets,
-            announced(self._folder, url := self._url(sockets)) as is_announced,
-        ):
-            if url and not is_announced:
-                self._see([Fault(0, "unannounced", UNANNOUNCED.format(url))])
-            self._key = Path(sockets) / "key"
-            self._key.touch(0o600)
-            self._key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
-            self._fly(limit, sockets)
+        with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
+            url = f"unix:{sockets}/api.sock" if self._api else ""
+            with announced(self._folder, url) as is_announced:
+                if url and not is_announced:
+                    self._see([Fault(0, "unannounced", UNANNOUNCED.format(url))])
+                key = Path(sockets, "key")
+                key.touch(0o600)
+                key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
+                try:
+                    self._fly(limit, Path(sockets), url)
+                finally:
+                    self._stop()
+                    (self._folder / API_FILE).unlink(missing_ok=True)
+                    shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
 
-    def _fly(self, limit: float, sockets: str) -> None:
-        world, from_world, from_cloud, cloud = _free_addresses(4)
-        try:
-            self._start(
-                "relay",
-                f"--world-side={from_world}",
-                f"--cloud-side={from_cloud}",
-                f"--world={world}",
-                f"--cloud={cloud}",
-                f"--link={self._folder / LINK_FOLDER}",
-                "--fifo",
-            )
-            self._start_end("world", world, from_world)
-            self._start_teleop(sockets)
-            self._wait_until_ready()
-            self._start_end("cloud", cloud, from_cloud, f"--teleop={sockets}")
-            self._wait_until_ready()
-            self._watch(limit)
-        finally:
-            self._stop()
-            (self._folder / API_FILE).unlink(missing_ok=True)
-            shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
+    def _fly(self, limit: float, sockets: Path, url: str) -> None:
+        folder, link = self._folder, self._folder / LINK_FOLDER
+        world, from_world, from_cloud, cloud = (f"127.0.0.1:{port}" for port in free_ports(4))
+        sides = {"world-side": from_world, "cloud-side": from_cloud, "world": world, "cloud": cloud}
+        self._start("relay", "--fifo", **sides, link=link)
+        record, key = folder / "world.mcap", sockets / "key"
+        state = link / "uplink.json"
+        self._start("world", listen=world, peer=from_world, key=key, link=state, record=record)
+        # Only this user can open the socket of the API: no token is needed.
+        files = {"api-file": folder / API_FILE, "audit": folder / AUDIT_FILE}
+        self._start("teleop", "--start", socket=sockets, **({"api": url, **files} if url else {}))
+        self._wait_until_ready()
+        record, state = folder / "cloud.mcap", link / "downlink.json"
+        ways = {"listen": cloud, "peer": from_cloud, "key": key, "link": state}
+        self._start("cloud", **ways, record=record, teleop=sockets)
+        self._wait_until_ready()
+        self._watch(limit)
 
-    def _start_end(self, name: str, listen: str, peer: str, *options: str) -> None:
-        record = self._folder / f"{name}.mcap"
-        link = self._folder / LINK_FOLDER / ("uplink.json" if name == "world" else "downlink.json")
-        ways = (f"--listen={listen}", f"--peer={peer}", f"--link={link}", f"--key={self._key}")
-        self._start(name, *ways, f"--record={record}", *options)
-
-    def _url(self, sockets: str) -> str:
-        """Return the address of the run's API in the folder of the sockets; "" without an API."""
-        return f"unix:{sockets}/api.sock" if self._api else ""
-
-    def _start_teleop(self, sockets: str) -> None:
-        api: list[str] = []
-        if self._api:  # only this user can open the socket file: no token is needed
-            api = [
-                f"--api={self._url(sockets)}",
-                f"--api-file={self._folder / API_FILE}",
-                f"--audit={self._folder / AUDIT_FILE}",
-            ]
-        self._start("teleop", f"--socket={sockets}", "--start", *api)
-
-    def _start(self, name: str, *options: str) -> None:
+    def _start(self, name: str, *flags: str, **options: object) -> None:
         log = self._folder / f"{name}.log"
-        config = f"--config={self._folder / 'config.yaml'}"
-        command = interpreter("-m", "cloudrc", name, config, "--feed", *options)
+        options["config"] = self._folder / "config.yaml"
+        words = [*flags, *(f"--{option}={value}" for option, value in options.items())]
         with log.open("wb") as errors:
             process = subprocess.Popen(
-                command,
+                interpreter("-m", "cloudrc", name, "--feed", *words),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 env={**os.environ, PARENT: str(os.getpid())},
                 start_new_session=True,  # Ctrl-C reaches only the supervisor, which ends them
             )
-        child = Child(name, process, log)
         assert process.stdout is not None
         os.set_blocking(process.stdout.fileno(), False)
-        self._selector.register(process.stdout, selectors.EVENT_READ, child)
-        self._children.append(child)
+        self._children.append(Child(name, process, log))
+        self._selector.register(process.stdout, selectors.EVENT_READ, self._children[-1])
 
     def _wait_until_ready(self) -> None:
         deadline = Deadline(START_LIMIT, PAUSE)
@@ -320,27 +263,21 @@ class LocalRun:
     def _watch(self, limit: float) -> None:
         deadline, paused = Deadline(limit, PAUSE), 0.0
         teleop = next(child for child in self._children if child.name == "teleop")
-        for child in self._children:
-            child.heard = time.monotonic()
+        self._forgive_silence()
         while teleop.process.poll() is None:
             self._see(self._listen())
             if deadline.passed():
                 raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
             if deadline.pause > paused:
-                self._note_pause(deadline.pause - paused)
+                stood = f"stood still for {deadline.pause - paused:.1f} s; the flight went on"
+                self.notes += (f"the supervisor of this run {stood}",)
+                self._see([Fault(0, "supervisor", self.notes[-1])])
+                self._forgive_silence()
                 paused = deadline.pause
             self._check_alive()
             self._check_silence()
         self._check_alive()
         self._see(self._listen())
-
-    def _note_pause(self, pause: float) -> None:
-        """Add a note on the pause, and restart the time limit of each process's silence."""
-        text = f"the supervisor of this run stood still for {pause:.1f} s; the flight went on"
-        self.notes += (text,)
-        self._see([Fault(0, "supervisor", text)])
-        for child in self._children:
-            child.heard = time.monotonic()
 
     def _listen(self) -> list[Record]:
         """Return the records of all feeds since the last call; wait at most 50 ms."""
@@ -350,19 +287,16 @@ class LocalRun:
             data = os.read(key.fd, 65_536)
             if not data:
                 self._selector.unregister(key.fileobj)
-            *lines, child.unread = (child.unread + data).split(b"\n")
-            for line in lines:
-                child.heard = time.monotonic()
-                if line == READY.encode():
-                    child.ready = True
-                else:
-                    records += _parse_line(child, line)
+            records += child.take(data)
         return records
 
-    def _check_silence(self) -> None:
-        now = time.monotonic()
+    def _forgive_silence(self) -> None:
         for child in self._children:
-            if now - child.heard > SILENCE_LIMIT:
+            child.heard = time.monotonic()
+
+    def _check_silence(self) -> None:
+        for child in self._children:
+            if time.monotonic() - child.heard > SILENCE_LIMIT:
                 raise TimedOutError(
                     f"the {child.name} process was silent for {SILENCE_LIMIT:g} s and was ended; "
                     f"see {child.log}"
@@ -385,15 +319,11 @@ class LocalRun:
             child.process.terminate()
         deadline = time.monotonic() + STOP_LIMIT
         for child in self._children:
-            try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
                 child.process.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                child.process.kill()
-                child.process.wait()
+            child.process.kill()
+            child.process.communicate()
         self._selector.close()
-        for child in self._children:
-            if child.process.stdout is not None:
-                child.process.stdout.close()
 
 
 def socket_folder() -> str:
@@ -411,20 +341,3 @@ def socket_folder() -> str:
         f"TMPDIR {given} is too long for a socket: its path may have "
         f"{PATH_MAX - len(SOCKET_NAME)} bytes; run with TMPDIR=/tmp"
     )
-
-
-def _parse_line(child: Child, line: bytes) -> list[Record]:
-    """Parse a line of a feed. Report a bad line once per process; the flight continues."""
-    try:
-        return [from_line(line.decode())]
-    except ValueError as error:
-        if child.garbled:
-            return []
-        child.garbled = True
-        reason = to_one_line(str(error))[:120]
-        return [Fault(0, "feed", f"skipped a line of the {child.name} process: {reason}")]
-
-
-def _free_addresses(count: int) -> list[str]:
-    """Find unused UDP addresses on this machine."""
-    return [f"{LOOPBACK}:{port}" for port in free_ports(count)]

@@ -1,7 +1,4 @@
-"""Describe this machine: its monotonic clock and its Python interpreter.
-
-`Deadline` is a time limit on the monotonic clock, for a process that waits for others.
-"""
+"""This machine: its monotonic clock, time limits by it, and its Python interpreter."""
 
 from __future__ import annotations
 
@@ -17,28 +14,21 @@ MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 
 
 def clock_id() -> bytes:
-    """Identify the monotonic clock: two processes with the same 16 bytes share it.
+    """Identify the monotonic clock by the kernel's boot id: processes with equal 16 bytes share it.
 
-    The kernel's boot id identifies the clock, since each boot restarts the clock. Without a boot id
-    the bytes are random: then the ends do not share a clock, and one-way delays are not reported.
+    Without a boot id the bytes are random, and no one-way delays are reported.
     """
-    text = _boot_id().replace("-", "").strip()
     try:
-        boot = bytes.fromhex(text)
-    except ValueError:
+        boot = bytes.fromhex(_boot_id().replace("-", "").strip())
+    except (OSError, subprocess.SubprocessError, ValueError):
         boot = b""
     return boot if len(boot) == 16 else os.urandom(16)
 
 
 def _boot_id() -> str:
-    try:
+    if LINUX_BOOT_ID.exists():
         return LINUX_BOOT_ID.read_text()
-    except OSError:
-        pass
-    try:
-        return subprocess.run(MACOS_BOOT_ID, capture_output=True, text=True, timeout=5).stdout
-    except (OSError, subprocess.SubprocessError):
-        return ""
+    return subprocess.run(MACOS_BOOT_ID, capture_output=True, text=True, timeout=5).stdout
 
 
 def interpreter(*words: str) -> list[str]:
@@ -53,9 +43,6 @@ def interpreter(*words: str) -> list[str]:
 
 class Deadline:
     """A time limit that does not count the time in which this process itself stood still.
-
-    A process that was stopped, or whose container was paused, cannot tell what others did in the
-    meantime. It has to give the others this time in addition.
 
     Attributes:
         pause: Total time for which this process stood still [s].

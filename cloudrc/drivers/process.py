@@ -1,11 +1,7 @@
 """Run one end as a process: record its data, feed its supervisor, and stop on signals.
 
-The process ends on SIGTERM or SIGINT, or when its parent process is gone.
-
-An end also records the state of its outgoing link. The link's process publishes the state in a file
-(`cloudrc/link/state.py`), which the end checks ten times a second. A second file tells how late the
-relay's datagrams left. The end does not trust the link's process: whatever these files contain, the
-loop continues.
+The process ends on SIGTERM or SIGINT, or when its parent process is gone. It feeds its supervisor
+one line of JSON per record on standard output; prints of plug-ins go to standard error, its log.
 """
 
 from __future__ import annotations
@@ -15,20 +11,25 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import IntEnum
 from math import nan
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
-from cloudrc.drivers.feed import Feed
+from cloudrc import records as kinds
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.realtime import Peer, serve
-from cloudrc.drivers.recording import Recorder, RecordingThread, told
+from cloudrc.drivers.recording import FlightsOnly, RecordingThread
 from cloudrc.endpoint import Endpoint
 from cloudrc.errors import to_one_line
-from cloudrc.files import TooLongError, read, version
-from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, LinkState, from_text
+from cloudrc.exposition.ends import CLOCK_SET
+from cloudrc.files import read, version
+from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, from_text
 from cloudrc.records import (
+    Control,
     Counted,
     Fault,
     GuardChange,
@@ -36,15 +37,26 @@ from cloudrc.records import (
     MissionEvent,
     Record,
     SessionOpened,
+    TelemetrySent,
 )
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.verify.monitor import LinkMonitor
+    from cloudrc.record.recorder import Recorder
 
-
+PARENT = "CLOUDRC_PARENT"
+"""Environment variable that holds the supervisor's process id."""
+READY = "ready"
+"""The line that a process writes when it can receive, and later as a sign of life."""
+ALIVE_PERIOD = 1.0
+"""Time between two signs of life [s]."""
+EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
+"""Record types of which the feed sends every record."""
+SAMPLED = (TelemetrySent, Control)
+"""Record types of which the feed sends at most one record per `PERIOD_NS`."""
 PERIOD_NS = 100_000_000
-"""Time between two checks of the state file [ns]."""
+"""Shortest time between two samples of the feed, or two checks of the link's state [ns]."""
 RELEASED_PERIOD_NS = 2_000_000_000
 """Time between two records of how late the relay's datagrams left [ns]."""
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
@@ -52,105 +64,6 @@ BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
 the link's state is recorded again after it."""
 NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 """Errors that an unreadable or malformed file can raise."""
-
-
-class LinkNotes:
-    """Turns the link's state file into records.
-
-    An unreadable file changes nothing. A file that is too long is not recorded.
-    """
-
-    def __init__(self, path: Path, *, uplink: bool) -> None:
-        """Follow the file at `path`, which need not exist yet.
-
-        Args:
-            path: State file of the link.
-            uplink: Whether this end sends on the uplink.
-        """
-        self._path, self._name, self._uplink = path, str(path), uplink
-        self._seen: tuple[int, int, int] | None = None
-        self._since_ns: int | None = None
-        self._note: LinkChanged | None = None
-        self._released = path.with_suffix(RELEASED_SUFFIX)
-        self._due_ns = self._released_ns = self._noted_ns = 0
-
-    def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
-        """Return the records about the link that follow these records.
-
-        Args:
-            records: Records that the end has just made.
-            now_ns: The machine's monotonic clock [ns].
-            slip_ns: Lag of the end's own clock [ns].
-
-        Returns:
-            A record if the link has changed or a mission may have begun. Every `RELEASED_PERIOD_NS`
-            also records of how late the relay's datagrams left.
-        """
-        if now_ns >= self._released_ns:
-            self._released_ns = now_ns + RELEASED_PERIOD_NS
-            return self._changed(records, now_ns, slip_ns) + self._late(now_ns - slip_ns)
-        return self._changed(records, now_ns, slip_ns)
-
-    def _changed(self, records: Iterable[Record], now_ns: int, slip_ns: int) -> list[Record]:
-        changed = now_ns >= self._due_ns and self._poll(now_ns)
-        if not changed and BEGINNINGS.isdisjoint(map(type, records)):
-            return []
-        note, later = self._note, (now_ns - self._noted_ns) * 1e-9
-        if note is None:
-            return []
-        age, time_line = note.age + later, note.time_line + later
-        return [note._replace(stamp_ns=now_ns - slip_ns, age=age, time_line=time_line)]
-
-    def _late(self, stamp_ns: int) -> list[Record]:
-        """Return records of how late datagrams left since the relay began; none without a relay."""
-        try:
-            found = json.loads(read(self._released, STATE_MAX))
-            counts = {name: int(n) for name, n in found.items() if name in RELEASED}
-        except NONSENSE:
-            return []
-        way = "uplink" if self._uplink else "downlink"
-        return [Counted(stamp_ns, "link", f"{way}_{name}", n) for name, n in counts.items()]
-
-    def _poll(self, now_ns: int) -> bool:
-        """Read the file if it was replaced, and return whether the state has changed."""
-        self._due_ns = now_ns + PERIOD_NS
-        seen = version(self._name)
-        if seen == self._seen:
-            return False
-        self._seen = seen  # do not read a malformed file twice
-        try:
-            state = from_text(read(self._path, STATE_MAX).decode())
-            self._note = _note(state, self._uplink, now_ns)
-        except TooLongError:  # a long time line is in force: the last note no longer holds
-            self._note = self._since_ns = None
-            return False
-        except NONSENSE:
-            return False
-        before_ns, self._since_ns = self._since_ns, state.since_ns
-        self._noted_ns = now_ns
-        return before_ns != state.since_ns
-
-
-def _note(state: LinkState, uplink: bool, now_ns: int) -> LinkChanged:
-    asked = {key: nan if value is None else float(value) for key, value in state.asked.items()}
-    time_line = nan if state.origin_ns is None else (now_ns - state.origin_ns) * 1e-9
-    return LinkChanged(
-        stamp_ns=now_ns,
-        uplink=uplink,
-        shaper=to_one_line(state.shaper),
-        cause=to_one_line(state.cause),
-        age=max(0, now_ns - state.since_ns) * 1e-9,
-        time_line=time_line,
-        delay=asked.get("delay", nan),
-        jitter=asked.get("jitter", nan),
-        loss=asked.get("loss", nan),
-        rate=asked.get("rate", nan),
-        conditions=json.dumps(state.profile.get(state.direction, {})),
-    )
-
-
-PARENT = "CLOUDRC_PARENT"
-"""Environment variable that holds the supervisor's process id."""
 
 
 class StopSignal:
@@ -176,139 +89,285 @@ class StopSignal:
         self._asked = True
 
 
-class Takes(Recorder, Protocol):
-    """A recorder that accepts records, such as the recorder in `cloudrc.record.recorder`.
+class Feed:
+    """Sends selected records to a pipe without blocking; lines that nobody reads are lost."""
+
+    def __init__(self, descriptor: int, *, watched: bool = True) -> None:
+        """Make the pipe non-blocking.
+
+        Args:
+            descriptor: File descriptor of the pipe.
+            watched: Whether a supervisor reads the pipe. If nobody does, as in a container, only
+                events are written, as lines of a log.
+        """
+        self._descriptor, self._watched = descriptor, watched
+        self._told_ns: dict[type, int] = {}
+        self._links: dict[bool, str] = {}
+        self._rest = b""  # of a line for which the pipe had too little room
+        os.set_blocking(descriptor, False)
+
+    @classmethod
+    def on_stdout(cls, *, watched: bool = True) -> Feed:
+        """Reserve standard output for the feed; redirect all other prints to standard error."""
+        feed = cls(os.dup(1), watched=watched)
+        os.dup2(2, 1)
+        return feed
+
+    def ready(self) -> None:
+        """Write that the process can receive."""
+        self._write(READY)
+
+    def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
+        """Wrap the `stop` that a loop calls in every turn: also write signs of life."""
+        due = 0.0
+
+        def ask() -> bool:
+            nonlocal due
+            if self._watched and (now := time.monotonic()) >= due:
+                due = now + ALIVE_PERIOD
+                self._write(READY)
+            return stop()
+
+        return ask
+
+    def tell(self, records: Iterable[Record]) -> None:
+        """Send the records that a supervisor wants to see."""
+        for record in records:
+            if isinstance(record, EVENTS):
+                if not isinstance(record, LinkChanged) or self._is_news(record):
+                    self._write(to_line(record) if self._watched else in_words(record))
+            elif self._watched and isinstance(record, SAMPLED) and self._is_due(record):
+                self._write(to_line(record))
+
+    def _is_news(self, record: LinkChanged) -> bool:
+        """Tell whether the link has changed: `LinkNotes` also repeats its records."""
+        last, self._links[record.uplink] = self._links.get(record.uplink), record.conditions
+        return last != record.conditions and bool(record.cause)
+
+    def _is_due(self, record: Record) -> bool:
+        kind, stamp_ns = type(record), record.stamp_ns
+        if stamp_ns - self._told_ns.get(kind, stamp_ns - PERIOD_NS) < PERIOD_NS:
+            return False
+        self._told_ns[kind] = stamp_ns
+        return True
+
+    def _write(self, line: str) -> None:
+        """Write a whole line or drop the line; the rest of a partly written line comes first."""
+        data = line.encode(errors="backslashreplace") + b"\n"
+        with suppress(OSError):  # full or closed: the flight continues without the feed
+            self._rest = self._rest[os.write(self._descriptor, self._rest) :]
+            if not self._rest:
+                self._rest = data[os.write(self._descriptor, data) :]
+
+
+def to_line(record: Record) -> str:
+    """Format a record as one line of JSON: the name of its type, then its fields in order."""
+    return json.dumps([type(record).__name__, record])
+
+
+def in_words(event: GuardChange | MissionEvent | Fault | LinkChanged) -> str:
+    """Describe an event for a log or a screen."""
+    if isinstance(event, GuardChange):
+        return f"guard: {event.state.name}, {event.cause}"
+    if isinstance(event, LinkChanged):
+        way = "uplink" if event.uplink else "downlink"
+        jitter = f" ± {event.jitter * 1e3:g}" if event.jitter else ""
+        loss = f", loss {event.loss * 100:.3g} %" if event.loss else ""
+        return f"link: {way} {event.delay * 1e3:g}{jitter} ms{loss} ({event.cause})"
+    return event.text
+
+
+def from_line(line: str) -> Record:
+    """Parse a record from its line; raise a ValueError if the line is not a record."""
+    try:
+        name, values = json.loads(line)
+        kind = getattr(kinds, name)
+        if kind not in get_args(Record):
+            raise ValueError(name)
+        record: Record = _from_json(kind, values)
+    except (TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise ValueError(f"not a record: {line!r}") from error
+    return record
+
+
+def _from_json(kind: Any, value: Any) -> Any:
+    """Convert a JSON value to the type `kind`."""
+    if hasattr(kind, "_fields"):
+        hints = get_type_hints(kind)
+        fields = zip(kind._fields, value, strict=True)
+        return kind(*[_from_json(hints[name], item) for name, item in fields])
+    if get_origin(kind) is tuple:
+        return tuple(value)
+    return kind(value) if isinstance(kind, type) and issubclass(kind, IntEnum) else value
+
+
+class LinkNotes:
+    """Turns the state of an end's outgoing link into records.
+
+    The link's process publishes the state in a file, and a second file tells how late the relay's
+    datagrams left. The end does not trust that process: unreadable files are ignored.
+    """
+
+    def __init__(self, path: Path, *, uplink: bool) -> None:
+        """Follow the state file at `path`, which need not exist yet."""
+        self._path, self._uplink = path, uplink
+        self._seen: tuple[int, int, int] | None = None
+        self._since_ns: int | None = None
+        self._due_ns = self._released_ns = 0
+
+    def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
+        """Return the records about the link that follow these records of the end.
+
+        Args:
+            records: Records that the end has just made; a mission may begin at one of them.
+            now_ns: The machine's monotonic clock [ns].
+            slip_ns: Lag of the end's own clock [ns].
+        """
+        noted: list[Record] = []
+        begins = not BEGINNINGS.isdisjoint(map(type, records))
+        if begins or now_ns >= self._due_ns:
+            self._due_ns = now_ns + PERIOD_NS
+            seen = version(self._path)
+            if begins or seen != self._seen:
+                self._seen = seen  # do not read a malformed file ten times a second
+                with suppress(*NONSENSE):
+                    noted += self._read_state(begins, now_ns, slip_ns)
+        if now_ns >= self._released_ns:
+            self._released_ns = now_ns + RELEASED_PERIOD_NS
+            with suppress(*NONSENSE):
+                noted += self._read_lateness(now_ns - slip_ns)
+        return noted
+
+    def _read_lateness(self, stamp_ns: int) -> list[Counted]:
+        """Return records of how late datagrams left since the relay began."""
+        found = json.loads(read(self._path.with_suffix(RELEASED_SUFFIX), STATE_MAX))
+        counts = {name: int(n) for name, n in found.items() if name in RELEASED}
+        way = "uplink" if self._uplink else "downlink"
+        return [Counted(stamp_ns, "link", f"{way}_{name}", n) for name, n in counts.items()]
+
+    def _read_state(self, begins: bool, now_ns: int, slip_ns: int) -> list[LinkChanged]:
+        """Return the record of the state if the link has changed or a mission may begin."""
+        state = from_text(read(self._path, STATE_MAX).decode())
+        asked = {key: nan if value is None else float(value) for key, value in state.asked.items()}
+        changed = LinkChanged(
+            stamp_ns=now_ns - slip_ns,
+            uplink=self._uplink,
+            shaper=to_one_line(state.shaper),
+            cause=to_one_line(state.cause),
+            age=max(0, now_ns - state.since_ns) * 1e-9,
+            time_line=nan if state.origin_ns is None else (now_ns - state.origin_ns) * 1e-9,
+            **{name: asked.get(name, nan) for name in ("delay", "jitter", "loss", "rate")},
+            conditions=json.dumps(state.profile.get(state.direction, {})),
+        )
+        since_ns, self._since_ns = self._since_ns, state.since_ns
+        return [changed] if begins or since_ns != state.since_ns else []
+
+
+@dataclass
+class EndProcess:
+    """All that an end needs as a process, besides the endpoint itself.
 
     Attributes:
-        error: Why something was not recorded, in words; "" without an error.
-        dropped: Number of records that did not reach the file.
-    """
-
-    error: str
-
-    @property
-    def dropped(self) -> int:
-        """Return the number of records that did not reach the file."""
-
-    def put(self, records: Iterable[Record]) -> None:
-        """Queue records, without waiting and without an exception."""
-
-
-def run_end(
-    endpoint: Endpoint,
-    peer: Peer,
-    recorder: Takes,
-    *,
-    end: str,
-    stop: Callable[[], bool],
-    over: Callable[[], bool] = lambda: False,
-    slip_ns: Callable[[], int] = lambda: 0,
-    exporter: Exporter | None = None,
-    watched: bool = True,
-    choose: Callable[[list[Record]], list[Record]] = list,
-    link: Path | None = None,
-    check: LinkMonitor | None = None,
-    keys: KeyFile | None = None,
-) -> bool:
-    """Run one end until `stop()` or `over()`, then complete its recording.
-
-    Args:
-        endpoint: World or cloud.
-        peer: Socket of the endpoint.
-        recorder: Gets the endpoint's records.
         end: "world" or "cloud".
-        stop: Whether somebody has asked this end to stop; create it before anything slow.
-        over: Whether this end has finished by itself.
-        slip_ns: Lag of world's clock [ns].
+        peer: Its socket.
+        recorder: Writes its records.
+        keys: Key file, which may get new keys.
         exporter: Turns the records into metrics; None for no metrics.
         watched: Whether a supervisor reads the feed.
-        choose: Selects the records that are recorded.
+        flights_only: Whether only events are recorded while the robot does not fly.
         link: State file of the link, whose changes are recorded; None without one.
         check: Compares the link with its profile by the datagrams that this end receives.
-        keys: Key file, which may get new keys; None without a key file.
-
-    Returns:
-        True if the end finished by itself, False if it was stopped.
     """
-    feed, thread = Feed.on_stdout(watched=watched), RecordingThread(recorder)
-    observers = _Observers(end, link, check, keys, slip_ns, thread.take_steps)
-    sink = _RecordSink(end, recorder, feed, exporter, choose, observers)
-    if exporter is not None:
-        exporter.recording(thread.sync_age)
-    thread.start()
-    feed.ready()
-    try:
-        ends = feed.alive_while(lambda: stop() or over())
-        serve(endpoint, peer, end=end, sink=sink, stop=ends, slip_ns=slip_ns)
-    finally:
-        sink.record_losses(time.monotonic_ns() - slip_ns())
-        thread.stop()
-    return over()
+
+    end: str
+    peer: Peer
+    recorder: Recorder
+    keys: KeyFile
+    exporter: Exporter | None = None
+    watched: bool = True
+    flights_only: bool = False
+    link: Path | None = None
+    check: LinkMonitor | None = None
+
+    def run(
+        self,
+        endpoint: Endpoint,
+        stop: Callable[[], bool],
+        flies: Callable[[], bool],
+        slip_ns: Callable[[], int] = lambda: 0,
+    ) -> None:
+        """Run the endpoint until `stop()`, then complete its recording.
+
+        Args:
+            endpoint: World or cloud.
+            stop: Whether this end has to stop; create it before anything slow.
+            flies: Whether the robot follows the commands of cloud.
+            slip_ns: Lag of world's clock [ns].
+        """
+        feed, thread = Feed.on_stdout(watched=self.watched), RecordingThread(self.recorder)
+        choose = FlightsOnly(flies) if self.flights_only else list
+        sink = _Sink(self, feed, choose, slip_ns, thread.take_steps)
+        if self.exporter is not None:
+            self.exporter.recording(thread.sync_age)
+        thread.start()
+        feed.ready()
+        try:
+            ends = feed.alive_while(stop)
+            serve(endpoint, self.peer, end=self.end, sink=sink, stop=ends, slip_ns=slip_ns)
+        finally:
+            self.recorder.put([sink.count_losses(time.monotonic_ns() - slip_ns())])
+            thread.stop()
 
 
-class _Observers:
-    """Records what happens around an end: new keys, link changes, steps of the wall clock."""
+class _Sink:
+    """Passes an end's records, and those of what happens around the end, on without waiting."""
 
     def __init__(
         self,
-        end: str,
-        link: Path | None,
-        check: LinkMonitor | None,
-        keys: KeyFile | None,
+        run: EndProcess,
+        feed: Feed,
+        choose: Callable[[list[Record]], list[Record]],
         slip_ns: Callable[[], int],
         clock_steps: Callable[[], list[float]],
     ) -> None:
-        self._clock_steps = clock_steps
-        self._notes = LinkNotes(link, uplink=end == "world") if link is not None else None
-        self._check, self._keys, self._slip_ns = check, keys, slip_ns
-
-    def after(self, records: list[Record]) -> list[Record]:
-        """Return the records to add after these records."""
-        now_ns, slip_ns = time.monotonic_ns(), self._slip_ns()
-        noted: list[Record] = [told(step, now_ns - slip_ns) for step in self._clock_steps()]
-        if self._keys is not None:
-            noted += self._keys.follow(now_ns)
-        if self._notes is not None:
-            noted += self._notes.after(records, now_ns, slip_ns)
-        if self._check is not None:
-            noted += self._check.after([*records, *noted], now_ns - slip_ns)
-        return noted
-
-
-class _RecordSink:
-    """Passes an end's records to its recording, its feed and its metrics."""
-
-    def __init__(
-        self,
-        end: str,
-        recorder: Takes,
-        feed: Feed,
-        exporter: Exporter | None,
-        choose: Callable[[list[Record]], list[Record]],
-        observers: _Observers,
-    ) -> None:
-        self._end, self._recorder, self._feed = end, recorder, feed
-        self._exporter, self._choose, self._observers = exporter, choose, observers
+        self._run, self._feed, self._choose = run, feed, choose
+        self._slip_ns, self._clock_steps = slip_ns, clock_steps
+        self._notes = LinkNotes(run.link, uplink=run.end == "world") if run.link else None
         self._trouble, self._dropped = "", 0
 
     def __call__(self, records: list[Record]) -> None:
-        """Pass records on, without waiting."""
-        recorder, exporter = self._recorder, self._exporter
-        records = records + self._observers.after(records)
+        run, recorder = self._run, self._run.recorder
+        records = records + self.look_around(records)
         recorder.put(self._choose(records))
         self._feed.tell(records)
-        if exporter is not None:
-            exporter.see(records)
-            if records and recorder.dropped != self._dropped:
-                self._dropped = recorder.dropped
-                exporter.see([self._losses(records[-1].stamp_ns)])
         if records and recorder.error != self._trouble:
             self._trouble = recorder.error
             self._feed.tell([Fault(records[-1].stamp_ns, "recorder", self._trouble)])
+        if run.exporter is not None:
+            if records and recorder.dropped != self._dropped:
+                self._dropped = recorder.dropped
+                records.append(self.count_losses(records[-1].stamp_ns))
+            run.exporter.see(records)
 
-    def record_losses(self, stamp_ns: int) -> None:
-        """Record the number of records that were lost."""
-        self._recorder.put([self._losses(stamp_ns)])
+    def look_around(self, records: list[Record]) -> list[Record]:
+        """Return records of steps of the wall clock, new keys and changes of the link."""
+        now_ns, slip_ns, run = time.monotonic_ns(), self._slip_ns(), self._run
+        noted: list[Record] = [
+            Fault(
+                now_ns - slip_ns,
+                CLOCK_SET,
+                f"wall clock stepped by {step:+.1f} s: the flight is not affected;"
+                " do not compare times of day before and after the step",
+            )
+            for step in self._clock_steps()
+        ]
+        noted += run.keys.follow(now_ns)
+        if self._notes is not None:
+            noted += self._notes.after(records, now_ns, slip_ns)
+        if run.check is not None:
+            noted += run.check.after([*records, *noted], now_ns - slip_ns)
+        return noted
 
-    def _losses(self, stamp_ns: int) -> Counted:
-        return Counted(stamp_ns, self._end, "recorder_dropped", self._recorder.dropped)
+    def count_losses(self, stamp_ns: int) -> Counted:
+        """Return the number of records that were lost so far."""
+        return Counted(stamp_ns, self._run.end, "recorder_dropped", self._run.recorder.dropped)

@@ -2,10 +2,6 @@
 
 The loop sleeps until the endpoint's next deadline or the next datagram, whichever comes first.
 All datagrams of one wake get the same instant, as the endpoint's contract requires.
-
-In a pod, a route file holds the address of the other end as one line HOST:PORT. The link's process
-writes the file when the link is up, and whenever the address changes. The loop checks the file
-twice a second. HOST is a numeric address, since a query to a name server would block the loop.
 """
 
 from __future__ import annotations
@@ -15,6 +11,7 @@ import select
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from ipaddress import ip_address
 from pathlib import Path
@@ -25,50 +22,6 @@ from cloudrc.records import Lateness, Record
 from cloudrc.tunnel.codec import DATAGRAM_MAX
 
 Address = tuple[str, int]
-
-
-class Route:
-    """Follows the route file; an unreadable file changes nothing."""
-
-    def __init__(self, path: Path) -> None:
-        """Follow the file at `path`, which may appear later."""
-        self._path = path
-        self._seen: tuple[int, int, int] | None = None
-        self._address: Address | None = None
-
-    def look(self) -> Address | None:
-        """Return the address of the other end; None before the first readable file.
-
-        If the file is missing or half written, the last address stays valid.
-        """
-        try:
-            seen = version(self._path)
-            if seen != self._seen:
-                self._address = parse(read(self._path).decode("ascii"))
-                self._seen = seen
-        except (OSError, ValueError):
-            self._seen = None
-        return self._address
-
-
-def parse(text: str) -> Address:
-    """Parse HOST:PORT, with an IPv6 address in brackets.
-
-    Raises:
-        ValueError: If the text is not a numeric address and a port.
-    """
-    host, _, port = text.strip().rpartition(":")
-    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
-    try:
-        numeric = str(ip_address(bare))
-    except ValueError as error:
-        raise ValueError(f"'{host}' is not a numeric address") from error
-    if (":" in numeric) == (bare == host):
-        raise ValueError(f"'{host}' is not an address with brackets around IPv6 alone")
-    if not port.isdecimal() or not 0 < int(port) < 65_536:
-        raise ValueError(f"'{port}' is not a port")
-    return numeric, int(port)
-
 
 DRAIN_MAX = 256
 """Largest number of datagrams per wake; so a flood cannot delay the loop's deadlines."""
@@ -91,6 +44,50 @@ ROUTE_PERIOD_NS = 500_000_000
 """Time between two checks of the route file [ns]."""
 
 
+def split_address(text: str) -> Address:
+    """Parse HOST:PORT, with an IPv6 address in brackets.
+
+    Raises:
+        ValueError: If the text is something else.
+    """
+    host, _, port = text.strip().rpartition(":")
+    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if not bare or not port.isdecimal() or not 0 < int(port) < 65_536:
+        raise ValueError(f"'{text}' is not HOST:PORT")
+    if (":" in bare) == (bare == host):
+        raise ValueError(f"'{text}': put an IPv6 address in brackets, [::1]:7400")
+    return bare, int(port)
+
+
+class Route:
+    """Follows a route file, which holds the address of the other end of a pod as HOST:PORT.
+
+    The link's process writes the file when the link is up, and whenever the address changes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Follow the file at `path`, which may appear later."""
+        self._path = path
+        self._seen: tuple[int, int, int] | None = None
+        self._address: Address | None = None
+
+    def look(self) -> Address | None:
+        """Return the address of the other end; None before the first readable file.
+
+        If the file is missing, half written or no numeric address (a query to a name server would
+        block the loop), the last address stays valid.
+        """
+        try:
+            seen = version(self._path)
+            if seen != self._seen:
+                address = split_address(read(self._path).decode("ascii"))
+                ip_address(address[0])
+                self._address, self._seen = address, seen
+        except (OSError, ValueError):
+            self._seen = None
+        return self._address
+
+
 @dataclass
 class Peer:
     """A UDP socket and the address of its peer.
@@ -99,17 +96,15 @@ class Peer:
         socket: The socket, bound and not blocking.
         address: Address of the other end of the tunnel or of the relay; None while it is unknown.
         route: Route file that holds the address; None if the address is fixed.
-        unsent: Number of datagrams that could not be sent.
     """
 
     socket: socket.socket
-    address: tuple[str, int] | None
+    address: Address | None
     route: Route | None = None
-    unsent: int = field(default=0)
     _followed_ns: int = field(default=0, init=False)
 
     @classmethod
-    def bind(cls, listen: tuple[str, int], where: tuple[str, int] | Route) -> Peer:
+    def bind(cls, listen: Address, where: Address | Route) -> Peer:
         """Bind a socket at `listen`; the peer's address is fixed or comes from a route file."""
         bound = bind(listen)
         if isinstance(where, Route):
@@ -138,15 +133,11 @@ class Peer:
         return datagrams
 
     def send(self, datagrams: list[bytes]) -> None:
-        """Send datagrams; datagrams that the socket refuses are lost and counted."""
-        if self.address is None:
-            self.unsent += len(datagrams)
-            return
-        for data in datagrams:
-            try:
-                self.socket.sendto(data, self.address)
-            except OSError:
-                self.unsent += 1
+        """Send datagrams; without an address, or if the socket refuses them, they are lost."""
+        if self.address is not None:
+            for data in datagrams:
+                with suppress(OSError):
+                    self.socket.sendto(data, self.address)
 
 
 def _reachable(bound: socket.socket, address: Address | None) -> Address | None:
@@ -156,7 +147,7 @@ def _reachable(bound: socket.socket, address: Address | None) -> Address | None:
     return f"::ffff:{address[0]}", address[1]
 
 
-def bind(listen: tuple[str, int]) -> socket.socket:
+def bind(listen: Address) -> socket.socket:
     """Open a UDP socket that does not block; with the host `::`, it also receives IPv4."""
     family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
     udp = socket.socket(family, socket.SOCK_DGRAM)

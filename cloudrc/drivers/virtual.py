@@ -10,9 +10,9 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from heapq import heappop, heappush
-from typing import Protocol
 
 from cloudrc.endpoint import Endpoint
+from cloudrc.link.model import LinkDirection
 from cloudrc.records import Record
 from cloudrc.tunnel.codec import peek
 
@@ -22,43 +22,19 @@ PERIOD_NS = 100_000_000
 """Virtual time between two calls of the sink and of `until` [ns]."""
 
 
-class Link(Protocol):
-    """One direction of the emulated network.
-
-    Attributes:
-        corrupts: Whether datagrams may be damaged; then `corrupted` must be called.
-    """
-
-    corrupts: bool
-
-    def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
-        """Return the datagram as it arrives, damaged or not."""
-
-    def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> tuple[int, ...]:
-        """Return the times at which the copies of this datagram arrive [ns]: none, one or two."""
-
-
 class VirtualRun:
-    """A run of world, cloud and two link directions in virtual time."""
+    """A run of world, cloud and two link directions in virtual time, which begins at 0."""
 
     def __init__(
         self,
         world: Endpoint,
         cloud: Endpoint,
-        uplink: Link,
-        downlink: Link,
+        uplink: LinkDirection,
+        downlink: LinkDirection,
         *,
         cloud_clock_offset_ns: int = 0,
     ) -> None:
-        """Connect the parts; time begins at 0.
-
-        Args:
-            world: World's end; its clock is virtual time.
-            cloud: Cloud's end; its clock is virtual time plus the offset.
-            uplink: Link from world to cloud.
-            downlink: Link from cloud to world.
-            cloud_clock_offset_ns: Cloud's clock minus world's [ns].
-        """
+        """Connect the parts; cloud's clock is ahead of world's by the offset [ns]."""
         self._world, self._cloud = world, cloud
         self._uplink, self._downlink = uplink, downlink
         self._offset_ns = cloud_clock_offset_ns
@@ -67,27 +43,21 @@ class VirtualRun:
         self.now_ns = 0
 
     def fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
-        """Run until `until()` is true or the limit is reached.
+        """Run until `until()` is true or virtual time reaches `limit_ns` [ns].
 
-        Args:
-            until: Whether the flight is over; called every 100 ms of virtual time.
-            limit_ns: Virtual time at which the run ends in any case [ns].
-            sink: Gets all records, every 100 ms of virtual time.
+        Every 100 ms of virtual time the sink gets all records, and `until` is called.
         """
         gc_was_on = gc.isenabled()
         gc.disable()  # a flight makes no cycles; the collector would scan its records in vain
         try:
-            self._fly(until, limit_ns, sink)
+            while self.now_ns < limit_ns:
+                self._advance(min(self.now_ns + PERIOD_NS, limit_ns))
+                sink(self._world.take_records(), self._cloud.take_records())
+                if until():
+                    return
         finally:
             if gc_was_on:
                 gc.enable()
-
-    def _fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
-        while self.now_ns < limit_ns:
-            self._advance(min(self.now_ns + PERIOD_NS, limit_ns))
-            sink(self._world.take_records(), self._cloud.take_records())
-            if until():
-                return
 
     def _advance(self, end_ns: int) -> None:
         """Handle all events up to and including `end_ns` [ns], in their order."""
@@ -122,7 +92,7 @@ class VirtualRun:
                     self._send(datagrams, self._downlink, to_world=True)
         self.now_ns = end_ns
 
-    def _send(self, datagrams: list[bytes], link: Link, *, to_world: bool) -> None:
+    def _send(self, datagrams: list[bytes], link: LinkDirection, *, to_world: bool) -> None:
         for data in datagrams:
             kind, epoch, counter = peek(data)
             arrivals = link.send(epoch, kind, counter, len(data), self.now_ns)

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli import link_set, relay
+from cloudrc.cli import link_set, processes
 from cloudrc.cli.main import main
-from cloudrc.cli.relay import RelayControl
+from cloudrc.cli.processes import RelayControl
 from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.drivers import local
@@ -129,7 +129,7 @@ def test_state_that_a_full_disk_refused_is_written_later(
 
     (folder / "profile.json").write_text('{"uplink": {"delay_ms": 80}}')
     with monkeypatch.context() as disk:
-        disk.setattr(relay, "publish", full)
+        disk.setattr(processes, "publish", full)
         for _ in range(3):
             flight.wait(0.05)
     assert flight.delay("uplink") == pytest.approx(0.08), "in force all the same"

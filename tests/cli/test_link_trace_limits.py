@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import runtime
+from cloudrc.cli import processes
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.link.verify.monitor import Asked, LinkMonitor, Load
@@ -23,7 +23,7 @@ def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
 
     monkeypatch.setattr(LinkMonitor, "begin", begin)
     options = argparse.Namespace(link=None, route=tmp_path / "route")
-    runtime._link_monitor(options, load_experiment("paper"), uplink=False)
+    processes.link_monitor(options, load_experiment("paper"), uplink=False)
     return kept[0]
 
 
@@ -35,7 +35,7 @@ def test_a_trace_named_by_the_link_is_read_within_bounds(
     profile = {"uplink": {key: str(path), "distribution": "table" if key == "table" else "normal"}}
     path.write_text(text)
     assert load(profile)[0].trace or load(profile)[0].table
-    path.write_text(text + "\n" * runtime.TRACE_MAX)
+    path.write_text(text + "\n" * processes.TRACE_MAX)
     with pytest.raises(BadInputError, match="longer than 2097152 bytes; give a CSV file"):
         load(profile)
     profile["uplink"][key] = "/dev/null"  # an endless device would fill the memory

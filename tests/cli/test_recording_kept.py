@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cloudrc.cli.runtime import _open_recorder
+from cloudrc.cli.processes import open_recorder
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
 from tests.record.conftest import MS, counted, world_records
@@ -13,7 +13,7 @@ from tests.record.conftest import MS, counted, world_records
 
 def started(path: Path | None, size_max: float | None = None) -> Recorder:
     options = argparse.Namespace(record=path, record_max=size_max)
-    return _open_recorder(options, "world", b"id")
+    return open_recorder(options, "world", b"id")
 
 
 def record(recorder: Recorder, seconds: int = 1) -> Recorder:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.relay import open_relay, read_profiles
+from cloudrc.cli.processes import open_relay, read_profiles
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection

@@ -16,7 +16,7 @@ import yaml
 
 from cloudrc.cli.client import Api
 from cloudrc.config.load import dump, load_experiment
-from cloudrc.drivers.local import _free_addresses
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.errors import CloudrcError
 from cloudrc.messages import GuardState
@@ -87,7 +87,7 @@ class Release:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.running, self.all = folder, {}, []
-        self.world, self.cloud = _free_addresses(2)
+        self.world, self.cloud = (f"127.0.0.1:{port}" for port in free_ports(2))
         (folder / "config.yaml").write_text(dump(load_experiment("paper")))
         (folder / "key").write_bytes(KEY)
         (folder / "mission.yaml").write_text(MISSION)

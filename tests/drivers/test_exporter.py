@@ -1,17 +1,26 @@
-"""The text for Prometheus is valid and small; unknown values are absent."""
+"""The exporter: valid text in bounds, probes on one port, hostile clients, CPU throttling."""
 
 from __future__ import annotations
 
 import shutil
+import socket
 import subprocess
+import threading
 import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc import __version__
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.exporter import Exporter
+from cloudrc.drivers import exporter as exporters
+from cloudrc.drivers.exporter import Exporter, read_throttling
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.exposition.table import (
     BODIES,
     DIRECTIONS,
@@ -39,7 +48,7 @@ from tests.drivers.conftest import here
 from tests.flights.conftest import records
 
 Flight = dict[str, list[Record]]
-PERIODS = (TelemetrySent, Control)
+HOST = "127.0.0.1"
 
 
 @pytest.fixture(scope="module")
@@ -51,24 +60,22 @@ def flight() -> Flight:
         seen[end] = []
         for record in of_end:
             seen[end].append(record)
-            if isinstance(record, PERIODS):
+            if isinstance(record, TelemetrySent | Control):
                 seen[end].append(Lateness(record.stamp_ns, end, 80e-6, 300e-6, 0))
-    seen["world"] += [Contact(0, body, ZERO, ZERO, ZERO, True) for body in BODIES]
-    for end in ENDS:
         way = DIRECTIONS[ENDS.index(end) - 1]
         seen[end] += [
             LinkChecked(9, way == "uplink", name, 0.1, 0.1, 0.0, 0.2, "ok", 3000)
             for name in ("mean", "deviation", "loss")
         ]
+    seen["world"] += [Contact(0, body, ZERO, ZERO, ZERO, True) for body in BODIES]
     seen["teleop"] = [r for r in seen["cloud"] if isinstance(r, MissionEvent)]
-    errors = ReleaseErrors()
+    errors, steps = ReleaseErrors(), Steps()
     for late_ns in (3_000, 30_000, 300_000, 3_000_000, 300_000_000):
         errors.observe(late_ns)
-    counts = dict.fromkeys(LINK_OUTCOMES, 5) | Recent().counts(errors) | {"restored": 1}
-    seen["link"] = [Counted(0, "link", name, total) for name, total in counts.items()]
-    steps = Steps()
     steps.note(1_000_000, 0)
-    seen["link"] += [Counted(0, "link", name, total) for name, total in steps.counts().items()]
+    counts = dict.fromkeys(LINK_OUTCOMES, 5) | Recent().counts(errors) | {"restored": 1}
+    counts |= steps.counts()
+    seen["link"] = [Counted(0, "link", name, total) for name, total in counts.items()]
     return seen
 
 
@@ -78,8 +85,9 @@ def exporter(role: str, flight: Flight, *, missions: bool = True) -> Exporter:
     if role in ENDS:
         made.recording(lambda: 0.3)
     if role == "link":
-        made.shaped("relay", "uplink", "auto")
-        made.shaped("relay", "downlink", "auto")
+        made.shaped("netem", "uplink", "auto")  # "relay" takes its place
+        for way in DIRECTIONS:
+            made.shaped("relay", way, "auto")
         made.asked("uplink", 0.045)
     return made
 
@@ -89,41 +97,35 @@ def series(text: str) -> list[str]:
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_promtool_finds_nothing_to_say(role: str, flight: Flight) -> None:
-    if shutil.which("promtool") is None:
-        pytest.skip("promtool is missing: apt-get install prometheus")
-    command = ["promtool", "check", "metrics"]
-    done = subprocess.run(
-        command, input=exporter(role, flight).text(), capture_output=True, text=True
-    )
-    assert (done.returncode, done.stdout + done.stderr) == (0, "")
-
-
-@pytest.mark.parametrize("role", ROLES)
-def test_a_flight_shows_every_metric_of_its_role_and_no_other(role: str, flight: Flight) -> None:
-    families = text_string_to_metric_families(exporter(role, flight).text())
-    found = {family.name + "_total" * (family.type == "counter") for family in families}
-    optional = {name for name in METRICS if "_cpu_" in name}  # only if the kernel counts it
-    expected = {metric.name for metric in of_role(role)}
-    assert {
-        name for name in found if not name.startswith("process_")
-    } | optional == expected | optional
-
-
-@pytest.mark.parametrize("role", ROLES)
-def test_labels_keep_to_their_sets(role: str, flight: Flight) -> None:
-    for family in text_string_to_metric_families(exporter(role, flight).text()):
+def test_a_flight_shows_the_metrics_of_its_role(role: str, flight: Flight) -> None:
+    text = exporter(role, flight).text()
+    found, optional = set(), {name for name in METRICS if "_cpu_" in name}  # the kernel may count
+    for family in text_string_to_metric_families(text):
+        found.add(family.name + "_total" * (family.type == "counter"))
         for sample in family.samples:
             metric = METRICS.get(sample.name)
             if metric is not None and metric.kind is not Kind.HISTOGRAM:
                 assert set(sample.labels) == set(metric.labels)
                 for name, value in sample.labels.items():
                     assert value in (metric.labels[name] or (__version__, ""))
+    expected = {metric.name for metric in of_role(role)}
+    own = {name for name in found if not name.startswith("process_")}
+    assert own | optional == expected | optional
+    assert "_created" not in text
+    assert text.count("cloudrc_link_info{") == (2 if role == "link" else 0)
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_promtool_finds_nothing_to_say(role: str, flight: Flight) -> None:
+    if shutil.which("promtool") is None:
+        pytest.skip("promtool is missing: apt-get install prometheus")
+    text, command = exporter(role, flight).text(), ["promtool", "check", "metrics"]
+    done = subprocess.run(command, input=text, capture_output=True, text=True)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("pod", [("world", "link"), ("cloud", "teleop", "link")])
 def test_a_pod_has_less_than_200_series(pod: tuple[str, ...], flight: Flight) -> None:
-    """Only teleop exports the metrics of missions."""
     made = [exporter(role, flight, missions=role != "cloud") for role in pod]
     assert sum(len(series(one.text())) for one in made) < 200
 
@@ -146,15 +148,9 @@ def test_the_sync_age_is_absent_until_it_is_known() -> None:
 
 def test_unresolved_names_are_counted_and_are_no_sign_of_life() -> None:
     link = Exporter("link")
-    assert "cloudrc_dns_errors_total 0.0" in link.text()
     link.unresolved(7)
     assert "cloudrc_dns_errors_total 7.0" in link.text()
     assert link._seen_at is None
-
-
-@pytest.mark.parametrize("role", ROLES)
-def test_nothing_says_when_it_was_created(role: str, flight: Flight) -> None:
-    assert "_created" not in exporter(role, flight).text()
 
 
 def test_the_build_is_named_once(flight: Flight) -> None:
@@ -164,14 +160,6 @@ def test_the_build_is_named_once(flight: Flight) -> None:
         text = f'config="{config}",role="world",version="{__version__}"'
         assert lines == [f"cloudrc_build_info{{{text}}} 1.0"]
         world.runs("0123456789ab" + "f" * 52)
-
-
-def test_a_shaper_takes_the_place_of_the_one_before() -> None:
-    link = Exporter("link")
-    link.shaped("relay", "uplink", "auto")
-    link.shaped("netem", "uplink", "auto")
-    lines = [line for line in series(link.text()) if "link_info" in line]
-    assert lines == ['cloudrc_link_info{direction="uplink",mode="auto",shaper="netem"} 1.0']
 
 
 @pytest.mark.full
@@ -187,3 +175,129 @@ def test_a_record_costs_less_than_a_microsecond(end: str, flight: Flight) -> Non
             made.see(chunk)
         least = min(least, time.process_time() - began)
     assert least / len(flight[end]) < 1e-6 * here()
+
+
+@pytest.mark.parametrize(
+    ("text", "counts"),
+    [
+        ("usage_usec 4402130\nnr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n",
+         [120, 17, pytest.approx(1.25)]),
+        ("usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),
+        ("", []),
+        (None, []),
+    ],
+    ids=["limited", "unlimited", "empty", "missing"],
+)  # fmt: skip
+def test_throttling_is_read_from_the_kernel(
+    text: str | None, counts: list[float], tmp_path: Path
+) -> None:
+    if text is not None:
+        (tmp_path / "cpu.stat").write_text(text)
+    read = read_throttling(tmp_path / "cpu.stat")
+    assert [value for reading in read.values() for value in dict(reading).values()] == counts
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[Exporter, int]]:
+    exporter = Exporter("link")
+    port = exporter.serve((HOST, 0))
+    yield exporter, port
+    exporter.close()
+
+
+def get(port: int, path: str, host: str = HOST) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(f"http://{host}:{port}{path}", timeout=10) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_metrics_and_probes_are_on_one_port(
+    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exporters, "KEPT", 0.0)
+    exporter, port = served
+    assert get(port, "/healthz") == (200, "alive\n")
+    assert get(port, "/readyz") == (503, "no peer yet\n")
+    assert "cloudrc_ready 0.0" in get(port, "/metrics")[1]
+    exporter.ready(True)
+    assert get(port, "/readyz")[0] == 200
+    with urllib.request.urlopen(f"http://{HOST}:{port}/metrics?name=any", timeout=10) as answer:
+        assert answer.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
+        assert b"cloudrc_ready 1.0" in answer.read()
+    exporter.ready(False)
+    assert get(port, "/readyz")[0] == 503
+    assert get(port, "/") == (404, "there are /metrics, /healthz, /readyz, /link.json\n")
+
+
+def test_scrapers_that_come_at_once_have_one_page_made(
+    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exporter, port = served
+    monkeypatch.setattr(exporters, "KEPT", 60.0)
+    write, calls, all_wait = exporter.text, [], threading.Event()
+
+    def slowly() -> str:
+        calls.append(1)
+        assert all_wait.wait(10.0)
+        return write()
+
+    monkeypatch.setattr(exporter, "text", slowly)
+    with ThreadPoolExecutor(8) as scrapers:
+        answers = [scrapers.submit(get, port, "/metrics") for _ in range(8)]
+        while threading.active_count() < 16:  # eight clients and eight server threads
+            assert get(port, "/healthz")[0] == 200  # probes do not wait for scrapes
+        all_wait.set()
+        pages = {each.result() for each in answers}
+    assert (len(pages), len(calls)) == (1, 1)
+
+
+def test_a_loop_that_stands_still_is_not_alive(
+    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Liveness does not depend on the other end, nor on the loop before its start."""
+    exporter, port = served
+    monkeypatch.setattr(exporters, "STILL_MAX", -1.0)
+    assert get(port, "/healthz")[0] == 503
+    monkeypatch.setattr(exporters, "STILL_MAX", 60.0)
+    assert get(port, "/healthz") == (200, "alive\n")
+    exporter._seen_at = time.monotonic() - 61.0
+    assert get(port, "/healthz") == (503, "the loop has stood still for 61 s\n")
+
+
+def test_probes_of_both_address_families_are_answered() -> None:
+    exporter = Exporter("link")
+    port = exporter.serve(("::", 0))
+    assert {get(port, "/healthz", host)[0] for host in ("127.0.0.1", "[::1]")} == {200}
+    exporter.close()
+
+
+def test_an_address_that_cannot_be_bound_is_told(served: tuple[Exporter, int]) -> None:
+    for address in ((HOST, served[1]), ("192.0.2.1", 9100)):
+        told = rf"cannot be served on {address[0]}:{address[1]}: .*--metrics$"
+        with pytest.raises(MissingPrerequisiteError, match=told):
+            Exporter("world").serve(address)
+    served[0].close()
+    other = Exporter("link")
+    assert other.serve((HOST, served[1])) == served[1], "the port is free again"
+    other.close()
+
+
+def test_a_burst_of_clients_that_hang_blocks_no_probe(served: tuple[Exporter, int]) -> None:
+    waiting = [socket.create_connection((HOST, served[1]), timeout=0.9) for _ in range(200)]
+    for client in waiting[::2]:
+        client.sendall(b"GET /metr")
+    assert get(served[1], "/healthz")[0] == 200
+    for client in waiting:
+        client.close()
+
+
+def test_a_client_that_hangs_is_cut(
+    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exporters._Handler, "timeout", 0.05)
+    with socket.create_connection((HOST, served[1]), timeout=10) as client:
+        client.sendall(b"GET /metrics HT")
+        assert client.recv(100) == b""

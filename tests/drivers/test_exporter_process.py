@@ -40,7 +40,7 @@ def test_a_metrics_port_that_is_taken_ends_in_one_sentence(
         assert main([end, "--config", "any.yaml", *LISTEN, *flags]) == 3
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 1
-    assert errors[0].startswith(f"cloudrc: error: metrics port {port} is taken: ")
+    assert errors[0].startswith(f"cloudrc: error: metrics cannot be served on 127.0.0.1:{port}: ")
 
 
 def free_ports(count: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""The recorder with its three threads: one puts, one writes, one syncs."""
+"""The recorder with its threads, what a pod records, and steps of the wall clock."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-from cloudrc.drivers.recording import RecordingThread
+import pytest
+
+from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread, WallClock
+from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
-from cloudrc.records import Record
+from cloudrc.records import GuardChange, Lateness, Record
 from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records
 
 
@@ -84,3 +87,65 @@ def test_a_hanging_disk_does_not_keep_the_process() -> None:
     assert recorder.dropped >= 15
     release.set()
     assert thread.stop(timeout=10.0)
+
+
+def test_a_pod_records_flights_whole_and_events_between_them() -> None:
+    now, kept = 0, {}
+    choose = FlightsOnly(lambda: now in (100, 101, 102))
+    for now in range(300):
+        start_ns = now * 1_000_000_000
+        wakes = [Lateness(start_ns + n * 10_000_000, "world", 0.0, 0.0, 0) for n in range(100)]
+        event = GuardChange(start_ns + 990_000_000, GuardState.HOLD, "told")
+        kept[now] = len(choose([*wakes, event]))
+    whole = {index for index, count in kept.items() if count == 101}
+    assert whole == set(range(100, 102 + AFTERWARDS_NS // 1_000_000_000 + 1))
+    assert {kept[index] for index in kept.keys() - whole} == {1}
+    assert choose([]) == []
+
+
+@pytest.mark.parametrize("by", [3600.0, -1.0])
+def test_a_step_of_the_wall_clock_is_noticed_once(
+    by: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offset, true = [0.0], time.time
+    monkeypatch.setattr(time, "time", lambda: true() + offset[0])
+    thread = RecordingThread(Recorder(Path("x"), lambda path: Shelf()))
+    thread.start()
+    offset[0] = by
+    steps, until = list[float](), time.monotonic() + 10.0
+    while not steps and time.monotonic() < until:
+        time.sleep(0.01)
+        steps = thread.take_steps()
+    assert steps == [pytest.approx(by, abs=0.1)]
+    assert thread.take_steps() == []
+    assert thread.stop(10.0)
+
+
+def test_a_clock_that_drifts_has_not_been_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    boot = [0.0]
+    monkeypatch.setattr(time, "clock_gettime", lambda clock: boot[-1])
+    monkeypatch.setattr(time, "time", lambda: 1.7e9 + boot[-1] * 1.0005)
+    seen = WallClock()
+    for later in (1.0, 60.0, 3600.0, 86_400.0):
+        boot.append(later)
+        assert seen.step() == 0.0
+
+
+@pytest.mark.parametrize("stopped_before", [True, False])
+def test_nor_has_one_whose_reader_was_stopped_meanwhile(
+    stopped_before: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stop of a second between the reads of both clocks, by SIGSTOP or a CPU quota."""
+    true, stops = [0.0], iter([False, True])
+
+    def look() -> float:
+        stop = next(stops, False)
+        true[0] += stop and stopped_before
+        shown = 1.7e9 + true[0]
+        true[0] += stop and not stopped_before
+        return shown
+
+    monkeypatch.setattr(time, "clock_gettime", lambda clock: true[0])
+    monkeypatch.setattr(time, "time", look)
+    seen = WallClock()
+    assert [seen.step(), seen.step()] == [0.0, 0.0]

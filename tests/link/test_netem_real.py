@@ -24,9 +24,9 @@ import pytest
 from numpy.typing import NDArray
 
 from cloudrc.assembly import link_profile
+from cloudrc.cli.link_run import Programs
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
-from cloudrc.drivers.iproute2 import Programs
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
 from cloudrc.link.netem import STRETCH, Netem, table, write_tables

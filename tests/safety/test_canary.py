@@ -11,7 +11,7 @@ import pytest
 from mcap.exceptions import McapError
 from mcap.stream_reader import StreamReader
 
-from cloudrc.drivers.local import _free_addresses
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Fault
 from cloudrc.teleop.auth import Tokens
@@ -68,7 +68,7 @@ class ObservedRelease(Release):
 
     def run(self, *words: str):  # type: ignore[no-untyped-def]
         if words[0] in ("world", "cloud", "teleop"):
-            (address,) = _free_addresses(1)
+            address = f"127.0.0.1:{free_ports(1)[0]}"
             self.metrics = [*getattr(self, "metrics", []), address]
             words = (*words, "--metrics", address)
         if words[0] in ("world", "cloud"):

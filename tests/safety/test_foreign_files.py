@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from cloudrc.record.recover import recover
 
 from cloudrc.cli.main import main
 from cloudrc.config import document
@@ -26,7 +27,6 @@ from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
 from cloudrc.record.reader import read_contents
-from cloudrc.record.recover import recover
 from cloudrc.records import GroundTruth
 from cloudrc.report.document import write_json
 from cloudrc.report.folder import read_run

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import runtime
+from cloudrc.cli import processes
 from cloudrc.cli.link_verify import find_experiment
 from cloudrc.cli.main import main
 from cloudrc.cluster.link import APPLY_SCRIPT
@@ -23,7 +23,7 @@ from tests.metrics.conftest import flown
 from tests.record.conftest import write_mission
 
 pytestmark = pytest.mark.promise("foreign-files-run-nothing")
-PACKAGE = Path(runtime.__file__).parents[1]
+PACKAGE = Path(processes.__file__).parents[1]
 CONFIG = """\
 cloud:
   estimator: {spy}
@@ -94,16 +94,19 @@ def test_link_verify_executes_nothing_of_the_run(run: Path, trace: Path) -> None
 def test_only_cloud_imports_plug_ins(
     run: Path, trace: Path, monkeypatch: pytest.MonkeyPatch, end: str, config: str, imports: bool
 ) -> None:
-    for name in ("_open_keys", "_open_peer", "_open_recorder", "open_exporter"):
-        monkeypatch.setattr(runtime, name, lambda *words: None)
+    for name in ("open_peer", "open_recorder", "open_exporter", "link_monitor"):
+        monkeypatch.setattr(processes, name, lambda *words, **more: None)
     (run / "config.yaml").write_text(config)
-    runtime.open_end(argparse.Namespace(config=run / "config.yaml"), end)
+    (run / "key").write_bytes(b"k" * 32)
+    unused = dict.fromkeys(("feed", "record_flights", "link", "route"))
+    options = argparse.Namespace(config=run / "config.yaml", key=run / "key", **unused)
+    processes.open_end(options, end)
     assert trace.exists() == imports
 
 
 def test_only_flying_code_loads_an_experiment_with_plug_ins() -> None:
     """All other code uses `read_experiment`, which imports none."""
-    flies = {"cli/run.py", "cli/sweep.py", "cli/runtime.py", "cli/bench.py"}
+    flies = {"cli/run.py", "cli/sweep.py", "cli/processes.py", "cli/bench.py"}
     flies |= {"faults/flight.py"}
     imports = {
         path.relative_to(PACKAGE).as_posix()

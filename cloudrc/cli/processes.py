@@ -1,0 +1,579 @@
+"""Run `cloudrc world`, `cloudrc cloud` and `cloudrc relay`: the processes of a local run or a pod.
+
+With `--link DIR` the relay follows the changes of `cloudrc link set` and publishes its state:
+
+    DIR/profile.json, change.json            requested profile; missing before the first change
+    DIR/uplink.json, downlink.json           state in force (`cloudrc/link/state.py`)
+    DIR/uplink.released, downlink.released   how late datagrams left so far, written every 2 s
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import socket
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from cloudrc.cli.output import print_line
+from cloudrc.drivers.process import EndProcess, Feed, StopSignal
+from cloudrc.drivers.realtime import Address, Peer, Route, bind, split_address
+from cloudrc.errors import BadInputError
+from cloudrc.files import readable_by_others
+from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
+from cloudrc.link.state import PROFILE_FILE, RELEASED_SUFFIX, LinkState, publish, summary, to_text
+from cloudrc.records import Counted
+
+if TYPE_CHECKING:
+    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.drivers.exporter import Exporter
+    from cloudrc.link.model import LinkDirection
+    from cloudrc.link.profile import DirectionProfile
+    from cloudrc.link.relay import Relay
+    from cloudrc.link.verify.monitor import LinkMonitor
+    from cloudrc.record.recorder import Recorder
+
+TRACE_MAX = 2 << 20
+"""Maximum size of a trace file that the state file of the link container names [bytes]. The
+container's own traces come from a ConfigMap, which holds at most 1 MiB."""
+PERIOD = 1.0
+"""Time between two updates of the relay's counts in the exporter [s]."""
+RELEASED_PERIOD = 2.0
+"""Time between two publications of the lateness of datagrams [s]; an end reads with this period."""
+
+
+class Command(NamedTuple):
+    """One of the commands of this module: declares its arguments, and runs."""
+
+    arguments: Callable[[argparse.ArgumentParser], None]
+    execute: Callable[[argparse.Namespace], int]
+
+
+def _add(
+    parser: argparse._ActionsContainer, flag: str, kind: str, text: str, *, required: bool = False
+) -> None:
+    """Declare a flag; its kind is the name of its value in the help."""
+    read: Callable[[str], object] = {"HOST:PORT": read_address, "SIZE": read_size}.get(kind, Path)
+    parser.add_argument(flag, type=read, metavar=kind, help=text, required=required)
+
+
+def process_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of every process."""
+    _add(parser, "--config", "FILE", "experiment file (YAML)", required=True)
+    feed = "write status for a supervisor to stdout (default: print events only)"
+    parser.add_argument("--feed", action="store_true", help=feed)
+    metrics = "serve /metrics, /healthz and /readyz at this address (default: off)"
+    _add(parser, "--metrics", "HOST:PORT", metrics)
+
+
+def _end_arguments(parser: argparse.ArgumentParser) -> None:
+    process_arguments(parser)
+    record = "MCAP file to write; an existing one is renamed to NAME.before.mcap"
+    _add(parser, "--record", "FILE", record)
+    flights = "leave out periodic records while the robot is not flying"
+    parser.add_argument("--record-flights", action="store_true", help=flights)
+    size = "size limit, such as 500M or 1Gi, for this recording and the renamed one together;"
+    size += " recording ends at 90 %% of it (default: no limit)"
+    _add(parser, "--record-max", "SIZE", size)
+    _add(parser, "--listen", "HOST:PORT", "address to receive at", required=True)
+    link = "file with the link's state, to be recorded (default: link.json beside --route)"
+    _add(parser, "--link", "FILE", link)
+    key = "the tunnel's pre-shared key ('cloudrc key new FILE'); it may change in flight"
+    _add(parser, "--key", "FILE", key, required=True)
+    target = parser.add_mutually_exclusive_group(required=True)
+    _add(target, "--peer", "HOST:PORT", "address to send to; a name is resolved once")
+    route = "file with the numeric HOST:PORT to send to; it may appear or change later"
+    _add(target, "--route", "FILE", route)
+
+
+def _world_arguments(parser: argparse.ArgumentParser) -> None:
+    _end_arguments(parser)
+    epochs = "ignored: cloud keeps the session number"
+    parser.add_argument("--epochs", metavar="FILE", help=epochs)
+
+
+def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
+    _end_arguments(parser)
+    teleop = "take missions from 'cloudrc teleop --socket DIR' (default: fly the experiment's)"
+    _add(parser, "--teleop", "DIR", teleop)
+
+
+def _relay_arguments(parser: argparse.ArgumentParser) -> None:
+    process_arguments(parser)
+    for end in ("world", "cloud"):
+        text = f"address to receive from {end} at"
+        _add(parser, f"--{end}-side", "HOST:PORT", text, required=True)
+    for end in ("world", "cloud"):
+        text = f"address at which {end} receives; a name is resolved once"
+        _add(parser, f"--{end}", "HOST:PORT", text, required=True)
+    link = "folder to write the link's state to and to read changes of 'cloudrc link set' from"
+    _add(parser, "--link", "DIR", link)
+    fifo = "use real-time priority (SCHED_FIFO), if permitted: less timing error"
+    parser.add_argument("--fifo", action="store_true", help=fifo)
+
+
+def read_address(text: str) -> Address:
+    """Read HOST:PORT, with an IPv6 address in brackets, as a type for argparse.
+
+    [::] means all IPv4 and IPv6 addresses; on a machine without IPv6, all IPv4 addresses.
+    """
+    try:
+        host, port = split_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return "0.0.0.0" if host == "::" and not _has_ipv6() else host, port
+
+
+def _has_ipv6() -> bool:
+    try:
+        socket.socket(socket.AF_INET6, socket.SOCK_DGRAM).close()
+    except OSError:
+        return False
+    return True
+
+
+def show_address(where: Address) -> str:
+    """Write an address as HOST:PORT, with an IPv6 address in brackets."""
+    host, port = where
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def read_size(text: str) -> float:
+    """Read a size in the notation of Kubernetes [bytes], as a type for argparse."""
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti)?", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 500M or 1Gi")
+    number, unit = found.groups(default="")
+    base = 1024.0 if unit.endswith("i") else 1000.0
+    power = {"m": -1, "k": 1, "K": 1, "M": 2, "G": 3, "T": 4}.get(unit[:1], 0)
+    return float(number) * base**power
+
+
+def ipv4_addresses(name: str) -> list[str]:
+    """Return the IPv4 addresses of a host name; relay and netem shape only IPv4.
+
+    Raises:
+        OSError: If the name has no IPv4 address; the text tells if it has only IPv6 addresses.
+    """
+    try:
+        return _addresses(name, socket.AF_INET)
+    except OSError:
+        others = []
+        with suppress(OSError):
+            others = _addresses(name, socket.AF_INET6)
+        if not others:
+            raise
+        raise OSError(
+            "it has IPv6 addresses alone, and a link is shaped over IPv4; in a cluster with both "
+            "families set ipFamilyPolicy=PreferDualStack"
+        ) from None
+
+
+def _addresses(name: str, family: int) -> list[str]:
+    try:
+        found = socket.getaddrinfo(name, None, family, socket.SOCK_DGRAM)
+    except UnicodeError as error:  # an empty label, or one that is too long
+        raise OSError(f"not a name: {error}") from error
+    return [str(entry[4][0]) for entry in found]
+
+
+def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0)) -> Address:
+    """Resolve an address once, before the loop starts: the loop must not wait for a name server.
+
+    Args:
+        flag: Flag of the address, for messages.
+        where: The address.
+        listen: Own address of the process, whose family the result has; [::] reaches both families.
+
+    Raises:
+        BadInputError: If the host cannot be resolved; the text names the flag.
+    """
+    host, port = where
+    family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
+    try:
+        return _addresses(host, 0 if listen[0] == "::" else family)[0], port
+    except OSError as error:
+        wanted = "IPv6" if family == socket.AF_INET6 else "IPv4"
+        raise BadInputError(
+            f"{flag} {show_address(where)}: {host} cannot be resolved ({error.strerror or error});"
+            f" name a host that has an {wanted} address, or the address itself"
+        ) from error
+
+
+def warn_if_exposed(listen: Address) -> None:
+    """Write a warning if other machines can send to an address."""
+    if not listen[0].startswith("127.") and listen[0] not in ("localhost", "::1"):
+        print(f"cloudrc: warning: {listen[0]} can be reached from outside", file=sys.stderr)
+
+
+@contextmanager
+def _listening(flag: str, listen: Address) -> Iterator[None]:
+    """Warn of an exposed address; name flag and address if opening a socket in the block fails."""
+    warn_if_exposed(listen)
+    try:
+        yield
+    except OSError as error:
+        raise BadInputError(
+            f"{flag} {show_address(listen)}: cannot receive there: {error.strerror or error};"
+            " name an address of this machine and a port that is free"
+        ) from error
+
+
+def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
+    """Serve the metrics of a process at the address of `--metrics`; None without the flag."""
+    if options.metrics is None:
+        return None
+    from cloudrc.drivers.exporter import Exporter
+
+    warn_if_exposed(options.metrics)
+    exporter = Exporter(role, missions=getattr(options, "teleop", None) is None)
+    exporter.serve(options.metrics)
+    return exporter
+
+
+def _run_world(options: argparse.Namespace) -> int:
+    stop = StopSignal()
+    from cloudrc import assembly
+    from cloudrc.world.endpoint import WorldIdentity
+
+    if options.epochs:
+        print("cloudrc: --epochs is ignored: cloud keeps the session number", file=sys.stderr)
+    experiment, clock, end = open_end(options, "world")
+    identity = WorldIdentity(clock, os.urandom(16), end.keys.ring)
+    world = assembly.build_world(experiment, identity, time.monotonic_ns)
+    end.run(world, stop, lambda: world.robot.guard.armed, lambda: world.slip_ns)
+    return 0
+
+
+def _run_cloud(options: argparse.Namespace) -> int:
+    stop: Callable[[], bool] = StopSignal()
+    from cloudrc import assembly
+    from cloudrc.cloud.endpoint import CloudIdentity
+    from cloudrc.drivers.teleop import LastWord, RemoteTeleop, UnixPeer
+    from cloudrc.messages import GuardState
+    from cloudrc.teleop import wire
+
+    experiment, clock, end = open_end(options, "cloud")
+    identity, teleop = CloudIdentity(clock, os.urandom(16), end.keys.ring), None
+    if options.teleop:
+        peer = UnixPeer(options.teleop / "cloud.sock", options.teleop / "teleop.sock")
+        teleop = RemoteTeleop(peer, wire.encode, wire.decode, time.monotonic_ns())
+    cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns, teleop)
+
+    def flies() -> bool:
+        return cloud.guard is GuardState.TRACK
+
+    asked = LastWord(stop, flies) if teleop else stop
+    end.run(cloud, lambda: asked() or cloud.mission_over, flies)
+    return 0
+
+
+def open_end(
+    options: argparse.Namespace, name: str
+) -> tuple[ResolvedExperiment, bytes, EndProcess]:
+    """Open all that the end "world" or "cloud" needs; an error names the flag.
+
+    Returns:
+        The experiment, the identity of the machine's clock, and the process of the end.
+    """
+    from cloudrc.config.load import fingerprint, load_experiment, read_experiment
+    from cloudrc.drivers.keyfile import KeyFile
+    from cloudrc.drivers.machine import clock_id
+
+    exporter, path, clock = open_exporter(options, name), str(options.config), clock_id()
+    given = read_experiment(path)
+    # Only cloud loads the plug-ins, which fill in their default parameters.
+    experiment = load_experiment(path) if name == "cloud" else given
+    if exporter is not None:
+        exporter.runs(fingerprint(given))
+    keys = KeyFile(options.key, time.monotonic_ns())
+    if readable_by_others(options.key):
+        key = options.key
+        print_line(f"cloudrc: warning: {key} can be read by others: chmod 600 {key}", sys.stderr)
+    return (
+        experiment,
+        clock,
+        EndProcess(
+            end=name,
+            peer=open_peer(options),
+            recorder=open_recorder(options, name, clock),  # renames an old recording
+            keys=keys,
+            exporter=exporter,
+            watched=options.feed,
+            flights_only=options.record_flights,
+            link=_link_state(options),
+            check=link_monitor(options, experiment, uplink=name == "cloud"),
+        ),
+    )
+
+
+def open_peer(options: argparse.Namespace) -> Peer:
+    """Bind the socket of an end; the socket sends to the peer or to the address of the route."""
+    if options.route is None:
+        target: Address | Route = resolve_address("--peer", options.peer, options.listen)
+    else:
+        target = Route(options.route)
+        if not options.route.exists():
+            print(f"cloudrc: sends nothing until {options.route} exists", file=sys.stderr)
+    with _listening("--listen", options.listen):
+        return Peer.bind(options.listen, target)
+
+
+def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
+    """Make the recorder of an end; without a file the recorder writes to /dev/null.
+
+    The recording of the previous process is kept as NAME.before.mcap: it shows why that process
+    ended. Both recordings together have the size limit.
+    """
+    from cloudrc.record.recorder import Recorder
+    from cloudrc.record.writer import McapWriter
+
+    path: Path = options.record or Path(os.devnull)
+    kept, size_max = 0, None
+    with suppress(OSError):  # the recorder meets the same error and reports it
+        if path.is_file() and (size := path.stat().st_size):
+            path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
+            kept = size
+    if options.record_max:
+        room = round(0.9 * options.record_max)
+        size_max = max(room - kept, room // 10)
+    return Recorder(
+        path,
+        lambda file: McapWriter(file, clock=clock, clock_id=clock_id.hex()),
+        size_max=size_max,
+    )
+
+
+def _link_state(options: argparse.Namespace) -> Path | None:
+    """Return the state file of the link's process; None without flags for the link."""
+    if options.link is None and options.route is not None:
+        return Path(options.route).with_name("link.json")
+    return options.link  # type: ignore[no-any-return]
+
+
+def link_monitor(
+    options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
+) -> LinkMonitor:
+    """Make the monitor of the direction that an end receives; it follows changes of the profile."""
+    from cloudrc.assembly import link_profile
+    from cloudrc.config.schema import Profile
+    from cloudrc.link.traces import SIZE_MAX
+    from cloudrc.link.verify.judge import Flow
+    from cloudrc.link.verify.monitor import LinkMonitor
+    from cloudrc.tunnel.codec import SIZES, Kind
+
+    def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
+        profile = Profile.model_validate_json(json.dumps(values))
+        return link_profile(profile.uplink, file_max), link_profile(profile.downlink, file_max)
+
+    # With a route the link is a container, which is not trusted: its files have a smaller limit.
+    file_max = TRACE_MAX if options.link is None else SIZE_MAX
+    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
+    check = LinkMonitor(uplink=uplink, flow=Flow(experiment.seed, uplink, kind, SIZES[kind]))
+    requested = link_profile(experiment.uplink), link_profile(experiment.downlink)
+    check.begin(requested, _link_state(options), load)
+    return check
+
+
+def _run_relay(options: argparse.Namespace) -> int:
+    """Forward datagrams until stopped."""
+    stop, exporter = StopSignal(), open_exporter(options, "link")
+    from cloudrc import assembly
+    from cloudrc.config.load import fingerprint, read_experiment
+    from cloudrc.link.relay import ask_for_fifo, settle
+
+    experiment = read_experiment(str(options.config))
+    links = dict(zip(("uplink", "downlink"), assembly.build_links(experiment), strict=True))
+    settle()
+    if options.fifo:
+        refused = ask_for_fifo()
+        result = f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO"
+        _log(result)
+    relay = open_relay(options, *links.values())
+    if exporter is not None:
+        for way, loaded in read_profiles(experiment).items():
+            exporter.shaped("relay", way, "relay")
+            exporter.asked(way, summary(loaded.direction)["delay"] or 0.0)
+        exporter.runs(fingerprint(experiment))
+        exporter.ready(True)
+    feed, should_stop = Feed.on_stdout(watched=options.feed), _counting(stop, relay, exporter)
+    if options.link:
+        asked = exporter.asked if exporter else lambda way, delay: None
+        control = RelayControl(options.link, links, read_profiles(experiment), asked, relay)
+        threading.Thread(target=control.follow, name="link control", daemon=True).start()
+        should_stop = control.stop_after(should_stop)
+    feed.ready()
+    relay.run(feed.alive_while(should_stop))
+    _log(", ".join(f"{name} {count:g}" for name, count in relay.counts().items()))
+    return 0
+
+
+def open_relay(
+    options: argparse.Namespace, uplink: LinkDirection, downlink: LinkDirection
+) -> Relay:
+    """Make the relay between the addresses of the command line.
+
+    Raises:
+        BadInputError: If an address is not usable; the text names the flags.
+    """
+    from cloudrc.link.relay import Relay
+    from cloudrc.tunnel.codec import peek
+
+    peers = {
+        "world_peer": resolve_address("--world", options.world),
+        "cloud_peer": resolve_address("--cloud", options.cloud),
+    }
+    with ExitStack() as opened:
+        sides = {}
+        for side in ("world_side", "cloud_side"):
+            address = getattr(options, side)
+            with _listening(f"--{side.replace('_', '-')}", address):
+                sides[side] = opened.enter_context(bind(address))
+        try:
+            relay = Relay(uplink, downlink, peek, **sides, **peers)  # type: ignore[arg-type]
+        except OSError as error:
+            raise BadInputError(
+                "the relay cannot reach --world from --world-side, or --cloud from --cloud-side "
+                f"({error.strerror or error}); give each side an address that reaches its end"
+            ) from error
+        opened.pop_all()  # they stay open until this process ends
+        return relay
+
+
+def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
+    """Return the profiles that the relay starts with, by direction."""
+    from cloudrc.assembly import link_profile
+
+    ways = {"uplink": experiment.uplink, "downlink": experiment.downlink}
+    values = {way: d.model_dump(mode="json", exclude_defaults=True) for way, d in ways.items()}
+    return {way: Loaded(link_profile(direction), values) for way, direction in ways.items()}
+
+
+def _counting(
+    stop: Callable[[], bool], relay: Relay, exporter: Exporter | None
+) -> Callable[[], bool]:
+    """Wrap `stop` in a function that also exports the relay's counts once a second."""
+    due = 0.0
+
+    def ask() -> bool:
+        nonlocal due
+        if exporter is not None and time.monotonic() >= due:
+            due = time.monotonic() + PERIOD
+            counts = relay.outcomes() | relay.recent()
+            exporter.see([Counted(0, "link", name, n) for name, n in counts.items()])
+        return stop()
+
+    return ask
+
+
+class RelayControl:
+    """Applies the changes of the profile file in a folder to both directions of a relay.
+
+    A thread reads and writes the files; the relay's loop only replaces the profiles.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        links: Mapping[str, LinkDirection],
+        first: Mapping[str, Loaded],
+        asked: Callable[[str, float], object],
+        relay: Relay,
+    ) -> None:
+        """Publish the initial state.
+
+        Args:
+            folder: Folder of the profile and of the link's state; created if missing.
+            links: The links "uplink" and "downlink".
+            first: The profiles that the links have started with.
+            asked: Called with a direction and its newly requested mean delay [s].
+            relay: The relay. Before a change it takes in the datagrams that have arrived.
+        """
+        from cloudrc.cli.link_run import make_profile_loader
+
+        self._folder, self._links, self._asked, self._relay = folder, links, asked, relay
+        folder.mkdir(exist_ok=True)
+        file, self._released_at = folder / PROFILE_FILE, 0.0
+        self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
+        self._pending: deque[tuple[str, Loaded]] = deque()
+        self._applied: deque[tuple[str, Loaded, int]] = deque()
+        self._changes = dict.fromkeys(links, -1)
+        for way, loaded in first.items():
+            self._publish(way, loaded, time.monotonic_ns())
+
+    def stop_after(self, stop: Callable[[], bool]) -> Callable[[], bool]:
+        """Return a function for the relay's loop: apply pending changes, then call `stop`."""
+
+        def ask() -> bool:
+            if self._pending:
+                self.swap()
+            return stop()
+
+        return ask
+
+    def swap(self) -> None:
+        """Apply the pending profiles; the relay's loop calls this between datagrams."""
+        self._relay.take_in()
+        while self._pending:
+            way, loaded = self._pending.popleft()
+            self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
+            self._applied.append((way, loaded, time.monotonic_ns()))
+
+    def follow(self) -> None:
+        """Look at the folder for ever."""
+        while True:
+            self.look()
+            time.sleep(PROFILE_PERIOD / 2 if self._pending else PROFILE_PERIOD)
+
+    def look(self) -> None:
+        """Check once for a requested change; publish applied changes and lateness."""
+        changes = {way: file.poll() for way, file in self._files.items()}
+        self._pending += [(way, loaded) for way, loaded in changes.items() if loaded is not None]
+        with suppress(OSError):  # such as a full disk: the next check tries again
+            while self._applied:
+                self._publish(*self._applied[0])
+                self._applied.popleft()
+            if time.monotonic() - self._released_at >= RELEASED_PERIOD:
+                self._released_at = time.monotonic()
+                for way in self._links:
+                    if released := self._relay.released(way):
+                        publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
+
+    def _publish(self, way: str, loaded: Loaded, since_ns: int) -> None:
+        changes, requested = self._changes[way] + 1, summary(loaded.direction)
+        state = LinkState(
+            shaper="relay",
+            reason="local mode",
+            mode="relay",
+            direction=way,
+            profile=loaded.values,
+            since=datetime.now(UTC).isoformat(timespec="seconds"),
+            since_ns=since_ns,
+            changes=changes,
+            change=loaded.change.number,
+            cause=loaded.change.cause if changes else "",
+            asked=requested,
+            # The time line of an initial profile starts with the first datagram.
+            origin_ns=since_ns if changes and loaded.change.restart else None,
+        )
+        self._asked(way, requested["delay"] or 0.0)
+        publish(self._folder / f"{way}.json", to_text(state))
+        self._changes[way] = changes
+
+
+def _log(line: str) -> None:
+    print_line(f"cloudrc relay: {line}", sys.stderr)
+
+
+world = Command(_world_arguments, _run_world)
+cloud = Command(_cloud_arguments, _run_cloud)
+relay = Command(_relay_arguments, _run_relay)

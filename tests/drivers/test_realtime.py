@@ -1,0 +1,239 @@
+"""The real-time driver: addresses and routes, sockets, stalls and floods, seals."""
+
+from __future__ import annotations
+
+import ast
+import os
+import socket
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from cloudrc.drivers.realtime import (
+    BACKLOG_MAX,
+    DRAIN_MAX,
+    ROUTE_PERIOD_NS,
+    STALL_AGAIN_NS,
+    STALL_NS,
+    Peer,
+    Route,
+    bind,
+    serve,
+    split_address,
+)
+from cloudrc.tunnel.codec import DATAGRAM_MAX, DecodeError, Direction, Kind
+from cloudrc.tunnel.session import make_session, pair
+from tests.flights.conftest import bare_world, ring
+
+PACKAGE = Path(__file__).parents[2] / "cloudrc"
+HERE, THERE = ("127.0.0.1", 7401), ("10.1.2.3", 7400)
+MANY = 300
+MS = 1_000_000
+LONG_NS = 10 * STALL_NS
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("127.0.0.1:7401\n", HERE),
+        ("[::1]:7400", ("::1", 7400)),
+        ("cloud:7400", ("cloud", 7400)),
+        *((text, None) for text in ("", "1.2.3.4", "1.2.3.4:", ":7401", "1.2.3.4:0")),
+        *((text, None) for text in ("1.2.3.4:65536", "1.2.3.4:x", "::1:7400", "[1.2.3.4]:1")),
+    ],
+)
+def test_an_address_is_a_host_and_a_port(text: str, address: tuple[str, int] | None) -> None:
+    if address is not None:
+        assert split_address(text) == address
+        return
+    with pytest.raises(ValueError, match=r"HOST:PORT|brackets"):
+        split_address(text)
+
+
+def write(path: Path, text: str, moment_ns: int) -> None:
+    path.write_text(text)
+    os.utime(path, ns=(moment_ns, moment_ns))
+
+
+def test_a_route_is_read_when_it_changes(tmp_path: Path) -> None:
+    path = tmp_path / "route"
+    route = Route(path)
+    assert route.look() is None
+    write(path, "127.0.0.1:7401\n", 1)
+    assert route.look() == HERE
+    with path.open("r+") as file:  # the same file, with the same size and time
+        file.write("127.0.0.1:7499\n")
+    os.utime(path, ns=(1, 1))
+    assert route.look() == HERE, "it is not read again"
+    write(path, "10.1.2.3:7400", 2)
+    assert route.look() == THERE
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        *(lambda path, text=text: path.write_bytes(text) for text in (b"\x00\xff", b"name:7400")),
+        os.mkfifo,
+        os.mkdir,
+        lambda path: path.symlink_to("/dev/zero"),
+        lambda path: None,
+    ],
+)
+def test_what_is_no_route_changes_nothing(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    path = tmp_path / "route"
+    write(path, "127.0.0.1:7401\n", 1)
+    route = Route(path)
+    route.look()
+    path.unlink()
+    make(path)
+    assert [route.look(), route.look()] == [HERE, HERE]
+
+
+def test_a_peer_follows_its_route_twice_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "route"
+    peer = Peer.bind(("127.0.0.1", 0), Route(path))
+    with peer.socket, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there:
+        there.bind(("127.0.0.1", 0))
+        there.settimeout(5)
+        peer.follow(0)
+        peer.send([b"to nobody"])
+        write(path, f"127.0.0.1:{there.getsockname()[1]}\n", 1)
+        peer.follow(ROUTE_PERIOD_NS - 1)
+        assert peer.address is None
+        peer.follow(ROUTE_PERIOD_NS)
+        peer.send([b"hello"])
+        assert there.recv(100) == b"hello"
+
+
+@pytest.mark.parametrize("size", [DATAGRAM_MAX, DATAGRAM_MAX + 1, 60_000])
+def test_an_oversized_datagram_is_cut_to_what_no_end_takes(size: int) -> None:
+    world, cloud = pair()
+    peer = Peer.bind(("127.0.0.1", 0), ("127.0.0.1", 9))
+    with closing(peer.socket), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.sendto(cloud.seal(Kind.COMMAND, b"").ljust(size, b"x"), peer.socket.getsockname())
+        (received,) = peer.receive()
+    assert len(received) == min(size, DATAGRAM_MAX + 1)
+    with pytest.raises(DecodeError, match=r"^malformed$"):
+        world.open(received)
+
+
+@pytest.mark.parametrize(("listen", "other"), [("::1", "::1"), ("::", "::1"), ("::", "127.0.0.1")])
+def test_ends_meet_over_ipv6_and_at_both_families(listen: str, other: str) -> None:
+    far = Peer.bind((other, 0), ("127.0.0.1", 9))
+    own = Peer.bind((listen, 0), far.socket.getsockname()[:2])
+    far.address = (other, own.socket.getsockname()[1])
+    with closing(own.socket), closing(far.socket):
+        own.send([b"there"])
+        far.send([b"back"])
+        assert (far.receive(), own.receive()) == ([b"there"], [b"back"])
+
+
+class Late:
+    """An end with a given lateness at each wake [ns]."""
+
+    sealed = True
+
+    def __init__(self, *late_ns: int) -> None:
+        self._late_ns = list(late_ns)
+        self.wakes: list[int] = []
+        self._heard: list[int] = []
+
+    def next_deadline_ns(self) -> int:
+        return time.monotonic_ns() - self._late_ns[0]
+
+    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+        self._heard.append(now_ns)
+
+    def handle_deadline(self, now_ns: int) -> None:
+        assert set(self._heard) <= {now_ns}
+        self.wakes.append(len(self._heard))
+        self._heard.clear()
+        self._late_ns.pop(0)
+
+    def take_datagrams(self) -> list[bytes]:
+        return []
+
+    take_records = take_datagrams
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "arrive", "wakes"),
+    [
+        ((0, 0), 0, [DRAIN_MAX, MANY - DRAIN_MAX]),
+        ((LONG_NS, 0), 0, [MANY, 0]),
+        ((0, LONG_NS), 0, [DRAIN_MAX, MANY - DRAIN_MAX]),
+        # A stall that follows a late wake, as on a busy processor:
+        ((LONG_NS, STALL_AGAIN_NS + MS, 0), 1, [0, MANY, 0]),
+        ((LONG_NS, STALL_AGAIN_NS - 100 * MS, 0), 1, [0, DRAIN_MAX, MANY - DRAIN_MAX]),
+    ],
+)
+def test_what_waited_through_a_stall_is_taken_in_one_wake(
+    late_ns: tuple[int, ...], arrive: int, wakes: list[int]
+) -> None:
+    with bind(("127.0.0.1", 0)) as udp, socket.socket(type=socket.SOCK_DGRAM) as sender:
+        end, sent = Late(*late_ns), []
+
+        def over() -> bool:
+            if len(end.wakes) == arrive and not sent:
+                sent.extend(sender.sendto(b"waits", udp.getsockname()) for _ in range(MANY))
+            return len(end.wakes) == len(wakes)
+
+        serve(end, Peer(udp, None), end="world", sink=list, stop=over)
+        assert end.wakes == wakes
+
+
+class Flooded(Peer):
+    """More datagrams wait than one wake takes."""
+
+    def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
+        return [b"flood"] * most
+
+
+def test_a_flood_that_is_too_much_does_not_keep_the_loop_in_it() -> None:
+    with bind(("127.0.0.1", 0)) as udp, socket.socket(type=socket.SOCK_DGRAM) as sender:
+        sender.sendto(b"waits", udp.getsockname())
+        end = Late(LONG_NS, LONG_NS, LONG_NS, LONG_NS)
+        serve(end, Flooded(udp, None), end="world", sink=list, stop=lambda: len(end.wakes) == 4)
+        assert end.wakes == [BACKLOG_MAX, DRAIN_MAX, BACKLOG_MAX, DRAIN_MAX]
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+def test_an_end_without_keys_gets_no_socket_and_strangers_no_answer(sealed: bool) -> None:
+    keys = ring() if sealed else None
+    assert make_session(Direction.UPLINK, keys).sealed is sealed
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        other.settimeout(0.06)
+        peer, asked = Peer.bind(("127.0.0.1", 0), other.getsockname()), iter([False] * 3)
+        with closing(peer.socket):
+            world, stop = bare_world(ring=keys), lambda: next(asked, True)
+            if sealed:
+                serve(world, peer, end="world", sink=list, stop=stop)
+            else:
+                with pytest.raises(ValueError, match="world has no key; a process must seal"):
+                    serve(world, peer, end="world", sink=list, stop=stop)
+        with pytest.raises(TimeoutError):
+            other.recv(2048)
+
+
+def calls(name: str) -> set[str]:
+    """Find the package's files that use a name."""
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            named = getattr(node, "id", None) or getattr(node, "attr", None)
+            if named == name or (isinstance(node, ast.alias) and node.name == name):
+                found.add(path.relative_to(PACKAGE).as_posix())
+    return found
+
+
+def test_only_what_checks_the_seal_sends_what_an_end_says() -> None:
+    """Each caller of `take_datagrams` has no socket or checks for the seal."""
+    takers = {name for name in calls("take_datagrams") if not name.startswith("faults/")}
+    assert takers == {"drivers/realtime.py", "drivers/virtual.py"}
+    assert "drivers/virtual.py" not in calls("socket")
+    assert calls("UnsealedSession") == {"tunnel/session.py", "cli/bench.py"}
+    assert calls("make_session") == {"world/endpoint.py", "cloud/endpoint.py"}
