@@ -64,8 +64,8 @@ def _draw_tracking(axes: Axes, subject: Subject) -> None:
 def _draw_accuracy(axes: Axes, subject: Subject) -> None:
     panel(axes, "b")
     applied = subject.flight.applied
-    error = applied.predicted - subject.flight.true_position(applied.stamp_ns)
-    time = subject.flight.seconds(applied.stamp_ns)
+    error = applied["position"] - subject.flight.true_position(applied["stamp_ns"])
+    time = subject.flight.seconds(applied["stamp_ns"])
     distance = np.linalg.norm(error, axis=1) * 1e3
     axes.plot(time, distance, ".", ms=2.0, mew=0, color=SKY, rasterized=True)
     axes.plot([], [], "o", ms=3.5, mew=0, color=SKY, label="each command")
