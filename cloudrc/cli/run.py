@@ -443,6 +443,6 @@ def main_numbers(report: Mapping[str, Any]) -> str:
 
 def _cells(name: str, entry: Mapping[str, Any]) -> tuple[str, str]:
     from cloudrc.metrics import Number
-    from cloudrc.report.numbers import readable
+    from cloudrc.report.page import readable
 
     return readable(name, Number(entry["value"], entry["unit"], ""))

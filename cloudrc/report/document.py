@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -13,19 +13,12 @@ from typing import Any
 
 from cloudrc.config.load import ResolvedExperiment, fingerprint
 from cloudrc.files import write_atomically
-from cloudrc.metrics import Number
+from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.verdict import Failure, Verdict
 
 SCHEMA_VERSION = 1
 PACKAGES = (
-    "cloudrc",
-    "mujoco",
-    "numpy",
-    "pydantic",
-    "pyyaml",
-    "cryptography",
-    "mcap",
-    "rosbags",
+    *("cloudrc", "mujoco", "numpy", "pydantic", "pyyaml", "cryptography", "mcap", "rosbags"),
     "matplotlib",
 )
 """Packages whose version can change the results of a run or its report."""
@@ -51,55 +44,54 @@ class Run:
     notes: tuple[str, ...] = ()
 
 
-def report_document(
-    run: Run,
-    experiment: ResolvedExperiment,
-    verdict: Verdict,
-    numbers: Mapping[str, Number],
-    notes: Sequence[str],
-    *,
-    clock_offset: Mapping[str, Any] | None,
-    complete: bool,
-    operator: Verdict | None = None,
-) -> dict[str, Any]:
-    """Build report.json.
+@dataclass(frozen=True)
+class Assessment:
+    """A run, measured and judged.
 
-    Args:
+    Attributes:
         run: Facts about the run that are not in its recording.
         experiment: The experiment.
-        verdict: The verdict on the run.
+        flight: The recorded flight.
         numbers: Measured numbers, without unknown numbers.
-        notes: Notes for the reader, a sentence each.
-        clock_offset: Document by `clock_offset_document`.
-        complete: False if the recording is torn.
+        verdict: The verdict on the run.
         operator: The operator's verdict if it differs from `verdict`, else None.
+        notes: Notes for the reader, a sentence each.
     """
-    document = {
-        "schemaVersion": SCHEMA_VERSION,
-        "verdict": verdict.outcome,
-        "failures": [_failure_document(failure) for failure in verdict.failures],
-        "operator_verdict": None if operator is None else _verdict_document(operator),
-        "experiment": experiment.name,
-        "config_sha256": fingerprint(experiment),
-        "mode": run.mode,
-        "seed": experiment.seed,
-        "shaper": run.shaper,
-        "records_sha256": run.records_sha256,
-        "numbers": {
-            name: {"value": number.value, "unit": number.unit} for name, number in numbers.items()
-        },
-        "clock_offset": clock_offset,
-        "complete": complete,
-        "notes": list(notes),
-    }
-    return _known(document)
+
+    run: Run
+    experiment: ResolvedExperiment
+    flight: Flight
+    numbers: dict[str, Number]
+    verdict: Verdict
+    operator: Verdict | None
+    notes: tuple[str, ...]
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """Content of report.json."""
+        recording, numbers = self.flight.recording, self.numbers.items()
+        values = {name: {"value": number.value, "unit": number.unit} for name, number in numbers}
+        return _known(
+            {
+                "schemaVersion": SCHEMA_VERSION,
+                **_verdict_document(self.verdict),
+                "operator_verdict": self.operator and _verdict_document(self.operator),
+                "experiment": self.experiment.name,
+                "config_sha256": fingerprint(self.experiment),
+                "mode": self.run.mode,
+                "seed": self.experiment.seed,
+                "shaper": self.run.shaper,
+                "records_sha256": self.run.records_sha256,
+                "numbers": values,
+                "clock_offset": clock_offset_document(recording.metadata),
+                "complete": recording.complete,
+                "notes": list(self.notes),
+            }
+        )
 
 
 def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
-    """Describe how cloud's stamps were shifted to world's clock.
-
-    Args:
-        metadata: Metadata of the recording.
+    """Describe how cloud's stamps were shifted to world's clock, by a recording's metadata.
 
     Returns:
         The method and, if known, the uncertainty; None if both ends share a clock.
@@ -114,15 +106,31 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
 
 def environment_document() -> dict[str, Any]:
     """Describe the software and hardware that made the report, without user or host names."""
+    packages = {}
+    for name in PACKAGES:
+        try:
+            packages[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
     return {
         "schemaVersion": SCHEMA_VERSION,
         "python": platform.python_version(),
-        "packages": {name: version for name in PACKAGES if (version := _version(name))},
+        "packages": packages,
         "system": f"{platform.system()} {platform.release()}",
         "architecture": platform.machine(),
         "processor": _processor(),
         "cores": os.cpu_count(),
     }
+
+
+def _processor() -> str:
+    """Read the processor's model from /proc/cpuinfo; if that fails, ask Python."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(models, platform.processor())
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
@@ -144,20 +152,3 @@ def _failure_document(failure: Failure) -> dict[str, Any]:
 def _known(entries: dict[str, Any]) -> dict[str, Any]:
     """Remove entries that are None: an unknown value is absent, never zero or null."""
     return {name: value for name, value in entries.items() if value is not None}
-
-
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def _processor() -> str:
-    """Read the processor's model from /proc/cpuinfo; if that fails, ask Python."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
-    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(models, platform.processor())
