@@ -23,24 +23,23 @@ examples:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument(
-        "what", nargs="?", choices=KINDS, metavar="WHAT", help=f"one of {', '.join(KINDS)}"
-    )
+    about = f"one of {', '.join(KINDS)}"
+    parser.add_argument("what", nargs="?", choices=KINDS, metavar="WHAT", help=about)
     output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Print the requested kinds."""
-    kinds = [options.what] if options.what else list(KINDS)
-    found = {kind: describe_all(kind) for kind in kinds}
-    if options.output != "table":
-        entries = {
-            kind: [{"name": name, "description": text} for name, text in lines.items()]
-            for kind, lines in found.items()
-        }
-        print(format_document({"schemaVersion": 1, **entries}, options.output))
+    found = {kind: describe_all(kind) for kind in ([options.what] if options.what else KINDS)}
+    if options.output == "table":
+        blocks = (f"{paint(kind, 'bold')}\n{_block(lines)}" for kind, lines in found.items())
+        print("\n\n".join(blocks))
         return 0
-    print("\n\n".join(f"{paint(kind, 'bold')}\n{_block(lines)}" for kind, lines in found.items()))
+    entries = {
+        kind: [{"name": name, "description": text} for name, text in lines.items()]
+        for kind, lines in found.items()
+    }
+    print(format_document({"schemaVersion": 1, **entries}, options.output))
     return 0
 
 
@@ -56,12 +55,11 @@ def describe_all(kind: str) -> dict[str, str]:
     """Return name -> description for all entries of a kind, sorted by name."""
     from cloudrc import plugins
     from cloudrc.config import shipped
+    from cloudrc.metrics import SHIPPED
 
     if kind in PLUGINS:
         lines = {name: plugins.describe(kind, name) for name in plugins.names(kind)}
         if kind == "metrics":
-            from cloudrc.metrics import SHIPPED
-
             lines |= {metric.name: metric.meaning for metric in SHIPPED.values()}
     else:
         one = kind.removesuffix("s")

@@ -15,16 +15,15 @@ from typing import TYPE_CHECKING, TextIO
 if TYPE_CHECKING:
     from rich.console import Console
 
-FORMATS = ("table", "json", "yaml")
 UNLIMITED = 10_000
 """Width of output that is not for a terminal [columns]."""
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
 
 
-def output_argument(parser: argparse.ArgumentParser, what: str = "") -> None:
+def output_argument(parser: argparse.ArgumentParser, what: str = "output format") -> None:
     """Declare `--output`; `what` describes further effects of the format."""
-    text = f"{what} (default: table)" if what else "output format (default: table)"
-    parser.add_argument("-o", "--output", choices=FORMATS, default="table", help=text)
+    forms, about = ("table", "json", "yaml"), f"{what} (default: table)"
+    parser.add_argument("-o", "--output", choices=forms, default="table", help=about)
 
 
 def format_document(document: object, form: str) -> str:
@@ -41,14 +40,6 @@ def is_live(stream: TextIO) -> bool:
     """Return whether a stream is a terminal that can rewrite a line in place."""
     dull = os.environ.get("TERM", "") in ("", "dumb") or bool(os.environ.get("CI"))
     return stream.isatty() and not dull
-
-
-def terminal_columns(stream: TextIO) -> int:
-    """Return the width of a stream's terminal in columns; 80 if it is unknown."""
-    try:
-        return os.get_terminal_size(stream.fileno()).columns or 80
-    except (OSError, ValueError):
-        return 80
 
 
 @contextlib.contextmanager
@@ -94,7 +85,7 @@ def console(stream: TextIO) -> Console:
         file=stream,
         force_terminal=live,
         color_system="standard" if live else None,
-        width=terminal_columns(stream) if live else UNLIMITED,
+        width=None if live else UNLIMITED,
         highlight=False,
         markup=False,
         emoji=False,
@@ -102,14 +93,9 @@ def console(stream: TextIO) -> Console:
 
 
 def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """Align rows in columns, one line per row.
+    """Align rows of equal length in columns, one line per row without trailing blanks.
 
-    Args:
-        rows: Cells; this function escapes them. All rows have the same length.
-        right: Indices of the columns to align right.
-
-    Returns:
-        Lines without trailing blanks, joined by newlines.
+    The cells are escaped. The columns with an index in `right` are aligned right.
     """
     from rich.table import Table
     from rich.text import Text

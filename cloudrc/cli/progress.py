@@ -62,7 +62,10 @@ class FlightView:
         for record in records:
             match record:
                 case TelemetrySent():
-                    self._see_telemetry(record)
+                    if self._first_ns == NEVER_NS:
+                        self._first_ns, self._began = record.stamp_ns, self._clock()
+                    self._now_ns = record.stamp_ns
+                    self._position = record.telemetry.odometry.position
                 case Control():
                     # The horizon is 0 and meaningless before the first round trip.
                     self._delay = math.nan if math.isnan(record.rtt) else record.horizon
@@ -85,29 +88,17 @@ class FlightView:
             # Leave one column free: some terminals wrap after the last one.
             self._status.update(self.line(self._console.width - 1), refresh=True)
 
-    def _see_telemetry(self, record: TelemetrySent) -> None:
-        if self._first_ns == NEVER_NS:
-            self._first_ns, self._began = record.stamp_ns, self._clock()
-        self._now_ns = record.stamp_ns
-        self._position = record.telemetry.odometry.position
-
-    @property
-    def flown(self) -> float:
-        """Return the time since the first telemetry, on world's clock [s]."""
-        return (self._now_ns - self._first_ns) * 1e-9
-
     def line(self, width: int = 80) -> Text:
         """Return the status line, at most `width` columns wide."""
-        elapsed = self._clock() - self._began
-        moving = elapsed > 0 and self.flown > 0
+        elapsed, flown = self._clock() - self._began, (self._now_ns - self._first_ns) * 1e-9
         number = self._waypoint + 1
         cells = {
-            "time": f"{self.flown:6.1f} s",
+            "time": f"{flown:6.1f} s",
             "waypoint": f"waypoint {number}/{self._waypoints}" if number else "",
             "position": self._position_text(),
             "delay": self._delay_text(),
             "guard": f"{self._guard.name:<6}",
-            "factor": f"x{self.flown / elapsed:.2f}" if moving else "",
+            "factor": f"x{flown / elapsed:.2f}" if elapsed > 0 and flown > 0 else "",
         }
         for name in DROPPED:
             if len(_joined(cells.values())) > width:
@@ -118,7 +109,6 @@ class FlightView:
         return line
 
     def _position_text(self) -> str:
-        """Return the robot's position as text [m]."""
         # Round first, then add 0.0: that turns a negative zero into a positive one.
         x, y, z = (round(coordinate, 2) + 0.0 for coordinate in self._position)
         return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
@@ -130,9 +120,9 @@ class FlightView:
         """Write the line of an event, with position and delay if there is room."""
         text = escape(text)
         width = self._console.width if self._status else FILE_COLUMNS
-        delays = (self._delay_text(), "")
-        lines = [_joined((f"  {text:<44}", self._position_text(), delay)) for delay in delays]
-        line = next((line for line in lines if len(line) <= width), f"  {text}")
+        cells = [f"  {text:<44}", self._position_text(), self._delay_text()]
+        lines = [_joined(cells), _joined(cells[:2]), f"  {text}"]
+        line = next((line for line in lines if len(line) <= width), lines[-1])
         if self._status and len(line) > width:
             line = textwrap.fill(line, width, subsequent_indent="    ", break_on_hyphens=False)
         self._console.print(Text(line), soft_wrap=True)

@@ -1,15 +1,30 @@
-"""`cloudrc report RUN`: rewrite the report of a recorded run."""
+"""`cloudrc report RUN`: rewrite the report of a recorded run; print reports."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import format_document, output_argument
+from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
 from cloudrc.errors import BadInputError
 
+COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
+MAIN = {
+    "duration": "mission took",
+    "contact_time": "arm touches the board at",
+    "tip_speed": "with the tip at",
+    "steady_contact_force": "and then presses with",
+    "min_clearance": "least clearance in the pipes",
+    "rtt_mean": "round trip, mean",
+    "prediction_error_rms": "prediction error, RMS",
+    "hold_count": "times in HOLD",
+    "real_time_factor": "real-time factor",
+}
+"""The most important numbers and their labels; report.html and report.json have all numbers."""
 EPILOG = """\
 examples:
   cloudrc report runs/latest
@@ -37,7 +52,6 @@ def execute(options: argparse.Namespace) -> int:
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
-    from cloudrc.cli.run import exit_code, show
     from cloudrc.report.folder import read_run
     from cloudrc.report.write import write_report
 
@@ -52,3 +66,44 @@ def execute(options: argparse.Namespace) -> int:
     else:
         show(document, options.run)
     return exit_code(document)
+
+
+def exit_code(report: Mapping[str, Any]) -> int:
+    """Return the exit code of a report's verdict."""
+    from cloudrc.metrics.verdict import EXIT_CODES
+
+    return EXIT_CODES[report["verdict"]]
+
+
+def show(report: Mapping[str, Any], folder: Path) -> None:
+    """Print the verdict, the main numbers and, on the last line, the report's path."""
+    print(f"\n{verdict(report)}\n\n{main_numbers(report)}")
+    faults = report["numbers"].get("fault_count", {"value": 0})["value"]
+    if faults:
+        print(paint(f"  faults noted in flight: {faults:.0f}, see the report", "yellow"))
+    print()
+    print_line(str(folder / "report.html"))
+
+
+def verdict(report: Mapping[str, Any]) -> str:
+    """Return the verdict with the first failure, then one line for each further failure."""
+    outcome, failures = report["verdict"], report["failures"]
+    first = failures[0]["text"] if failures else "every waypoint reached, every criterion met"
+    lines = [f"{paint(outcome.upper(), COLOURS[outcome])}: {escape(first)}"]
+    for failure in failures[1:]:
+        when = f" (at {failure['time']:.2f} s)" if "time" in failure else ""
+        lines.append(escape(f"  also: {failure['text']}{when}"))
+    return "\n".join(lines)
+
+
+def main_numbers(report: Mapping[str, Any]) -> str:
+    """Lay out the main numbers as a table; leave out unknown numbers."""
+    from cloudrc.metrics import Number
+    from cloudrc.report.page import readable
+
+    numbers = {
+        name: Number(entry["value"], entry["unit"], "") for name, entry in report["numbers"].items()
+    }
+    known = [(name, label) for name, label in MAIN.items() if name in numbers]
+    rows = [(f"  {label}", *readable(name, numbers[name])) for name, label in known]
+    return table(rows, right=[1]) if rows else "  no numbers: nothing was flown"

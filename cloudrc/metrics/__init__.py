@@ -26,17 +26,11 @@ METRIC_NOTE = "metric "
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """One measured number.
+    """One measured number."""
 
-    Attributes:
-        value: Finite value in `unit`.
-        unit: SI unit as text; "1" for counts and shares.
-        meaning: Meaning of the number, one sentence.
-    """
-
-    value: float
-    unit: str
-    meaning: str
+    value: float  # finite
+    unit: str  # SI unit as text; "1" for counts and shares
+    meaning: str  # one sentence
 
 
 def find(choice: str) -> Metric:

@@ -1,8 +1,7 @@
 """Define `Flight`, a recording cut to its mission, and the metrics of the robot's motion.
 
-All stamps are on world's clock. Time zero is the guard's first change to TRACK; the robot does not
-move before. The flight ends with the event that ends the mission or, without such an event, at the
-end of the recording.
+Time zero is the guard's first change to TRACK; the robot does not move before. The flight ends with
+the event that ends the mission or, without such an event, at the end of the recording.
 """
 
 from __future__ import annotations
@@ -34,19 +33,12 @@ CONTROL_TOPICS = (
 
 @dataclass(frozen=True)
 class Flight:
-    """A recorded flight, its criteria and its scene.
+    """A recorded flight, its criteria and its scene."""
 
-    Attributes:
-        recording: All topics; cloud's stamps are shifted to world's clock.
-        criteria: Criteria of success.
-        waypoints: Number of waypoints of the mission.
-        scene: Pipes and board.
-    """
-
-    recording: Recording
+    recording: Recording  # all topics; cloud's stamps are shifted to world's clock
     criteria: Criteria
-    waypoints: int
-    scene: Scene
+    waypoints: int  # number of waypoints of the mission
+    scene: Scene  # pipes and board
 
     @cached_property
     def start_ns(self) -> int | None:
@@ -82,10 +74,7 @@ class Flight:
         return self._within(_columns(self.recording[topic]))
 
     def true_position(self, stamp_ns: Array) -> Array:
-        """Interpolate the true position of the base.
-
-        Args:
-            stamp_ns: Instants [ns], world's clock, shape (n,).
+        """Interpolate the true position of the base at instants [ns], world's clock, shape (n,).
 
         Returns:
             Positions [m], shape (n, 3); NaN outside the recording.
@@ -137,8 +126,6 @@ class Flight:
     @cached_property
     def pipes_flown(self) -> int:
         """Number of different pipes in which the base has been."""
-        if not len(self.truth["stamp_ns"]):
-            return 0
         return int((np.unique(pipe_index(self.scene, self.truth["position"])) >= 0).sum())
 
     @cached_property
@@ -182,14 +169,11 @@ Measure: TypeAlias = Callable[[Flight], float | None]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A metric: its name in report.json, SI unit ("1" for counts and shares), and meaning.
+    """A metric, which `measure` computes in `unit`, or as None if the number is unknown."""
 
-    `measure` computes the number in `unit`; it returns None if the number is unknown.
-    """
-
-    name: str
-    unit: str
-    meaning: str
+    name: str  # in report.json
+    unit: str  # SI unit as text; "1" for counts and shares
+    meaning: str  # one sentence
     measure: Measure
 
 

@@ -39,19 +39,12 @@ Outcome = Literal["success", "failure", "invalid", "interrupted"]
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A criterion of success that is not met.
+    """A criterion of success that is not met."""
 
-    Attributes:
-        code: One word, for programs.
-        text: Description for people.
-        time: Time since the start of the mission [s]; None if the failure has no instant.
-        place: True position of the base at that time [m], shape (3,); None if unknown.
-    """
-
-    code: str
-    text: str
-    time: float | None = None
-    place: Vector | None = None
+    code: str  # one word, for programs
+    text: str  # for people
+    time: float | None = None  # since the start of the mission [s]; None without an instant
+    place: Vector | None = None  # true position of the base at that time [m]; None if unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +62,7 @@ class Verdict:
 
 
 class Moment(NamedTuple):
-    """When [s since the mission's start] and where [m] something happened, as in `Failure`."""
+    """When and where something happened, as in `Failure`."""
 
     time: float | None = None
     place: Vector | None = None
@@ -87,31 +80,18 @@ class Ending(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What is known of a mission that is over.
-
-    Attributes:
-        waypoints: Number of waypoints of the mission.
-        reached: Number of waypoints reached.
-        contact: Whether the arm's tip has to touch the board.
-        contact_speed_max: Limit of the speed at the touch [m/s].
-        ending: How the mission ended, as code and text: "done" or a failure.
-        end: End of the flight.
-        time_limit: Limit of the time of `end` [s].
-        touch: Speed of the first touch of the board [m/s] and its moment; None without a touch.
-        violations: Other events that must not happen.
-        slow: Why the run did not keep real time; "" if it kept real time or did not have to.
-    """
+    """What is known of a mission that is over."""
 
     waypoints: int
-    reached: int
-    contact: bool
-    contact_speed_max: float
+    reached: int  # number of waypoints reached
+    contact: bool  # whether the arm's tip has to touch the board
+    contact_speed_max: float  # limit of the speed at the touch [m/s]
     ending: Ending
     end: Moment = UNKNOWN
-    time_limit: float = inf
-    touch: tuple[float, Moment] | None = None
-    violations: tuple[Failure, ...] = ()
-    slow: str = ""
+    time_limit: float = inf  # limit of the time of `end` [s]
+    touch: tuple[float, Moment] | None = None  # speed of the first touch of the board [m/s]
+    violations: tuple[Failure, ...] = ()  # other events that must not happen
+    slow: str = ""  # why the run did not keep real time; "" if it did or did not have to
 
 
 def judge(evidence: Evidence) -> Verdict:
@@ -162,7 +142,7 @@ def _too_slow(factor: float) -> str:
 def flight_evidence(
     flight: Flight, numbers: Mapping[str, Number], *, real_time: bool, interrupted: bool
 ) -> Evidence:
-    """Take the evidence from the recorded truth of a flight.
+    """Take the evidence from the recorded truth of a flight, and from its numbers.
 
     Args:
         flight: The recorded flight.
@@ -170,8 +150,11 @@ def flight_evidence(
         real_time: True if the run had to keep real time: any mode except virtual.
         interrupted: True if the run was stopped, or if its recording is torn.
     """
-    criteria, end_ns, touch = flight.criteria, flight.end_ns, first_touch(flight)
-    reached = numbers.get("waypoints_reached")
+    criteria, end_ns = flight.criteria, flight.end_ns
+    reached, touch = numbers.get("waypoints_reached"), None
+    if row := first_touch(flight):
+        speed = float(np.linalg.norm(row["tip_velocity"]))
+        touch = speed, _moment(flight, int(row["stamp_ns"]))
     return Evidence(
         waypoints=flight.waypoints,
         reached=0 if reached is None else round(reached.value),
@@ -180,7 +163,7 @@ def flight_evidence(
         ending=_ending(flight, interrupted),
         end=UNKNOWN if end_ns is None else _moment(flight, end_ns),
         time_limit=criteria.time_limit_s,
-        touch=None if touch is None else _touch(flight, touch),
+        touch=touch,
         violations=(*_pipes(flight), *_interventions(flight), *_restarts(flight)),
         slow=_not_real_time(numbers) if real_time else "",
     )
@@ -203,11 +186,6 @@ def _moment(flight: Flight, stamp_ns: int) -> Moment:
     x, y, z = flight.true_position(np.array([stamp_ns]))[0]
     place = (float(x), float(y), float(z)) if np.isfinite((x, y, z)).all() else None
     return Moment(float(flight.seconds(stamp_ns)), place)
-
-
-def _touch(flight: Flight, touch: Mapping[str, Any]) -> tuple[float, Moment]:
-    speed = float(np.linalg.norm(touch["tip_velocity"]))
-    return speed, _moment(flight, int(touch["stamp_ns"]))
 
 
 def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
@@ -276,11 +254,10 @@ def _why_grounded(flight: Flight) -> str:
 
 
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
-    """Judge a recorded mission in the way in which the operator judges at the end of the mission.
+    """Judge a recorded mission as the operator does at its end, with the report's `evidence`.
 
     The operator knows only the contacts in telemetry that has arrived by the end of the mission,
-    not the time limit of the report, and of the timing only the real-time factor. The arguments are
-    as in `flight_evidence`, and its result.
+    not the time limit of the report, and of the timing only the real-time factor.
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0
@@ -301,24 +278,14 @@ AWAY = -1
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Contacts and slip during a mission, as telemetry shows them.
+    """Contacts and slip during a mission, as telemetry shows them."""
 
-    Attributes:
-        pipe_contacts: Last count of contacts in telemetry.
-        pipe_touches: Number of contacts since the mission began.
-        touch_before: Speed of an earlier mission's touch in telemetry [m/s]; None without one.
-        touch_speed: Speed of this mission's touch [m/s]; None if the board was not touched.
-        slip_began_ns: World's slip when the mission began, plus the slip during a restart of teleop
-            [ns]: slip that does not count.
-        slip_ns: World's slip in the last telemetry [ns]; AWAY after a restart of teleop.
-    """
-
-    pipe_contacts: int = 0
-    pipe_touches: int = 0
-    touch_before: float | None = None
-    touch_speed: float | None = None
-    slip_began_ns: int = 0
-    slip_ns: int = 0
+    pipe_contacts: int = 0  # last count in telemetry
+    pipe_touches: int = 0  # contacts since the mission began
+    touch_before: float | None = None  # speed of an earlier mission's touch [m/s]
+    touch_speed: float | None = None  # speed of this mission's touch of the board [m/s]
+    slip_began_ns: int = 0  # slip before the mission and during a restart of teleop: not counted
+    slip_ns: int = 0  # world's slip in the last telemetry; AWAY after a restart of teleop
 
     @classmethod
     def begin(cls, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
@@ -330,8 +297,7 @@ class Observations:
 
         Args:
             pipe_contacts: Number of contacts with pipes since the robot was reset.
-            touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before the
-                touch.
+            touch_speed: Speed at which the tip touched the board [m/s]; NaN before the touch.
             slip_ns: Lag of world's clock behind its machine's clock [ns].
         """
         touch = finite_or_none(touch_speed)
@@ -362,10 +328,7 @@ class Observations:
             yield "board_touched", text
 
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
-        """Return the evidence of a mission that ended after `elapsed` [s].
-
-        `known` are the other attributes of the evidence.
-        """
+        """Return the evidence of a mission that ended after `elapsed` [s]."""
         slipped = (self.slip_ns - self.slip_began_ns) * 1e-9
         return Evidence(
             ending=ending,

@@ -14,7 +14,7 @@ from typing import Any
 from cloudrc.config.load import ResolvedExperiment, fingerprint
 from cloudrc.files import write_atomically
 from cloudrc.metrics import Flight, Number
-from cloudrc.metrics.verdict import Failure, Verdict
+from cloudrc.metrics.verdict import Verdict
 
 SCHEMA_VERSION = 1
 PACKAGES = (
@@ -28,43 +28,28 @@ PACKAGES = (
 class Run:
     """Facts about a run that are not in its recording.
 
-    Attributes:
-        mode: "virtual", "local" or "cluster".
-        shaper: What emulated the link: "virtual", "relay" or "netem".
-        records_sha256: Hash by `record.hash`: of all records in virtual time, of all messages in
-            real time. None if the recording is incomplete.
-        interrupted: True if the run was stopped.
-        notes: Notes for the reader, a sentence each.
+    The hash by `record.hash` is of all records in virtual time, of all messages in real time, and
+    None if the recording is incomplete.
     """
 
-    mode: str
-    shaper: str
+    mode: str  # "virtual", "local" or "cluster"
+    shaper: str  # what emulated the link: "virtual", "relay" or "netem"
     records_sha256: str | None = None
-    interrupted: bool = False
-    notes: tuple[str, ...] = ()
+    interrupted: bool = False  # whether the run was stopped
+    notes: tuple[str, ...] = ()  # for the reader, a sentence each
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """A run, measured and judged.
-
-    Attributes:
-        run: Facts about the run that are not in its recording.
-        experiment: The experiment.
-        flight: The recorded flight.
-        numbers: Measured numbers, without unknown numbers.
-        verdict: The verdict on the run.
-        operator: The operator's verdict if it differs from `verdict`, else None.
-        notes: Notes for the reader, a sentence each.
-    """
+    """A run, measured and judged."""
 
     run: Run
     experiment: ResolvedExperiment
     flight: Flight
-    numbers: dict[str, Number]
+    numbers: dict[str, Number]  # without unknown numbers
     verdict: Verdict
-    operator: Verdict | None
-    notes: tuple[str, ...]
+    operator: Verdict | None  # the operator's verdict if it differs
+    notes: tuple[str, ...]  # for the reader, a sentence each
 
     @property
     def document(self) -> dict[str, Any]:
@@ -91,11 +76,7 @@ class Assessment:
 
 
 def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
-    """Describe how cloud's stamps were shifted to world's clock, by a recording's metadata.
-
-    Returns:
-        The method and, if known, the uncertainty; None if both ends share a clock.
-    """
+    """Describe how cloud's stamps were shifted, by a recording's metadata; None if not at all."""
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
         return None
@@ -140,13 +121,11 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def _verdict_document(verdict: Verdict) -> dict[str, Any]:
-    failures = [_failure_document(failure) for failure in verdict.failures]
+    failures = [
+        _known({**asdict(failure), "place": failure.place and list(failure.place)})
+        for failure in verdict.failures
+    ]
     return {"verdict": verdict.outcome, "failures": failures}
-
-
-def _failure_document(failure: Failure) -> dict[str, Any]:
-    place = None if failure.place is None else list(failure.place)
-    return _known({**asdict(failure), "place": place})
 
 
 def _known(entries: dict[str, Any]) -> dict[str, Any]:

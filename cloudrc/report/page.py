@@ -118,13 +118,7 @@ SENTENCES = (_waypoints, _pipes, _contact, _link, _guard)
 def render(
     assessment: Assessment, pictures: Sequence[Picture], environment: Mapping[str, Any]
 ) -> str:
-    """Fill in the page.
-
-    Args:
-        assessment: The run, measured and judged.
-        pictures: Figures in the order of the page.
-        environment: Content of environment.json.
-    """
+    """Fill in the page; `environment` is the content of environment.json."""
     run, experiment, verdict = assessment.run, assessment.experiment, assessment.verdict
     headline, accent = HEADLINES[verdict.outcome]
     digest = run.records_sha256

@@ -28,24 +28,16 @@ def assess(
 ) -> Assessment:
     """Measure and judge a run without writing files or drawing figures.
 
-    Args:
-        recording: Recording of both ends, on world's clock.
-        experiment: The experiment. Metric files named in the experiment are not executed, because
-            the experiment may come from somebody else.
-        run: Facts about the run that are not in its recording.
-        own: The user's own metrics, names or paths; files are executed.
+    `own` are the user's own metrics, names or paths; files are executed. Metric files named in the
+    experiment are not executed, because the experiment may come from somebody else.
     """
     mission = experiment.mission
     waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
     scene = load_scene(experiment.world.scene)
     flight = Flight(recording, experiment.criteria, waypoints, scene)
     numbers, metric_notes = measure_all(flight, own)
-    evidence = flight_evidence(
-        flight,
-        numbers,
-        real_time=run.mode != "virtual",
-        interrupted=run.interrupted or not recording.complete,
-    )
+    real_time, stopped = run.mode != "virtual", run.interrupted or not recording.complete
+    evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)
     verdict, operator = judge(evidence), None
     notes = list(run.notes)
     if not recording.complete:

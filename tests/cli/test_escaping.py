@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.cli import run
+from cloudrc.cli import report
 from cloudrc.cli.link_verify_report import as_text, make_report
 from cloudrc.cli.main import main
 from cloudrc.cli.output import print_line, table
@@ -85,8 +85,8 @@ def test_the_description_of_a_profile(here: Path, printed: Printing) -> None:
 
 def test_the_failures_of_a_run(printed: Printing) -> None:
     failures = [{"code": "x", "text": EVIL}] * 2
-    report = {"verdict": "failure", "failures": failures, "numbers": {}}
-    run.show(report, Path(EVIL))
+    found = {"verdict": "failure", "failures": failures, "numbers": {}}
+    report.show(found, Path(EVIL))
     assert printed().count(SHOWN) == 3
 
 

@@ -28,21 +28,13 @@ NAMES = tuple(FIGURES)
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A drawn figure.
+    """A drawn figure."""
 
-    Attributes:
-        name: File name without suffix.
-        png: Content of the PNG file, 200 dpi.
-        svg: Content of the SVG file.
-        caption: Caption, as in a paper.
-        alt: Description for readers who cannot see the figure.
-    """
-
-    name: str
+    name: str  # of its files, without suffix
     png: bytes
     svg: bytes
-    caption: str
-    alt: str
+    caption: str  # as in a paper
+    alt: str  # for readers who cannot see the figure
 
 
 def draw_all(subject: Subject) -> list[Picture]:

@@ -29,21 +29,13 @@ DOTS = 6000
 
 @dataclass(frozen=True, slots=True)
 class DirectionSample:
-    """One direction of a link: its profile, n packets over time, and m packets for statistics.
+    """One direction of a link: its profile, n packets over time, and m packets for statistics."""
 
-    Attributes:
-        asked: The link profile of this direction.
-        sent: When each packet was sent, since the start of the link [s], shape (n,).
-        delays: One-way delays, NaN for lost packets [s], shape (n,).
-        many: One-way delays for the distribution, NaN for lost packets [s], shape (m,).
-        runs: Lengths of the runs of losses among the m packets.
-    """
-
-    asked: Direction
-    sent: Array
-    delays: Array
-    many: Array
-    runs: tuple[int, ...]
+    asked: Direction  # the link profile
+    sent: Array  # when each packet was sent, since the start of the link [s], shape (n,)
+    delays: Array  # one-way delays, NaN for lost packets [s], shape (n,)
+    many: Array  # one-way delays for the distribution, NaN for lost packets [s], shape (m,)
+    runs: tuple[int, ...]  # lengths of the runs of losses among the m packets
 
 
 _LabelledWay: TypeAlias = tuple[DirectionSample, str, str]
@@ -53,13 +45,9 @@ _LabelledWay: TypeAlias = tuple[DirectionSample, str, str]
 def render_link(
     title: str, uplink: DirectionSample, downlink: DirectionSample | None, kind: str
 ) -> bytes:
-    """Draw the figure of a link, as the content of a file.
+    """Draw the figure of a link, as the content of a file: "png", "svg" or "pdf".
 
-    Args:
-        title: Title above the panels.
-        uplink: Direction from world to cloud.
-        downlink: Direction from cloud to world; None for a trace, which has one direction.
-        kind: "png", "svg" or "pdf".
+    `downlink` is None for a trace, which has one direction.
     """
     with matplotlib.rc_context(style.RC):
         return save(_draw(title, uplink, downlink), kind)

@@ -76,21 +76,13 @@ def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """An interval in which a direction has one link profile.
+    """An interval in which a direction has one link profile; times are since the flight's start."""
 
-    Attributes:
-        begin: Begin, as time since the start of the flight [s]; -inf if the span began before.
-        origin: Start of the profile's time line, likewise [s].
-        direction: The link profile of this direction.
-        cause: Cause of the change; "" if the link started with this profile.
-        end: End, likewise [s]; inf if the span lasts to the end of the flight.
-    """
-
-    begin: float
-    origin: float
+    begin: float  # [s]; -inf if the span began before
+    origin: float  # start of the profile's time line [s]
     direction: Direction
-    cause: str
-    end: float = inf
+    cause: str  # cause of the change; "" if the link started with this profile
+    end: float = inf  # [s]; inf if the span lasts to the end of the flight
 
 
 def spans(subject: Subject, *, uplink: bool) -> list[Span]:
@@ -123,16 +115,10 @@ def _changes(subject: Subject, uplink: bool) -> Iterator[Span]:
 
 
 def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
-    """Look up the delays that the link profile sets for a direction.
-
-    Args:
-        subject: The flight.
-        time: Time since the start of the flight [s], shape (n,).
-        uplink: True for the uplink, False for the downlink.
+    """Look up the delays that the link profile sets, at times [s] since the start of the flight.
 
     Returns:
-        Lower and upper bound [s], shape (n,), NaN where a trace no longer exists; None if all
-        values are NaN.
+        Lower and upper bound [s], NaN where a trace no longer exists; None if all values are NaN.
     """
     low, high = np.full(len(time), np.nan), np.full(len(time), np.nan)
     for span in spans(subject, uplink=uplink):
