@@ -6,6 +6,8 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -32,10 +34,12 @@ if TYPE_CHECKING:
     from cloudrc.report.document import Run
     from cloudrc.world.endpoint import WorldEndpoint
 
-Flight = Callable[[Path, TextIO], dict[str, Any]]
-"""Function that flies: (run folder, stream for the progress) -> report."""
+Flight = Callable[[Path], dict[str, Any]]
+"""Function that flies and fills a run folder; it returns the content of report.json."""
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
+Write = Callable[["Recording", "Run"], dict[str, Any]]
+"""Function that writes the report and returns the content of report.json."""
 
 MODES = ("local", "virtual", "cluster")
 EXTRAS = {
@@ -112,27 +116,27 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     seed = [] if options.seed is None else [f"seed={options.seed}"]
     experiment = load_experiment(options.experiment, [*options.set, *seed])
     metrics.check(experiment.report.metrics)
+    in_cluster, for_programs = mode == "cluster", options.output != "table"
+    stream = sys.stderr if for_programs else sys.stdout
     mission = experiment.mission
-    waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
+    count = mission.steps.count if mission.steps else len(mission.waypoints)
     # First prepare the flight: if that fails, no folder must be left.
-    in_cluster = mode == "cluster"
-    flight = _cluster(experiment, options) if in_cluster else _here(experiment, mode, waypoints)
+    flight: Flight = partial(_fly_here, experiment, mode, stream, count)
+    if in_cluster:
+        flight = _cluster_flight(experiment, options, stream)
     # A cluster can fail before anything is recorded; the folder is then removed.
     name = f"{experiment.name}-{mode}-seed{experiment.seed}"
     folder = new_folder(options.out, name, latest=not in_cluster)
-    for_programs = options.output != "table"
-    stream = sys.stderr if for_programs else sys.stdout
     if not for_programs:
+        facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
         with ignore_closed_pipe(stream):
-            print_line(
-                f"{experiment.name}: mode {mode}, seed {experiment.seed}, link"
-                f" {experiment.link.profile}, {waypoints} waypoint{'s' if waypoints != 1 else ''}"
-            )
+            print_line(f"{experiment.name}: {facts}, {count} waypoint{'s' if count != 1 else ''}")
     try:
-        report = flight(folder, stream)
+        report = flight(folder)
     except (CloudrcError, KeyboardInterrupt):
         if not (in_cluster and discard(folder)):
-            print_line(f"the recording is in {folder}", sys.stderr)
+            again = f"'cloudrc report {folder}' writes its report"
+            print_line(f"the recording is in {folder}; {again}", sys.stderr)
         raise
     finally:
         if in_cluster and options.out is None and folder.exists():
@@ -147,24 +151,21 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     return exit_code(report)
 
 
-def _here(experiment: ResolvedExperiment, mode: str, waypoints: int) -> Flight:
-    """Return the function that flies on this machine."""
+def _fly_here(
+    experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int, folder: Path
+) -> dict[str, Any]:
+    """Fly on this machine, and show the progress on a stream."""
+    from cloudrc.cli.progress import FlightView
 
-    def flight(folder: Path, stream: TextIO) -> dict[str, Any]:
-        from cloudrc.cli.progress import FlightView
-
-        if stream is sys.stderr and not is_live(stream):
-            return fly(experiment, mode, folder)
-        view = FlightView(stream, waypoints)
-        try:
-            return fly(experiment, mode, folder, view.see)
-        finally:
-            view.close()
-
-    return flight
+    if stream is sys.stderr and not is_live(stream):
+        return fly(experiment, mode, folder)
+    with closing(FlightView(stream, waypoints)) as view:
+        return fly(experiment, mode, folder, view.see)
 
 
-def _cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> Flight:
+def _cluster_flight(
+    experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
+) -> Flight:
     """Return the function that flies in the cluster that the flags name."""
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files
     from cloudrc.cluster.tools import program
@@ -174,13 +175,10 @@ def _cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> Fli
     for name in ("helm", "kubectl"):
         program(name)
 
-    def flight(folder: Path, stream: TextIO) -> dict[str, Any]:
-        def tell(text: str) -> None:
-            print_line(f"  {text}", stream)
+    def tell(text: str) -> None:
+        print_line(f"  {text}", stream)
 
-        return fly_in_cluster(experiment, folder, release, options.timeout, tell)
-
-    return flight
+    return lambda folder: fly_in_cluster(experiment, folder, release, options.timeout, tell)
 
 
 def _ignore(records: list[Record]) -> None:
@@ -195,12 +193,12 @@ def fly(
     *,
     page: bool = True,
 ) -> dict[str, Any]:
-    """Fly one experiment and fill its run folder.
+    """Fly one experiment in mode "virtual" or "local", and fill its empty run folder.
 
     Args:
         experiment: The experiment, complete and checked.
-        mode: "virtual" or "local".
-        folder: Empty folder; receives configuration, recording and report.
+        mode: Where to fly.
+        folder: Receives configuration, recording and report.
         see: Called with records during the flight: with all in virtual mode, with a selection in
             local mode.
         page: Whether to write the HTML page with figures; the numbers are always written.
@@ -209,15 +207,19 @@ def fly(
         The content of report.json.
 
     Raises:
-        CloudrcError: If the flight broke off. The recording stays, and the report says
-            "interrupted".
+        CloudrcError: If the flight broke off. The recording stays; its report says "interrupted".
     """
     from cloudrc.config.load import dump
+    from cloudrc.report.write import write_report
+
+    def write(recording: Recording, run: Run) -> dict[str, Any]:
+        own = experiment.report.metrics
+        return write_report(folder, recording, experiment, run, own=own, page=page)
 
     fly_mode = _fly_virtual if mode == "virtual" else _fly_local
     try:
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        return fly_mode(experiment, folder, see, page)
+        return fly_mode(experiment, folder, see, write)
     except OSError as error:
         where = error.filename or folder
         raise CloudrcError(
@@ -240,7 +242,7 @@ def assemble(
 
 
 def _fly_virtual(
-    experiment: ResolvedExperiment, folder: Path, see: See, page: bool
+    experiment: ResolvedExperiment, folder: Path, see: See, write: Write
 ) -> dict[str, Any]:
     from cloudrc.record.columns import Recording, merged
     from cloudrc.record.hash import RecordHash
@@ -271,14 +273,14 @@ def _fly_virtual(
             interrupted = True
         run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
         try:
-            return _report(folder, Recording.from_records(*records), experiment, run, page)
+            return write(Recording.from_records(*records), run)
         finally:
             for name, data in attachments(folder).items():
                 writer.attach(name, data)
 
 
 def _fly_local(
-    experiment: ResolvedExperiment, folder: Path, see: See, page: bool
+    experiment: ResolvedExperiment, folder: Path, see: See, write: Write
 ) -> dict[str, Any]:
     from cloudrc.drivers.local import LocalRun
     from cloudrc.record.hash import messages_sha256
@@ -309,13 +311,12 @@ def _fly_local(
     except CloudrcError:
         if not interrupted:
             raise
-        nothing = InterruptedRunError("interrupted before anything was recorded")
-        raise broken or nothing from None
+        raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
     digest = messages_sha256(mission.contents.messages)
     notes = (*local.notes, *([str(broken)] if broken else ()))
     run = Run("local", "relay", digest, interrupted, notes)
     try:
-        document = _report(folder, mission.recording(), experiment, run, page)
+        document = write(mission.recording(), run)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
     if broken is not None:
@@ -333,18 +334,3 @@ def _check_own_models(experiment: ResolvedExperiment) -> None:
         from cloudrc.world.scene import compile_model
 
         compile_model(world.robot, world.scene)
-
-
-def _report(
-    folder: Path, recording: Recording, experiment: ResolvedExperiment, run: Run, page: bool
-) -> dict[str, Any]:
-    from cloudrc.report.write import write_report
-
-    try:
-        own = experiment.report.metrics
-        return write_report(folder, recording, experiment, run, own=own, page=page)
-    except KeyboardInterrupt:
-        raise InterruptedRunError(
-            f"interrupted; the recording is kept but the report is not written: "
-            f"run 'cloudrc report {folder}'"
-        ) from None
