@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import argparse
 import re
-import shutil
-import sys
-import textwrap
 
-from cloudrc.cli.output import format_document, output_argument, paint
+from cloudrc.cli.output import format_document, output_argument, paint, table
 
 PLUGINS = ("estimators", "predictors", "controllers", "metrics")
 YAML = ("experiments", "missions", "profiles")
@@ -32,7 +29,10 @@ def execute(options: argparse.Namespace) -> int:
     """Print the requested kinds."""
     found = {kind: describe_all(kind) for kind in ([options.what] if options.what else KINDS)}
     if options.output == "table":
-        blocks = (f"{paint(kind, 'bold')}\n{_block(lines)}" for kind, lines in found.items())
+        blocks = []
+        for kind, lines in found.items():
+            rows = [(f"  {name}", line) for name, line in lines.items()]
+            blocks.append(f"{paint(kind, 'bold')}\n{table(rows)}")
         print("\n\n".join(blocks))
         return 0
     entries = {
@@ -41,14 +41,6 @@ def execute(options: argparse.Namespace) -> int:
     }
     print(format_document({"schemaVersion": 1, **entries}, options.output))
     return 0
-
-
-def _block(lines: dict[str, str]) -> str:
-    """Lay out names and descriptions; wrap lines only on a terminal."""
-    indent = max(map(len, lines), default=0) + 4
-    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
-    wrap = textwrap.TextWrapper(max(columns, indent + 20), subsequent_indent=" " * indent)
-    return "\n".join(wrap.fill(f"  {name:<{indent - 2}}{line}") for name, line in lines.items())
 
 
 def describe_all(kind: str) -> dict[str, str]:

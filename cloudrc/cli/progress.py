@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 import time
 from collections.abc import Callable, Iterable
 from typing import TextIO
@@ -28,9 +27,7 @@ ENDINGS = ("done", "cancelled", "timed_out")
 REDRAW_PERIOD = 0.1
 """Minimum time between two drawings of the status line [s]."""
 FILE_COLUMNS = 100
-"""Maximum width of an event's line where there is no terminal."""
-DROPPED = ("factor", "delay", "position", "waypoint")
-"""Cells that the status line drops, in this order, until the line fits."""
+"""Maximum width of an event's line with its position."""
 
 
 class FlightView:
@@ -44,7 +41,7 @@ class FlightView:
         Args:
             stream: Where to write; never stdout if that carries JSON or YAML.
             waypoints: Number of the mission's waypoints.
-            clock: Returns the monotonic time [s], for the real-time factor and for redrawing.
+            clock: Returns the monotonic time [s].
         """
         self._waypoints, self._clock = waypoints, clock
         self._console = console(stream)
@@ -85,25 +82,21 @@ class FlightView:
         if self._status and self._clock() - self._drawn >= REDRAW_PERIOD:
             self._drawn = self._clock()
             self._status.start()
-            # Leave one column free: some terminals wrap after the last one.
-            self._status.update(self.line(self._console.width - 1), refresh=True)
+            self._status.update(self.line(), refresh=True)
 
-    def line(self, width: int = 80) -> Text:
-        """Return the status line, at most `width` columns wide."""
+    def line(self) -> Text:
+        """Return the status line; a narrow terminal cuts off its end, the least important part."""
         elapsed, flown = self._clock() - self._began, (self._now_ns - self._first_ns) * 1e-9
         number = self._waypoint + 1
-        cells = {
-            "time": f"{flown:6.1f} s",
-            "waypoint": f"waypoint {number}/{self._waypoints}" if number else "",
-            "position": self._position_text(),
-            "delay": self._delay_text(),
-            "guard": f"{self._guard.name:<6}",
-            "factor": f"x{flown / elapsed:.2f}" if elapsed > 0 and flown > 0 else "",
-        }
-        for name in DROPPED:
-            if len(_joined(cells.values())) > width:
-                cells[name] = ""
-        line = Text(_joined(cells.values())[:width])
+        cells = (
+            f"{flown:6.1f} s",
+            f"{self._guard.name:<6}",
+            f"waypoint {number}/{self._waypoints}" if number else "",
+            self._position_text(),
+            self._delay_text(),
+            f"x{flown / elapsed:.2f}" if elapsed > 0 and flown > 0 else "",
+        )
+        line = Text(_joined(cells), no_wrap=True, overflow="crop")
         colour = "green" if self._guard == GuardState.TRACK else "yellow"
         line.highlight_words([self._guard.name], colour)
         return line
@@ -118,14 +111,13 @@ class FlightView:
 
     def _event(self, text: str) -> None:
         """Write the line of an event, with position and delay if there is room."""
-        text = escape(text)
-        width = self._console.width if self._status else FILE_COLUMNS
-        cells = [f"  {text:<44}", self._position_text(), self._delay_text()]
-        lines = [_joined(cells), _joined(cells[:2]), f"  {text}"]
-        line = next((line for line in lines if len(line) <= width), lines[-1])
-        if self._status and len(line) > width:
-            line = textwrap.fill(line, width, subsequent_indent="    ", break_on_hyphens=False)
-        self._console.print(Text(line), soft_wrap=True)
+        line = f"  {escape(text)}"
+        for cells in ((self._position_text(), self._delay_text()), (self._position_text(),)):
+            longer = _joined((f"{line:<46}", *cells))
+            if len(longer) <= min(self._console.width, FILE_COLUMNS):
+                line = longer
+                break
+        self._console.print(Text(line))
 
     def close(self) -> None:
         """Erase the status line."""
