@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -101,23 +103,24 @@ ODOM = (
     "Measured: the newest odometry that had arrived. Estimated: the prediction from which the "
     "command was computed."
 )
+STEPS = {"ls": "--", "drawstyle": "steps-post"}
+"""Line of a setpoint, which is constant between its changes."""
 
 
 def draw_odom(subject: Subject) -> Figure:
     """Draw reference, measured and estimated position, one panel per axis."""
-    figure = new_figure(4.2)
-    control = subject.flight.control
+    figure, control = new_figure(4.2), subject.flight.control
+    looks: dict[str, dict[str, Any]] = {
+        "setpoint": {"label": "reference", "color": style.REFERENCE, **STEPS},
+        "measured": {"label": "measured", "color": style.MEASURED, "lw": 1.8},
+        "position": {"label": "estimated", "color": style.ESTIMATED},
+    }
     time = subject.flight.seconds(control["stamp_ns"])
     rows = figure.subplots(3, 1, sharex=True)
     for index, (axes, name) in enumerate(zip(rows, "xyz", strict=True)):
         panel(axes, "abc"[index])
-        for label, column, look in (
-            ("reference", "setpoint", {"color": style.REFERENCE, "ls": "--"}),
-            ("measured", "measured", {"color": style.MEASURED, "lw": 1.8}),
-            ("estimated", "position", {"color": style.ESTIMATED}),
-        ):
-            steps = {"drawstyle": "steps-post"} if column == "setpoint" else {}
-            axes.plot(time, control[column][:, index], label=label, **look, **steps)
+        for column, look in looks.items():
+            axes.plot(time, control[column][:, index], **look)
         mark_events(axes, subject)
         axes.set_ylabel(f"${name}$ (m)")
         axes.margins(y=0.12)
