@@ -9,7 +9,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
@@ -42,15 +42,11 @@ def is_live(stream: TextIO) -> bool:
     return stream.isatty() and not dull
 
 
-@contextlib.contextmanager
-def ignore_closed_pipe(stream: TextIO) -> Iterator[None]:
-    """Ignore the error if a stream's reader, such as `head`, has closed the pipe.
-
-    The caller must flush the stream inside the block: otherwise buffered text fails after the
-    block.
-    """
+def print_or_drop(text: str, stream: TextIO | None = None) -> None:
+    """Print a text (default: on stdout) and flush; drop it if the reader has closed the pipe."""
+    stream = stream or sys.stdout
     try:
-        yield
+        print(text, file=stream, flush=True)
     except OSError:
         discard_output(stream)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
+from cloudrc.cli.output import escape, format_document, output_argument, paint, table
 from cloudrc.errors import BadInputError
 
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
@@ -64,7 +64,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.output != "table":
         print(format_document(document, options.output))
     else:
-        show(document, options.run)
+        print(summary(document, options.run))
     return exit_code(document)
 
 
@@ -75,35 +75,24 @@ def exit_code(report: Mapping[str, Any]) -> int:
     return EXIT_CODES[report["verdict"]]
 
 
-def show(report: Mapping[str, Any], folder: Path) -> None:
-    """Print the verdict, the main numbers and, on the last line, the report's path."""
-    print(f"\n{verdict(report)}\n\n{main_numbers(report)}")
-    faults = report["numbers"].get("fault_count", {"value": 0})["value"]
-    if faults:
-        print(paint(f"  faults noted in flight: {faults:.0f}, see the report", "yellow"))
-    print()
-    print_line(str(folder / "report.html"))
-
-
-def verdict(report: Mapping[str, Any]) -> str:
-    """Return the verdict with the first failure, then one line for each further failure."""
-    outcome, failures = report["verdict"], report["failures"]
-    first = failures[0]["text"] if failures else "every waypoint reached, every criterion met"
-    lines = [f"{paint(outcome.upper(), COLOURS[outcome])}: {escape(first)}"]
-    for failure in failures[1:]:
-        when = f" (at {failure['time']:.2f} s)" if "time" in failure else ""
-        lines.append(escape(f"  also: {failure['text']}{when}"))
-    return "\n".join(lines)
-
-
-def main_numbers(report: Mapping[str, Any]) -> str:
-    """Lay out the main numbers as a table; leave out unknown numbers."""
+def summary(report: Mapping[str, Any], folder: Path) -> str:
+    """Write the verdict, the failures, the main numbers and, on the last line, the page's path."""
     from cloudrc.metrics import Number
     from cloudrc.report.page import readable
 
+    outcome, failures = report["verdict"], report["failures"]
+    first = failures[0]["text"] if failures else "every waypoint reached, every criterion met"
+    lines = ["", f"{paint(outcome.upper(), COLOURS[outcome])}: {escape(first)}"]
+    for failure in failures[1:]:
+        when = f" (at {failure['time']:.2f} s)" if "time" in failure else ""
+        lines.append(escape(f"  also: {failure['text']}{when}"))
     numbers = {
         name: Number(entry["value"], entry["unit"], "") for name, entry in report["numbers"].items()
     }
     known = [(name, label) for name, label in MAIN.items() if name in numbers]
     rows = [(f"  {label}", *readable(name, numbers[name])) for name, label in known]
-    return table(rows, right=[1]) if rows else "  no numbers: nothing was flown"
+    lines += ["", table(rows, right=[1]) if rows else "  no numbers: nothing was flown"]
+    if "fault_count" in numbers and numbers["fault_count"].value:
+        count = numbers["fault_count"].value
+        lines.append(paint(f"  faults noted in flight: {count:.0f}, see the report", "yellow"))
+    return "\n".join([*lines, "", escape(str(folder / "report.html"))])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -14,15 +13,16 @@ from typing import TYPE_CHECKING, Any, TextIO
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.extras import missing, require
 from cloudrc.cli.output import (
+    escape,
     format_document,
-    ignore_closed_pipe,
     is_live,
     output_argument,
     print_line,
+    print_or_drop,
 )
 from cloudrc.cli.parser import read_count
 from cloudrc.cli.pool import interrupt_on_signals
-from cloudrc.cli.report import exit_code, show
+from cloudrc.cli.report import exit_code, summary
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.seeds:
         from cloudrc.cli import sweep
 
-        return sweep.fly_seeds(options, fly)
+        return sweep.fly_seeds(options)
     return _fly_once(options, mode)
 
 
@@ -129,8 +129,8 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     folder = new_folder(options.out, name, latest=not in_cluster)
     if not for_programs:
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
-        with ignore_closed_pipe(stream):
-            print_line(f"{experiment.name}: {facts}, {count} waypoint{'s' if count != 1 else ''}")
+        waypoints = "1 waypoint" if count == 1 else f"{count} waypoints"
+        print_or_drop(escape(f"{experiment.name}: {facts}, {waypoints}"))
     try:
         report = flight(folder)
     except (CloudrcError, KeyboardInterrupt):
@@ -141,13 +141,8 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     finally:
         if in_cluster and options.out is None and folder.exists():
             point_latest_to(folder)
-    with ignore_closed_pipe(sys.stdout):
-        if for_programs:
-            document = json.loads((folder / "report.json").read_text())
-            print(format_document(document, options.output))
-        else:
-            show(report, folder)
-        sys.stdout.flush()
+    text = format_document(report, options.output) if for_programs else summary(report, folder)
+    print_or_drop(text)
     return exit_code(report)
 
 

@@ -9,20 +9,18 @@ import json
 import math
 import statistics
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.find_run import new_folder
-from cloudrc.cli.output import format_document, format_number, ignore_closed_pipe, print_line, table
+from cloudrc.cli.output import escape, format_document, format_number, print_or_drop, table
 from cloudrc.cli.pool import WORKER_KILLED, WorkerDiedError, map_in_order
 from cloudrc.metrics.verdict import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
 """The content of a `report.json`."""
-Fly: TypeAlias = Callable[..., dict[str, Any]]
-"""Function like `cloudrc.cli.run.fly`."""
 METHOD = "95 % interval of the median, by order statistics"
 
 
@@ -87,14 +85,10 @@ def as_csv(reports: Sequence[Report]) -> str:
     return text.getvalue()
 
 
-def fly_seeds(options: argparse.Namespace, fly: Fly) -> int:
+def fly_seeds(options: argparse.Namespace) -> int:
     """Fly seeds 1 to N; return the exit code, which is 0 only if all runs succeed.
 
     After an interrupt or the death of a worker, the table covers the finished seeds.
-
-    Args:
-        options: Flags of `cloudrc run`.
-        fly: Flies one experiment and returns its report; a function of a module.
     """
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
@@ -103,7 +97,7 @@ def fly_seeds(options: argparse.Namespace, fly: Fly) -> int:
     loaded = load_experiment(options.experiment, options.set)
     metrics.check(loaded.report.metrics)
     folder = new_folder(options.out, f"{loaded.name}-virtual-{options.seeds}seeds")
-    work = [(fly, options.experiment, options.set, folder, n + 1) for n in range(options.seeds)]
+    work = [(options.experiment, options.set, folder, n + 1) for n in range(options.seeds)]
     reports: list[dict[str, Any]] = []
     stopped, code = "", 0
     try:
@@ -119,14 +113,12 @@ def fly_seeds(options: argparse.Namespace, fly: Fly) -> int:
         stopped, code = WORKER_KILLED, error.exit_code
     if stopped:
         text = f"\ncloudrc: {stopped}: {len(reports)} of {len(work)} seeds are finished"
-        with ignore_closed_pipe(sys.stderr):
-            print(text, file=sys.stderr, flush=True)
+        print_or_drop(text, sys.stderr)
     document = _write(folder, loaded.name, reports, bool(stopped))
-    with ignore_closed_pipe(sys.stdout):
-        if options.output != "table":
-            print(format_document(document, options.output), flush=True)
-        else:
-            print(f"\n{as_table(document)}\n\n{folder / 'sweep.json'}", flush=True)
+    if options.output != "table":
+        print_or_drop(format_document(document, options.output))
+    else:
+        print_or_drop(f"\n{as_table(document)}\n\n{folder / 'sweep.json'}")
     return code or max(EXIT_CODES[report["verdict"]] for report in reports)
 
 
@@ -135,15 +127,15 @@ def _show_run(options: argparse.Namespace, report: Report, progress: str) -> Non
     if options.output == "table" or stream.isatty():
         failure = "".join(f": {f['text']}" for f in report["failures"][:1])
         line = f"{progress:>7}  seed {report['seed']}  {report['verdict']}{failure}"
-        with ignore_closed_pipe(stream):
-            print_line(line, stream)
+        print_or_drop(escape(line), stream)
 
 
-def _fly_one(job: tuple[Fly, str, list[str], Path, int]) -> dict[str, Any]:
+def _fly_one(job: tuple[str, list[str], Path, int]) -> dict[str, Any]:
     """Fly one seed, in a worker."""
+    from cloudrc.cli.run import fly
     from cloudrc.config.load import load_experiment
 
-    fly, experiment, overrides, folder, seed = job
+    experiment, overrides, folder, seed = job
     loaded = load_experiment(experiment, [*overrides, f"seed={seed}"])
     run_folder = folder / f"seed-{seed}"
     run_folder.mkdir()

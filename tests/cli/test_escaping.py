@@ -85,7 +85,8 @@ def test_the_description_of_a_profile(here: Path, printed: Printing) -> None:
 
 def test_what_is_printed_of_a_flight(printed: Printing) -> None:
     failures = [{"code": "x", "text": EVIL}] * 2
-    report.show({"verdict": "failure", "failures": failures, "numbers": {}}, Path(EVIL))
+    found = {"verdict": "failure", "failures": failures, "numbers": {}}
+    print(report.summary(found, Path(EVIL)))
     assert printed().count(SHOWN) == 3
     stream = io.StringIO()
     FlightView(stream, 1).see([Fault(0, "bad", EVIL)])

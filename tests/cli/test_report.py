@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cli.report import exit_code, show
+from cloudrc.cli.report import exit_code, summary
 
 
 def report(outcome: str, *failures: str, **numbers: tuple[float, str]) -> dict[str, Any]:
@@ -44,10 +44,7 @@ def report(outcome: str, *failures: str, **numbers: tuple[float, str]) -> dict[s
         (report("interrupted", "x"), 130, ["INTERRUPTED: x", "no numbers: nothing was flown"]),
     ],
 )
-def test_summary(
-    found: dict[str, Any], code: int, lines: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    show(found, Path("runs/a"))
-    shown = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines() if line]
-    assert shown == [*lines, "runs/a/report.html"]
+def test_summary(found: dict[str, Any], code: int, lines: list[str]) -> None:
+    shown = summary(found, Path("runs/a")).splitlines()
+    assert [" ".join(line.split()) for line in shown if line] == [*lines, "runs/a/report.html"]
     assert exit_code(found) == code
