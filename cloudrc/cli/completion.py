@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from cloudrc.errors import MissingPrerequisiteError
 
-SHELLS = ("bash", "zsh", "fish")
 EPILOG = """\
 installation:
   cloudrc completion bash > ~/.local/share/bash-completion/completions/cloudrc
@@ -42,7 +41,7 @@ complete -o bashdefault -F _cloudrc_joined cloudrc
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("shell", choices=SHELLS, help="your shell")
+    parser.add_argument("shell", choices=("bash", "zsh", "fish"), help="your shell")
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -56,48 +55,43 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.cli.parser import COMMANDS, build_parser
     from cloudrc.config import shipped
 
-    parser = build_parser(COMMANDS, for_completion=True)
-    names = {
-        "EXPERIMENT": (shipped.names("experiment"), True),
-        "PROFILE": (shipped.names("profile"), True),
-        "KEY=VALUE": (settings(), False),
+    keys = list(_settings())
+    candidates = {
+        "EXPERIMENT": _candidates("experiment", shipped.names("experiment"), files=True),
+        "PROFILE": _candidates("profile", shipped.names("profile"), files=True),
+        "KEY=VALUE": _candidates("key", keys),
     }
-    link = [word.removeprefix("link.") for word in names["KEY=VALUE"][0] if word[:5] == "link."]
+    links = [key.removeprefix("link.") for key in keys if key.startswith("link.")]
+    of_link_set = _candidates("link", links)
+    parser = build_parser(COMMANDS, for_completion=True)
     for action in _actions(parser):
-        if action.metavar in names:
-            words, files = names[str(action.metavar)]
-            if action.metavar == "KEY=VALUE" and not action.option_strings:  # of `link set`
-                candidates = _candidates("link", link, files)
-            else:
-                candidates = _candidates(str(action.metavar), words, files)
-            action.complete = candidates  # type: ignore[attr-defined]
+        if action.metavar in candidates:
+            is_option = action.option_strings or action.metavar != "KEY=VALUE"
+            found = candidates[str(action.metavar)] if is_option else of_link_set
+            action.complete = found  # type: ignore[attr-defined]
     print(shtab.complete(parser, options.shell))
     if options.shell == "bash":
         print(JOINED)
     return 0
 
 
-def settings() -> list[str]:
-    """List the completions of `--set`: KEY=, or KEY=NAME for a key whose value is a known name."""
+def _settings() -> Iterator[str]:
+    """Yield the completions of `--set`: KEY=, or KEY=NAME for a key whose value is a known name."""
     from cloudrc import plugins
     from cloudrc.config import problems, shipped
     from cloudrc.config.overrides import KINDS
     from cloudrc.config.schema import Experiment
 
-    keys = {".".join(path) for path, _ in problems.leaves(Experiment) if "0" not in path}
-    keys |= {
-        f"cloud.{key}.{parameter}"
-        for key, kind in KINDS.items()
-        for name in plugins.names(kind)
-        for parameter in plugins.signature(kind, name).parameters
-    }
     named = {f"cloud.{key}": plugins.names(kind) for key, kind in KINDS.items()}
     named |= {"link.profile": shipped.names("profile"), "mission": shipped.names("mission")}
     named |= {f"world.{kind}": shipped.names(kind) for kind in ("robot", "scene")}
-    values = [f"{key}={name}" for key, found in named.items() for name in found]
-    return sorted(f"{key}=" for key in keys - set(named) if not key.endswith(".name")) + sorted(
-        values
-    )
+    keys = {".".join(path) for path, _ in problems.leaves(Experiment) if "0" not in path}
+    for key, kind in KINDS.items():
+        for name in named[f"cloud.{key}"]:
+            parameters = plugins.signature(kind, name).parameters
+            keys |= {f"cloud.{key}.{parameter}" for parameter in parameters}
+    yield from (f"{key}=" for key in sorted(keys - set(named)) if not key.endswith(".name"))
+    yield from sorted(f"{key}={name}" for key, names in named.items() for name in names)
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
@@ -109,9 +103,9 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
                 yield from _actions(command)
 
 
-def _candidates(metavar: str, words: list[str], files: bool) -> dict[str, Any]:
+def _candidates(name: str, words: Sequence[str], *, files: bool = False) -> dict[str, Any]:
     """Write completion candidates for shtab, in the syntax of each shell."""
-    function, joined = f"_cloudrc_{metavar.partition('=')[0].lower()}", " ".join(words)
+    function, joined = f"_cloudrc_{name}", " ".join(words)
     bash = "; compgen -f -- $1" if files else ""
     zsh = "; _files -g '*.yaml'" if files else ""
     return {

@@ -7,7 +7,6 @@ from collections.abc import Iterable
 
 from cloudrc.errors import MissingPrerequisiteError
 
-# Extra of pyproject.toml -> its modules; the distributions have the same names.
 EXTRAS: dict[str, tuple[str, ...]] = {
     "world": ("mujoco",),
     "record": ("mcap", "rosbags", "zstandard"),
@@ -15,6 +14,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "kube": ("kubernetes",),
     "api": ("fastapi", "uvicorn"),
 }
+"""Extra of pyproject.toml -> its modules; the distributions have the same names."""
 
 
 def missing(extra: str) -> list[str]:
@@ -23,21 +23,15 @@ def missing(extra: str) -> list[str]:
 
 
 def require(purpose: str, extras: Iterable[str]) -> None:
-    """Check that extras are installed.
-
-    Args:
-        purpose: What needs the extras, such as "mode virtual".
-        extras: Names in `EXTRAS`.
+    """Check that extras are installed, for a purpose such as "mode virtual".
 
     Raises:
         MissingPrerequisiteError: If a module is missing; the text says how to install it.
     """
-    absent = {extra: missing(extra) for extra in extras}
-    absent = {extra: modules for extra, modules in absent.items() if modules}
+    absent = {extra: found for extra in extras if (found := missing(extra))}
     if absent:
         modules = ", ".join(module for names in absent.values() for module in names)
-        verb = "is" if modules.count(",") == 0 else "are"
         raise MissingPrerequisiteError(
-            f"{purpose} needs {modules}, which {verb} not installed; "
+            f"{purpose} needs {modules} (not installed); "
             f"run: pip install 'cloudrc[{','.join(absent)}]'"
         )

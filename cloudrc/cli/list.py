@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import argparse
 import re
-import shutil
-import sys
-import textwrap
 
-from cloudrc.cli.output import format_document, output_argument, paint
+from cloudrc.cli.output import format_document, output_argument, paint, table
 
 PLUGINS = ("estimators", "predictors", "controllers", "metrics")
 YAML = ("experiments", "missions", "profiles")
@@ -23,45 +20,38 @@ examples:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument(
-        "what", nargs="?", choices=KINDS, metavar="WHAT", help=f"one of {', '.join(KINDS)}"
-    )
+    about = f"one of {', '.join(KINDS)}"
+    parser.add_argument("what", nargs="?", choices=KINDS, metavar="WHAT", help=about)
     output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Print the requested kinds."""
-    kinds = [options.what] if options.what else list(KINDS)
-    found = {kind: describe_all(kind) for kind in kinds}
-    if options.output != "table":
-        entries = {
-            kind: [{"name": name, "description": text} for name, text in lines.items()]
-            for kind, lines in found.items()
-        }
-        print(format_document({"schemaVersion": 1, **entries}, options.output))
+    found = {kind: describe_all(kind) for kind in ([options.what] if options.what else KINDS)}
+    if options.output == "table":
+        blocks = []
+        for kind, lines in found.items():
+            rows = [(f"  {name}", line) for name, line in lines.items()]
+            blocks.append(f"{paint(kind, 'bold')}\n{table(rows)}")
+        print("\n\n".join(blocks))
         return 0
-    print("\n\n".join(f"{paint(kind, 'bold')}\n{_block(lines)}" for kind, lines in found.items()))
+    entries = {
+        kind: [{"name": name, "description": text} for name, text in lines.items()]
+        for kind, lines in found.items()
+    }
+    print(format_document({"schemaVersion": 1, **entries}, options.output))
     return 0
-
-
-def _block(lines: dict[str, str]) -> str:
-    """Lay out names and descriptions; wrap lines only on a terminal."""
-    indent = max(map(len, lines), default=0) + 4
-    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
-    wrap = textwrap.TextWrapper(max(columns, indent + 20), subsequent_indent=" " * indent)
-    return "\n".join(wrap.fill(f"  {name:<{indent - 2}}{line}") for name, line in lines.items())
 
 
 def describe_all(kind: str) -> dict[str, str]:
     """Return name -> description for all entries of a kind, sorted by name."""
     from cloudrc import plugins
     from cloudrc.config import shipped
+    from cloudrc.metrics import SHIPPED
 
     if kind in PLUGINS:
         lines = {name: plugins.describe(kind, name) for name in plugins.names(kind)}
         if kind == "metrics":
-            from cloudrc.metrics import SHIPPED
-
             lines |= {metric.name: metric.meaning for metric in SHIPPED.values()}
     else:
         one = kind.removesuffix("s")

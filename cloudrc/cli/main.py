@@ -13,13 +13,11 @@ from cloudrc.errors import BadInputError, CloudrcError
 INTERRUPTED = 130
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
-NOT_ALLOWED = "choose a file or folder that you have access to"
 REMEDIES = {
-    errno.EACCES: NOT_ALLOWED,
-    errno.EPERM: NOT_ALLOWED,
-    errno.EROFS: NOT_ALLOWED,
-    errno.ENOENT: "check the path",
-    errno.ENOTDIR: "check the path",
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM, errno.EROFS), "choose a file or folder that you have access to"
+    ),
+    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR), "check the path"),
     errno.EISDIR: "name a file in this folder",
     errno.ENOSPC: "free some space or choose another disk",
 }
@@ -27,11 +25,7 @@ REMEDIES = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command line.
-
-    Args:
-        arguments: Words of the command line without the program's name; by default those of this
-            process.
+    """Run one command line, by default that of this process.
 
     Returns:
         The exit code; `cloudrc --help` lists the codes.

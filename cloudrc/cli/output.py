@@ -9,22 +9,21 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-FORMATS = ("table", "json", "yaml")
 UNLIMITED = 10_000
 """Width of output that is not for a terminal [columns]."""
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
 
 
-def output_argument(parser: argparse.ArgumentParser, what: str = "") -> None:
+def output_argument(parser: argparse.ArgumentParser, what: str = "output format") -> None:
     """Declare `--output`; `what` describes further effects of the format."""
-    text = f"{what} (default: table)" if what else "output format (default: table)"
-    parser.add_argument("-o", "--output", choices=FORMATS, default="table", help=text)
+    forms, about = ("table", "json", "yaml"), f"{what} (default: table)"
+    parser.add_argument("-o", "--output", choices=forms, default="table", help=about)
 
 
 def format_document(document: object, form: str) -> str:
@@ -43,23 +42,11 @@ def is_live(stream: TextIO) -> bool:
     return stream.isatty() and not dull
 
 
-def terminal_columns(stream: TextIO) -> int:
-    """Return the width of a stream's terminal in columns; 80 if it is unknown."""
+def print_or_drop(text: str, stream: TextIO | None = None) -> None:
+    """Print a text (default: on stdout) and flush; drop it if the reader has closed the pipe."""
+    stream = stream or sys.stdout
     try:
-        return os.get_terminal_size(stream.fileno()).columns or 80
-    except (OSError, ValueError):
-        return 80
-
-
-@contextlib.contextmanager
-def ignore_closed_pipe(stream: TextIO) -> Iterator[None]:
-    """Ignore the error if a stream's reader, such as `head`, has closed the pipe.
-
-    The caller must flush the stream inside the block: otherwise buffered text fails after the
-    block.
-    """
-    try:
-        yield
+        print(text, file=stream, flush=True)
     except OSError:
         discard_output(stream)
 
@@ -94,7 +81,7 @@ def console(stream: TextIO) -> Console:
         file=stream,
         force_terminal=live,
         color_system="standard" if live else None,
-        width=terminal_columns(stream) if live else UNLIMITED,
+        width=None if live else UNLIMITED,
         highlight=False,
         markup=False,
         emoji=False,
@@ -102,14 +89,9 @@ def console(stream: TextIO) -> Console:
 
 
 def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """Align rows in columns, one line per row.
+    """Align rows of equal length in columns, one line per row without trailing blanks.
 
-    Args:
-        rows: Cells; this function escapes them. All rows have the same length.
-        right: Indices of the columns to align right.
-
-    Returns:
-        Lines without trailing blanks, joined by newlines.
+    The cells are escaped. The columns with an index in `right` are aligned right.
     """
     from rich.table import Table
     from rich.text import Text

@@ -7,14 +7,13 @@ import difflib
 import importlib
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
 from cloudrc import __version__
 from cloudrc.errors import BadInputError
 
-# Name -> help line, by group. A command's module is `cloudrc/cli/<name>.py` but for `PROCESSES`.
 GROUPS: dict[str, dict[str, str]] = {
     "fly": {
         "run": "fly an experiment and write its report",
@@ -38,7 +37,9 @@ GROUPS: dict[str, dict[str, str]] = {
         "relay": "the emulated link between world and cloud",
     },
 }
+"""Command -> help line, by group; the module of a command is `cloudrc/cli/<name>.py`."""
 PROCESSES = ("world", "cloud", "relay")
+"""Commands whose module is `cloudrc/cli/processes.py` instead."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 COUNT_MAX = 100_000
 """Largest number of repeats that a flag accepts."""
@@ -75,12 +76,9 @@ class Parser(argparse.ArgumentParser):
 def describe_unknown(given: str, names: Iterable[str]) -> str:
     """Return an error text about an unknown name, with the most similar known name or all names."""
     known = sorted(names)
-    near = difflib.get_close_matches(given, known, n=1, cutoff=0.5)
-    return f"no '{given}'; " + (f"did you mean '{near[0]}'?" if near else f"choose {_or(known)}")
-
-
-def _or(names: Sequence[str]) -> str:
-    return ", ".join(names[:-1]) + f" or {names[-1]}" if len(names) > 1 else "".join(names)
+    if near := difflib.get_close_matches(given, known, n=1, cutoff=0.5):
+        return f"no '{given}'; did you mean '{near[0]}'?"
+    return f"no '{given}'; choose one of {', '.join(known)}"
 
 
 def read_count(text: str) -> int:
@@ -108,17 +106,12 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
         for_completion: Whether argparse lists the commands. Otherwise the help lists them in
             groups.
     """
-    common = Parser(add_help=False)
-    common.add_argument(
-        "--debug",
-        action="store_true",
-        default=argparse.SUPPRESS,
-        help="show the traceback of an error",
-    )
+    common, about = Parser(add_help=False), "show the traceback of an error"
+    common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)
     parser = Parser(
         prog="cloudrc",
         usage="cloudrc [-h] [--version] [--debug] COMMAND ...",
-        description=ABOUT + "\n\n" + _groups(),
+        description="\n\n".join([ABOUT, *map(_lines, GROUPS)]),
         epilog=EXAMPLES,
         formatter_class=_formatter,
         allow_abbrev=False,
@@ -151,12 +144,9 @@ def _find_command(name: str) -> Any:
     return importlib.import_module(f"cloudrc.cli.{name}")
 
 
-def _groups() -> str:
-    blocks = []
-    for title, commands in GROUPS.items():
-        lines = [f"  {name:<12}{line}" for name, line in commands.items()]
-        blocks.append("\n".join([f"{title}:", *lines]))
-    return "\n\n".join(blocks)
+def _lines(title: str) -> str:
+    lines = [f"  {name:<12}{line}" for name, line in GROUPS[title].items()]
+    return "\n".join([f"{title}:", *lines])
 
 
 def _formatter(prog: str) -> argparse.HelpFormatter:

@@ -18,8 +18,18 @@ from typing import TypeVar
 
 from cloudrc.errors import InvalidRunError
 
+Work = TypeVar("Work")
+Result = TypeVar("Result")
 PARENT_PERIOD = 0.5
 """Period in which a worker checks whether its parent still runs [s]."""
+BATCH_MAX = 1000
+"""Maximum number of tasks that a pool gets at once. Before Python 3.11.6, a pool hangs if it gets
+more than 16,384 tasks at once (cpython issue 105829)."""
+WORKER_KILLED = "a worker was killed, perhaps by the kernel because memory ran out"
+
+
+class WorkerDiedError(InvalidRunError):
+    """Report that somebody has killed a process of the pool."""
 
 
 def interrupt_on_signals() -> None:
@@ -38,12 +48,8 @@ def _hung_up(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def exit_with_parent(parent: int) -> None:
-    """End this worker process soon after its parent has ended, even if the parent was killed.
-
-    Args:
-        parent: Process id of the process that made the pool.
-    """
+def _exit_with_parent(parent: int) -> None:
+    """End this worker soon after the process `parent` has ended, even if that was killed."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -51,18 +57,6 @@ def exit_with_parent(parent: int) -> None:
         os._exit(1)  # without clean-up: nobody waits for this process
 
     threading.Thread(target=watch, name="parent", daemon=True).start()
-
-
-Work = TypeVar("Work")
-Result = TypeVar("Result")
-BATCH_MAX = 1000
-"""Maximum number of tasks that a pool gets at once. Before Python 3.11.6, a pool hangs if it gets
-more than 16,384 tasks at once (cpython issue 105829)."""
-WORKER_KILLED = "a worker was killed, perhaps by the kernel because memory ran out"
-
-
-class WorkerDiedError(InvalidRunError):
-    """Report that somebody has killed a process of the pool."""
 
 
 def map_in_order(
@@ -78,9 +72,6 @@ def map_in_order(
         work: Arguments of the function, one for each call.
         jobs: Number of processes; limited to the number of cores and to the length of `work`.
 
-    Yields:
-        The function's results, in the order of `work`.
-
     Raises:
         WorkerDiedError: If one of the processes was killed.
     """
@@ -91,14 +82,12 @@ def map_in_order(
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
     with _isolated_start():  # the pool starts multiprocessing's resource tracker
-        pool = ProcessPoolExecutor(workers, context, exit_with_parent, (os.getpid(),))
+        pool = ProcessPoolExecutor(workers, context, _exit_with_parent, (os.getpid(),))
     try:
         waiting = iter(work)
-        while True:  # a broken pool accepts no work, so finished results come before the next batch
+        while batch := list(islice(waiting, BATCH_MAX)):
             with _isolated_start():
-                futures = deque(pool.submit(function, each) for each in islice(waiting, BATCH_MAX))
-            if not futures:
-                return
+                futures = deque(pool.submit(function, each) for each in batch)
             while futures:
                 yield futures.popleft().result()
     except BrokenProcessPool as error:
@@ -119,16 +108,12 @@ def _isolated_start() -> Iterator[None]:
     the parent ends the workers. The workers import no Python from the working folder, because its
     files may come from somebody else.
     """
-    numbers = (signal.SIGINT, signal.SIGHUP)
-    before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
+    before = {n: signal.signal(n, signal.SIG_IGN) for n in (signal.SIGINT, signal.SIGHUP)}
     safe_path = os.environ.get("PYTHONSAFEPATH")
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
         yield
     finally:
-        if safe_path is None:
-            del os.environ["PYTHONSAFEPATH"]
-        else:
-            os.environ["PYTHONSAFEPATH"] = safe_path
-        for number, handler in zip(numbers, before, strict=True):
+        os.environ["PYTHONSAFEPATH"] = safe_path or ""  # empty: not set
+        for number, handler in before.items():
             signal.signal(number, handler)

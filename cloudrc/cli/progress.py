@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 import time
 from collections.abc import Callable, Iterable
 from typing import TextIO
@@ -28,9 +27,7 @@ ENDINGS = ("done", "cancelled", "timed_out")
 REDRAW_PERIOD = 0.1
 """Minimum time between two drawings of the status line [s]."""
 FILE_COLUMNS = 100
-"""Maximum width of an event's line where there is no terminal."""
-DROPPED = ("factor", "delay", "position", "waypoint")
-"""Cells that the status line drops, in this order, until the line fits."""
+"""Maximum width of an event's line with its position."""
 
 
 class FlightView:
@@ -44,7 +41,7 @@ class FlightView:
         Args:
             stream: Where to write; never stdout if that carries JSON or YAML.
             waypoints: Number of the mission's waypoints.
-            clock: Returns the monotonic time [s], for the real-time factor and for redrawing.
+            clock: Returns the monotonic time [s].
         """
         self._waypoints, self._clock = waypoints, clock
         self._console = console(stream)
@@ -62,7 +59,10 @@ class FlightView:
         for record in records:
             match record:
                 case TelemetrySent():
-                    self._see_telemetry(record)
+                    if self._first_ns == NEVER_NS:
+                        self._first_ns, self._began = record.stamp_ns, self._clock()
+                    self._now_ns = record.stamp_ns
+                    self._position = record.telemetry.odometry.position
                 case Control():
                     # The horizon is 0 and meaningless before the first round trip.
                     self._delay = math.nan if math.isnan(record.rtt) else record.horizon
@@ -82,43 +82,26 @@ class FlightView:
         if self._status and self._clock() - self._drawn >= REDRAW_PERIOD:
             self._drawn = self._clock()
             self._status.start()
-            # Leave one column free: some terminals wrap after the last one.
-            self._status.update(self.line(self._console.width - 1), refresh=True)
+            self._status.update(self.line(), refresh=True)
 
-    def _see_telemetry(self, record: TelemetrySent) -> None:
-        if self._first_ns == NEVER_NS:
-            self._first_ns, self._began = record.stamp_ns, self._clock()
-        self._now_ns = record.stamp_ns
-        self._position = record.telemetry.odometry.position
-
-    @property
-    def flown(self) -> float:
-        """Return the time since the first telemetry, on world's clock [s]."""
-        return (self._now_ns - self._first_ns) * 1e-9
-
-    def line(self, width: int = 80) -> Text:
-        """Return the status line, at most `width` columns wide."""
-        elapsed = self._clock() - self._began
-        moving = elapsed > 0 and self.flown > 0
+    def line(self) -> Text:
+        """Return the status line; a narrow terminal cuts off its end, the least important part."""
+        elapsed, flown = self._clock() - self._began, (self._now_ns - self._first_ns) * 1e-9
         number = self._waypoint + 1
-        cells = {
-            "time": f"{self.flown:6.1f} s",
-            "waypoint": f"waypoint {number}/{self._waypoints}" if number else "",
-            "position": self._position_text(),
-            "delay": self._delay_text(),
-            "guard": f"{self._guard.name:<6}",
-            "factor": f"x{self.flown / elapsed:.2f}" if moving else "",
-        }
-        for name in DROPPED:
-            if len(_joined(cells.values())) > width:
-                cells[name] = ""
-        line = Text(_joined(cells.values())[:width])
+        cells = (
+            f"{flown:6.1f} s",
+            f"{self._guard.name:<6}",
+            f"waypoint {number}/{self._waypoints}" if number else "",
+            self._position_text(),
+            self._delay_text(),
+            f"x{flown / elapsed:.2f}" if elapsed > 0 and flown > 0 else "",
+        )
+        line = Text(_joined(cells), no_wrap=True, overflow="crop")
         colour = "green" if self._guard == GuardState.TRACK else "yellow"
         line.highlight_words([self._guard.name], colour)
         return line
 
     def _position_text(self) -> str:
-        """Return the robot's position as text [m]."""
         # Round first, then add 0.0: that turns a negative zero into a positive one.
         x, y, z = (round(coordinate, 2) + 0.0 for coordinate in self._position)
         return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
@@ -128,14 +111,13 @@ class FlightView:
 
     def _event(self, text: str) -> None:
         """Write the line of an event, with position and delay if there is room."""
-        text = escape(text)
-        width = self._console.width if self._status else FILE_COLUMNS
-        delays = (self._delay_text(), "")
-        lines = [_joined((f"  {text:<44}", self._position_text(), delay)) for delay in delays]
-        line = next((line for line in lines if len(line) <= width), f"  {text}")
-        if self._status and len(line) > width:
-            line = textwrap.fill(line, width, subsequent_indent="    ", break_on_hyphens=False)
-        self._console.print(Text(line), soft_wrap=True)
+        line = f"  {escape(text)}"
+        for cells in ((self._position_text(), self._delay_text()), (self._position_text(),)):
+            longer = _joined((f"{line:<46}", *cells))
+            if len(longer) <= min(self._console.width, FILE_COLUMNS):
+                line = longer
+                break
+        self._console.print(Text(line))
 
     def close(self) -> None:
         """Erase the status line."""

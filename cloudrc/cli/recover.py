@@ -6,15 +6,11 @@ import argparse
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import format_document, output_argument, print_line
 from cloudrc.cli.parser import input_file
 from cloudrc.errors import BadInputError
-
-if TYPE_CHECKING:
-    from cloudrc.record.reader import Recovery
 
 LOSSY = 1
 """Exit code if data is lost."""
@@ -29,13 +25,8 @@ exit codes: 0 complete, 1 some data is lost (printed), 2 nothing readable"""
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("file", type=input_file, metavar="FILE", help="a recording (.mcap)")
-    parser.add_argument(
-        "-t",
-        "--to",
-        type=Path,
-        metavar="NEW",
-        help="file for the clean copy (default: FILE with '.recovered' before its ending)",
-    )
+    about = "file for the clean copy (default: FILE with '.recovered' before its ending)"
+    parser.add_argument("-t", "--to", type=Path, metavar="NEW", help=about)
     output_argument(parser)
 
 
@@ -53,19 +44,11 @@ def execute(options: argparse.Namespace) -> int:
     except OSError as error:  # names a temporary file
         reason = error.strerror or error
         raise BadInputError(f"{target}: {reason}; name another file with --to") from error
-    if options.output == "table":
-        _show(recovery, target)
-    else:
-        print(format_document(_document(recovery, target), options.output))
-    return 0 if recovery.complete else LOSSY
-
-
-def _document(recovery: Recovery, target: Path) -> dict[str, object]:
-    summary = {"complete": recovery.complete, "share": recovery.share, "file": str(target)}
-    return {"schemaVersion": 1, **summary, **asdict(recovery)}
-
-
-def _show(recovery: Recovery, target: Path) -> None:
+    if options.output != "table":
+        head = {"schemaVersion": 1, "complete": recovery.complete, "share": recovery.share}
+        document = {**head, "file": str(target), **asdict(recovery)}
+        print(format_document(document, options.output))
+        return 0 if recovery.complete else LOSSY
     kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
     print(f"kept {recovery.share:.1%}: {kept}")
     for note in recovery.notes:
@@ -73,3 +56,4 @@ def _show(recovery: Recovery, target: Path) -> None:
     if recovery.complete and recovery.index_is_new:
         print("the index was missing or damaged and is rebuilt; nothing is lost")
     print_line(str(target))
+    return 0 if recovery.complete else LOSSY

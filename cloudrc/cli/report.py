@@ -1,15 +1,30 @@
-"""`cloudrc report RUN`: rewrite the report of a recorded run."""
+"""`cloudrc report RUN`: rewrite the report of a recorded run; print reports."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import format_document, output_argument
+from cloudrc.cli.output import escape, format_document, output_argument, paint, table
 from cloudrc.errors import BadInputError
 
+COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
+MAIN = {
+    "duration": "mission took",
+    "contact_time": "arm touches the board at",
+    "tip_speed": "with the tip at",
+    "steady_contact_force": "and then presses with",
+    "min_clearance": "least clearance in the pipes",
+    "rtt_mean": "round trip, mean",
+    "prediction_error_rms": "prediction error, RMS",
+    "hold_count": "times in HOLD",
+    "real_time_factor": "real-time factor",
+}
+"""The most important numbers and their labels; report.html and report.json have all numbers."""
 EPILOG = """\
 examples:
   cloudrc report runs/latest
@@ -37,7 +52,6 @@ def execute(options: argparse.Namespace) -> int:
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
-    from cloudrc.cli.run import exit_code, show
     from cloudrc.report.folder import read_run
     from cloudrc.report.write import write_report
 
@@ -50,5 +64,35 @@ def execute(options: argparse.Namespace) -> int:
     if options.output != "table":
         print(format_document(document, options.output))
     else:
-        show(document, options.run)
+        print(summary(document, options.run))
     return exit_code(document)
+
+
+def exit_code(report: Mapping[str, Any]) -> int:
+    """Return the exit code of a report's verdict."""
+    from cloudrc.metrics.verdict import EXIT_CODES
+
+    return EXIT_CODES[report["verdict"]]
+
+
+def summary(report: Mapping[str, Any], folder: Path) -> str:
+    """Write the verdict, the failures, the main numbers and, on the last line, the page's path."""
+    from cloudrc.metrics import Number
+    from cloudrc.report.page import readable
+
+    outcome, failures = report["verdict"], report["failures"]
+    first = failures[0]["text"] if failures else "every waypoint reached, every criterion met"
+    lines = ["", f"{paint(outcome.upper(), COLOURS[outcome])}: {escape(first)}"]
+    for failure in failures[1:]:
+        when = f" (at {failure['time']:.2f} s)" if "time" in failure else ""
+        lines.append(escape(f"  also: {failure['text']}{when}"))
+    numbers = {
+        name: Number(entry["value"], entry["unit"], "") for name, entry in report["numbers"].items()
+    }
+    known = [(name, label) for name, label in MAIN.items() if name in numbers]
+    rows = [(f"  {label}", *readable(name, numbers[name])) for name, label in known]
+    lines += ["", table(rows, right=[1]) if rows else "  no numbers: nothing was flown"]
+    if "fault_count" in numbers and numbers["fault_count"].value:
+        count = numbers["fault_count"].value
+        lines.append(paint(f"  faults noted in flight: {count:.0f}, see the report", "yellow"))
+    return "\n".join([*lines, "", escape(str(folder / "report.html"))])

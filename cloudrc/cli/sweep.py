@@ -9,25 +9,18 @@ import json
 import math
 import statistics
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.find_run import new_folder
-from cloudrc.cli.output import format_document, format_number, ignore_closed_pipe, print_line, table
+from cloudrc.cli.output import escape, format_document, format_number, print_or_drop, table
 from cloudrc.cli.pool import WORKER_KILLED, WorkerDiedError, map_in_order
 from cloudrc.metrics.verdict import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
 """The content of a `report.json`."""
-Fly: TypeAlias = Callable[..., dict[str, Any]]
-"""Function like `cloudrc.cli.run.fly`."""
-Job: TypeAlias = tuple[Fly, str, list[str], Path, int]
-"""Function that flies, experiment, overrides, folder of the sweep, seed."""
-
-CONFIDENCE = 0.95
-"""Confidence level of the intervals [1]."""
 METHOD = "95 % interval of the median, by order statistics"
 
 
@@ -47,7 +40,7 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
     outside, k = 0.0, 0
     while k < n // 2:
         outside += 2 * math.comb(n, k) / 2**n
-        if 1 - outside < CONFIDENCE:
+        if 1 - outside < 0.95:
             break
         k += 1
     return (ordered[k - 1], ordered[n - k]) if k else None
@@ -55,31 +48,24 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
 
 def summarise(reports: Sequence[Report]) -> dict[str, Any]:
     """Summarise reports: number of successful runs, of all runs, and statistics per number."""
-    units: dict[str, str] = {}
-    values: dict[str, list[float]] = {}
-    for report in reports:
-        for name, entry in report["numbers"].items():
-            units[name] = entry["unit"]
-            values.setdefault(name, []).append(entry["value"])
-    numbers = {
-        name: {
-            "median": statistics.median(samples),
-            "interval": interval(samples),
-            "unit": units[name],
-            "count": len(samples),
-        }
-        for name, samples in values.items()
-    }
+    numbers = {}
+    for name, unit in _units(reports).items():
+        found = [r["numbers"][name]["value"] for r in reports if name in r["numbers"]]
+        middle = {"median": statistics.median(found), "interval": interval(found)}
+        numbers[name] = {**middle, "unit": unit, "count": len(found)}
     done = sum(report["verdict"] == "success" for report in reports)
     return {"done": done, "count": len(reports), "method": METHOD, "numbers": numbers}
+
+
+def _units(reports: Sequence[Report]) -> dict[str, str]:
+    return {name: e["unit"] for report in reports for name, e in report["numbers"].items()}
 
 
 def as_table(summary: Mapping[str, Any]) -> str:
     """Lay out a summary as a table; the last line is the share of successful runs."""
     rows = [("number", "median", "95 % interval", "unit")]
     for name, entry in summary["numbers"].items():
-        bounds = entry["interval"]
-        between = f"{format_number(bounds[0])} .. {format_number(bounds[1])}" if bounds else "-"
+        between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
         unit = "" if entry["unit"] == "1" else entry["unit"]
         note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
         rows.append((name, format_number(entry["median"]), between, unit + note))
@@ -90,95 +76,79 @@ def as_table(summary: Mapping[str, Any]) -> str:
 
 def as_csv(reports: Sequence[Report]) -> str:
     """Write one line per run: seed, verdict and all numbers."""
-    columns = list(dict.fromkeys(name for report in reports for name in report["numbers"]))
-    units = {name: e["unit"] for report in reports for name, e in report["numbers"].items()}
-    text = io.StringIO()
+    units, text = _units(reports), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["seed", "verdict", *(f"{name} [{units[name]}]" for name in columns)])
+    writer.writerow(["seed", "verdict", *(f"{name} [{unit}]" for name, unit in units.items())])
     for report in reports:
-        numbers = report["numbers"]
-        values = [numbers[name]["value"] if name in numbers else "" for name in columns]
+        values = [report["numbers"].get(name, {"value": ""})["value"] for name in units]
         writer.writerow([report["seed"], report["verdict"], *values])
     return text.getvalue()
 
 
-def fly_seeds(options: argparse.Namespace, overrides: list[str], fly: Fly) -> int:
+def fly_seeds(options: argparse.Namespace) -> int:
     """Fly seeds 1 to N; return the exit code, which is 0 only if all runs succeed.
 
     After an interrupt or the death of a worker, the table covers the finished seeds.
-
-    Args:
-        options: Flags of `cloudrc run`.
-        overrides: Changes of the experiment, as `--set` takes them.
-        fly: Flies one experiment and returns its report; a function of a module.
     """
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
 
     # Load the experiment here too, so that a mistake is reported once, not N times.
-    loaded = load_experiment(options.experiment, overrides)
+    loaded = load_experiment(options.experiment, options.set)
     metrics.check(loaded.report.metrics)
-    name = loaded.name
-    folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds")
-    seeds = range(1, options.seeds + 1)
+    folder = new_folder(options.out, f"{loaded.name}-virtual-{options.seeds}seeds")
+    work = [(options.experiment, options.set, folder, n + 1) for n in range(options.seeds)]
     reports: list[dict[str, Any]] = []
-    code = 0
-    work = [(fly, options.experiment, overrides, folder, seed) for seed in seeds]
+    stopped, code = "", 0
     try:
-        with closing(map_in_order(_fly_one, work, len(seeds))) as finished:
+        with closing(map_in_order(_fly_one, work, len(work))) as finished:
             for report in finished:
                 reports.append(report)
-                _show_run(options, report, f"{len(reports)}/{len(seeds)}")
+                _show_run(options, report, f"{len(reports)}/{len(work)}")
                 if report["verdict"] == "interrupted":  # with one core, this process flies
                     raise KeyboardInterrupt
-    except (KeyboardInterrupt, WorkerDiedError) as error:
-        killed = isinstance(error, WorkerDiedError)
-        code = WorkerDiedError.exit_code if killed else EXIT_CODES["interrupted"]
-        reason = (
-            f"{WORKER_KILLED if killed else 'interrupted'}: {len(reports)} of {len(seeds)} seeds"
-        )
-        with ignore_closed_pipe(sys.stderr):
-            print(f"\ncloudrc: {reason} are finished", file=sys.stderr, flush=True)
-    summary = _write(folder, name, reports, bool(code))
-    with ignore_closed_pipe(sys.stdout):
-        if options.output != "table":
-            document = json.loads((folder / "sweep.json").read_text())
-            print(format_document(document, options.output), flush=True)
-        else:
-            print(f"\n{as_table(summary)}\n\n{folder / 'sweep.json'}", flush=True)
+    except KeyboardInterrupt:
+        stopped, code = "interrupted", EXIT_CODES["interrupted"]
+    except WorkerDiedError as error:
+        stopped, code = WORKER_KILLED, error.exit_code
+    if stopped:
+        text = f"\ncloudrc: {stopped}: {len(reports)} of {len(work)} seeds are finished"
+        print_or_drop(text, sys.stderr)
+    document = _write(folder, loaded.name, reports, bool(stopped))
+    if options.output != "table":
+        print_or_drop(format_document(document, options.output))
+    else:
+        print_or_drop(f"\n{as_table(document)}\n\n{folder / 'sweep.json'}")
     return code or max(EXIT_CODES[report["verdict"]] for report in reports)
 
 
-def _show_run(options: argparse.Namespace, report: dict[str, Any], progress: str) -> None:
+def _show_run(options: argparse.Namespace, report: Report, progress: str) -> None:
     stream = sys.stdout if options.output == "table" else sys.stderr
     if options.output == "table" or stream.isatty():
-        failures = "".join(f": {f['text']}" for f in report["failures"][:1])
-        with ignore_closed_pipe(stream):
-            print_line(
-                f"{progress:>7}  seed {report['seed']}  {report['verdict']}{failures}", stream
-            )
+        failure = "".join(f": {f['text']}" for f in report["failures"][:1])
+        line = f"{progress:>7}  seed {report['seed']}  {report['verdict']}{failure}"
+        print_or_drop(escape(line), stream)
 
 
-def _fly_one(job: Job) -> dict[str, Any]:
+def _fly_one(job: tuple[str, list[str], Path, int]) -> dict[str, Any]:
     """Fly one seed, in a worker."""
+    from cloudrc.cli.run import fly
     from cloudrc.config.load import load_experiment
 
-    fly, experiment, overrides, folder, seed = job
+    experiment, overrides, folder, seed = job
     loaded = load_experiment(experiment, [*overrides, f"seed={seed}"])
     run_folder = folder / f"seed-{seed}"
     run_folder.mkdir()
-    return fly(loaded, "virtual", run_folder, lambda records: None, page=False)
+    return fly(loaded, "virtual", run_folder, page=False)
 
 
-def _write(
-    folder: Path, name: str, reports: list[dict[str, Any]], interrupted: bool
-) -> dict[str, Any]:
+def _write(folder: Path, name: str, reports: Sequence[Report], interrupted: bool) -> dict[str, Any]:
+    """Write sweep.json and sweep.csv; return the content of sweep.json."""
     runs = [
         {"seed": r["seed"], "verdict": r["verdict"], "folder": f"seed-{r['seed']}"} for r in reports
     ]
     head = {"schemaVersion": 1, "experiment": name, "mode": "virtual", "interrupted": interrupted}
-    summary = {**head, **summarise(reports)}
-    text = json.dumps({**summary, "runs": runs}, indent=2)
-    (folder / "sweep.json").write_text(text + "\n")
+    document = {**head, **summarise(reports), "runs": runs}
+    (folder / "sweep.json").write_text(json.dumps(document, indent=2) + "\n")
     (folder / "sweep.csv").write_text(as_csv(reports))
-    return summary
+    return document

@@ -1,14 +1,8 @@
 """Compute metrics of a recorded flight: each is one number with a unit.
 
-A shipped metric is a row of the table METRICS in `flight`, `control`, `link` or `mission`: name,
-unit, meaning, and the function that computes the number. Your own metric is one Python file with
-
-- a docstring whose first line says in one sentence what the number means; the report prints it;
-- `UNIT`, an SI unit as text: "s", "m", "m/s", "N", or "1" for counts and shares;
-- `measure(flight: Flight) -> float | None`, which returns None if the number is unknown.
-
-Name the file in an experiment (`report.metrics`), or list its module in the entry-point group
-`cloudrc.metrics` of a package: every report measures installed metrics.
+A shipped metric is a function in `flight`, `control`, `link` or `mission`. The report prints its
+name, and the first line of its docstring as the meaning of the number. docs/plugins.md describes
+metrics of your own.
 """
 
 from __future__ import annotations
@@ -21,52 +15,26 @@ from pathlib import Path
 
 from cloudrc import plugins
 from cloudrc.errors import BadInputError
-from cloudrc.metrics import control, flight, link, mission
-from cloudrc.metrics.flight import Flight, Metric
+from cloudrc.metrics import control, link, mission
+from cloudrc.metrics.flight import SHIPPED, Flight, Metric
 
-__all__ = [
-    "METRIC_NOTE",
-    "SHIPPED",
-    "Flight",
-    "Metric",
-    "Number",
-    "check",
-    "find",
-    "measure_all",
-    "name_of",
-    "not_measured",
-]
-
+__all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission"]
 
 METRIC_NOTE = "metric "
 """Beginning of a note on a metric."""
-SHIPPED = {
-    metric.name: metric
-    for metric in (*flight.METRICS, *control.METRICS, *link.METRICS, *mission.METRICS)
-}
-"""Shipped metrics by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """One measured number.
+    """One measured number."""
 
-    Attributes:
-        value: Finite value in `unit`.
-        unit: SI unit as text; "1" for counts and shares.
-        meaning: Meaning of the number, one sentence.
-    """
-
-    value: float
-    unit: str
-    meaning: str
+    value: float  # finite
+    unit: str  # SI unit as text; "1" for counts and shares
+    meaning: str  # one sentence
 
 
 def find(choice: str) -> Metric:
-    """Find a metric.
-
-    Args:
-        choice: Name of a shipped or installed metric, or path of a Python file, which is executed.
+    """Find a metric by its name, or by the path of a Python file, which is executed.
 
     Raises:
         BadInputError: If `choice` does not exist, or is not a metric.
@@ -94,10 +62,7 @@ def name_of(choice: str) -> str:
 
 
 def check(own: Iterable[str]) -> None:
-    """Check the user's metrics before the flight.
-
-    Args:
-        own: Names or paths, as for `find`.
+    """Check the user's metrics, names or paths as for `find`, before the flight.
 
     Raises:
         BadInputError: For the first invalid metric, or if two have the same name.
@@ -121,11 +86,7 @@ def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
 
 
 def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Number], list[str]]:
-    """Measure all shipped and installed metrics, and the user's own.
-
-    Args:
-        flight: A recorded flight.
-        own: The user's own metrics, as for `find`.
+    """Measure all shipped and installed metrics, and the user's own, as for `find`.
 
     Returns:
         Known numbers by name, sorted; and a note for each metric that failed. After an exception
@@ -137,15 +98,11 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
         name = name_of(choice)
         try:
             metric = find(choice)
-            measured = metric.measure(flight)
-            value = None if measured is None else float(measured)
+            value = metric.measure(flight)
+            if value is not None and isfinite(value):
+                numbers[name] = Number(float(value), metric.unit, metric.meaning)
+            elif value is not None:
+                notes.append(f"{METRIC_NOTE}{name} gave {value}: left out")
         except Exception as error:
             notes.append(f"{METRIC_NOTE}{name} failed: {type(error).__name__}: {error}")
-            continue
-        if value is None:
-            continue
-        if isfinite(value):
-            numbers[name] = Number(value, metric.unit, metric.meaning)
-        else:
-            notes.append(f"{METRIC_NOTE}{name} gave {value}: left out")
     return numbers, notes

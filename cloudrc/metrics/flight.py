@@ -1,13 +1,12 @@
 """Define `Flight`, a recording cut to its mission, and the metrics of the robot's motion.
 
-All stamps are on world's clock. Time zero is the guard's first change to TRACK; the robot does not
-move before. The flight ends with the event that ends the mission or, without such an event, at the
-end of the recording.
+Time zero is the guard's first change to TRACK; the robot does not move before. The flight ends with
+the event that ends the mission or, without such an event, at the end of the recording.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Any, TypeAlias
@@ -23,50 +22,23 @@ from cloudrc.record.columns import Recording, Table
 from cloudrc.records import UNDER_WAY
 
 Array: TypeAlias = NDArray[Any]
-Columns: TypeAlias = Mapping[str, Array]
+Columns: TypeAlias = dict[str, Array]
 
 CONTROL_TOPICS = (
-    "/estimated_odometry",
-    "/setpoint_position",
-    "/cmd_vel",
-    "/delay_estimate",
-    "/pid",
+    *("/estimated_odometry", "/setpoint_position", "/cmd_vel"),
+    *("/delay_estimate", "/pid"),
 )
 """Topics that together record the periods of the control loop."""
 
 
-@dataclass(frozen=True, slots=True)
-class AppliedCommands:
-    """Commands that the low-level controller applied, joined with their control periods; n rows.
-
-    Attributes:
-        stamp_ns: Instant of application [ns], world's clock, shape (n,).
-        basis_stamp_ns: Stamp of the odometry behind the command [ns], world's clock, shape (n,).
-        horizon: Time from that odometry to the instant that cloud predicted [s], shape (n,).
-        predicted: Position that cloud predicted [m], shape (n, 3).
-    """
-
-    stamp_ns: Array
-    basis_stamp_ns: Array
-    horizon: Array
-    predicted: Array
-
-
 @dataclass(frozen=True)
 class Flight:
-    """A recorded flight, its criteria and its scene.
+    """A recorded flight, its criteria and its scene."""
 
-    Attributes:
-        recording: All topics; cloud's stamps are shifted to world's clock.
-        criteria: Criteria of success.
-        waypoints: Number of waypoints of the mission.
-        scene: Pipes and board.
-    """
-
-    recording: Recording
+    recording: Recording  # all topics; cloud's stamps are shifted to world's clock
     criteria: Criteria
-    waypoints: int
-    scene: Scene
+    waypoints: int  # number of waypoints of the mission
+    scene: Scene  # pipes and board
 
     @cached_property
     def start_ns(self) -> int | None:
@@ -77,14 +49,9 @@ class Flight:
 
     @cached_property
     def end_ns(self) -> int | None:
-        """Stamp of the end [ns], world's clock; None if the robot never flew.
-
-        The end is the event that ended the mission or, without such an event, the last true state.
-        """
-        if self.start_ns is None:
-            return None
-        if self.ending is not None:
-            return self.ending[0]
+        """Stamp of the end [ns], world's clock; None if the robot never flew."""
+        if self.start_ns is None or self.ending is not None:
+            return self.ending[0] if self.ending else None
         stamps = self.recording["/ground_truth"]["stamp_ns"]
         return int(stamps[-1]) if len(stamps) else self.start_ns
 
@@ -102,15 +69,12 @@ class Flight:
         """Convert stamps on world's clock [ns] to time since the start [s]."""
         return (stamp_ns - (self.start_ns or 0)) * 1e-9
 
-    def during(self, topic: str) -> dict[str, Array]:
+    def during(self, topic: str) -> Columns:
         """Select the rows of a topic from the start to the end of the flight, both included."""
-        return _within(_columns(self.recording[topic]), self.start_ns, self.end_ns)
+        return self._within(_columns(self.recording[topic]))
 
     def true_position(self, stamp_ns: Array) -> Array:
-        """Interpolate the true position of the base.
-
-        Args:
-            stamp_ns: Instants [ns], world's clock, shape (n,).
+        """Interpolate the true position of the base at instants [ns], world's clock, shape (n,).
 
         Returns:
             Positions [m], shape (n, 3); NaN outside the recording.
@@ -125,21 +89,21 @@ class Flight:
         return np.stack(axes, axis=1)
 
     @cached_property
-    def truth(self) -> dict[str, Array]:
+    def truth(self) -> Columns:
         """True states during the flight."""
         return self.during("/ground_truth")
 
     @cached_property
-    def control(self) -> dict[str, Array]:
+    def control(self) -> Columns:
         """Periods of the control loop during the flight, joined from their topics."""
-        return _within(self._control, self.start_ns, self.end_ns)
+        return self._within(self._control)
 
     @cached_property
-    def _control(self) -> dict[str, Array]:
+    def _control(self) -> Columns:
         tables = [_columns(self.recording[topic]) for topic in CONTROL_TOPICS]
         # In the last period of a torn recording some topics may be missing.
         stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
-        columns: dict[str, Array] = {}
+        columns: Columns = {}
         for table in tables:
             rows = np.searchsorted(table["stamp_ns"], stamps)
             columns |= {name: column[rows] for name, column in table.items()}
@@ -155,66 +119,82 @@ class Flight:
     @cached_property
     def inside(self) -> Array:
         """Whether the base is inside a pipe, per row of `truth`; empty without pipes."""
-        if not self.scene.pipes or not len(self.truth["stamp_ns"]):
+        if not len(self.clearance):
             return np.zeros(0, dtype=bool)
         return inside_pipe(self.scene, self.truth["position"])
 
     @cached_property
     def pipes_flown(self) -> int:
         """Number of different pipes in which the base has been."""
-        if not len(self.truth["stamp_ns"]):
-            return 0
-        indices = np.unique(pipe_index(self.scene, self.truth["position"]))
-        return int((indices >= 0).sum())
+        return int((np.unique(pipe_index(self.scene, self.truth["position"])) >= 0).sum())
 
     @cached_property
-    def applied(self) -> AppliedCommands:
-        """Commands applied during the flight whose control period was recorded."""
-        applied, control = self.during("/command_applied"), self._control
-        rows = {
-            key: row
-            for row, key in enumerate(zip(control["epoch"], control["counter"], strict=True))
-        }
-        keys = zip(applied["epoch"], applied["counter"], strict=True)
+    def applied(self) -> Columns:
+        """Commands applied during the flight, joined with their control periods.
+
+        `stamp_ns` is the instant of application [ns], `position` the predicted one [m].
+        """
+        return self.join_control(self.during("/command_applied"))
+
+    def join_control(self, commands: Columns) -> Columns:
+        """Join commands, rows with `epoch` and `counter`, with their control periods.
+
+        Rows without a recorded control period are left out. A column of both keeps the value of the
+        row.
+        """
+        keys = zip(self._control["epoch"], self._control["counter"], strict=True)
+        rows = {key: row for row, key in enumerate(keys)}
+        keys = zip(commands["epoch"], commands["counter"], strict=True)
         joined = np.array([rows.get(key, -1) for key in keys], dtype=np.int64)
-        source = joined[joined >= 0]
-        return AppliedCommands(
-            applied["stamp_ns"][joined >= 0],
-            applied["basis_stamp_ns"][joined >= 0],
-            control["horizon"][source],
-            control["position"][source],
-        )
+        known, source = joined >= 0, joined[joined >= 0]
+        periods = {name: column[source] for name, column in self._control.items()}
+        return periods | {name: column[known] for name, column in commands.items()}
+
+    def _within(self, columns: Columns) -> Columns:
+        """Select the rows from start to end, both included; none without a start."""
+        stamps = columns["stamp_ns"]
+        if self.start_ns is None or self.end_ns is None:
+            rows = np.zeros(len(stamps), dtype=bool)
+        else:
+            rows = (stamps >= self.start_ns) & (stamps <= self.end_ns)
+        return {name: column[rows] for name, column in columns.items()}
 
 
-def _columns(table: Table) -> dict[str, Array]:
+def _columns(table: Table) -> Columns:
     return {name: table[name] for name in table.names}
 
 
-def _within(columns: Columns, start_ns: int | None, end_ns: int | None) -> dict[str, Array]:
-    """Select the rows from `start_ns` to `end_ns`, both included; none without a start."""
-    stamps = columns["stamp_ns"]
-    if start_ns is None or end_ns is None:
-        rows = np.zeros(len(stamps), dtype=bool)
-    else:
-        rows = (stamps >= start_ns) & (stamps <= end_ns)
-    return {name: column[rows] for name, column in columns.items()}
+Measure: TypeAlias = Callable[[Flight], float | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A metric: one row of the tables in this package.
+    """A metric, which `measure` computes in `unit`, or as None if the number is unknown."""
 
-    Attributes:
-        name: Name in report.json.
-        unit: An SI unit as text: "s", "m", "m/s", "N"; "1" for counts and shares.
-        meaning: One sentence for the report and for `cloudrc list metrics`.
-        measure: Computes the number in `unit`; returns None if the number is unknown.
-    """
+    name: str  # in report.json
+    unit: str  # SI unit as text; "1" for counts and shares
+    meaning: str  # one sentence
+    measure: Measure
 
-    name: str
-    unit: str
-    meaning: str
-    measure: Callable[[Flight], float | None]
+
+SHIPPED: dict[str, Metric] = {}
+"""Shipped metrics by name; complete once `cloudrc.metrics` is imported."""
+
+
+def add_metric(name: str, unit: str, meaning: str, measure: Measure) -> None:
+    """Add a shipped metric; the arguments are the attributes of a `Metric`."""
+    SHIPPED[name] = Metric(name, unit, meaning, measure)
+
+
+def metric(unit: str) -> Callable[[Measure], Measure]:
+    """Make a function a shipped metric in `unit`: its name, and the first line of its docstring."""
+
+    def add(measure: Measure) -> Measure:
+        meaning = (measure.__doc__ or "").partition("\n")[0]
+        add_metric(measure.__name__, unit, meaning, measure)
+        return measure
+
+    return add
 
 
 def mean(values: Array) -> float | None:
@@ -224,74 +204,49 @@ def mean(values: Array) -> float | None:
 
 
 def percentile(values: Array, percent: float) -> float | None:
-    """Compute a percentile; None if no value is finite.
-
-    Args:
-        values: Shape (n,), any unit; only finite values count.
-        percent: Share of the values that are below the result [%].
-    """
+    """Compute a percentile of the finite `values`, shape (n,), any unit; None without any."""
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, percent)) if len(finite) else None
 
 
 def rms(errors: Array) -> float | None:
-    """Compute the RMS length of error vectors.
+    """Compute the RMS length of error vectors, shape (n,) or (n, 3), any unit.
 
-    Args:
-        errors: Shape (n,) or (n, 3), any unit; only finite rows count.
-
-    Returns:
-        RMS in the unit of `errors`; None if no row is finite.
+    Only finite rows count; without any, return None.
     """
     squares = np.square(errors) if errors.ndim == 1 else np.square(errors).sum(axis=1)
     square = mean(squares)
     return None if square is None else float(np.sqrt(square))
 
 
-def _duration(flight: Flight) -> float | None:
+@metric("s")
+def duration(flight: Flight) -> float | None:
+    """Time from the start of the mission to its end."""
     return None if flight.end_ns is None else float(flight.seconds(flight.end_ns))
 
 
-def _distance_flown(flight: Flight) -> float | None:
+@metric("m")
+def distance_flown(flight: Flight) -> float | None:
+    """Length of the path that the robot's base flew."""
     steps = np.diff(flight.truth["position"], axis=0)
     return float(np.linalg.norm(steps, axis=1).sum()) if len(steps) else None
 
 
-def _speed_max(flight: Flight) -> float | None:
+@metric("m/s")
+def speed_max(flight: Flight) -> float | None:
+    """Largest true speed of the robot's base."""
     speeds = np.linalg.norm(flight.truth["velocity"], axis=1)
     return float(speeds.max()) if len(speeds) else None
 
 
-def _min_clearance(flight: Flight) -> float | None:
-    """Return the minimum clearance inside a pipe; negative if a wall was penetrated."""
+@metric("m")
+def min_clearance(flight: Flight) -> float | None:
+    """Smallest distance between the robot and a pipe's wall while the base is inside a pipe."""
     inside = flight.clearance[flight.inside]
     return float(inside.min()) if len(inside) else None
 
 
-def _min_clearance_flight(flight: Flight) -> float | None:
-    """Return the minimum clearance of all samples.
-
-    The board does not count, because the arm must touch the board.
-    """
+@metric("m")
+def min_clearance_flight(flight: Flight) -> float | None:
+    """Smallest distance between the robot and a pipe during the whole flight."""
     return float(flight.clearance.min()) if len(flight.clearance) else None
-
-
-METRICS = (
-    Metric("duration", "s", "Time from the start of the mission to its end.", _duration),
-    Metric(
-        "distance_flown", "m", "Length of the path that the robot's base flew.", _distance_flown
-    ),
-    Metric("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
-    Metric(
-        "min_clearance",
-        "m",
-        "Smallest distance between the robot and a pipe's wall while the base is inside a pipe.",
-        _min_clearance,
-    ),
-    Metric(
-        "min_clearance_flight",
-        "m",
-        "Smallest distance between the robot and a pipe during the whole flight.",
-        _min_clearance_flight,
-    ),
-)

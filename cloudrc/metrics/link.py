@@ -5,12 +5,11 @@ The metrics include late datagrams, because the datagrams that the loop uses are
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 
-from cloudrc.metrics.flight import Flight, Metric, mean
+from cloudrc.metrics.flight import Flight, add_metric, mean
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
 """Direction -> description of the direction in the meaning of a metric."""
@@ -19,14 +18,6 @@ SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 SETTLING_NS = 2_000_000_000
 """Time after which a datagram that has not arrived counts as lost [ns]."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
-"""Name of a percentile -> description of the percentile."""
-RELAY_COUNTS = {
-    "relay_overflow": "that the relay dropped because its queue was full.",
-    # The release errors do not include this time.
-    "relay_stalled": "that waited 50 ms or more until the relay read them.",
-    "released_early": "that left before they were due; above 0 the relay has a bug.",
-}
-"""Metric of the relay's counts -> end of the text that says what the metric means."""
 
 
 def _delay_mean(flight: Flight, way: str) -> float | None:
@@ -58,43 +49,32 @@ def loss(flight: Flight, way: str) -> float | None:
 def _relay_count(flight: Flight, name: str, scale: float = 1.0) -> float | None:
     """Return the relay's last total of a count; None if no relay shaped the link."""
     count = flight.recording["/count"]
-    rows = zip(count["name"], count["total"], strict=True)
-    totals = [int(total) for one, total in rows if one == name]
-    return totals[-1] * scale if totals else None
+    totals = count["total"][count["name"] == name]
+    return int(totals[-1]) * scale if len(totals) else None
 
 
-def _direction_metrics(way: str, words: str) -> Iterator[Metric]:
-    """Yield the metrics of one direction."""
-    yield Metric(
-        f"{way}_delay_mean",
-        "s",
-        f"Mean one-way delay {words} of all datagrams that arrived, late ones included.",
-        partial(_delay_mean, way=way),
-    )
-    yield Metric(
-        f"late_{way}",
-        "1",
-        f"Share of the arrived datagrams {words} that were too late to be used.",
-        partial(_late, way=way),
-    )
-    yield Metric(
-        f"loss_{way}",
-        "1",
-        f"Share of the datagrams {words} that never arrived.",
-        partial(loss, way=way),
-    )
-    for name, share in PERCENTILES.items():
-        yield Metric(
-            f"release_error_{name}_{way}",
+for _way, _words in WAYS.items():
+    _all = f"Mean one-way delay {_words} of all datagrams that arrived, late ones included."
+    add_metric(f"{_way}_delay_mean", "s", _all, partial(_delay_mean, way=_way))
+    for _name, _which, _measure in (
+        ("late", f"arrived datagrams {_words} that were too late to be used.", _late),
+        ("loss", f"datagrams {_words} that never arrived.", loss),
+    ):
+        add_metric(f"{_name}_{_way}", "1", f"Share of the {_which}", partial(_measure, way=_way))
+    for _name, _which in PERCENTILES.items():
+        add_metric(
+            f"release_error_{_name}_{_way}",
             "s",
-            f"Delay with which the relay released datagrams {words} after they were due: {share}.",
-            partial(_relay_count, name=f"{way}_release_error_{name}_ns", scale=1e-9),
+            f"Delay with which the relay released datagrams {_words} after they were due: "
+            f"{_which}.",
+            partial(_relay_count, name=f"{_way}_release_error_{_name}_ns", scale=1e-9),
         )
-    for name, what in RELAY_COUNTS.items():
-        count = f"{way}_{name.removeprefix('relay_')}"
-        yield Metric(
-            f"{name}_{way}", "1", f"Datagrams {words} {what}", partial(_relay_count, name=count)
-        )
-
-
-METRICS = tuple(metric for way, words in WAYS.items() for metric in _direction_metrics(way, words))
+    for _name, _which in (
+        ("relay_overflow", "that the relay dropped because its queue was full."),
+        # The release errors do not include this time.
+        ("relay_stalled", "that waited 50 ms or more until the relay read them."),
+        ("released_early", "that left before they were due; above 0 the relay has a bug."),
+    ):
+        _count = f"{_way}_{_name.removeprefix('relay_')}"
+        _last = partial(_relay_count, name=_count)
+        add_metric(f"{_name}_{_way}", "1", f"Datagrams {_words} {_which}", _last)

@@ -2,16 +2,14 @@
 
 The verdict is the first of these that applies:
 
-- `interrupted`: the run was stopped, the mission was cancelled, or the recording ends before the
-  mission;
+- `interrupted`: the run was stopped or the mission was cancelled before its end;
 - `invalid`: the run did not keep real time although it had to, so its numbers mean nothing;
 - `failure`: at least one criterion of success is not met; each is listed with time and place;
 - `success`: all waypoints were reached within the time limit, the board was touched slowly enough,
   no pipe was touched, the guard was only in TRACK or HOLD, and world never restarted.
 
-The rules judge `Evidence`. The report takes the evidence from the recorded truth
-(`flight_evidence`), teleop takes it from telemetry (`Observations`). Telemetry arrives late and
-shows less, so the two verdicts can differ.
+The rules judge `Evidence`, by the recorded truth (`flight_evidence`, for the report) or by
+telemetry (`Observations`, for teleop), which arrives late and shows less.
 """
 
 from __future__ import annotations
@@ -41,19 +39,12 @@ Outcome = Literal["success", "failure", "invalid", "interrupted"]
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A criterion of success that is not met.
+    """A criterion of success that is not met."""
 
-    Attributes:
-        code: One word, for programs.
-        text: Description for people.
-        time: Time since the start of the mission [s]; None if the failure has no instant.
-        place: True position of the base at that time [m], shape (3,); None if unknown.
-    """
-
-    code: str
-    text: str
-    time: float | None = None
-    place: Vector | None = None
+    code: str  # one word, for programs
+    text: str  # for people
+    time: float | None = None  # since the start of the mission [s]; None without an instant
+    place: Vector | None = None  # true position of the base at that time [m]; None if unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,20 +57,12 @@ class Verdict:
     def as_json(self) -> dict[str, Any]:
         """Return the verdict for the API, without times and places."""
         failures = [{"code": each.code, "text": each.text} for each in self.failures]
-        return {
-            "outcome": self.outcome,
-            "exit_code": EXIT_CODES[self.outcome],
-            "failures": failures,
-        }
+        code = EXIT_CODES[self.outcome]
+        return {"outcome": self.outcome, "exit_code": code, "failures": failures}
 
 
 class Moment(NamedTuple):
-    """When and where something happened, as in `Failure`.
-
-    Attributes:
-        time: Time since the start of the mission [s].
-        place: True position of the base [m], shape (3,).
-    """
+    """When and where something happened, as in `Failure`."""
 
     time: float | None = None
     place: Vector | None = None
@@ -89,104 +72,65 @@ UNKNOWN = Moment()
 
 
 class Ending(NamedTuple):
-    """How a mission ended: code, text and moment of its last event."""
+    """How a mission ended: one word for programs, and a text for people."""
 
     code: str
     text: str
-    moment: Moment = UNKNOWN
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What is known of a mission that is over.
-
-    Attributes:
-        waypoints: Number of waypoints of the mission.
-        reached: Number of waypoints reached.
-        contact: Whether the arm's tip has to touch the board.
-        contact_speed_max: Limit of the speed at the touch [m/s].
-        ending: How the mission ended; None if its last event is unknown.
-        end: End of the flight.
-        interrupted: Why the run ended, if somebody stopped it before the mission's end; else "".
-        grounded: Why the robot never flew; "" if it flew.
-        duration: Duration [s]; 0 if the limit of the duration is not judged.
-        time_limit: Limit of the duration [s].
-        touch: Speed of the first touch of the board [m/s] and its moment; None without a touch.
-        pipes: Name, number of contacts and first moment of each pipe that was touched.
-        guard: State, cause and moment of each change of the guard beyond HOLD.
-        restarts: Cause and moment of each session that world opened in flight.
-        slow: Why the run did not keep real time; "" if it kept real time or did not have to.
-    """
+    """What is known of a mission that is over."""
 
     waypoints: int
-    reached: int
-    contact: bool
-    contact_speed_max: float
-    ending: Ending | None
+    reached: int  # number of waypoints reached
+    contact: bool  # whether the arm's tip has to touch the board
+    contact_speed_max: float  # limit of the speed at the touch [m/s]
+    ending: Ending
     end: Moment = UNKNOWN
-    interrupted: str = ""
-    grounded: str = ""
-    duration: float = 0.0
-    time_limit: float = inf
-    touch: tuple[float, Moment] | None = None
-    pipes: tuple[tuple[str, int, Moment], ...] = ()
-    guard: tuple[tuple[str, str, Moment], ...] = ()
-    restarts: tuple[tuple[str, Moment], ...] = ()
-    slow: str = ""
+    time_limit: float = inf  # limit of the time of `end` [s]
+    touch: tuple[float, Moment] | None = None  # speed of the first touch of the board [m/s]
+    violations: tuple[Failure, ...] = ()  # other events that must not happen
+    slow: str = ""  # why the run did not keep real time; "" if it did or did not have to
 
 
 def judge(evidence: Evidence) -> Verdict:
     """Judge a mission."""
-    violations, ending = tuple(_violations(evidence)), evidence.ending
-    if ending is None and evidence.interrupted:
-        stopped = Failure("interrupted", evidence.interrupted, *evidence.end)
-        return Verdict("interrupted", (stopped, *violations))
-    if ending is not None and ending.code == "cancelled":  # its unmet goals are no failure
-        cancelled = Failure(ending.code, ending.text, *ending.moment)
-        return Verdict("interrupted", (cancelled, *violations))
-    codes = {failure.code for failure in violations}
-    failures = [*violations, *(f for f in _unmet_goals(evidence) if f.code not in codes)]
-    failures.sort(key=lambda failure: inf if failure.time is None else failure.time)
-    slow = (Failure("not_real_time", evidence.slow),) if evidence.slow else ()
-    outcome: Outcome = "invalid" if slow else "failure" if failures else "success"
-    return Verdict(outcome, (*slow, *failures))
-
-
-def _violations(evidence: Evidence) -> Iterator[Failure]:
-    """Yield events that must not happen at any time of the flight."""
-    limit = evidence.contact_speed_max
+    violations, limit = evidence.violations, evidence.contact_speed_max
     if evidence.contact and evidence.touch is not None and evidence.touch[0] >= limit:
         speed, moment = evidence.touch
         text = f"the tip met the board at {speed:.2f} m/s, not below {limit:g} m/s"
-        yield Failure("contact_too_fast", text, *moment)
-    for name, count, moment in evidence.pipes:
-        times = f" ({count} times)" if count > 1 else ""
-        yield Failure("pipe_touched", f"the robot touched {name}{times}", *moment)
-    for state, cause, moment in evidence.guard:
-        yield Failure("guard_intervened", f"the guard went to {state}: {cause}", *moment)
-    for cause, moment in evidence.restarts:
-        text = f"world opened a new session in flight: {cause}"
-        yield Failure("world_restarted", text, *moment)
+        violations = (Failure("contact_too_fast", text, *moment), *violations)
+    if evidence.ending.code in ("interrupted", "cancelled"):  # unmet goals are no failure
+        return Verdict("interrupted", (Failure(*evidence.ending, *evidence.end), *violations))
+    codes = {failure.code for failure in violations}
+    failures = [*violations, *(f for f in _unmet_goals(evidence) if f.code not in codes)]
+    failures.sort(key=lambda failure: inf if failure.time is None else failure.time)
+    if evidence.slow:
+        return Verdict("invalid", (Failure("not_real_time", evidence.slow), *failures))
+    return Verdict("failure" if failures else "success", tuple(failures))
 
 
 def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
     """Yield the goals that the mission did not reach."""
-    if evidence.grounded:
-        yield Failure("not_started", f"the robot never left the ground: {evidence.grounded}")
-        return
     ending, end = evidence.ending, evidence.end
-    if ending is None:
-        yield Failure("mission_not_ended", "the mission did not end", *end)
-    elif ending.code != "done":
-        yield Failure(ending.code, ending.text, *ending.moment)
+    if ending.code != "done":
+        yield Failure(*ending, *end)
+    if ending.code == "not_started":
+        return
     if evidence.reached < evidence.waypoints:
         text = f"{evidence.reached} of {evidence.waypoints} waypoints reached"
         yield Failure("waypoint_not_reached", text, *end)
     if evidence.contact and evidence.touch is None:
         yield Failure("board_not_touched", "the arm never touched the board")
-    if evidence.duration > evidence.time_limit:
-        text = f"the mission took {evidence.duration:.1f} s, more than {evidence.time_limit:g} s"
+    if end.time is not None and end.time > evidence.time_limit:
+        text = f"the mission took {end.time:.1f} s, more than {evidence.time_limit:g} s"
         yield Failure("time_limit_exceeded", text, *end)
+
+
+def _pipe_touched(name: str, count: int, moment: Moment = UNKNOWN) -> Failure:
+    times = f" ({count} times)" if count > 1 else ""
+    return Failure("pipe_touched", f"the robot touched {name}{times}", *moment)
 
 
 def _too_slow(factor: float) -> str:
@@ -198,7 +142,7 @@ def _too_slow(factor: float) -> str:
 def flight_evidence(
     flight: Flight, numbers: Mapping[str, Number], *, real_time: bool, interrupted: bool
 ) -> Evidence:
-    """Take the evidence from the recorded truth of a flight.
+    """Take the evidence from the recorded truth of a flight, and from its numbers.
 
     Args:
         flight: The recorded flight.
@@ -206,31 +150,35 @@ def flight_evidence(
         real_time: True if the run had to keep real time: any mode except virtual.
         interrupted: True if the run was stopped, or if its recording is torn.
     """
-    criteria, end_ns, why = flight.criteria, flight.end_ns, ""
-    if interrupted:
-        before = "the run was stopped before the mission started"
-        why = before if end_ns is None else "the run ended before the mission"
-    touch, ending = first_touch(flight), None
-    if flight.ending is not None:
-        ending = Ending(flight.ending[1], flight.ending[2], _moment(flight, flight.ending[0]))
-    reached = numbers.get("waypoints_reached")
+    criteria, end_ns = flight.criteria, flight.end_ns
+    reached, touch = numbers.get("waypoints_reached"), None
+    if row := first_touch(flight):
+        speed = float(np.linalg.norm(row["tip_velocity"]))
+        touch = speed, _moment(flight, int(row["stamp_ns"]))
     return Evidence(
         waypoints=flight.waypoints,
         reached=0 if reached is None else round(reached.value),
         contact=criteria.contact,
         contact_speed_max=criteria.contact_speed_max_mps,
-        ending=ending,
+        ending=_ending(flight, interrupted),
         end=UNKNOWN if end_ns is None else _moment(flight, end_ns),
-        interrupted=why,
-        grounded=_why_grounded(flight) if end_ns is None else "",
-        duration=0.0 if end_ns is None else float(flight.seconds(end_ns)),
         time_limit=criteria.time_limit_s,
-        touch=None if touch is None else _touch(flight, touch),
-        pipes=tuple(_pipes(flight)),
-        guard=tuple(_interventions(flight)),
-        restarts=tuple(_restarts(flight)),
+        touch=touch,
+        violations=(*_pipes(flight), *_interventions(flight), *_restarts(flight)),
         slow=_not_real_time(numbers) if real_time else "",
     )
+
+
+def _ending(flight: Flight, interrupted: bool) -> Ending:
+    if flight.ending is not None:
+        return Ending(*flight.ending[1:])
+    if interrupted and flight.end_ns is None:
+        return Ending("interrupted", "the run was stopped before the mission started")
+    if interrupted:
+        return Ending("interrupted", "the run ended before the mission")
+    if flight.end_ns is None:
+        return Ending("not_started", f"the robot never left the ground: {_why_grounded(flight)}")
+    return Ending("mission_not_ended", "the mission did not end")
 
 
 def _moment(flight: Flight, stamp_ns: int) -> Moment:
@@ -240,39 +188,36 @@ def _moment(flight: Flight, stamp_ns: int) -> Moment:
     return Moment(float(flight.seconds(stamp_ns)), place)
 
 
-def _touch(flight: Flight, touch: Mapping[str, Any]) -> tuple[float, Moment]:
-    speed = float(np.linalg.norm(touch["tip_velocity"]))
-    return speed, _moment(flight, int(touch["stamp_ns"]))
-
-
-def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[tuple[str, int, Moment]]:
-    """Yield the pipes that were touched up to an instant [ns]."""
+def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
+    """Yield the touches of pipes up to an instant [ns], one failure for each pipe."""
     contact = flight.during("/contact")
     for body in sorted({str(body) for body in contact["body"] if str(body).startswith("pipe")}):
         stamps = contact["stamp_ns"][contact["body"] == body]
         stamps = stamps[stamps <= until_ns]
         if len(stamps):
-            yield body, len(stamps), _moment(flight, int(stamps[0]))
+            yield _pipe_touched(body, len(stamps), _moment(flight, int(stamps[0])))
 
 
-def _interventions(flight: Flight) -> Iterator[tuple[str, str, Moment]]:
+def _interventions(flight: Flight) -> Iterator[Failure]:
+    """Yield the guard's changes to a state beyond HOLD."""
     guard, before = flight.during("/guard"), None
-    for stamp_ns, state, cause in zip(
-        guard["stamp_ns"], guard["state"], guard["cause"], strict=True
-    ):
+    rows = zip(guard["stamp_ns"], guard["state"], guard["cause"], strict=True)
+    for stamp_ns, state, cause in rows:
         before, repeated = state, state == before  # a touch-down repeats LAND
         if state not in (GuardState.TRACK, GuardState.HOLD) and not repeated:
-            yield GuardState(state).name, str(cause), _moment(flight, int(stamp_ns))
+            text = f"the guard went to {GuardState(state).name}: {cause}"
+            yield Failure("guard_intervened", text, *_moment(flight, int(stamp_ns)))
 
 
-def _restarts(flight: Flight) -> Iterator[tuple[str, Moment]]:
+def _restarts(flight: Flight) -> Iterator[Failure]:
+    """Yield the sessions that world opened in flight."""
     session = flight.during("/session")
-    for stamp_ns, end, cause in zip(
-        session["stamp_ns"], session["end"], session["cause"], strict=True
-    ):
+    rows = zip(session["stamp_ns"], session["end"], session["cause"], strict=True)
+    for stamp_ns, end, cause in rows:
         # The session that the mission itself opens may have the stamp of the start.
         if end == "world" and stamp_ns > (flight.start_ns or 0):
-            yield str(cause), _moment(flight, int(stamp_ns))
+            text = f"world opened a new session in flight: {cause}"
+            yield Failure("world_restarted", text, *_moment(flight, int(stamp_ns)))
 
 
 def _not_real_time(numbers: Mapping[str, Number]) -> str:
@@ -288,8 +233,8 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
 
 def _why_grounded(flight: Flight) -> str:
     """Describe why the guard never applied a command in a flight that did not start."""
-    arrivals, control = flight.recording["/downlink_delay"], flight.recording["/delay_estimate"]
-    if not len(control):
+    arrivals = flight.recording["/downlink_delay"]
+    if not len(flight.recording["/delay_estimate"]):
         return "its telemetry or cloud's answers were lost, so cloud computed no command"
     if not len(arrivals):
         return "no command arrived"
@@ -297,15 +242,9 @@ def _why_grounded(flight: Flight) -> str:
     last = arrivals["epoch"] == arrivals["epoch"].max()
     if arrivals["used"][last].any():
         return "fresh commands arrived, but no request to start"
-    keys = zip(control["epoch"], control["counter"], strict=True)
-    basis_ns = dict(zip(keys, control["basis_stamp_ns"], strict=True))
-    rows = (arrivals[name][last] for name in ("epoch", "counter", "stamp_ns"))
-    ages_ns = [
-        stamp_ns - basis_ns[epoch, counter]
-        for epoch, counter, stamp_ns in zip(*rows, strict=True)
-        if (epoch, counter) in basis_ns
-    ]
-    if not ages_ns:
+    commands = flight.join_control({name: arrivals[name][last] for name in arrivals.names})
+    ages_ns = commands["stamp_ns"] - commands["basis_stamp_ns"]
+    if not len(ages_ns):
         return "no fresh command arrived"
     return (
         f"the odometry behind each command was {min(ages_ns) * 1e-9:.3f} s old or older when the"
@@ -315,28 +254,18 @@ def _why_grounded(flight: Flight) -> str:
 
 
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
-    """Judge a recorded mission in the way in which the operator judges at the end of the mission.
+    """Judge a recorded mission as the operator does at its end, with the report's `evidence`.
 
-    The operator knows only the contacts in telemetry that has arrived by the end of the mission.
-    The operator does not know the time limit of the report. Of the timing, the operator knows only
-    the real-time factor.
-
-    Args:
-        flight: The recorded flight.
-        evidence: Evidence by `flight_evidence`.
-        numbers: Measured numbers of the flight.
+    The operator knows only the contacts in telemetry that has arrived by the end of the mission,
+    not the time limit of the report, and of the timing only the real-time factor.
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0
-    touch = first_touch(flight)
-    shown = evidence.touch if touch is not None and touch["stamp_ns"] <= seen_ns else None
-    factor = numbers.get("real_time_factor")
+    touch, factor = first_touch(flight), numbers.get("real_time_factor")
     seen = replace(
         evidence,
-        touch=shown,
-        pipes=tuple(_pipes(flight, seen_ns)),
-        guard=(),
-        restarts=(),
+        touch=evidence.touch if touch is not None and touch["stamp_ns"] <= seen_ns else None,
+        violations=tuple(_pipes(flight, seen_ns)),
         time_limit=inf,
         slow=_too_slow(factor.value) if evidence.slow and factor is not None else "",
     )
@@ -349,43 +278,26 @@ AWAY = -1
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Contacts and slip during a mission, as telemetry shows them.
+    """Contacts and slip during a mission, as telemetry shows them."""
 
-    Attributes:
-        pipe_contacts: Last count of contacts in telemetry.
-        pipe_touches: Number of contacts since the mission began.
-        touch_before: Speed of an earlier mission's touch in telemetry [m/s]; None without one.
-        touch_speed: Speed of this mission's touch [m/s]; None if the board was not touched.
-        slip_began_ns: World's slip when the mission began, plus the slip during a restart of teleop
-            [ns]: slip that does not count.
-        slip_ns: World's slip in the last telemetry [ns]; AWAY after a restart of teleop.
-    """
-
-    pipe_contacts: int = 0
-    pipe_touches: int = 0
-    touch_before: float | None = None
-    touch_speed: float | None = None
-    slip_began_ns: int = 0
-    slip_ns: int = 0
+    pipe_contacts: int = 0  # last count in telemetry
+    pipe_touches: int = 0  # contacts since the mission began
+    touch_before: float | None = None  # speed of an earlier mission's touch [m/s]
+    touch_speed: float | None = None  # speed of this mission's touch of the board [m/s]
+    slip_began_ns: int = 0  # slip before the mission and during a restart of teleop: not counted
+    slip_ns: int = 0  # world's slip in the last telemetry; AWAY after a restart of teleop
 
     @classmethod
     def begin(cls, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Begin with the telemetry at the start of the mission.
-
-        Args:
-            pipe_contacts: Number of contacts, as in `see`.
-            touch_speed: Speed of the touch, as in `see` [m/s].
-            slip_ns: Slip, as in `see` [ns].
-        """
+        """Begin with the telemetry at the start of the mission; arguments as in `see`."""
         return cls(pipe_contacts, 0, finite_or_none(touch_speed), None, slip_ns, slip_ns)
 
     def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Process new telemetry; return the same object if nothing has changed.
+        """Process new telemetry.
 
         Args:
             pipe_contacts: Number of contacts with pipes since the robot was reset.
-            touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before the
-                touch.
+            touch_speed: Speed at which the tip touched the board [m/s]; NaN before the touch.
             slip_ns: Lag of world's clock behind its machine's clock [ns].
         """
         touch = finite_or_none(touch_speed)
@@ -394,8 +306,6 @@ class Observations:
         new = pipe_contacts - self.pipe_contacts
         if new < 0:  # the robot was reset to its spawn and counts from 0
             new = pipe_contacts
-        if not new and touch == self.touch_speed and slip_ns == self.slip_ns:
-            return self
         return replace(
             self,
             pipe_contacts=pipe_contacts,
@@ -418,21 +328,13 @@ class Observations:
             yield "board_touched", text
 
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
-        """Return the evidence of a mission that has ended.
-
-        Args:
-            ending: How the mission ended.
-            elapsed: Duration of the mission [s].
-            known: Other attributes of the evidence.
-        """
-        end = Moment(elapsed)
+        """Return the evidence of a mission that ended after `elapsed` [s]."""
         slipped = (self.slip_ns - self.slip_began_ns) * 1e-9
-        pipes = (("a pipe", self.pipe_touches, UNKNOWN),) if self.pipe_touches else ()
         return Evidence(
-            ending=ending._replace(moment=end),
-            end=end,
+            ending=ending,
+            end=Moment(elapsed),
             touch=None if self.touch_speed is None else (self.touch_speed, UNKNOWN),
-            pipes=pipes,
+            violations=(_pipe_touched("a pipe", self.pipe_touches),) if self.pipe_touches else (),
             slow=_too_slow(1.0 - slipped / elapsed) if elapsed > 0 else "",
             **known,
         )

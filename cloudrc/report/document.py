@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -13,19 +13,12 @@ from typing import Any
 
 from cloudrc.config.load import ResolvedExperiment, fingerprint
 from cloudrc.files import write_atomically
-from cloudrc.metrics import Number
-from cloudrc.metrics.verdict import Failure, Verdict
+from cloudrc.metrics import Flight, Number
+from cloudrc.metrics.verdict import Verdict
 
 SCHEMA_VERSION = 1
 PACKAGES = (
-    "cloudrc",
-    "mujoco",
-    "numpy",
-    "pydantic",
-    "pyyaml",
-    "cryptography",
-    "mcap",
-    "rosbags",
+    *("cloudrc", "mujoco", "numpy", "pydantic", "pyyaml", "cryptography", "mcap", "rosbags"),
     "matplotlib",
 )
 """Packages whose version can change the results of a run or its report."""
@@ -35,75 +28,55 @@ PACKAGES = (
 class Run:
     """Facts about a run that are not in its recording.
 
-    Attributes:
-        mode: "virtual", "local" or "cluster".
-        shaper: What emulated the link: "virtual", "relay" or "netem".
-        records_sha256: Hash by `record.hash`: of all records in virtual time, of all messages in
-            real time. None if the recording is incomplete.
-        interrupted: True if the run was stopped.
-        notes: Notes for the reader, a sentence each.
+    The hash by `record.hash` is of all records in virtual time, of all messages in real time, and
+    None if the recording is incomplete.
     """
 
-    mode: str
-    shaper: str
+    mode: str  # "virtual", "local" or "cluster"
+    shaper: str  # what emulated the link: "virtual", "relay" or "netem"
     records_sha256: str | None = None
-    interrupted: bool = False
-    notes: tuple[str, ...] = ()
+    interrupted: bool = False  # whether the run was stopped
+    notes: tuple[str, ...] = ()  # for the reader, a sentence each
 
 
-def report_document(
-    run: Run,
-    experiment: ResolvedExperiment,
-    verdict: Verdict,
-    numbers: Mapping[str, Number],
-    notes: Sequence[str],
-    *,
-    clock_offset: Mapping[str, Any] | None,
-    complete: bool,
-    operator: Verdict | None = None,
-) -> dict[str, Any]:
-    """Build report.json.
+@dataclass(frozen=True)
+class Assessment:
+    """A run, measured and judged."""
 
-    Args:
-        run: Facts about the run that are not in its recording.
-        experiment: The experiment.
-        verdict: The verdict on the run.
-        numbers: Measured numbers, without unknown numbers.
-        notes: Notes for the reader, a sentence each.
-        clock_offset: Document by `clock_offset_document`.
-        complete: False if the recording is torn.
-        operator: The operator's verdict if it differs from `verdict`, else None.
-    """
-    document = {
-        "schemaVersion": SCHEMA_VERSION,
-        "verdict": verdict.outcome,
-        "failures": [_failure_document(failure) for failure in verdict.failures],
-        "operator_verdict": None if operator is None else _verdict_document(operator),
-        "experiment": experiment.name,
-        "config_sha256": fingerprint(experiment),
-        "mode": run.mode,
-        "seed": experiment.seed,
-        "shaper": run.shaper,
-        "records_sha256": run.records_sha256,
-        "numbers": {
-            name: {"value": number.value, "unit": number.unit} for name, number in numbers.items()
-        },
-        "clock_offset": clock_offset,
-        "complete": complete,
-        "notes": list(notes),
-    }
-    return _known(document)
+    run: Run
+    experiment: ResolvedExperiment
+    flight: Flight
+    numbers: dict[str, Number]  # without unknown numbers
+    verdict: Verdict
+    operator: Verdict | None  # the operator's verdict if it differs
+    notes: tuple[str, ...]  # for the reader, a sentence each
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """Content of report.json."""
+        recording, numbers = self.flight.recording, self.numbers.items()
+        values = {name: {"value": number.value, "unit": number.unit} for name, number in numbers}
+        return _known(
+            {
+                "schemaVersion": SCHEMA_VERSION,
+                **_verdict_document(self.verdict),
+                "operator_verdict": self.operator and _verdict_document(self.operator),
+                "experiment": self.experiment.name,
+                "config_sha256": fingerprint(self.experiment),
+                "mode": self.run.mode,
+                "seed": self.experiment.seed,
+                "shaper": self.run.shaper,
+                "records_sha256": self.run.records_sha256,
+                "numbers": values,
+                "clock_offset": clock_offset_document(recording.metadata),
+                "complete": recording.complete,
+                "notes": list(self.notes),
+            }
+        )
 
 
 def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
-    """Describe how cloud's stamps were shifted to world's clock.
-
-    Args:
-        metadata: Metadata of the recording.
-
-    Returns:
-        The method and, if known, the uncertainty; None if both ends share a clock.
-    """
+    """Describe how cloud's stamps were shifted, by a recording's metadata; None if not at all."""
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
         return None
@@ -114,43 +87,21 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
 
 def environment_document() -> dict[str, Any]:
     """Describe the software and hardware that made the report, without user or host names."""
+    packages = {}
+    for name in PACKAGES:
+        try:
+            packages[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
     return {
         "schemaVersion": SCHEMA_VERSION,
         "python": platform.python_version(),
-        "packages": {name: version for name in PACKAGES if (version := _version(name))},
+        "packages": packages,
         "system": f"{platform.system()} {platform.release()}",
         "architecture": platform.machine(),
         "processor": _processor(),
         "cores": os.cpu_count(),
     }
-
-
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a document as JSON; raise a ValueError if a number is not finite."""
-    text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
-    write_atomically(path, f"{text}\n".encode())
-
-
-def _verdict_document(verdict: Verdict) -> dict[str, Any]:
-    failures = [_failure_document(failure) for failure in verdict.failures]
-    return {"verdict": verdict.outcome, "failures": failures}
-
-
-def _failure_document(failure: Failure) -> dict[str, Any]:
-    place = None if failure.place is None else list(failure.place)
-    return _known({**asdict(failure), "place": place})
-
-
-def _known(entries: dict[str, Any]) -> dict[str, Any]:
-    """Remove entries that are None: an unknown value is absent, never zero or null."""
-    return {name: value for name, value in entries.items() if value is not None}
-
-
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def _processor() -> str:
@@ -161,3 +112,22 @@ def _processor() -> str:
         lines = []
     models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(models, platform.processor())
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a document as JSON; raise a ValueError if a number is not finite."""
+    text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
+    write_atomically(path, f"{text}\n".encode())
+
+
+def _verdict_document(verdict: Verdict) -> dict[str, Any]:
+    failures = [
+        _known({**asdict(failure), "place": failure.place and list(failure.place)})
+        for failure in verdict.failures
+    ]
+    return {"verdict": verdict.outcome, "failures": failures}
+
+
+def _known(entries: dict[str, Any]) -> dict[str, Any]:
+    """Remove entries that are None: an unknown value is absent, never zero or null."""
+    return {name: value for name, value in entries.items() if value is not None}

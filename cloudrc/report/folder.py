@@ -1,8 +1,7 @@
 """Read the folder of a recorded run, and refuse a recording that is not sufficient for a report.
 
 A new report of an old run is made from `mission.mcap`. Other programs may have filtered, cut,
-renamed or replaced that file. Then the report would be wrong. Therefore the command ends with the
-reason, and the earlier report.json stays unchanged.
+renamed or replaced that file. Then no report is written, and the earlier one stays unchanged.
 """
 
 from __future__ import annotations
@@ -58,54 +57,51 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
         BadInputError: If the folder has no experiment or no readable recording, or if the
             recording lacks what a report needs.
     """
-    if not (folder / "config.yaml").is_file():
+    config, merged = folder / "config.yaml", folder / "mission.mcap"
+    if not config.is_file():
         raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
-    experiment = read_experiment(folder / "config.yaml")
+    experiment = read_experiment(config)
     mission, contents = None, _read_merged(folder)
     if contents is None:
         mission = merge(folder / "world.mcap", folder / "cloud.mcap")
         contents = mission.contents
     recording = Recording.from_contents(contents)
-    earlier = _read_earlier(folder / "report.json")
-    for lack in _lacking(recording, folder / "config.yaml", earlier):
-        raise BadInputError(f"{folder / 'mission.mcap'}: {lack}; no report is written")
+    earlier = _earlier_report(folder / "report.json")
+    for lack in _lacking(recording, config, whole=earlier is not None and earlier.complete):
+        raise BadInputError(f"{merged}: {lack}; no report is written")
     if mission is not None:
-        mission.write(folder / "mission.mcap")
-    run = _describe(recording, earlier, messages_sha256(contents.messages))
-    return recording, experiment, run
+        mission.write(merged)
+    return recording, experiment, _describe(recording, earlier, contents)
 
 
 def _read_merged(folder: Path) -> Contents | None:
     """Read mission.mcap. Return None if it is absent or torn and the ends' recordings exist."""
-    merged, ends = folder / "mission.mcap", (folder / "world.mcap", folder / "cloud.mcap")
-    there = [path.is_file() for path in ends]
-    if not merged.exists():
-        if not any(there):
+    ends = [(folder / f"{end}.mcap").is_file() for end in ("world", "cloud")]
+    if not (folder / "mission.mcap").exists():
+        if not any(ends):
             raise BadInputError(f"{folder}: has no mission.mcap; name the folder of a run")
         return None
     try:
-        contents = read_contents(merged)
+        contents = read_contents(folder / "mission.mcap")
     except NothingReadableError:
-        if not any(there):
-            raise
-        return None
+        if any(ends):
+            return None
+        raise
     torn = contents.note and not contents.lacking
-    return None if torn and all(there) else contents
+    return None if torn and all(ends) else contents
 
 
-def _lacking(recording: Recording, config: Path, earlier: _EarlierReport | None) -> Iterator[str]:
+def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str]:
     """Yield the reasons why a recording is not sufficient for a report, the plainest reason first.
 
-    Args:
-        recording: The recording.
-        config: Configuration in the folder of the run.
-        earlier: The earlier report; None without one.
+    `config` is the configuration in the folder of the run. `whole` says that the earlier report was
+    of a complete recording.
     """
     if not any(len(recording[topic]) for topic in TOPICS):
         yield "; ".join(["holds no message of cloudrc", *recording.remarks])
     if recording.lacking:
         yield recording.lacking
-    if recording.note and earlier is not None and earlier.complete:
+    if recording.note and whole:
         yield (
             f"{recording.note}, but report.json is of the whole recording: to report on what is"
             " left, move report.json away"
@@ -119,8 +115,7 @@ def _lacking(recording: Recording, config: Path, earlier: _EarlierReport | None)
         yield from _unequal(recording)
     for topic in ("/ground_truth", *CONTROL_TOPICS):
         steps = np.diff(recording[topic]["stamp_ns"])
-        wrong = int((steps < (topic == "/ground_truth")).sum())
-        if wrong:
+        if wrong := int((steps < (topic == "/ground_truth")).sum()):
             yield f"has {wrong} rows on {topic} that are not later than the row before"
 
 
@@ -128,11 +123,10 @@ def _unequal(recording: Recording) -> Iterator[str]:
     """Yield the topics that have fewer rows than related topics show."""
     for topic in TOPICS.values():
         count = len(recording[topic.name])
-        siblings = [t.name for t in TOPICS.values() if t.source is topic.source]
-        if topic.source is not Arrival and (
-            more := [name for name in siblings if len(recording[name]) > count + 1]
-        ):
-            yield f"has {count} rows on {topic.name}, but {len(recording[more[0]])} on {more[0]}"
+        for other in TOPICS.values() if topic.source is not Arrival else ():
+            more = len(recording[other.name])
+            if other.source is topic.source and more > count + 1:
+                yield f"has {count} rows on {topic.name}, but {more} on {other.name}"
     for first, second in FOLLOWS:
         if len(recording[first]) and not len(recording[second]):
             yield f"has rows on {first}, but none on {second}"
@@ -145,36 +139,32 @@ def _flown(data: bytes, name: str) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key not in JUDGEMENT}
 
 
-def _read_earlier(path: Path) -> _EarlierReport | None:
+def _earlier_report(source: Path | bytes | None) -> _EarlierReport | None:
     try:
-        return _EarlierReport.model_validate_json(read(path, REPORT_BYTES_MAX))
+        data = read(source, REPORT_BYTES_MAX) if isinstance(source, Path) else source or b""
+        return _EarlierReport.model_validate_json(data)
     except (OSError, ValueError):
         return None
 
 
-def _describe(recording: Recording, earlier: _EarlierReport | None, sha256: str) -> Run:
+def _describe(recording: Recording, earlier: _EarlierReport | None, contents: Contents) -> Run:
     """Describe a run by its earlier report.
 
     Without an earlier report, guess mode and shaper: a run that recorded lateness was in real time.
-
-    Args:
-        recording: The recording of the run.
-        earlier: The earlier report; None without one.
-        sha256: Hash of the recording's messages.
     """
     if earlier is None:
         real_time = len(recording["/lateness"]) > 0
-        earlier = _EarlierReport(
-            mode="local" if real_time else "virtual", shaper="relay" if real_time else "virtual"
-        )
+        mode, shaper = ("local", "relay") if real_time else ("virtual", "virtual")
+        earlier = _EarlierReport.model_validate({"mode": mode, "shaper": shaper})
     # Each report writes these notes anew.
     anew = (METRIC_NOTE, RECORDING_NOTE, DIFFERS)
     notes = [note for note in earlier.notes if not note.startswith(anew)]
-    digest: str | None = sha256
-    if earlier.mode == "virtual":
-        digest = _records_sha256(recording)
-        if recording.metadata.get(SHA256, sha256) != sha256:
-            digest = None
+    digest: str | None = messages_sha256(contents.messages)
+    if earlier.mode == "virtual":  # its hash is of all records, and is in the recording
+        unchanged = recording.metadata.get(SHA256, digest) == digest
+        kept = _earlier_report(recording.attachments.get("report.json"))
+        digest = kept.records_sha256 if kept and unchanged else None
+        if not unchanged:
             notes.append(f"{RECORDING_NOTE}was changed after the run: its hash is left out.")
     return Run(
         earlier.mode,
@@ -183,12 +173,3 @@ def _describe(recording: Recording, earlier: _EarlierReport | None, sha256: str)
         earlier.verdict == "interrupted",
         tuple(notes),
     )
-
-
-def _records_sha256(recording: Recording) -> str | None:
-    """Return the hash of all records, which the recording of a run in virtual time contains."""
-    try:
-        kept = _EarlierReport.model_validate_json(recording.attachments["report.json"])
-    except (KeyError, ValueError):
-        return None
-    return kept.records_sha256

@@ -7,31 +7,50 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cloudrc import __version__
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.metrics import Flight, Number
-from cloudrc.metrics.verdict import Failure, Verdict
-from cloudrc.report.document import Run
-from cloudrc.report.numbers import table_rows
-
-if TYPE_CHECKING:
-    from cloudrc.report.figures import Picture
-
+from cloudrc.metrics.verdict import Failure
+from cloudrc.report.document import Assessment, Run
+from cloudrc.report.figures import Picture
 
 HEADLINES = {
-    "success": "The mission succeeded.",
-    "failure": "The mission failed.",
-    "invalid": "The run is invalid: it did not keep real time.",
-    "interrupted": "The run was interrupted.",
+    "success": ("The mission succeeded.", "#00694b"),
+    "failure": ("The mission failed.", "#a33a00"),
+    "invalid": ("The run is invalid: it did not keep real time.", "#7a5200"),
+    "interrupted": ("The run was interrupted.", "#7a5200"),
 }
+"""Outcome -> headline and colour of the page."""
+REPEAT = {
+    True: "Run this in the folder of the report; the records will be identical:",
+    False: "Run this in the folder of the report. The random numbers of the link come from the "
+    "same seed. The timing of the machine differs between runs, so the numbers will be close but "
+    "not identical:",
+}
+"""Whether the run was in virtual time -> how to repeat it."""
+GROUPS = {
+    "Mission": "duration waypoints_reached distance_flown speed_max contact_time tip_speed "
+    "peak_contact_force steady_contact_force steady_error_x steady_error_y steady_error_z",
+    "Distance to the pipes": "min_clearance min_clearance_flight pipe_contacts",
+    "Estimation and tracking": "prediction_error_rms estimate_error_rms delay_estimate_error_rms "
+    "tracking_rms_measured tracking_rms_estimated",
+    "Link and loop": "uplink_delay_mean downlink_delay_mean loss_uplink loss_downlink late_uplink "
+    "late_downlink rtt_mean rtt_p95 loop_delay_mean age_of_information_mean commands_applied",
+    "Guard and faults": "hold_count hold_time fault_count recorder_dropped",
+    "Real time": "real_time_factor world_slip world_lateness_p99 cloud_lateness_p99 missed_periods",
+}
+"""Groups of the table, in order; metrics in no group come last, under "Others"."""
+SHARES = ("loss_", "late_")
+"""Prefixes of the names of numbers that are shown in per cent."""
+_UNIT = re.compile(r"(\d) (s|m|mm|ms|N|m/s)\b")
+"""Pattern of a number and its unit; no line may break between number and unit."""
 
 
 def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:
@@ -39,37 +58,25 @@ def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:
     if flight.start_ns is None:
         return "The robot never left the ground."
     known = {name: number.value for name, number in numbers.items()}
-    parts = [
-        _waypoints(flight, known),
-        _pipes(flight, known),
-        _contact(flight, known),
-        _link(known),
-        _guard(known),
-    ]
-    return " ".join(part for part in parts if part)
+    return " ".join(filter(None, (part(flight, known) for part in SENTENCES)))
 
 
 def _waypoints(flight: Flight, known: Mapping[str, float]) -> str:
-    reached = f"{known.get('waypoints_reached', 0):.0f}"
+    reached, count = round(known.get("waypoints_reached", 0)), flight.waypoints
+    goal = "its waypoint" if count == 1 else f"all {count} waypoints"
+    if reached != count:
+        goal = f"{reached} of {count} waypoints"
     duration = f" in {known['duration']:.1f} s" if "duration" in known else ""
     distance = f" and flew {known['distance_flown']:.1f} m" if "distance_flown" in known else ""
-    count = flight.waypoints
-    if reached == str(count):
-        goal = "its waypoint" if count == 1 else f"all {count} waypoints"
-    else:
-        goal = f"{reached} of {count} waypoints"
     return f"The drone reached {goal}{duration}{distance}."
 
 
 def _pipes(flight: Flight, known: Mapping[str, float]) -> str:
-    flown = flight.pipes_flown
-    if not flown or "min_clearance" not in known:
+    if not flight.pipes_flown or "min_clearance" not in known:
         return ""
-    pipes = "one pipe" if flown == 1 else f"{flown} pipes"
-    touched = known.get("pipe_contacts", 0)
-    if touched:
-        times = "once" if touched == 1 else f"{touched:.0f} times"
-        return f"It flew through {pipes} and touched a wall {times}."
+    pipes = "one pipe" if flight.pipes_flown == 1 else f"{flight.pipes_flown} pipes"
+    if touched := known.get("pipe_contacts", 0):
+        return f"It flew through {pipes} and touched a wall {_times(touched)}."
     nearest = known["min_clearance"] * 1e3
     return f"It flew through {pipes} and never came closer than {nearest:.0f} mm to a wall."
 
@@ -77,16 +84,14 @@ def _pipes(flight: Flight, known: Mapping[str, float]) -> str:
 def _contact(flight: Flight, known: Mapping[str, float]) -> str:
     if "contact_time" not in known or "tip_speed" not in known:
         return "It never touched the board." if flight.criteria.contact else ""
-    text = (
-        f"Its arm touched the board after {known['contact_time']:.1f} s "
-        f"at {known['tip_speed']:.2f} m/s"
-    )
+    time, speed = known["contact_time"], known["tip_speed"]
+    text = f"Its arm touched the board after {time:.1f} s at {speed:.2f} m/s"
     if "steady_contact_force" in known:
         text += f" and then pressed against it with {known['steady_contact_force']:.2f} N"
     return text + "."
 
 
-def _link(known: Mapping[str, float]) -> str:
+def _link(flight: Flight, known: Mapping[str, float]) -> str:
     if "prediction_error_rms" not in known or "rtt_mean" not in known:
         return ""
     return (
@@ -96,82 +101,46 @@ def _link(known: Mapping[str, float]) -> str:
     )
 
 
-def _guard(known: Mapping[str, float]) -> str:
-    if "hold_count" not in known:
-        return ""
-    count = known["hold_count"]
-    if not count:
-        return "The guard on board never took over."
-    times = "once" if count == 1 else f"{count:.0f} times"
-    return f"The guard on board took over {times}, for {known.get('hold_time', 0):.1f} s in total."
+def _guard(flight: Flight, known: Mapping[str, float]) -> str:
+    if not known.get("hold_count"):
+        return "The guard on board never took over." if "hold_count" in known else ""
+    times, total = _times(known["hold_count"]), known.get("hold_time", 0)
+    return f"The guard on board took over {times}, for {total:.1f} s in total."
 
 
-_UNIT = re.compile(r"(\d) (s|m|mm|ms|N|m/s)\b")
-"""Pattern of a number and its unit; no line may break between number and unit."""
-ACCENTS = {
-    "success": "#00694b",
-    "failure": "#a33a00",
-    "invalid": "#7a5200",
-    "interrupted": "#7a5200",
-}
+def _times(count: float) -> str:
+    return "once" if count == 1 else f"{count:.0f} times"
+
+
+SENTENCES = (_waypoints, _pipes, _contact, _link, _guard)
 
 
 def render(
-    run: Run,
-    experiment: ResolvedExperiment,
-    flight: Flight,
-    verdict: Verdict,
-    numbers: Mapping[str, Number],
-    notes: Sequence[str],
-    pictures: Sequence[Picture],
-    environment: Mapping[str, Any],
+    assessment: Assessment, pictures: Sequence[Picture], environment: Mapping[str, Any]
 ) -> str:
-    """Fill in the page.
-
-    Args:
-        run: Facts about the run that are not in its recording.
-        experiment: The experiment.
-        flight: The recorded flight.
-        verdict: The verdict on the run.
-        numbers: Measured numbers.
-        notes: Notes for the reader, a sentence each.
-        pictures: Figures in the order of the page.
-        environment: Content of environment.json.
-    """
-    repeat, command = _repeat(run)
+    """Fill in the page; `environment` is the content of environment.json."""
+    run, experiment, verdict = assessment.run, assessment.experiment, assessment.verdict
+    headline, accent = HEADLINES[verdict.outcome]
     digest = run.records_sha256
+    kicker = f"cloudrc run report · {experiment.name} · {run.mode} · seed {experiment.seed}"
     return Template(files(__package__).joinpath("page.html").read_text("utf-8")).substitute(
         version=escape(__version__),
         title=escape(f"{experiment.name}: {verdict.outcome}"),
-        accent=ACCENTS[verdict.outcome],
-        kicker=escape(
-            f"cloudrc run report · {experiment.name} · {run.mode} · seed {experiment.seed}"
-        ),
-        headline=escape(HEADLINES[verdict.outcome]),
-        summary=_UNIT.sub("\\1\u00a0\\2", escape(summary(flight, numbers))),
+        accent=accent,
+        kicker=escape(kicker),
+        headline=escape(headline),
+        summary=_UNIT.sub("\\1\u00a0\\2", escape(summary(assessment.flight, assessment.numbers))),
         failures=_list([_failure(failure) for failure in verdict.failures], "failures"),
-        notes=_list([escape(note) for note in notes], "note"),
+        notes=_list([escape(note) for note in assessment.notes], "note"),
         facts=_facts(run, experiment),
         figures="\n".join(_figure(n, picture) for n, picture in enumerate(pictures, start=1)),
-        numbers=table_rows(numbers),
-        repeat=escape(repeat),
-        command=escape(command),
+        numbers=_table_rows(assessment.numbers),
+        repeat=escape(REPEAT[run.mode == "virtual"]),
+        command=f"cloudrc run config.yaml --mode {escape(run.mode)}",
         hash=f"<p>SHA-256 of all records: <code>{escape(digest)}</code></p>" if digest else "",
         config=escape(dump(experiment)),
         environment=escape(json.dumps(environment, indent=2)),
     )
-
-
-def _repeat(run: Run) -> tuple[str, str]:
-    """Return an instruction and a command with which the reader can repeat the run."""
-    command = shlex.join(["cloudrc", "run", "config.yaml", "--mode", run.mode])
-    if run.mode == "virtual":
-        return "Run this in the folder of the report; the records will be identical:", command
-    return (
-        "Run this in the folder of the report. The random numbers of the link come from the same "
-        "seed. The timing of the machine differs between runs, so the numbers will be close but "
-        "not identical:"
-    ), command
 
 
 def _facts(run: Run, experiment: ResolvedExperiment) -> str:
@@ -187,8 +156,7 @@ def _facts(run: Run, experiment: ResolvedExperiment) -> str:
         "Controller": cloud.controller.name,
     }
     return "\n".join(
-        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>"
-        for name, value in pairs.items()
+        f"<div><dt>{name}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs.items()
     )
 
 
@@ -202,10 +170,8 @@ def _failure(failure: Failure) -> str:
 
 
 def _list(items: Sequence[str], name: str) -> str:
-    if not items:
-        return ""
     rows = "".join(f"<li>{item}</li>" for item in items)
-    return f'<ul class="{name}">{rows}</ul>'
+    return f'<ul class="{name}">{rows}</ul>' if items else ""
 
 
 def _figure(number: int, picture: Picture) -> str:
@@ -213,4 +179,48 @@ def _figure(number: int, picture: Picture) -> str:
     return (
         f'<figure id="{picture.name}"><img src="{source}" alt="{escape(picture.alt)}">\n'
         f"<figcaption><b>Fig. {number}.</b> {escape(picture.caption)}</figcaption></figure>"
+    )
+
+
+def _table_rows(numbers: Mapping[str, Number]) -> str:
+    """Lay out the table's body as HTML, a `tbody` for each group that has numbers."""
+    groups = {title: names.split() for title, names in GROUPS.items()}
+    grouped = {name for names in groups.values() for name in names}
+    groups["Others"] = [name for name in numbers if name not in grouped]
+    bodies = []
+    for title, names in groups.items():
+        known = [name for name in names if name in numbers]
+        if known:
+            cells = "\n".join(_row(name, numbers[name]) for name in known)
+            head = f'<tr><th scope="rowgroup" colspan="4">{escape(title)}</th></tr>'
+            bodies.append(f"<tbody>\n{head}\n{cells}\n</tbody>")
+    return "\n".join(bodies)
+
+
+def readable(name: str, number: Number) -> tuple[str, str]:
+    """Format a number in a readable unit; return the digits and the unit."""
+    value, unit = number.value, number.unit
+    if value == 0:
+        return "0", "" if unit == "1" else unit
+    if unit == "1":
+        if name.startswith(SHARES):
+            return f"{value * 100:.2f}", "%"
+        return (f"{value:.0f}" if value.is_integer() else f"{value:.4g}"), ""
+    if unit in ("s", "m") and abs(value) < (1.0 if unit == "s" else 0.1):
+        return _digits(value * 1e3), f"m{unit}"
+    return _digits(value), unit
+
+
+def _digits(value: float) -> str:
+    """Format with four significant digits, at most three decimals: 27.60, 0.237, 16.99."""
+    places = 3 if abs(value) < 1 else 4 - len(str(int(abs(value))))
+    return f"{value:.{max(places, 0)}f}"
+
+
+def _row(name: str, number: Number) -> str:
+    digits, unit = readable(name, number)
+    return (
+        f"<tr><td><code>{escape(name)}</code></td>"
+        f'<td class="value">{escape(digits)}</td><td class="unit">{escape(unit)}</td>'
+        f"<td>{escape(number.meaning)}</td></tr>"
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,12 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.geometry.scene import load_scene
-from cloudrc.metrics import Flight, Number, measure_all
-from cloudrc.metrics.verdict import Verdict, flight_evidence, judge, operator_verdict
+from cloudrc.metrics import Flight, measure_all
+from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
-from cloudrc.report.document import (
-    Run,
-    clock_offset_document,
-    environment_document,
-    report_document,
-    write_json,
-)
+from cloudrc.report.document import Assessment, Run, environment_document, write_json
+
+__all__ = ["Assessment", "assess", "attachments", "write_report"]
 
 DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
 """Beginning of the note on an operator's verdict that differs."""
@@ -28,78 +23,34 @@ RECORDING_NOTE = "The recording "
 """Beginning of the notes on a recording; a new report replaces the old notes."""
 
 
-@dataclass(frozen=True)
-class Assessment:
-    """A run, measured and judged.
-
-    Attributes:
-        run: Facts about the run that are not in its recording.
-        experiment: The experiment.
-        flight: The recorded flight.
-        numbers: Measured numbers, without unknown numbers.
-        verdict: The verdict on the run.
-        notes: Notes for the reader, a sentence each.
-        document: Content of report.json.
-    """
-
-    run: Run
-    experiment: ResolvedExperiment
-    flight: Flight
-    numbers: dict[str, Number]
-    verdict: Verdict
-    notes: tuple[str, ...]
-    document: dict[str, Any]
-
-
 def assess(
-    recording: Recording,
-    experiment: ResolvedExperiment,
-    run: Run,
-    own: Iterable[str] = (),
+    recording: Recording, experiment: ResolvedExperiment, run: Run, own: Iterable[str] = ()
 ) -> Assessment:
     """Measure and judge a run without writing files or drawing figures.
 
-    Args:
-        recording: Recording of both ends, on world's clock.
-        experiment: The experiment. Metric files named in the experiment are not executed, because
-            the experiment may come from somebody else.
-        run: Facts about the run that are not in its recording.
-        own: The user's own metrics, names or paths; files are executed.
+    `own` are the user's own metrics, names or paths; files are executed. Metric files named in the
+    experiment are not executed, because the experiment may come from somebody else.
     """
     mission = experiment.mission
     waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
     scene = load_scene(experiment.world.scene)
     flight = Flight(recording, experiment.criteria, waypoints, scene)
     numbers, metric_notes = measure_all(flight, own)
-    torn = not recording.complete
-    evidence = flight_evidence(
-        flight,
-        numbers,
-        real_time=run.mode != "virtual",
-        interrupted=run.interrupted or torn,
-    )
+    real_time, stopped = run.mode != "virtual", run.interrupted or not recording.complete
+    evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)
     verdict, operator = judge(evidence), None
+    notes = list(run.notes)
+    if not recording.complete:
+        notes.append(f"{RECORDING_NOTE}is incomplete: {recording.note}.")
+    notes += [f"{RECORDING_NOTE}{remark}." for remark in recording.remarks]
+    notes += [f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text]
     if flight.ending is not None:
-        operator = operator_verdict(flight, evidence, numbers)
-    if operator is not None and operator.outcome == verdict.outcome:
-        operator = None
-    incomplete = (f"{RECORDING_NOTE}is incomplete: {recording.note}.",) if torn else ()
-    remarks = tuple(f"{RECORDING_NOTE}{remark}." for remark in recording.remarks)
-    faults = tuple(f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text)
-    differs = () if operator is None else (f"{DIFFERS}{operator.outcome}. This report's counts.",)
-    notes = (*run.notes, *incomplete, *remarks, *faults, *differs, *metric_notes)
-    notes = tuple(dict.fromkeys(notes))
-    document = report_document(
-        run,
-        experiment,
-        verdict,
-        numbers,
-        notes,
-        clock_offset=clock_offset_document(recording.metadata),
-        complete=not torn,
-        operator=operator,
-    )
-    return Assessment(run, experiment, flight, numbers, verdict, notes, document)
+        seen = operator_verdict(flight, evidence, numbers)
+        if seen.outcome != verdict.outcome:
+            operator = seen
+            notes.append(f"{DIFFERS}{seen.outcome}. This report's counts.")
+    kept = tuple(dict.fromkeys([*notes, *metric_notes]))
+    return Assessment(run, experiment, flight, numbers, verdict, operator, kept)
 
 
 def write_report(
@@ -111,15 +62,10 @@ def write_report(
     own: Iterable[str] = (),
     page: bool = True,
 ) -> dict[str, Any]:
-    """Write report.json and environment.json, and report.html with its figures.
+    """Write report.json and environment.json and, if `page`, report.html with its figures.
 
-    Args:
-        folder: Folder of the run; files of an earlier report are replaced.
-        recording: Recording of both ends, on world's clock.
-        experiment: The experiment.
-        run: Facts about the run that are not in its recording.
-        own: The user's own metrics, as for `assess`.
-        page: Whether to write report.html and the figures.
+    `folder` is the folder of the run; files of an earlier report are replaced. The other arguments
+    are as in `assess`.
 
     Returns:
         Content of report.json.
@@ -129,17 +75,18 @@ def write_report(
             written before the error.
     """
     assessment = assess(recording, experiment, run, own)
-    write_json(folder / "report.json", assessment.document)
-    environment = environment_document()
+    document, environment = assessment.document, environment_document()
+    write_json(folder / "report.json", document)
     write_json(folder / "environment.json", environment)
     if page:
         _write_page(folder, assessment, environment)
-    return assessment.document
+    return document
 
 
 def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any]) -> None:
     try:
-        from cloudrc.report.figures import Subject, draw_all
+        from cloudrc.report.figures import draw_all
+        from cloudrc.report.figures.style import Subject
     except ImportError as error:
         raise MissingPrerequisiteError(
             f"report.html needs {error.name}, which is not installed; report.json is written; "
@@ -147,10 +94,9 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
         ) from error
     from cloudrc.report.page import render
 
-    experiment = assessment.experiment
-    subject = Subject(assessment.flight, experiment.uplink, experiment.downlink)
+    link = assessment.experiment.uplink, assessment.experiment.downlink
     try:
-        pictures = draw_all(subject)
+        pictures = draw_all(Subject(assessment.flight, *link))
     except ValueError as error:  # from matplotlib, for values that no flight has
         raise BadInputError(
             f"{folder}: the recorded values cannot be drawn ({describe_error(error)}); "
@@ -163,16 +109,7 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
     for picture in pictures:
         write_atomically(figures / f"{picture.name}.png", picture.png)
         write_atomically(figures / f"{picture.name}.svg", picture.svg)
-    text = render(
-        assessment.run,
-        experiment,
-        assessment.flight,
-        assessment.verdict,
-        assessment.numbers,
-        assessment.notes,
-        pictures,
-        environment,
-    )
+    text = render(assessment, pictures, environment)
     write_atomically(folder / "report.html", text.encode("utf-8"))
 
 

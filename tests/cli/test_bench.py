@@ -17,9 +17,11 @@ def test_a_sealed_odometry_costs_an_eighth_of_a_pickled_one(
     figure: Callable[..., None],
 ) -> None:
     wire = measure_wire()
-    figure("seal, open and codec of an odometry over a pickled round trip", wire.ratio, "<=", 0.12)
-    assert 1000 <= wire.pickled_size <= 1100  # the size in the paper
-    assert wire.ratio <= 0.12
+    figure(
+        "seal, open and codec of an odometry over a pickled round trip", wire["ratio"], "<=", 0.12
+    )
+    assert 1000 <= wire["pickled_size"] <= 1100  # the size in the paper
+    assert wire["ratio"] <= 0.12
 
 
 @pytest.mark.process  # runs alone: other processes would take its caches

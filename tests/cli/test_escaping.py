@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.cli import run
+from cloudrc.cli import report
 from cloudrc.cli.link_verify import as_text, make_report
 from cloudrc.cli.main import main
 from cloudrc.cli.output import print_line, table
@@ -83,17 +83,18 @@ def test_the_description_of_a_profile(here: Path, printed: Printing) -> None:
     assert printed().startswith(f"a: {SHOWN}\n")
 
 
-def test_the_failures_of_a_run(printed: Printing) -> None:
+def test_what_is_printed_of_a_flight(printed: Printing) -> None:
     failures = [{"code": "x", "text": EVIL}] * 2
-    report = {"verdict": "failure", "failures": failures, "numbers": {}}
-    run.show(report, Path(EVIL))
+    found = {"verdict": "failure", "failures": failures, "numbers": {}}
+    print(report.summary(found, Path(EVIL)))
     assert printed().count(SHOWN) == 3
-
-
-def test_the_events_of_a_flight() -> None:
     stream = io.StringIO()
     FlightView(stream, 1).see([Fault(0, "bad", EVIL)])
     assert_harmless(stream.getvalue())
+    print(table([["name", "value"], [EVIL, "1"]]))
+    assert printed().count("\n") == 2
+    print_line(EVIL)
+    assert printed() == f"{SHOWN}\n"
 
 
 def test_the_state_of_a_link_container() -> None:
@@ -103,10 +104,3 @@ def test_the_state_of_a_link_container() -> None:
     text = as_text(make_report(EVIL, ways, probes, [EVIL]))
     assert_harmless(text)
     assert text.count(SHOWN) == 4
-
-
-def test_a_cell_of_a_table_and_a_line(printed: Printing) -> None:
-    print(table([["name", "value"], [EVIL, "1"]]))
-    assert printed().count("\n") == 2
-    print_line(EVIL)
-    assert printed() == f"{SHOWN}\n"

@@ -13,21 +13,19 @@ import pytest
 from cloudrc.cli.pool import BATCH_MAX, WorkerDiedError, map_in_order
 
 KILLED = 5
-"""The piece of work, or seed, that kills its process."""
+"""The piece of work that kills its process."""
 
 
 @pytest.fixture(autouse=True)
-def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+def two_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    yield
+    assert multiprocessing.active_children() == []
 
 
-def _slow_first(number: int) -> int:
+def _slow_first(number: int) -> tuple[int, int]:
     time.sleep(0.2 * (number == 0))
-    return number
-
-
-def _process_id(number: int) -> int:
-    return os.getpid()
+    return number, os.getpid()
 
 
 def _kill_at_five(number: int) -> int:
@@ -36,8 +34,15 @@ def _kill_at_five(number: int) -> int:
     return number
 
 
-def test_results_have_the_order_of_the_work() -> None:
-    assert list(map_in_order(_slow_first, range(6), 2)) == list(range(6))
+@pytest.mark.parametrize(("pieces", "jobs", "workers"), [(6, 100_000, 2), (1, 9, 0), (6, 1, 0)])
+def test_results_keep_the_order_of_the_work(pieces: int, jobs: int, workers: int) -> None:
+    done = map_in_order(_slow_first, range(pieces), jobs)
+    first = next(done)
+    assert len(multiprocessing.active_children()) == workers
+    numbers, pids = zip(first, *done, strict=True)
+    assert numbers == tuple(range(pieces))
+    assert (os.getpid() in pids) is (workers == 0)
+    assert list(map_in_order(_slow_first, [], 2)) == []
 
 
 class _CountingWork(list[int]):
@@ -52,44 +57,19 @@ class _CountingWork(list[int]):
 
 
 def test_much_work_is_submitted_in_batches() -> None:
-    work = _CountingWork(range(3 * BATCH_MAX))
-    done = map_in_order(_process_id, work, 2)
+    work = _CountingWork(range(1, 3 * BATCH_MAX))
+    done = map_in_order(_slow_first, work, 2)
     next(done)
     assert work.taken == BATCH_MAX
-    assert sum(1 for _ in done) == 3 * BATCH_MAX - 1
-
-
-def test_there_are_no_more_processes_than_cores() -> None:
-    done = map_in_order(_process_id, range(6), 100_000)
-    pids = {next(done)}
-    assert len(multiprocessing.active_children()) == 2
-    assert os.getpid() not in pids.union(done)
-    assert multiprocessing.active_children() == []
-
-
-@pytest.mark.parametrize(("pieces", "jobs"), [(1, 100_000), (6, 1), (0, 2)])
-def test_work_for_one_process_runs_in_this_one(pieces: int, jobs: int) -> None:
-    assert list(map_in_order(_process_id, range(pieces), jobs)) == [os.getpid()] * pieces
-
-
-def test_a_killed_worker_is_an_error() -> None:
-    with pytest.raises(WorkerDiedError, match=r"a worker was killed.*fewer '--jobs'"):
-        list(map_in_order(_kill_at_five, range(9), 2))
-    assert multiprocessing.active_children() == []
-
-
-def _slowly(done: Iterator[int]) -> Iterator[int]:
-    """Take results more slowly than the workers produce them."""
-    for each in done:
-        yield each
-        time.sleep(0.1)
+    assert sum(1 for _ in done) == len(work) - 1
 
 
 def test_results_before_a_worker_was_killed_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cloudrc.cli.pool.BATCH_MAX", KILLED)
     results: list[int] = []
-    with pytest.raises(WorkerDiedError):
-        results.extend(_slowly(map_in_order(_kill_at_five, range(9), 2)))
+    done = map_in_order(_kill_at_five, range(9), 2)
+    with pytest.raises(WorkerDiedError, match=r"a worker was killed.*fewer '--jobs'"):
+        results.extend(each for each in done if time.sleep(0.1) is None)  # take them slowly
     assert results[:KILLED] == list(range(KILLED))
 
 
@@ -100,4 +80,3 @@ def test_ctrl_c_ends_the_workers_at_once() -> None:
     with pytest.raises(KeyboardInterrupt):
         done.throw(KeyboardInterrupt)
     assert time.monotonic() - started < 30.0
-    assert multiprocessing.active_children() == []

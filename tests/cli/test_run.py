@@ -1,4 +1,4 @@
-"""`cloudrc run` and `cloudrc report`: refused input, output and written files."""
+"""`cloudrc run` and `cloudrc report`: refused input, output, and the folder of a run."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import extras
+from cloudrc.cli.find_run import new_folder
 from cloudrc.cli.main import main
+from cloudrc.errors import BadInputError
 
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
 """Overrides of `steps` for one second of flight."""
+FLY = ["run", "steps", "--mode", "virtual", *SHORT]
+Printed = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(autouse=True)
@@ -24,67 +28,50 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the figures, which take longer than the flight."""
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
+
+    def write_page(folder: Path, *assessment: object) -> None:
+        (folder / "report.html").write_text("drawn elsewhere")
+
+    monkeypatch.setattr("cloudrc.report.write._write_page", write_page)
 
 
 @pytest.mark.parametrize(
-    ("line", "code", "words"),
+    ("line", "words"),
     [
-        ("--mode local --seeds 3", 2, "virtual time"),
-        ("--seeds 0", 2, "'0' is not a whole number from 1 to 100000"),
-        ("--seed -1", 2, "--seed"),
-        ("--seed 1 --seeds 2", 2, "not allowed with"),
-        ("papper", 2, "paper"),
-        ("no/such.yaml", 2, "no/such.yaml"),
-        ("--set cloud.predictr=last_sample", 2, "predictor"),
-        ("--set cloud.predictor=kalmann", 2, "last_sample"),
-        ("--set link.uplink.loss=1.2", 2, "loss"),
-        ("--set report.metrics=./no.py", 2, "no.py': there is no such file"),
-        ("--set report.metrics=duratoin", 2, "did you mean duration?"),
-        ("--set nonsense", 2, "key=value"),
+        ("--mode local --seeds 3", "virtual time"),
+        ("--seeds 0", "'0' is not a whole number from 1 to 100000"),
+        ("--seed -1", "--seed"),
+        ("--seed 1 --seeds 2", "not allowed with"),
+        ("papper", "paper"),
+        ("no/such.yaml", "no/such.yaml"),
+        ("--set cloud.predictr=last_sample", "predictor"),
+        ("--set cloud.predictor=kalmann", "last_sample"),
+        ("--set link.uplink.loss=1.2", "loss"),
+        ("--set report.metrics=./no.py", "no.py': there is no such file"),
+        ("--set nonsense", "key=value"),
     ],
 )
 def test_bad_input_gives_one_line_and_writes_nothing(
-    line: str, code: int, words: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    line: str, words: str, folder: Path, capsys: Printed
 ) -> None:
-    assert main(["run", *line.split()]) == code
-    captured = capsys.readouterr()
-    assert captured.err.startswith("cloudrc: error: ")
-    assert captured.err.count("\n") == 1
-    assert words in captured.err
-    assert captured.out == ""
+    assert main(["run", *line.split()]) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith("cloudrc: error: ")
+    assert (err.count("\n"), out) == (1, "")
+    assert words in err
     assert list(folder.iterdir()) == []
 
 
-def test_a_missing_extra_ends_with_3(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_extra_ends_with_3(monkeypatch: pytest.MonkeyPatch, capsys: Printed) -> None:
     monkeypatch.setitem(extras.EXTRAS, "world", ("no_such_module",))
     assert main(["run", "--mode", "virtual"]) == 3
     assert "pip install 'cloudrc[world]'" in capsys.readouterr().err
 
 
-def test_a_full_folder_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "precious").write_text("data")
-    assert main(["run", "steps", "--mode", "virtual", "--out", str(folder)]) == 2
-    assert "never overwritten" in capsys.readouterr().err
-    assert (folder / "precious").read_text() == "data"
-
-
-@pytest.mark.usefixtures("no_page")
-def test_json_output_is_only_the_report(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = ["run", "steps", "--mode", "virtual", "--out", "here", "-o", "json", *SHORT]
-    assert main(line) == 0
-    captured = capsys.readouterr()
-    assert json.loads(captured.out) == json.loads((folder / "here/report.json").read_text())
-    assert captured.out == (folder / "here/report.json").read_text()
-    assert captured.err == ""
-
-
 def test_the_last_line_is_the_report_and_the_folder_is_complete(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, capsys: Printed
 ) -> None:
-    assert main(["run", "steps", "--mode", "virtual", "--seed", "7", *SHORT]) == 0
+    assert main([*FLY, "--seed", "7"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("steps: mode virtual, seed 7, link paper-p3")
     assert any(line.startswith("SUCCESS") for line in lines)
@@ -97,18 +84,14 @@ def test_the_last_line_is_the_report_and_the_folder_is_complete(
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_mission_that_fails_its_criteria_ends_with_1(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    line = ["run", "steps", "--mode", "virtual", *SHORT, "--set", "criteria.contact=true"]
-    assert main(line) == 1
-    assert "FAILURE: " in capsys.readouterr().out
+def test_json_output_is_only_the_report(folder: Path, capsys: Printed) -> None:
+    assert main([*FLY, "--out", "here", "-o", "json"]) == 0
+    assert capsys.readouterr() == ((folder / "here/report.json").read_text(), "")
 
 
 @pytest.mark.usefixtures("no_page")
 def test_the_resolved_file_flies_the_same_run_again(folder: Path) -> None:
-    first = ["run", "steps", "--mode", "virtual", "--seed", "3", *SHORT, "--out", "a"]
-    assert main(first) == 0
+    assert main([*FLY, "--seed", "3", "--out", "a"]) == 0
     assert main(["run", "a/config.yaml", "--mode", "virtual", "--out", "b"]) == 0
     hashes = [json.loads((folder / d / "report.json").read_text())["records_sha256"] for d in "ab"]
     assert hashes[0] == hashes[1]
@@ -124,35 +107,49 @@ def test_a_closed_pipe_does_not_end_the_run(
     os.close(reader)
     with os.fdopen(writer, "w") as closed_pipe:
         monkeypatch.setattr("sys.stdout", closed_pipe)
-        line = ["run", "steps", "--mode", "virtual", "--out", "here", "-o", output, *SHORT]
-        assert main([*line, "--set", "criteria.contact=true"]) == 1
+        line = [*FLY, "--out", "here", "-o", output, "--set", "criteria.contact=true"]
+        assert main(line) == 1
     left = {path.name for path in (folder / "here").iterdir()}
     assert {"mission.mcap", "report.json", "config.yaml"} <= left
 
 
-def test_a_report_is_written_again(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def write_page(folder: Path, *assessment: object) -> None:
-        (folder / "report.html").write_text("drawn elsewhere")
-
-    monkeypatch.setattr("cloudrc.report.write._write_page", write_page)
-    assert main(["run", "steps", "--mode", "virtual", *SHORT, "--out", "run"]) == 0
-    before = (folder / "run/report.json").read_text()
+@pytest.mark.usefixtures("no_page")
+def test_a_report_is_written_again(folder: Path, capsys: Printed) -> None:
+    assert main([*FLY, "--out", "run"]) == 0
+    before = json.loads((folder / "run/report.json").read_text())
     for name in ("report.json", "report.html"):
         (folder / "run" / name).unlink()
-    capsys.readouterr()
     assert main(["report", "run"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "run/report.html"
     assert (folder / "run/report.html").is_file()
-    after = json.loads((folder / "run/report.json").read_text())
-    assert after["numbers"] == json.loads(before)["numbers"]
-
-
-@pytest.mark.parametrize("name", ["missing", "empty"])
-def test_a_report_needs_a_recorded_run(
-    name: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    assert json.loads((folder / "run/report.json").read_text())["numbers"] == before["numbers"]
     (folder / "empty").mkdir()
-    assert main(["report", name]) == 2
-    assert capsys.readouterr().err.startswith("cloudrc: error: ")
+    for name in ("missing", "empty"):
+        assert main(["report", name]) == 2
+        assert capsys.readouterr().err.startswith("cloudrc: error: ")
+
+
+def test_folders_are_numbered_and_latest_is_the_newest() -> None:
+    names = [new_folder(None, "paper-local-seed1").as_posix() for _ in range(3)]
+    assert names == [f"runs/paper-local-seed1-{n}" for n in (1, 2, 3)]
+    assert Path("runs/latest").resolve() == Path(names[-1]).resolve()
+    assert new_folder(Path("a/b"), "x").is_dir()
+    assert new_folder(Path("a/b"), "x") == Path("a/b"), "an empty folder is accepted"
+
+
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        (None, r"^runs/ in the working folder: .*with --out$"),
+        (Path("runs/x"), r"^--out runs/x: .*name another folder$"),
+        (Path("runs"), "never overwritten"),
+        (Path("full"), "never overwritten"),
+    ],
+)
+def test_what_is_there_is_never_overwritten(out: Path | None, said: str) -> None:
+    Path("runs").write_text("a file")
+    Path("full").mkdir()
+    Path("full/precious").write_text("data")
+    with pytest.raises(BadInputError, match=said):
+        new_folder(out, "x")
+    assert Path("full/precious").read_text() == "data"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
 import signal
@@ -13,10 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from cloudrc.cli import sweep
 from cloudrc.cli.main import main
 from cloudrc.cli.pool import WorkerDiedError
+from cloudrc.cli.sweep import as_csv, as_table, interval, summarise
 from tests.conftest import nightly
 
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
@@ -29,16 +34,26 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def report(seed: int, verdict: str = "success", **numbers: float) -> dict[str, Any]:
+    found = {name: {"value": value, "unit": "m"} for name, value in numbers.items()}
+    return {"seed": seed, "verdict": verdict, "failures": [], "numbers": found}
+
+
+def written(folder: Path) -> tuple[dict[str, Any], int]:
+    """Return the content of sweep.json, and the number of runs in sweep.csv."""
+    document = json.loads((folder / "sweep/sweep.json").read_text())
+    return document, len((folder / "sweep/sweep.csv").read_text().splitlines()) - 1
+
+
 def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "steps", "--seeds", "2", *SHORT, "--out", "sweep"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "sweep/sweep.json"
     assert "done 2/2" in lines
     assert any(line.startswith("prediction_error_rms") for line in lines)
-    document = json.loads((folder / "sweep/sweep.json").read_text())
-    assert [run["seed"] for run in document["runs"]] == [1, 2]
+    document, rows = written(folder)
+    assert ([run["seed"] for run in document["runs"]], rows) == ([1, 2], 2)
     assert (document["done"], document["count"], document["interrupted"]) == (2, 2, False)
-    assert len((folder / "sweep/sweep.csv").read_text().splitlines()) == 3
 
 
 @pytest.mark.parametrize("finished", [0, 2])
@@ -59,9 +74,7 @@ def test_an_interrupted_sweep_keeps_what_is_finished(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def reports(*arguments: object) -> Iterator[dict[str, Any]]:
-        for seed in range(1, finished + 1):
-            numbers = {"duration": {"value": float(seed), "unit": "s"}}
-            yield {"seed": seed, "verdict": "success", "failures": [], "numbers": numbers}
+        yield from (report(seed, duration=1.0) for seed in range(1, finished + 1))
         raise error
 
     monkeypatch.setattr(sweep, "map_in_order", reports)
@@ -70,51 +83,79 @@ def test_an_interrupted_sweep_keeps_what_is_finished(
     assert f"cloudrc: {word}" in captured.err
     assert f": {finished} of 9 seeds are finished\n" in captured.err
     assert captured.out.splitlines()[-1] == "sweep/sweep.json"
-    document = json.loads((folder / "sweep/sweep.json").read_text())
-    assert [run["seed"] for run in document["runs"]] == list(range(1, finished + 1))
-    assert (document["count"], document["interrupted"]) == (finished, True)
-    assert len((folder / "sweep/sweep.csv").read_text().splitlines()) == 1 + finished
+    document, rows = written(folder)
+    assert (len(document["runs"]), document["count"], rows) == (finished,) * 3
+    assert document["interrupted"]
 
 
-def _begin_sweep() -> subprocess.Popen[str]:
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "how", [signal.SIGTERM, signal.SIGKILL, *nightly(signal.SIGINT, signal.SIGHUP)]
+)
+def test_a_signal_ends_a_sweep_at_once(how: int, folder: Path) -> None:
+    """A terminal sends SIGINT and SIGHUP to the group; SIGTERM goes to one, SIGKILL to a worker."""
     command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     assert process.stdout is not None
     assert "1/40" in process.stdout.readline()
-    return process
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("number", [signal.SIGTERM, *nightly(signal.SIGINT, signal.SIGHUP)])
-def test_a_signal_ends_a_sweep_at_once(number: int, folder: Path) -> None:
-    """A terminal sends SIGINT and SIGHUP to the whole process group, but SIGTERM goes to one."""
-    process = _begin_sweep()
     start = time.monotonic()
-    if number != signal.SIGTERM:
-        os.killpg(process.pid, number)
+    if how == signal.SIGKILL:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        of_pool = [p for p in children if "spawn_main" in Path(f"/proc/{p}/cmdline").read_text()]
+        os.kill(int(of_pool[0]), how)
+    elif how == signal.SIGTERM:
+        process.send_signal(how)
     else:
-        process.send_signal(number)
+        os.killpg(process.pid, how)
     _, errors = process.communicate(timeout=20)  # returns only once no worker holds the pipes
-    assert time.monotonic() - start < 3.0
-    assert process.returncode == 130
+    if how == signal.SIGKILL:
+        assert "cloudrc: a worker was killed" in errors
+    else:
+        assert time.monotonic() - start < 3.0
+    assert process.returncode == (6 if how == signal.SIGKILL else 130)
     assert "Traceback" not in errors
-    document = json.loads((folder / "sweep/sweep.json").read_text())
+    document, _ = written(folder)
     assert document["interrupted"]
     assert 1 <= document["count"] < 40
 
 
-@pytest.mark.process
-def test_a_sweep_that_loses_a_worker_keeps_what_is_finished(folder: Path) -> None:
-    process = _begin_sweep()
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    workers = [pid for pid in children if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
-    os.kill(int(workers[0]), signal.SIGKILL)
-    _, errors = process.communicate(timeout=20)
-    assert process.returncode == 6
-    assert "Traceback" not in errors
-    assert "cloudrc: a worker was killed" in errors
-    document = json.loads((folder / "sweep/sweep.json").read_text())
-    assert document["interrupted"]
-    assert 1 <= document["count"] < 40
+@pytest.mark.parametrize(
+    ("n", "bounds"),
+    [
+        (5, None),  # minimum and maximum enclose the median with 1 - 2/32 = 0.9375 only
+        (6, (1, 6)),  # 1 - 2/64 = 0.969
+        (9, (2, 8)),  # 1 - 2 * 10/512 = 0.961
+        (10, (2, 9)),  # 1 - 2 * 11/1024 = 0.979; (3, 8) has 0.891
+        (20, (6, 15)),  # 0.9586 in textbooks
+    ],
+)
+def test_the_interval_has_the_bounds_computed_by_hand(
+    n: int, bounds: tuple[float, float] | None
+) -> None:
+    assert interval([float(i) for i in range(n, 0, -1)]) == bounds
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=6, max_size=40))
+@settings(max_examples=50, deadline=None)
+def test_the_interval_encloses_the_median(values: list[float]) -> None:
+    bounds = interval(values)
+    median = summarise([report(i, x=v) for i, v in enumerate(values)])["numbers"]["x"]["median"]
+    assert bounds is not None
+    assert bounds[0] <= median <= bounds[1]
+
+
+def test_runs_may_lack_a_number() -> None:
+    runs = [report(1, x=1.0), report(2, "failure", y=2.0), report(3, x=3.0)]
+    summary = summarise(runs)
+    assert (summary["done"], summary["count"]) == (2, 3)
+    assert (summary["numbers"]["x"]["median"], summary["numbers"]["x"]["count"]) == (2.0, 2)
+    assert "(2 runs)" in as_table(summary)
+    assert as_table(summary).endswith("done 2/3")
+    assert list(csv.reader(io.StringIO(as_csv(runs)))) == [
+        ["seed", "verdict", "x [m]", "y [m]"],
+        ["1", "success", "1.0", ""],
+        ["2", "failure", "", "2.0"],
+        ["3", "success", "3.0", ""],
+    ]

@@ -26,7 +26,7 @@ LINE = ["doctor", "--mode", "cluster", "-o", "json"]
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip slow checks that have nothing to do with a cluster."""
-    for name in ("mujoco_steps", "udp_loopback", "timer", "graphics"):
+    for name in ("mujoco_steps", "udp_loopback", "timer"):
         monkeypatch.setattr(checks, name, lambda name=name: checks.Check(name, "ok", ""))
 
 
@@ -141,10 +141,6 @@ def test_other_modes_do_not_contact_the_cluster(api: FakeApi) -> None:
     names = [check.name for check in checks.all_checks("local")]
     assert "cluster" not in names
     assert "kubeconfig" not in names
-
-
-def test_no_version_of_cgroups_is_required() -> None:
-    assert "want" not in checks.cgroup().fix
 
 
 def test_the_oldest_version_equals_that_of_the_chart() -> None:

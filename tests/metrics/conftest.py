@@ -10,11 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 
-from cloudrc.assembly import build_cloud, build_links, build_world
-from cloudrc.cloud.endpoint import CloudIdentity
+from cloudrc.cli.run import assemble
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.config.schema import Criteria
-from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.geometry.scene import Board, Pipe, Scene
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry, Vector
 from cloudrc.metrics import Flight
@@ -31,12 +29,9 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
-from cloudrc.world.endpoint import WorldIdentity
 
 SECOND = 1_000_000_000
-START = 10 * SECOND
-DONE = 20 * SECOND
-END = 25 * SECOND
+START, DONE, END = 10 * SECOND, 20 * SECOND, 25 * SECOND
 PERIOD = 40_000_000
 UPLINK, DOWNLINK, HORIZON = 0.05, 0.04, 0.08
 
@@ -67,15 +62,10 @@ class Log:
     def change(self, kind: type, how: Callable[[int, Record], Record | None]) -> None:
         """Replace the n-th record of a class by `how(n, record)`; None removes it."""
         for records in (self.world, self.cloud):
-            n, changed = 0, []
-            for record in records:
-                if isinstance(record, kind):
-                    new = how(n, record)
-                    n += 1
-                    changed += [] if new is None else [new]
-                else:
-                    changed.append(record)
-            records[:] = changed
+            found = [each for each in records if isinstance(each, kind)]
+            new = iter([how(n, record) for n, record in enumerate(found)])
+            changed = [next(new) if isinstance(each, kind) else each for each in records]
+            records[:] = [each for each in changed if each is not None]
 
     def flight(
         self,
@@ -115,42 +105,29 @@ def flown(path: Callable[[float], Vector] = straight) -> Log:
 
 
 def _step(log: Log, counter: int, stamp: int, path: Callable[[float], Vector]) -> None:
-    position = path((stamp - START) / SECOND)
-    odometry = Odometry(stamp, position, UPRIGHT, (1.0, 0.0, 0.0), ZERO)
+    odometry = Odometry(stamp, path((stamp - START) / SECOND), UPRIGHT, (1.0, 0.0, 0.0), ZERO)
     telemetry = Telemetry(stamp, odometry, 0.0, 0, 0, 0, 1, GuardState.TRACK)
     arrival, applied = stamp + round(UPLINK * SECOND), stamp + round(DOWNLINK * SECOND)
     basis = stamp - round(UPLINK * SECOND)
     x, y, z = path((applied - START) / SECOND)
+    measured = path((basis - START) / SECOND)
     log.world += [
         TelemetrySent(stamp, 2, counter, telemetry),
         GroundTruth(stamp, odometry, 0.0, ZERO),
         Arrival(applied, False, 2, counter, DOWNLINK, True),
         CommandApplied(applied, 2, counter, basis, ZERO),
     ]
-    measured = path((basis - START) / SECOND)
-    log.cloud += [
-        Arrival(arrival, True, 2, counter, UPLINK, True),
+    log.cloud.append(Arrival(arrival, True, 2, counter, UPLINK, True))
+    log.cloud.append(
         Control(
-            stamp_ns=stamp,
-            epoch=2,
-            counter=counter,
-            basis_stamp_ns=basis,
-            horizon=HORIZON,
-            rtt=UPLINK + DOWNLINK,
-            loop_delay=UPLINK + DOWNLINK + 0.005,
-            measured=measured,
-            position=(x + 0.003, y + 0.004, z),
-            orientation_wxyz=UPRIGHT,
-            velocity=(1.0, 0.0, 0.0),
+            stamp_ns=stamp, epoch=2, counter=counter, basis_stamp_ns=basis, horizon=HORIZON,
+            rtt=UPLINK + DOWNLINK, loop_delay=UPLINK + DOWNLINK + 0.005, measured=measured,
+            position=(x + 0.003, y + 0.004, z), orientation_wxyz=UPRIGHT,
+            velocity=(1.0, 0.0, 0.0), waypoint=0, command=ZERO, yaw_rate=0.0,
             setpoint=(measured[0] + 0.3, measured[1] + 0.4, measured[2]),
-            waypoint=0,
-            command=ZERO,
-            yaw_rate=0.0,
-            proportional=ZERO,
-            integral=ZERO,
-            derivative=ZERO,
-        ),
-    ]
+            proportional=ZERO, integral=ZERO, derivative=ZERO,
+        )
+    )  # fmt: skip
 
 
 @cache
@@ -173,26 +150,22 @@ def good() -> Log:
 
 def pressing(log: Log, since: float, force: Callable[[int], float]) -> None:
     """Apply a force to the tip from a time on [s since the start]."""
-
-    def how(n: int, record: Record) -> Record:
-        assert isinstance(record, GroundTruth)
-        return record._replace(tip_force=force(n) if record.stamp_ns >= at(since) else 0.0)
-
-    log.change(GroundTruth, how)
+    log.change(
+        GroundTruth,
+        lambda n, truth: truth._replace(tip_force=force(n) if truth.stamp_ns >= at(since) else 0.0),
+    )
 
 
 @cache
 def paper() -> tuple[ResolvedExperiment, Recording]:
     """Fly the shipped experiment once in virtual time."""
     experiment = load_experiment("paper")
-    world = build_world(experiment, WorldIdentity(bytes(16), b"w" * 16))
-    cloud = build_cloud(experiment, CloudIdentity(bytes(16), b"c" * 16))
+    _, cloud, run = assemble(experiment)
     records: tuple[list[Record], list[Record]] = ([], [])
 
     def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
         records[0].extend(from_world)
         records[1].extend(from_cloud)
 
-    run = VirtualRun(world, cloud, *build_links(experiment))
     run.fly(lambda: cloud.teleop.outcome is not None, 60 * SECOND, sink)
     return experiment, Recording.from_records(*records)

@@ -2,77 +2,77 @@
 
 from __future__ import annotations
 
+import builtins
 import getpass
 import json
 import platform
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.record.columns import Recording
 from cloudrc.report.document import Run, clock_offset_document, environment_document, write_json
-from cloudrc.report.write import assess
-from tests.metrics.conftest import paper
+from cloudrc.report.write import assess, write_report
+from tests.metrics.conftest import good, paper
 
 RUN = Run("virtual", "virtual", "0" * 64)
+NAMES = {
+    *("schemaVersion", "verdict", "failures", "experiment", "mode", "seed", "shaper"),
+    *("config_sha256", "records_sha256", "numbers", "complete", "notes"),
+}
 
 
-def document() -> dict[str, object]:
+def document(run: Run = RUN, **criteria: Any) -> dict[str, Any]:
     experiment, recording = paper()
-    return assess(recording, experiment, RUN).document
+    changed = experiment.criteria.model_copy(update=criteria)
+    return assess(recording, experiment.model_copy(update={"criteria": changed}), run).document
 
 
-def test_names() -> None:
-    assert set(document()) == {
-        *("schemaVersion", "verdict", "failures", "experiment", "mode", "seed", "shaper"),
-        *("config_sha256", "records_sha256", "numbers", "complete", "notes"),
-    }
-
-
-def test_values() -> None:
+def test_names_and_values() -> None:
     report = document()
-    assert report["schemaVersion"] == 1
-    assert report["verdict"] == "success"
-    assert report["failures"] == []
+    assert set(report) == NAMES
+    assert (report["schemaVersion"], report["verdict"], report["failures"]) == (1, "success", [])
     assert (report["experiment"], report["mode"], report["seed"]) == ("paper", "virtual", 1)
-    assert report["shaper"] == "virtual"
-    assert report["complete"] is True
+    assert (report["shaper"], report["complete"], report["notes"]) == ("virtual", True, [])
     assert all(set(number) == {"value", "unit"} for number in report["numbers"].values())
+    assert json.dumps(report) == json.dumps(document())
 
 
 def test_unknown_values_are_absent() -> None:
-    experiment, recording = paper()
-    report = assess(recording, experiment, Run("virtual", "virtual")).document
-    assert "records_sha256" not in report
+    report = document(Run("virtual", "virtual"))
+    assert set(report) == NAMES - {"records_sha256"}
     assert "real_time_factor" not in report["numbers"]
     assert "null" not in json.dumps(report)
 
 
 def test_failures_say_code_text_time_and_place() -> None:
-    experiment, recording = paper()
-    strict = experiment.criteria.model_copy(update={"time_limit_s": 5.0})
-    failed = experiment.model_copy(update={"criteria": strict})
-    report = assess(recording, failed, RUN).document
+    report = document(time_limit_s=5.0)
     (failure,) = report["failures"]
     assert set(failure) == {"code", "text", "time", "place"}
-    assert failure["code"] == "time_limit_exceeded"
-    assert len(failure["place"]) == 3
+    assert (failure["code"], len(failure["place"])) == ("time_limit_exceeded", 3)
     assert report["operator_verdict"] == {"verdict": "success", "failures": []}
     assert "the operator's verdict is success. This report's counts." in report["notes"][-1]
 
 
-def test_the_same_flight_gives_the_same_document() -> None:
-    assert json.dumps(document()) == json.dumps(document())
-
-
-def test_a_clock_offset_has_its_uncertainty() -> None:
-    metadata = {"clock_offset_method": "packets", "clock_offset_uncertainty_ns": "1500000"}
-    uncertainty = {"value": pytest.approx(0.0015), "unit": "s"}
-    assert clock_offset_document(metadata) == {"method": "packets", "uncertainty": uncertainty}
-    assert clock_offset_document({"clock_offset_method": "first records"}) == {
-        "method": "first records"
-    }
-    assert clock_offset_document({"clock_offset_method": "same clock"}) is None
-    assert clock_offset_document({}) is None
+@pytest.mark.parametrize(
+    ("metadata", "expected"),
+    [
+        (
+            {"clock_offset_method": "packets", "clock_offset_uncertainty_ns": "1500000"},
+            {"method": "packets", "uncertainty": {"value": pytest.approx(0.0015), "unit": "s"}},
+        ),
+        ({"clock_offset_method": "first records"}, {"method": "first records"}),
+        ({"clock_offset_method": "same clock"}, None),
+        ({}, None),
+    ],
+)
+def test_a_clock_offset_has_its_uncertainty(
+    metadata: dict[str, str], expected: dict[str, Any] | None
+) -> None:
+    assert clock_offset_document(metadata) == expected
 
 
 def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
@@ -85,5 +85,23 @@ def test_the_environment_names_software_but_no_user_or_host() -> None:
     assert environment["packages"]["numpy"]
     assert environment["cores"] >= 1
     words = json.dumps(environment).replace('"', " ").split()
-    assert getpass.getuser() not in words
-    assert platform.node() not in words
+    assert {getpass.getuser(), platform.node()}.isdisjoint(words)
+
+
+def test_without_matplotlib_the_numbers_are_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = builtins.__import__
+
+    def refuse(name: str, *args: Any) -> Any:
+        if name.partition(".")[0] == "matplotlib":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        return real(name, *args)
+
+    for name in [n for n in sys.modules if n.startswith("cloudrc.report.figures")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[report\]"):
+        write_report(tmp_path, Recording.from_records(*good().ends()), paper()[0], RUN)
+    assert json.loads((tmp_path / "report.json").read_text())["schemaVersion"] == 1
+    assert not (tmp_path / "report.html").exists()

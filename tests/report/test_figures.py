@@ -1,42 +1,37 @@
-"""Figures mark events of the link and guard, and draw flights with little data."""
+"""Figures are drawn of any flight, also with little data, and in the style of cloudrc alone."""
 
 from __future__ import annotations
-
-import importlib
 
 import matplotlib
 import numpy as np
 import pytest
 
-from cloudrc.config.schema import Blackout, Change, Direction
+from cloudrc.config.schema import Direction
 from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import GuardState
-from cloudrc.records import Control, GuardChange
-from cloudrc.report.figures import NAMES, draw_all, flight
-from cloudrc.report.figures.marks import LEGEND, legend, mark_events
+from cloudrc.records import Control
+from cloudrc.report.figures import FIGURES, draw_all
 from cloudrc.report.figures.snapshots import WALL_COLOUR, is_inside_pipe, pipe_faces
-from cloudrc.report.figures.style import RC, Subject, new_figure
+from cloudrc.report.figures.style import RC, Subject
 from tests.metrics.conftest import ONE_PIPE, START, Log, at, flown
 
 CALM = Direction(delay_ms=50.0)
 
 
-def subject_of(log: Log, uplink: Direction = CALM) -> Subject:
-    return Subject(log.flight(ONE_PIPE), uplink, CALM)
+def subject_of(log: Log) -> Subject:
+    return Subject(log.flight(ONE_PIPE), CALM, CALM)
 
 
-@pytest.mark.parametrize("empty", [False, True])
-@pytest.mark.parametrize("name", NAMES)
-def test_a_flight_without_data_is_drawn(name: str, empty: bool) -> None:
-    """The recording is empty or ends at the start."""
+@pytest.mark.parametrize("end_ns", [0, START], ids=["empty", "ends at the start"])
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_flight_without_data_is_drawn(name: str, end_ns: int) -> None:
     log = flown()
-    log.world = [] if empty else [record for record in log.world if record.stamp_ns <= START]
-    log.cloud = [] if empty else [record for record in log.cloud if record.stamp_ns <= START]
-    drawing = importlib.import_module(f"cloudrc.report.figures.{name}")
+    for records in (log.world, log.cloud):
+        records[:] = [record for record in records if record.stamp_ns <= end_ns]
+    draw, caption, _ = FIGURES[name]
     subject = subject_of(log)
     with matplotlib.rc_context(RC):
-        drawing.draw(subject).draw_without_rendering()
-    assert drawing.caption(subject)
+        draw(subject).draw_without_rendering()
+    assert caption(subject)
 
 
 def test_a_pipes_rim_inside_another_pipe_is_not_drawn() -> None:
@@ -53,39 +48,11 @@ def test_a_pipes_rim_inside_another_pipe_is_not_drawn() -> None:
         assert abs(offset[1]) < first.length / 2
 
 
-def test_the_caption_names_the_end_of_the_clearance_axis() -> None:
-    assert "Panel (c) ends at 0.8 m" in flight.caption(subject_of(flown()))
-
-
-def test_a_calm_flight_has_no_marks() -> None:
-    assert legend(subject_of(flown())) == ""
-
-
-def test_holds_blackouts_and_changes_are_marked() -> None:
-    log = flown()
-    log.world += [
-        GuardChange(at(2), GuardState.HOLD, "command age"),
-        GuardChange(at(3), GuardState.TRACK, "fresh command"),
-    ]
-    # The link started one second before the mission.
-    uplink = Direction(
-        blackouts=(Blackout(start_s=3.0, duration_s=1.0), Blackout(start_s=500.0, duration_s=1.0)),
-        changes=(Change(at_s=0.5, delay_ms=1.0), Change(at_s=6.0, delay_ms=9.0)),
-    )
-    subject = subject_of(log, uplink)
-    assert legend(subject) == LEGEND
-    axes = new_figure(3.0, 2.0).subplots()
-    mark_events(axes, subject)
-    spans = [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
-    assert spans == [pytest.approx((2.0, 3.0)), pytest.approx((2.0, 3.0))]
-    assert [line.get_xdata()[0] for line in axes.lines] == pytest.approx([5.0])
-
-
 def test_waypoints_are_the_first_setpoints_of_each() -> None:
     log = flown()
 
     def fly_to(n: int, control: Control) -> Control:
-        waypoint = -1 if control.stamp_ns < at(1) else 0 if control.stamp_ns < at(4) else 1
+        waypoint = -1 if control.stamp_ns < at(1) else int(control.stamp_ns >= at(4))
         return control._replace(waypoint=waypoint, setpoint=(float(waypoint), 2.0, 3.0))
 
     log.change(Control, fly_to)

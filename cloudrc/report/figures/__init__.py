@@ -1,43 +1,40 @@
-"""Draw the figures of a report as PNG and SVG.
-
-Each module draws one figure. A module has `draw(subject)`, `caption(subject)`, and the text `ALT`
-for readers who cannot see the figure. No module needs a display, GL or pyplot.
-"""
+"""Draw the figures of a report as PNG and SVG, without a display, GL or pyplot."""
 
 from __future__ import annotations
 
-import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
 
 import matplotlib
 from matplotlib.figure import Figure
 
+from cloudrc.report.figures import curves, flight, marks, snapshots
 from cloudrc.report.figures.style import RC, Subject
 
-__all__ = ["NAMES", "Picture", "Subject", "draw_all"]
-
-NAMES = ("flight", "delay", "odom", "error", "snapshots")
-"""Figures in the order of the page; the paper has the figures delay, odom and error."""
+Draw = Callable[[Subject], Figure]
+Write = Callable[[Subject], str]
+FIGURES: dict[str, tuple[Draw, Write, str]] = {
+    "flight": (flight.draw, flight.caption, flight.ALT),
+    "delay": (curves.draw_delay, lambda s: curves.DELAY + marks.legend(s), curves.DELAY_ALT),
+    "odom": (curves.draw_odom, lambda s: curves.ODOM + marks.legend(s), curves.ODOM_ALT),
+    "error": (curves.draw_error, lambda s: curves.ERROR + marks.legend(s), curves.ERROR_ALT),
+    "snapshots": (snapshots.draw, lambda s: snapshots.CAPTION, snapshots.ALT),
+}
+"""Figures in the order of the page: drawing, caption, and text for readers who cannot see it. The
+paper has the figures delay, odom and error."""
+NAMES = tuple(FIGURES)
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A drawn figure.
+    """A drawn figure."""
 
-    Attributes:
-        name: File name without suffix.
-        png: Content of the PNG file, 200 dpi.
-        svg: Content of the SVG file.
-        caption: Caption, as in a paper.
-        alt: Description for readers who cannot see the figure.
-    """
-
-    name: str
+    name: str  # of its files, without suffix
     png: bytes
     svg: bytes
-    caption: str
-    alt: str
+    caption: str  # as in a paper
+    alt: str  # for readers who cannot see the figure
 
 
 def draw_all(subject: Subject) -> list[Picture]:
@@ -51,15 +48,16 @@ def draw_all(subject: Subject) -> list[Picture]:
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(RC)
         for name in NAMES:
-            drawing = importlib.import_module(f"{__name__}.{name}")
-            figure = drawing.draw(subject)
-            png, svg = _saved(figure, "png"), _saved(figure, "svg")
-            pictures.append(Picture(name, png, svg, drawing.caption(subject), drawing.ALT))
+            draw, caption, alt = FIGURES[name]
+            figure = draw(subject)
+            png, svg = save(figure, "png"), save(figure, "svg")
+            pictures.append(Picture(name, png, svg, caption(subject), alt))
     return pictures
 
 
-def _saved(figure: Figure, kind: str) -> bytes:
+def save(figure: Figure, kind: str) -> bytes:
+    """Return the content of a file, "png", "svg" or "pdf"; equal for equal figures."""
     target = BytesIO()
-    # Without a date, and with a hash salt in RC, the same flight gives the same bytes.
-    figure.savefig(target, format=kind, metadata={"Date": None} if kind == "svg" else None)
+    date = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    figure.savefig(target, format=kind, metadata=date)
     return target.getvalue()

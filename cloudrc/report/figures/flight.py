@@ -16,60 +16,51 @@ from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH, ARM_RADIUS, Spheres, 
 from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import first_touch
-from cloudrc.report.figures.style import BLACK, GREY, PAGE, VERMILION, Subject, new_figure, panel
+from cloudrc.report.figures.style import BLACK, BORE, GREY, VERMILION, Subject, new_figure, panel
 
+CLEARANCE_SHOWN = 0.40
+"""Clearance at the end of the colour scale [m]; inside a pipe the clearance is never larger."""
+CEILING = 2 * CLEARANCE_SHOWN
+"""Upper end of the axis of panel (c) [m]."""
 ALT = "The flown path from above and from the side through the pipes, coloured by clearance."
 CAPTION_PIPES = (
     "Flight. (a) Path from above: pipes cut open, waypoints numbered, the board as a bar, a star "
     "where the arm first touches it. (b) Height along the path, with the bore of each pipe. "
     "(c) Clearance: distance from the robot (rotors, arm, body) to the nearest wall. The colour is "
-    "the clearance in all three panels. Panel (c) ends at {ceiling:.1f} m; outside the pipes the "
+    f"the clearance in all three panels. Panel (c) ends at {CEILING:.1f} m; outside the pipes the "
     "clearance can be larger."
 )
 CAPTION_FREE = "Flight. (a) Path from above, waypoints numbered. (b) Height along the path."
-COLOURS = "viridis"
-CLEARANCE_SHOWN = 0.40
-"""Clearance at the end of the colour scale [m]; inside a pipe the clearance is never larger."""
-CEILING = 2 * CLEARANCE_SHOWN
-"""Upper end of the axis of panel (c) [m]."""
 
 
 def caption(subject: Subject) -> str:
-    """Write the caption; the caption mentions clearance only if the scene has pipes."""
-    if not subject.flight.scene.pipes:
-        return CAPTION_FREE
-    return CAPTION_PIPES.format(ceiling=CEILING)
+    """Return the caption; it mentions clearance only if the scene has pipes."""
+    return CAPTION_PIPES if subject.flight.scene.pipes else CAPTION_FREE
 
 
 def draw(subject: Subject) -> Figure:
-    """Draw the three panels and the colour bar."""
-    figure = new_figure(PAGE, 3.5)
+    """Draw the path from above and, along the path, height and clearance."""
+    figure = new_figure(3.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.05))
-    top = figure.add_subplot(grid[:, 0])
     position = subject.flight.truth["position"]
-    distance = _distance_flown(position)
-    coloured = _draw_top(top, subject, position)
+    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    flown = np.concatenate([np.zeros(min(len(position), 1)), np.cumsum(steps)])
+    coloured = _draw_top(figure.add_subplot(grid[:, 0]), subject, position)
     if not len(subject.flight.clearance):
         side = figure.add_subplot(grid[:, 1])
-        _draw_side(side, subject, distance, position)
+        _draw_side(side, subject, flown, position)
         side.set_xlabel("distance flown (m)")
         return figure
     side = figure.add_subplot(grid[0, 1])
-    _draw_side(side, subject, distance, position)
+    _draw_side(side, subject, flown, position)
     side.tick_params(labelbottom=False)
     margin = figure.add_subplot(grid[1, 1], sharex=side)
-    _draw_clearance(margin, subject, distance)
+    _draw_clearance(margin, subject, flown, position)
     if coloured is not None:
         bar = figure.colorbar(coloured, ax=[side, margin], extend="max", aspect=40, pad=0.01)
         bar.set_label("clearance (m)")
         bar.outline.set_linewidth(0.5)
     return figure
-
-
-def _distance_flown(position: Array) -> Array:
-    """Compute the distance flown up to each sample [m]."""
-    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
-    return np.concatenate([np.zeros(min(len(position), 1)), np.cumsum(steps)])
 
 
 def _draw_path(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollection | None:
@@ -84,7 +75,7 @@ def _draw_path(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollecti
     axes.plot(*points.T, color=BLACK, lw=3.0, solid_capstyle="round", zorder=3)
     lines = LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)),
-        cmap=COLOURS,
+        cmap="viridis",
         norm=Normalize(0.0, CLEARANCE_SHOWN),
         lw=1.8,
         capstyle="round",
@@ -128,77 +119,62 @@ def _touch_point(subject: Subject) -> Array | None:
 
 
 def _draw_pipe(axes: Axes, pipe: Pipe) -> None:
-    """Draw a pipe from above, cut along its axis: two walls and the bore between them."""
+    """Draw a pipe from above, cut along its axis: the bore and the two walls beside it."""
     centre, along = np.array(pipe.centre[:2]), np.array(pipe.axis[:2])
-    across = np.array([-along[1], along[0]])
-    half = along * pipe.length / 2
-    bore = [
-        centre - half - across * pipe.inner,
-        centre + half - across * pipe.inner,
-        centre + half + across * pipe.inner,
-        centre - half + across * pipe.inner,
-    ]
-    axes.add_patch(Polygon(bore, closed=True, fc="#f4f4f4", ec="none", zorder=1))
-    for side in (-1, 1):
-        wall = [
-            centre + sign * half + side * across * radius
-            for sign, radius in (
-                (-1, pipe.inner),
-                (1, pipe.inner),
-                (1, pipe.outer),
-                (-1, pipe.outer),
-            )
+    across, half = np.array([-along[1], along[0]]), along * pipe.length / 2
+    for low, high, colour, zorder in (
+        (-pipe.inner, pipe.inner, BORE, 1),
+        (-pipe.inner, -pipe.outer, GREY, 2),
+        (pipe.inner, pipe.outer, GREY, 2),
+    ):
+        corners = [
+            centre + end * half + radius * across
+            for end, radius in ((-1, low), (1, low), (1, high), (-1, high))
         ]
-        axes.add_patch(Polygon(wall, closed=True, fc=GREY, ec="none", zorder=2))
+        axes.add_patch(Polygon(corners, closed=True, fc=colour, ec="none", zorder=zorder))
 
 
-def _draw_side(axes: Axes, subject: Subject, distance: Array, position: Array) -> None:
+def _draw_side(axes: Axes, subject: Subject, flown: Array, position: Array) -> None:
     panel(axes, "b", "height along the path")
-    for pipe, begin, end in _passages(subject, distance, position):
+    for pipe, begin, end in _passages(subject, flown, position):
         low, high = pipe.centre[2] - pipe.inner, pipe.centre[2] + pipe.inner
-        axes.fill_between([begin, end], low, high, color="#f4f4f4", lw=0, zorder=1)
+        axes.fill_between([begin, end], low, high, color=BORE, lw=0, zorder=1)
         axes.hlines([low, high], begin, end, color=GREY, lw=1.5, zorder=2)
     axes.axhline(subject.flight.scene.floor, color=BLACK, lw=0.8)
-    _draw_path(axes, subject, distance, position[:, 2])
+    _draw_path(axes, subject, flown, position[:, 2])
     axes.margins(y=0.12)
     axes.set_ylabel("$z$ (m)")
 
 
-def _passages(
-    subject: Subject, distance: Array, position: Array
-) -> list[tuple[Pipe, float, float]]:
+def _passages(subject: Subject, flown: Array, position: Array) -> list[tuple[Pipe, float, float]]:
     """List the pipes in the order flown, with the distances flown up to entry and exit [m]."""
     inside = pipe_index(subject.flight.scene, position)
     changes = np.flatnonzero(np.diff(inside, prepend=-1, append=-1))
-    spans = []
-    for first, last in pairwise(changes):
-        if inside[first] >= 0:
-            pipe = subject.flight.scene.pipes[inside[first]]
-            spans.append((pipe, float(distance[first]), float(distance[last - 1])))
-    return spans
+    return [
+        (subject.flight.scene.pipes[inside[first]], float(flown[first]), float(flown[last - 1]))
+        for first, last in pairwise(changes)
+        if inside[first] >= 0
+    ]
 
 
-def _draw_clearance(axes: Axes, subject: Subject, distance: Array) -> None:
+def _draw_clearance(axes: Axes, subject: Subject, flown: Array, position: Array) -> None:
     panel(axes, "c", "clearance along the path")
     axes.set_ylabel("clearance (m)")
     axes.set_xlabel("distance flown (m)")
-    clearance = subject.flight.clearance
-    position = subject.flight.truth["position"]
-    for _, begin, end in _passages(subject, distance, position):
-        axes.axvspan(begin, end, color="#f4f4f4", lw=0, zorder=0)
-    _draw_path(axes, subject, distance, clearance)
+    flight, clearance = subject.flight, subject.flight.clearance
+    for _, begin, end in _passages(subject, flown, position):
+        axes.axvspan(begin, end, color=BORE, lw=0, zorder=0)
+    _draw_path(axes, subject, flown, clearance)
     axes.set_ylim(min(0.0, float(clearance.min())), CEILING)
-    axes.set_xlim(0.0, max(float(distance[-1]), 1e-3))
-    lowest = np.where(subject.flight.inside, clearance, np.inf).argmin()
-    if subject.flight.inside.any():
-        axes.plot(
-            distance[lowest], clearance[lowest], "o", ms=4, mfc="none", mec=VERMILION, zorder=6
-        )
-        text = f"{clearance[lowest]:.3f} m"
+    axes.set_xlim(0.0, max(float(flown[-1]), 1e-3))
+    if flight.inside.any():
+        row = np.where(flight.inside, clearance, np.inf).argmin()
+        lowest = flown[row], clearance[row]
+        axes.plot(*lowest, "o", ms=4, mfc="none", mec=VERMILION, zorder=6)
         axes.annotate(
-            text,
-            (distance[lowest], clearance[lowest]),
-            (0, -11 if clearance[lowest] > 0.1 else 7),
+            f"{lowest[1]:.3f} m",
+            lowest,
+            (0, -11 if lowest[1] > 0.1 else 7),
             textcoords="offset points",
             ha="center",
             color=VERMILION,

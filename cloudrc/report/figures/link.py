@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from io import BytesIO
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import matplotlib
 import numpy as np
@@ -17,18 +16,8 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from cloudrc.config.schema import Direction
 from cloudrc.metrics.flight import Array
-from cloudrc.report.figures import marks
-from cloudrc.report.figures.style import (
-    DOWNLINK,
-    GREY,
-    LIGHT,
-    PAGE,
-    RC,
-    UPLINK,
-    VERMILION,
-    new_figure,
-    panel,
-)
+from cloudrc.report.figures import marks, save, style
+from cloudrc.report.figures.style import dots, legend_above, new_figure, panel
 
 RUNS_SHOWN = 20
 """Longest run of losses in the figure [1]; a longer run counts as one of this length."""
@@ -40,21 +29,13 @@ DOTS = 6000
 
 @dataclass(frozen=True, slots=True)
 class DirectionSample:
-    """One direction of a link: its profile, n packets over time, and m packets for statistics.
+    """One direction of a link: its profile, n packets over time, and m packets for statistics."""
 
-    Attributes:
-        asked: The link profile of this direction.
-        sent: When each packet was sent, since the start of the link [s], shape (n,).
-        delays: One-way delays, NaN for lost packets [s], shape (n,).
-        many: One-way delays for the distribution, NaN for lost packets [s], shape (m,).
-        runs: Lengths of the runs of losses among the m packets.
-    """
-
-    asked: Direction
-    sent: Array
-    delays: Array
-    many: Array
-    runs: tuple[int, ...]
+    asked: Direction  # the link profile
+    sent: Array  # when each packet was sent, since the start of the link [s], shape (n,)
+    delays: Array  # one-way delays, NaN for lost packets [s], shape (n,)
+    many: Array  # one-way delays for the distribution, NaN for lost packets [s], shape (m,)
+    runs: tuple[int, ...]  # lengths of the runs of losses among the m packets
 
 
 _LabelledWay: TypeAlias = tuple[DirectionSample, str, str]
@@ -64,33 +45,22 @@ _LabelledWay: TypeAlias = tuple[DirectionSample, str, str]
 def render_link(
     title: str, uplink: DirectionSample, downlink: DirectionSample | None, kind: str
 ) -> bytes:
-    """Draw the figure of a link, as the content of a file.
+    """Draw the figure of a link, as the content of a file: "png", "svg" or "pdf".
 
-    Args:
-        title: Title above the panels.
-        uplink: Direction from world to cloud.
-        downlink: Direction from cloud to world; None for a trace, which has one direction.
-        kind: "png", "svg" or "pdf".
-
-    Returns:
-        Content of the file; identical for the same link.
+    `downlink` is None for a trace, which has one direction.
     """
-    target = BytesIO()
-    with matplotlib.rc_context(RC):
-        figure = draw(title, uplink, downlink)
-        date = {"png": None, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
-        figure.savefig(target, format=kind, metadata=date)
-    return target.getvalue()
+    with matplotlib.rc_context(style.RC):
+        return save(_draw(title, uplink, downlink), kind)
 
 
-def draw(title: str, uplink: DirectionSample, downlink: DirectionSample | None) -> Figure:
-    """Draw the panels; the settings `style.RC` must be active."""
-    figure = new_figure(PAGE, 4.4)
+def _draw(title: str, uplink: DirectionSample, downlink: DirectionSample | None) -> Figure:
+    figure = new_figure(4.4)
     figure.suptitle(title, x=0.01, ha="left", fontsize=9.5)
-    ways: list[_LabelledWay] = [(uplink, "uplink" if downlink else "one way", UPLINK)]
+    ways: list[_LabelledWay] = [(uplink, "uplink" if downlink else "one way", style.UPLINK)]
     if downlink:
-        ways.append((downlink, "downlink", DOWNLINK))
-    top = 1.12 * max(_top(way) for way, _, _ in ways)
+        ways.append((downlink, "downlink", style.DOWNLINK))
+    largest = [np.nanmax(way.delays, initial=0.0) * 1e3 for way, _, _ in ways]
+    top = 1.12 * max(*largest, 1.0)
     grid = figure.add_gridspec(2, 2)
     for place, (way, name, colour) in enumerate(ways):
         axes = figure.add_subplot(grid[0, place] if downlink else grid[0, :])
@@ -101,64 +71,39 @@ def draw(title: str, uplink: DirectionSample, downlink: DirectionSample | None) 
     return figure
 
 
-def _top(way: DirectionSample) -> float:
-    """Compute the largest delay of a direction [ms], at least 1 ms."""
-    shown = way.delays[np.isfinite(way.delays)] * 1e3
-    return max(float(shown.max(initial=0.0)), 1.0)
-
-
 def _draw_delay(axes: Axes, way: DirectionSample, colour: str, top: float) -> None:
     """Draw the profile as a band, each packet as a dot, lost packets along the lower edge."""
     duration = float(way.sent[-1]) if len(way.sent) else 1.0
-    steps = marks.band(way.asked)
-    if steps is not None and (way.asked.trace is None or way.asked.jitter_ms):
+    delays = marks.delays_of(way.asked)
+    if delays is not None and (way.asked.trace is None or way.asked.jitter_ms):
         time = np.linspace(0.0, duration, 2000)
-        low, high = marks.bounds_at(steps, time)
-        axes.fill_between(time, low * 1e3, high * 1e3, color=LIGHT, lw=0, zorder=1, label="profile")
-    _mark_blackouts(axes, way.asked, duration)
+        low, high = (1e3 * bound for bound in marks.band(delays, time))
+        axes.fill_between(time, low, high, color=style.LIGHT, lw=0, zorder=1, label="profile")
+    shown = [blackout for blackout in way.asked.blackouts if blackout.start_s < duration]
+    for index, blackout in enumerate(shown):  # at least as wide as a line
+        end = blackout.start_s + max(blackout.duration_s, duration / 300)
+        label = "_" if index else "blackout"
+        axes.axvspan(blackout.start_s, end, color=BLACKOUT, lw=0, zorder=1.5, label=label)
     thin = slice(None, None, max(1, len(way.sent) // DOTS))
-    axes.plot(
-        way.sent[thin],
-        way.delays[thin] * 1e3,
-        ".",
-        ms=1.8,
-        mew=0,
-        color=colour,
-        rasterized=True,
-        zorder=2,
-    )
-    axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label="packet")
+    dots(axes, way.sent[thin], way.delays[thin] * 1e3, colour, "packet")
     lost = way.sent[np.isnan(way.delays)]
     if len(lost):
         bottom = np.full(len(lost), -0.045 * top)
-        axes.plot(lost, bottom, "|", ms=4.0, mew=0.5, color=VERMILION, clip_on=False, zorder=3)
-        axes.plot([], [], "|", ms=5.0, mew=1.0, color=VERMILION, label="lost")
+        look: dict[str, Any] = {"marker": "|", "ls": "none", "color": style.VERMILION}
+        axes.plot(lost, bottom, ms=4.0, mew=0.5, clip_on=False, zorder=3, **look)
+        axes.plot([], [], ms=5.0, mew=1.0, label="lost", **look)
     axes.set_xlim(0.0, duration)
     axes.set_ylim((-0.09 if len(lost) else -0.02) * top, top)
     axes.set_xlabel("time since the link started (s)")
     axes.set_ylabel("one-way delay (ms)")
-    _legend(axes)
-
-
-def _mark_blackouts(axes: Axes, asked: Direction, duration: float) -> None:
-    """Mark blackouts; a short blackout is drawn at least as wide as a line."""
-    shown = [blackout for blackout in asked.blackouts if blackout.start_s < duration]
-    for index, blackout in enumerate(shown):
-        axes.axvspan(
-            blackout.start_s,
-            blackout.start_s + max(blackout.duration_s, duration / 300),
-            color=BLACKOUT,
-            lw=0,
-            zorder=1.5,
-            label="_" if index else "blackout",
-        )
+    legend_above(axes, 4)
 
 
 def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
     """Draw the share of packets with more than a given delay; a log scale shows the tail."""
     panel(axes, letter, "distribution")
     least = 1e-2
-    for (way, name, colour), style in zip(ways, ("-", "--"), strict=False):
+    for (way, name, colour), dashes in zip(ways, ("-", "--"), strict=False):
         delays = np.sort(way.many[np.isfinite(way.many)]) * 1e3
         if not len(delays):
             continue
@@ -169,33 +114,19 @@ def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
         rows = np.unique(np.concatenate((rows - 1, len(delays) - rows)))
         shown = np.concatenate(([0.0, delays[0]], delays[rows]))
         share = np.concatenate(([1.0, 1.0], later[rows]))
-        axes.plot(
-            shown,
-            share,
-            color=colour,
-            ls=style,
-            drawstyle="steps-post",
-            label=name if len(ways) == 2 else "_",
-        )
+        label = name if len(ways) == 2 else "_"
+        axes.plot(shown, share, color=colour, ls=dashes, drawstyle="steps-post", label=label)
     axes.set_yscale("log")
     axes.set_ylim(max(least, 1e-4) / 1.3, 1.3)
     for level, name in ((0.5, "median"), (0.01, "99 %")):
-        axes.axhline(level, color=GREY, lw=0.6, ls=(0, (1, 2)), zorder=1)
-        axes.text(
-            0.995,
-            level * 1.12,
-            name,
-            color=GREY,
-            fontsize=7.5,
-            ha="right",
-            va="bottom",
-            transform=axes.get_yaxis_transform(),
-        )
+        axes.axhline(level, color=style.GREY, lw=0.6, ls=(0, (1, 2)), zorder=1)
+        text = axes.text(0.995, level * 1.12, name, transform=axes.get_yaxis_transform())
+        text.set(color=style.GREY, fontsize=7.5, ha="right", va="bottom")
     right = max(axes.get_xlim()[1], 1.0)
     axes.set_xlim(-0.005 * right, right)
     axes.set_xlabel("one-way delay (ms)")
     axes.set_ylabel("share with more delay")
-    _legend(axes)
+    legend_above(axes, 4)
 
 
 def _draw_runs(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
@@ -223,7 +154,7 @@ def _draw_runs(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
         axes.set_yticks([])
         return
     _scale_runs(axes, longest, least, most)
-    _legend(axes)
+    legend_above(axes, 4)
 
 
 def _scale_runs(axes: Axes, longest: int, least: float, most: float) -> None:
@@ -235,14 +166,3 @@ def _scale_runs(axes: Axes, longest: int, least: float, most: float) -> None:
     few = max(longest, 5) <= 10
     axes.set_xlim(0.4, max(longest, 5) + 0.6)
     axes.set_xticks(np.arange(1, max(longest, 5) + 1) if few else [1, *range(5, longest + 1, 5)])
-
-
-def _legend(axes: Axes) -> None:
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(
-            loc="lower right",
-            bbox_to_anchor=(1.0, 1.0),
-            ncols=4,
-            columnspacing=1.0,
-            handletextpad=0.4,
-        )

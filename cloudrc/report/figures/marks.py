@@ -22,148 +22,88 @@ from cloudrc.link.profile import Change, DirectionProfile, Timeline
 from cloudrc.link.traces import read_trace
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import holds
-from cloudrc.report.figures.style import GREY, PURPLE, VERMILION, Subject
+from cloudrc.report.figures import style
+from cloudrc.report.figures.style import Subject
 
-
-@dataclass(frozen=True, slots=True)
-class Band:
-    """Configured delay over time, in n steps.
-
-    Attributes:
-        time: Start of each step, since the start of the link [s], shape (n,).
-        low: Delay minus jitter, not below 0 [s], shape (n,).
-        high: Delay plus jitter [s], shape (n,).
-        period: Time after which the steps begin again [s]; infinite if they do not.
-    """
-
-    time: Array
-    low: Array
-    high: Array
-    period: float
-
-
-def band(direction: Direction) -> Band | None:
-    """Compute the band of delays that a link profile sets.
-
-    The band is delay plus and minus jitter. For uniform jitter the band contains all delays; for
-    other distributions it has a half-width of one standard deviation.
-
-    Returns:
-        The band; None if the delays come from a trace that no longer exists.
-    """
-    try:
-        trace = read_trace(Path(direction.trace)) if direction.trace else None
-    except BadInputError:
-        return None
-    profile = DirectionProfile(
-        delay=direction.delay_ms * 1e-3,
-        jitter=direction.jitter_ms * 1e-3,
-        changes=tuple(
-            Change(change.at_s, _seconds(change.delay_ms), _seconds(change.jitter_ms))
-            for change in direction.changes
-        ),
-        trace=replace(trace, loop=direction.loop) if trace else None,
-    )
-    timeline = Timeline(profile)
-    delay = np.array([piece.delay_ns * 1e-9 for piece in timeline.pieces])
-    jitter = np.array([piece.jitter for piece in timeline.pieces])
-    period = inf if timeline.period_ns is None else timeline.period_ns * 1e-9
-    time = np.array(timeline.pass_ns) * 1e-9
-    return Band(time, np.maximum(delay - jitter, 0.0), delay + jitter, period)
-
-
-def bounds_at(steps: Band, time: Array) -> tuple[Array, Array]:
-    """Look up the lower and upper bound [s] at each `time` [s] since the start of the link."""
-    inside = np.where(time > 0.0, np.mod(time, steps.period), time)
-    rows = np.maximum(np.searchsorted(steps.time, inside, side="right") - 1, 0)
-    return steps.low[rows], steps.high[rows]
-
-
-def _seconds(value_ms: float | None) -> float | None:
-    return None if value_ms is None else value_ms * 1e-3
-
-
+Interval: TypeAlias = tuple[float, float]
 SAME_CHANGE = 0.05
 """Two records less than this time apart describe the same change [s]."""
+SAME_CAUSE = 1.0
+"""Largest time between the records of one change in both directions [s]."""
+LABEL_WIDTH = 0.05
+"""Width of a number beside a triangle, as a share of the narrowest panel's time axis [1]."""
+ROW_HEIGHT, ROWS = 8, 8
+"""Distance between two rows of numbers [points], and number of rows for which there is room."""
+LEGEND = (
+    " Behind the curves: red, the guard was in HOLD; hatched, a blackout of the link; dotted, a "
+    "change of the link by its profile."
+)
+
+
+def delays_of(direction: Direction) -> Timeline | None:
+    """Return the delays that a link profile sets; None if their trace no longer exists."""
+    changes = (
+        Change(change.at_s, _seconds(change.delay_ms), _seconds(change.jitter_ms))
+        for change in direction.changes
+    )
+    profile = DirectionProfile(
+        direction.delay_ms * 1e-3, direction.jitter_ms * 1e-3, changes=tuple(changes)
+    )
+    if direction.trace:
+        try:
+            trace = read_trace(Path(direction.trace))
+        except BadInputError:
+            return None
+        profile = replace(profile, trace=replace(trace, loop=direction.loop))
+    return Timeline(profile)
+
+
+def _seconds(milliseconds: float | None) -> float | None:
+    return None if milliseconds is None else milliseconds * 1e-3
+
+
+def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
+    """Compute delay minus and plus jitter [s] at each `time` [s] since the start of the link.
+
+    For uniform jitter the band contains all delays; for other distributions it has a half-width of
+    one standard deviation.
+    """
+    found = [delays.at(round(instant * 1e9)) for instant in time.tolist()]
+    delay = np.array([conditions.delay_ns for conditions in found]) * 1e-9
+    jitter = np.array([conditions.jitter for conditions in found])
+    return np.maximum(delay - jitter, 0.0), delay + jitter
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """An interval in which a direction has one link profile.
+    """An interval in which a direction has one link profile; times are since the flight's start."""
 
-    Attributes:
-        begin: Begin, as time since the start of the flight [s]; -inf if the span began before.
-        end: End, likewise [s]; inf if the span lasts to the end of the flight.
-        origin: Start of the profile's time line, likewise [s].
-        direction: The link profile of this direction.
-        cause: Cause of the change; "" if the link started with this profile.
-    """
-
-    begin: float
-    end: float
-    origin: float
+    begin: float  # [s]; -inf if the span began before
+    origin: float  # start of the profile's time line [s]
     direction: Direction
-    cause: str
+    cause: str  # cause of the change; "" if the link started with this profile
+    end: float = inf  # [s]; inf if the span lasts to the end of the flight
 
 
 def spans(subject: Subject, *, uplink: bool) -> list[Span]:
     """List the spans of a direction, in the order of time."""
     configured = subject.uplink if uplink else subject.downlink
-    found = [Span(-inf, inf, subject.link_start, configured, "")]
-    for begin, origin, direction, cause in _changes(subject, uplink):
+    found = [Span(-inf, subject.link_start, configured, "")]
+    for span in sorted(_changes(subject, uplink), key=lambda span: span.begin):
         last = found[-1]
-        if not cause and isnan(origin) and direction == last.direction:
+        if not span.cause and isnan(span.origin) and span.direction == last.direction:
             continue  # the link started as configured
-        if abs(begin - last.begin) < SAME_CHANGE:
+        if span.begin - last.begin < SAME_CHANGE:
             continue  # a repeated record
-        origin = last.origin if isnan(origin) else origin
-        found.append(Span(begin, inf, origin, direction, cause))
+        found.append(replace(span, origin=last.origin) if isnan(span.origin) else span)
     ends = [after.begin for _, after in pairwise(found)] + [inf]
-    return [
-        Span(span.begin, end, span.origin, span.direction, span.cause)
-        for span, end in zip(found, ends, strict=True)
-        if span.begin < end
-    ]
+    ended = [replace(span, end=end) for span, end in zip(found, ends, strict=True)]
+    return [span for span in ended if span.begin < span.end]
 
 
-def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
-    """Look up the delays that the link profile sets for a direction.
-
-    Args:
-        subject: The flight.
-        time: Time since the start of the flight [s], shape (n,).
-        uplink: True for the uplink, False for the downlink.
-
-    Returns:
-        Lower and upper bound [s], shape (n,), NaN where a trace no longer exists; None if all
-        values are NaN.
-    """
-    low, high = np.full(len(time), np.nan), np.full(len(time), np.nan)
-    for span in spans(subject, uplink=uplink):
-        steps = band(span.direction)
-        rows = (time >= span.begin) & (time < span.end)
-        if steps is not None and rows.any():
-            low[rows], high[rows] = bounds_at(steps, time[rows] - span.origin)
-    return None if np.isnan(low).all() and len(time) else (low, high)
-
-
-def set_in_flight(subject: Subject) -> list[tuple[float, str]]:
-    """List the changes of the link made in flight: time since its start [s], and cause."""
-    found: list[tuple[float, str]] = []
-    both = [span for uplink in (True, False) for span in spans(subject, uplink=uplink)]
-    for span in sorted(both, key=lambda span: span.begin):
-        if not span.cause or not 0.0 < span.begin < subject.duration:
-            continue
-        # Both directions record the same change, at most 0.1 s apart.
-        if not found or found[-1][1] != span.cause or span.begin - found[-1][0] > 1.0:
-            found.append((span.begin, span.cause))
-    return found
-
-
-def _changes(subject: Subject, uplink: bool) -> list[tuple[float, float, Direction, str]]:
-    """Read the recorded changes: begin, start of the time line, link profile, cause."""
+def _changes(subject: Subject, uplink: bool) -> Iterator[Span]:
+    """Read the recorded changes."""
     table = subject.flight.recording["/link"]
-    found = []
     for row in np.flatnonzero(table["uplink"] == uplink):
         stamp = float(subject.flight.seconds(table["stamp_ns"][row]))
         try:
@@ -171,22 +111,37 @@ def _changes(subject: Subject, uplink: bool) -> list[tuple[float, float, Directi
         except ValueError:  # recorded by another version
             continue
         begin, origin = stamp - table["age"][row], stamp - table["time_line"][row]
-        found.append((float(begin), float(origin), direction, str(table["cause"][row])))
-    return sorted(found, key=lambda change: change[0])
+        yield Span(float(begin), float(origin), direction, str(table["cause"][row]))
 
 
-Interval: TypeAlias = tuple[float, float]
-HATCH = "#b0b0b0"
-LABEL_WIDTH = 0.05
-"""Width of a number beside a triangle, as a share of the narrowest panel's time axis [1]."""
-ROW_HEIGHT = 8
-"""Distance between two rows of numbers [points]."""
-ROWS = 8
-"""Number of rows of numbers for which a panel has room [1]."""
-LEGEND = (
-    " Behind the curves: red, the guard was in HOLD; hatched, a blackout of the link; dotted, a "
-    "change of the link by its profile."
-)
+def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
+    """Look up the delays that the link profile sets, at times [s] since the start of the flight.
+
+    Returns:
+        Lower and upper bound [s], NaN where a trace no longer exists; None if all values are NaN.
+    """
+    low, high = np.full(len(time), np.nan), np.full(len(time), np.nan)
+    for span in spans(subject, uplink=uplink):
+        delays = delays_of(span.direction)
+        rows = (time >= span.begin) & (time < span.end)
+        if delays is not None:
+            low[rows], high[rows] = band(delays, time[rows] - span.origin)
+    return None if np.isnan(low).all() else (low, high)
+
+
+def set_in_flight(subject: Subject) -> list[tuple[float, str]]:
+    """List the changes of the link made in flight: time since its start [s], and cause."""
+    found: list[tuple[float, str]] = []
+    for span in sorted(_all_spans(subject), key=lambda span: span.begin):
+        if not span.cause or not 0.0 < span.begin < subject.duration:
+            continue
+        if not found or found[-1][1] != span.cause or span.begin - found[-1][0] > SAME_CAUSE:
+            found.append((span.begin, span.cause))
+    return found
+
+
+def _all_spans(subject: Subject) -> list[Span]:
+    return [span for uplink in (True, False) for span in spans(subject, uplink=uplink)]
 
 
 def legend(subject: Subject) -> str:
@@ -202,40 +157,28 @@ def legend(subject: Subject) -> str:
 
 
 def mark_events(axes: Axes, subject: Subject) -> None:
-    """Shade HOLD, hatch blackouts and draw a line at each change of the link."""
+    """Shade HOLD, hatch blackouts and mark each change of the link."""
     held, silent, changed = _marks(subject)
     for begin, end in held:
-        axes.axvspan(begin, end, color=VERMILION, alpha=0.15, lw=0, zorder=0.5)
+        axes.axvspan(begin, end, color=style.VERMILION, alpha=0.15, lw=0, zorder=0.5)
     for begin, end in silent:
-        axes.axvspan(begin, end, fc="none", ec=HATCH, hatch="////", lw=0, zorder=0.6)
+        axes.axvspan(begin, end, fc="none", ec="#b0b0b0", hatch="////", lw=0, zorder=0.6)
     for instant in changed:
-        axes.axvline(instant, color=GREY, lw=0.7, ls=(0, (1, 2)))
-    instants = [instant for instant, _ in set_in_flight(subject)]
-    rows = _rows(instants, LABEL_WIDTH * subject.duration)
-    for number, (instant, row) in enumerate(zip(instants, rows, strict=True), start=1):
-        _mark_set(axes, instant, number, row)
-
-
-def _rows(instants: list[float], width: float) -> Iterator[int]:
-    """Choose the row of each label, from the top, so that labels do not overlap.
-
-    Args:
-        instants: Start of each label, rising [s].
-        width: Width of a label [s].
-    """
-    last = [-inf] * ROWS
-    for instant in instants:
+        axes.axvline(instant, color=style.GREY, lw=0.7, ls=(0, (1, 2)))
+    last = [-inf] * ROWS  # start of the last number in each row: numbers must not overlap
+    for number, (instant, _) in enumerate(set_in_flight(subject), start=1):
+        width = LABEL_WIDTH * subject.duration
         free = (row for row, before in enumerate(last) if instant - before >= width)
         row = next(free, last.index(min(last)))
         last[row] = instant
-        yield row
+        _mark_set(axes, instant, number, row)
 
 
 def _mark_set(axes: Axes, instant: float, number: int, row: int) -> None:
     """Mark a change by the user at an instant [s]: a line, a triangle on top, and its number."""
     place = axes.get_xaxis_transform()
-    axes.axvline(instant, color=PURPLE, lw=0.8, zorder=2.5)
-    axes.plot(instant, 1.0, "v", ms=6.5, mew=0, color=PURPLE, transform=place, clip_on=False)
+    axes.axvline(instant, color=style.PURPLE, lw=0.8, zorder=2.5)
+    axes.plot(instant, 1.0, "v", ms=6.5, mew=0, color=style.PURPLE, transform=place, clip_on=False)
     axes.annotate(
         str(number),
         (instant, 1.0),
@@ -243,7 +186,7 @@ def _mark_set(axes: Axes, instant: float, number: int, row: int) -> None:
         xycoords=place,
         textcoords="offset points",
         fontsize=7.0,
-        color=PURPLE,
+        color=style.PURPLE,
         bbox={"fc": "white", "ec": "none", "pad": 0.5, "alpha": 0.8},
         zorder=6,
     )
@@ -255,7 +198,7 @@ def _marks(subject: Subject) -> tuple[list[Interval], list[Interval], list[float
     held = [(flight.seconds(start), flight.seconds(end)) for start, end in holds(flight)]
     blackouts: set[Interval] = set()
     instants: set[float] = set()
-    for span in (one for uplink in (True, False) for one in spans(subject, uplink=uplink)):
+    for span in _all_spans(subject):
         for blackout in span.direction.blackouts:
             begin = blackout.start_s + span.origin
             cut = max(begin, span.begin), min(begin + blackout.duration_s, span.end)

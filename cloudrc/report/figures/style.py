@@ -17,10 +17,11 @@ from matplotlib.figure import Figure
 from cloudrc.config.schema import Direction
 from cloudrc.messages import Vector
 from cloudrc.metrics import Flight
+from cloudrc.metrics.flight import Array
 
 PAGE = 7.16
 """Width of two columns [in]. Source: IEEE conference template."""
-BLACK, GREY, LIGHT = "#1a1a1a", "#6b6b6b", "#d9d9d9"
+BLACK, GREY, LIGHT, BORE = "#1a1a1a", "#6b6b6b", "#d9d9d9", "#f4f4f4"
 BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
 ORANGE, VERMILION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
 UPLINK, DOWNLINK = BLUE, ORANGE
@@ -29,31 +30,19 @@ REFERENCE, MEASURED, ESTIMATED = BLACK, ORANGE, BLUE
 RC: dict[Any, Any] = {
     "font.family": "STIXGeneral",  # shipped with matplotlib: same picture on every machine
     "mathtext.fontset": "stix",
-    "font.size": 9.0,
-    "axes.titlesize": 9.0,
-    "axes.labelsize": 9.0,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "legend.fontsize": 8.0,
-    "axes.linewidth": 0.6,
+    **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), 9.0),
+    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 8.0),
+    **dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), 0.6),
+    **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 3.0),
+    **dict.fromkeys(("xtick.direction", "ytick.direction"), "out"),
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
+    **dict.fromkeys(("axes.grid", "axes.axisbelow"), True),
+    **dict.fromkeys(("grid.linewidth", "hatch.linewidth"), 0.5),
     "axes.edgecolor": BLACK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
     "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.5,
     "lines.linewidth": 1.1,
-    "xtick.direction": "out",
-    "ytick.direction": "out",
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.major.size": 3.0,
-    "ytick.major.size": 3.0,
-    "legend.frameon": False,
     "legend.handlelength": 1.6,
     "legend.borderaxespad": 0.2,
-    "hatch.linewidth": 0.5,
     "svg.fonttype": "path",
     "svg.hashsalt": "cloudrc",  # the same flight gives an identical file
     "savefig.dpi": 200,
@@ -62,15 +51,9 @@ RC: dict[Any, Any] = {
 """Settings of matplotlib while a figure is drawn and saved."""
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """Make an empty figure, `width` by `height` [in], without a display or pyplot."""
+def new_figure(height: float, width: float = PAGE) -> Figure:
+    """Make an empty figure [in], without a display or pyplot."""
     return Figure(figsize=(width, height), layout="constrained")
-
-
-def time_axis(axes: Axes, duration: float) -> None:
-    """Label the x axis as time since the mission's start, from 0 to `duration` [s]."""
-    axes.set_xlim(0.0, max(duration, 1e-3))
-    axes.set_xlabel("time since start (s)")
 
 
 def panel(axes: Axes, letter: str, title: str = "") -> None:
@@ -79,25 +62,29 @@ def panel(axes: Axes, letter: str, title: str = "") -> None:
 
 
 def legend_above(axes: Axes, columns: int) -> None:
-    """Put the legend above the panel, where it cannot hide data."""
-    axes.legend(
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        ncols=columns,
-        columnspacing=1.0,
-        handletextpad=0.4,
-    )
+    """Put the legend, if there is one, above the panel, where it cannot hide data."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            ncols=columns,
+            columnspacing=1.0,
+            handletextpad=0.4,
+        )
+
+
+def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1.8) -> None:
+    """Draw a dot of `size` [points] for each value, and its entry in the legend.
+
+    As pixels inside the SVG file, thousands of dots stay small and fast to display.
+    """
+    axes.plot(x, y, ".", ms=size, mew=0, color=colour, rasterized=True, zorder=2)
+    axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label=name)
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A flight and its configured link.
-
-    Attributes:
-        flight: The recorded flight.
-        uplink: Configured link profile from world to cloud.
-        downlink: Configured link profile from cloud to world.
-    """
+    """A flight and the configured link profile of both directions."""
 
     flight: Flight
     uplink: Direction

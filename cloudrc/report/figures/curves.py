@@ -1,0 +1,188 @@
+"""Draw the figures over time: delays, position per axis, and errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cloudrc.metrics.control import round_trips
+from cloudrc.metrics.flight import Array, rms
+from cloudrc.report.figures import style
+from cloudrc.report.figures.marks import bounds, mark_events
+from cloudrc.report.figures.style import Subject, dots, legend_above, new_figure, panel
+
+DELAY_ALT = "Two scatter plots over time: one-way delays, and the loop delay with its estimate."
+DELAY = (
+    "Delays. (a) Each dot is the one-way delay of a datagram that arrived, late ones included; the "
+    "band is the link profile. (b) Each dot is the loop delay of one echo: the time from a "
+    "command's stamp to its echo (the paper's τₙ). The solid line is the delay estimate, over "
+    "which the controller predicts. The band is the sum of both directions of the link profile, "
+    "the dashed line its mean. Only applied commands have echoes; if the newest command wins, "
+    "these are the fast ones, so the loop delay lies below the mean of the profile."
+)
+MARGIN = 1.25
+"""Upper end of the delay axis, divided by the 99.5th percentile of the delays [1]."""
+
+
+def draw_delay(subject: Subject) -> Figure:
+    """Draw the one-way delay of each datagram, and the loop delay with its estimate."""
+    figure = new_figure(2.6)
+    one_way, loop = figure.subplots(1, 2)
+    flight, time = subject.flight, np.linspace(0.0, subject.duration, 600)
+    limits = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
+
+    panel(one_way, "a")
+    shown = []
+    for name, colour in (("uplink", style.UPLINK), ("downlink", style.DOWNLINK)):
+        arrivals = flight.during(f"/{name}_delay")
+        delay = arrivals["delay"] * 1e3
+        if np.isfinite(delay).any():
+            dots(one_way, flight.seconds(arrivals["stamp_ns"]), delay, colour, name)
+            shown.append(delay)
+    if not shown:
+        text = "unknown: the two ends\ndo not share a clock"
+        one_way.text(0.5, 0.5, text, ha="center", va="center", transform=one_way.transAxes)
+    known = [each for each in limits if each is not None]
+    for index, (low, high) in enumerate(known):
+        _fill(one_way, time, low, high, "_" if index else "profile")
+        shown.append(high * 1e3)
+    _finish_delay(one_way, subject, "one-way delay (ms)", shown)
+
+    panel(loop, "b")
+    echoes, control = round_trips(flight), flight.control
+    loop_delay, horizon = echoes["loop_delay"] * 1e3, control["horizon"] * 1e3
+    dots(loop, flight.seconds(echoes["stamp_ns"]), loop_delay, style.SKY, "loop delay")
+    stamps = flight.seconds(control["stamp_ns"])
+    loop.plot(stamps, horizon, color=style.BLACK, label="estimate", zorder=4)
+    shown = [loop_delay, horizon]
+    if len(known) == 2:
+        low, high = (sum(each) for each in zip(*known, strict=True))
+        _fill(loop, time, low, high, "profile")
+        mean = (low + high) * 1e3 / 2
+        loop.plot(time, mean, color=style.GREEN, lw=0.8, ls="--", label="mean", zorder=3)
+        shown.append(high * 1e3)
+    _finish_delay(loop, subject, "loop delay (ms)", shown)
+    return figure
+
+
+def _fill(axes: Axes, time: Array, low: Array, high: Array, label: str) -> None:
+    axes.fill_between(time, low * 1e3, high * 1e3, color=style.LIGHT, lw=0, label=label, zorder=1)
+
+
+def _finish_delay(axes: Axes, subject: Subject, label: str, shown: list[Array]) -> None:
+    """Scale the axis so that outliers do not flatten the curves, and write how many are cut off."""
+    values = [v[np.isfinite(v)] for v in shown]
+    top = max((float(np.percentile(v, 99.5)) for v in values if len(v)), default=1.0) * MARGIN
+    top = max(top, 1.0)
+    axes.set_ylim(0.0, top)
+    above = sum(int((v > top).sum()) for v in values)
+    if above:
+        axes.text(0.99, 0.97, f"{above} above", ha="right", va="top", transform=axes.transAxes)
+    _finish(axes, subject, label, 4)
+
+
+def _finish(axes: Axes, subject: Subject, label: str, columns: int) -> None:
+    """Mark the events, and label the axes of a panel over time."""
+    mark_events(axes, subject)
+    _time_axis(axes, subject)
+    axes.set_ylabel(label)
+    legend_above(axes, columns)
+
+
+def _time_axis(axes: Axes, subject: Subject) -> None:
+    axes.set_xlim(0.0, max(subject.duration, 1e-3))
+    axes.set_xlabel("time since start (s)")
+
+
+ODOM_ALT = "Three line plots of the x, y and z position over time: reference, measured, estimated."
+ODOM = (
+    "Position per axis, as cloud knew it. Reference: the setpoint that the controller tracks. "
+    "Measured: the newest odometry that had arrived. Estimated: the prediction from which the "
+    "command was computed."
+)
+STEPS = {"ls": "--", "drawstyle": "steps-post"}
+"""Line of a setpoint, which is constant between its changes."""
+
+
+def draw_odom(subject: Subject) -> Figure:
+    """Draw reference, measured and estimated position, one panel per axis."""
+    figure, control = new_figure(4.2), subject.flight.control
+    looks: dict[str, dict[str, Any]] = {
+        "setpoint": {"label": "reference", "color": style.REFERENCE, **STEPS},
+        "measured": {"label": "measured", "color": style.MEASURED, "lw": 1.8},
+        "position": {"label": "estimated", "color": style.ESTIMATED},
+    }
+    time = subject.flight.seconds(control["stamp_ns"])
+    rows = figure.subplots(3, 1, sharex=True)
+    for index, (axes, name) in enumerate(zip(rows, "xyz", strict=True)):
+        panel(axes, "abc"[index])
+        for column, look in looks.items():
+            axes.plot(time, control[column][:, index], **look)
+        mark_events(axes, subject)
+        axes.set_ylabel(f"${name}$ (m)")
+        axes.margins(y=0.12)
+    _time_axis(rows[-1], subject)
+    legend_above(rows[0], 3)
+    figure.align_ylabels(rows)
+    return figure
+
+
+ERROR_ALT = "Two line plots over time: distance to the setpoint, and the error of the estimate."
+ERROR = (
+    "Errors. (a) Distance from the reference to the measured and to the estimated position, as in "
+    "the paper. The distance to the next waypoint dominates both curves; a lower estimated curve "
+    "says nothing about how accurate the estimate is. (b) Accuracy of the estimate: distance from "
+    "the position estimated for each command to the true position when the command was applied. "
+    "Each dot is one command, the line is the RMS over half a second. RMS values in the legends "
+    "are over the whole flight."
+)
+SPAN = 0.5
+"""Length of the window of the moving RMS [s]."""
+
+
+def draw_error(subject: Subject) -> Figure:
+    """Draw the distance to the setpoint, as in the paper, and the error of the estimate."""
+    figure = new_figure(2.6)
+    tracking, accuracy = figure.subplots(1, 2)
+    flight, control, applied = subject.flight, subject.flight.control, subject.flight.applied
+
+    panel(tracking, "a")
+    time = flight.seconds(control["stamp_ns"])
+    for name, column, colour, width in (
+        ("measured", "measured", style.MEASURED, 1.8),
+        ("estimated", "position", style.ESTIMATED, 1.1),
+    ):
+        error = control["setpoint"] - control[column]
+        label = f"{name}{_rms(error, 'm', 1.0)}"
+        tracking.plot(time, np.linalg.norm(error, axis=1), color=colour, lw=width, label=label)
+    tracking.set_ylim(bottom=0.0)
+    _finish(tracking, subject, "distance to reference (m)", 2)
+
+    panel(accuracy, "b")
+    error = applied["position"] - flight.true_position(applied["stamp_ns"])
+    time, distance = flight.seconds(applied["stamp_ns"]), np.linalg.norm(error, axis=1) * 1e3
+    dots(accuracy, time, distance, style.SKY, "each command", 2.0)
+    label = f"over {SPAN:g} s{_rms(error, 'mm', 1e3)}"
+    accuracy.plot(time, _moving_rms(time, distance), color=style.ESTIMATED, label=label)
+    accuracy.set_ylim(bottom=0.0)
+    _finish(accuracy, subject, "distance to truth (mm)", 2)
+    return figure
+
+
+def _moving_rms(time: Array, values: Array) -> Array:
+    """Compute at each instant the RMS of the values in the last `SPAN` seconds."""
+    known = np.isfinite(values)
+    squares = np.concatenate([[0.0], np.cumsum(np.where(known, np.square(values), 0.0))])
+    counts = np.concatenate([[0], np.cumsum(known)])
+    first = np.searchsorted(time, time - SPAN)
+    rows = np.arange(1, len(time) + 1)
+    means: Array = (squares[rows] - squares[first]) / np.maximum(counts[rows] - counts[first], 1)
+    return np.asarray(np.sqrt(means))
+
+
+def _rms(error: Array, unit: str, scale: float) -> str:
+    value = rms(error)
+    return "" if value is None else f" (RMS {value * scale:.3g} {unit})"

@@ -1,0 +1,175 @@
+"""Figures show the configured delays, and mark events of the link and the guard."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+
+from cloudrc.config.schema import Blackout, Change, Direction
+from cloudrc.messages import GuardState
+from cloudrc.records import GuardChange, LinkChanged
+from cloudrc.report.figures import curves
+from cloudrc.report.figures.marks import LEGEND, bounds, legend, mark_events, set_in_flight, spans
+from cloudrc.report.figures.style import RC, Subject, new_figure
+from tests.metrics.conftest import ONE_PIPE, Log, at, flown
+
+CALM = Direction(delay_ms=50.0)
+SHORT = Direction(delay_ms=9.0)
+TIMED = Direction(
+    delay_ms=20.0,
+    changes=(Change(at_s=2.0, delay_ms=90.0), Change(at_s=99.0, delay_ms=9.0)),
+    blackouts=(Blackout(start_s=1.0, duration_s=9.0),),
+)
+
+
+def changed(
+    time: float,
+    direction: Direction,
+    cause: str,
+    age: float = 0.0,
+    *,
+    uplink: bool = True,
+    line: float | None = None,
+) -> LinkChanged:
+    conditions = json.dumps(direction.model_dump(mode="json", exclude_defaults=True))
+    origin = age if line is None else line
+    return LinkChanged(
+        at(time), uplink, "relay", cause, age, origin, 0.0, 0.0, 0.0, math.nan, conditions
+    )
+
+
+def subject_of(*changes: LinkChanged, uplink: Direction = CALM, log: Log | None = None) -> Subject:
+    log = log or flown()
+    log.world += [change for change in changes if change.uplink]
+    log.cloud += [change for change in changes if not change.uplink]
+    return Subject(log.flight(ONE_PIPE), uplink, CALM)
+
+
+def band(subject: Subject, time: float, *, uplink: bool = True) -> tuple[float, float]:
+    """Return the bounds of the delay [s] at a time since the start of the flight [s]."""
+    found = bounds(subject, np.array([time]), uplink=uplink)
+    assert found is not None
+    return float(found[0][0]), float(found[1][0])
+
+
+def low(subject: Subject, *times: float) -> list[float]:
+    return [band(subject, time)[0] for time in times]
+
+
+def marked(subject: Subject) -> Axes:
+    axes = new_figure(2.0, 3.0).subplots()
+    mark_events(axes, subject)
+    return axes
+
+
+def patches(axes: Axes) -> list[tuple[float, float]]:
+    return [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
+
+
+STEPS = (Change(at_s=5.0, delay_ms=70.0), Change(at_s=9.0, jitter_ms=5.0))
+
+
+@pytest.mark.parametrize(
+    ("direction", "time", "expected"),
+    [
+        (Direction(delay_ms=45.0, jitter_ms=25.0), 3.0, (0.020, 0.070)),
+        (Direction(delay_ms=5.0, jitter_ms=20.0), 0.0, (0.0, 0.025)),  # never negative
+        # The link started one second before the mission.
+        (Direction(delay_ms=20.0, jitter_ms=10.0, changes=STEPS), 3.99, (0.010, 0.030)),
+        (Direction(delay_ms=20.0, jitter_ms=10.0, changes=STEPS), 4.0, (0.060, 0.080)),
+        (Direction(delay_ms=20.0, jitter_ms=10.0, changes=STEPS), 9.0, (0.065, 0.075)),
+    ],
+)
+def test_band(direction: Direction, time: float, expected: tuple[float, float]) -> None:
+    assert band(subject_of(uplink=direction), time) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])  # the second as Excel writes it
+def test_a_trace_replaces_the_delay(tmp_path: Path, encoding: str) -> None:
+    trace = tmp_path / "trace.csv"
+    trace.write_text("time_s,delay_ms,loss\n1,30,0\n5,90,0\n", encoding=encoding)
+    subject = subject_of(uplink=Direction(delay_ms=5.0, jitter_ms=10.0, trace=str(trace)))
+    # The first row also holds before it.
+    assert low(subject, -0.9, 6.0) == pytest.approx([0.020, 0.080])
+    trace.unlink()
+    assert bounds(subject, np.zeros(1), uplink=True) is None
+
+
+def test_a_change_affects_only_its_own_direction() -> None:
+    cause = "uplink.delay_ms=120"
+    subject = subject_of(changed(3.05, Direction(delay_ms=120.0), cause, 0.05))
+    assert low(subject, 2.9, 3.1) == pytest.approx([0.05, 0.12])
+    assert band(subject, 3.1, uplink=False)[0] == pytest.approx(0.05)
+    assert set_in_flight(subject) == [(pytest.approx(3.0), cause)]
+
+
+def test_a_time_line_starts_at_its_change_and_ends_at_the_next() -> None:
+    subject = subject_of(changed(1.0, TIMED, "profile timed"), changed(4.0, CALM, "profile calm"))
+    assert low(subject, 0.5, 1.5, 3.5, 4.5) == pytest.approx([0.05, 0.02, 0.09, 0.05])
+    assert patches(marked(subject)) == [pytest.approx((2.0, 4.0))], "its blackout ends, too"
+    said = "set in flight (1: profile timed, at 1.0 s; 2: profile calm, at 4.0 s)."
+    assert said in legend(subject)
+
+
+def test_changing_one_value_keeps_the_time_line() -> None:
+    subject = subject_of(
+        changed(1.0, TIMED, "profile timed"),
+        changed(2.0, TIMED.model_copy(update={"jitter_ms": 5.0}), "jitter_ms=5", line=1.0),
+        changed(2.5, TIMED, "jitter_ms=0", line=math.nan),
+    )
+    assert low(subject, 2.2, 2.9, 3.1) == pytest.approx([0.015, 0.02, 0.09])
+
+
+def test_repeated_records_are_no_changes() -> None:
+    subject = subject_of(
+        changed(-1.0, CALM, "", line=math.nan),  # the link started as configured
+        changed(3.0, SHORT, "by hand"),
+        changed(5.0, SHORT, "by hand", 2.0),
+        changed(3.1, SHORT, "by hand", uplink=False),
+    )
+    assert len(spans(subject, uplink=True)) == 2
+    assert set_in_flight(subject) == [(pytest.approx(3.0), "by hand")]
+
+
+def test_a_change_before_the_mission_holds_from_its_start() -> None:
+    subject = subject_of(changed(-0.5, SHORT, "by hand", 300.0))
+    assert (low(subject, 0.0), set_in_flight(subject)) == ([pytest.approx(0.009)], [])
+
+
+def test_holds_blackouts_and_changes_are_marked() -> None:
+    assert legend(subject_of()) == ""
+    log = flown()
+    log.world += [
+        GuardChange(at(2), GuardState.HOLD, "command age"),
+        GuardChange(at(3), GuardState.TRACK, "fresh command"),
+    ]
+    uplink = Direction(
+        blackouts=(Blackout(start_s=3.0, duration_s=1.0), Blackout(start_s=500.0, duration_s=1.0)),
+        changes=(Change(at_s=0.5, delay_ms=1.0), Change(at_s=6.0, delay_ms=9.0)),
+    )
+    subject = subject_of(uplink=uplink, log=log)
+    assert legend(subject) == LEGEND
+    axes = marked(subject)
+    assert patches(axes) == [pytest.approx((2.0, 3.0)), pytest.approx((2.0, 3.0))]
+    assert [line.get_xdata()[0] for line in axes.lines] == pytest.approx([5.0])
+
+
+@pytest.mark.parametrize("count", [4, 8])
+def test_numbers_of_close_changes_do_not_overlap(count: int) -> None:
+    each = [changed(3.0 + 0.1 * n, CALM, f"number {n + 1}") for n in range(count)]
+    with matplotlib.rc_context(RC):
+        figure = curves.draw_delay(subject_of(*each, changed(6.0, CALM, "the last")))
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            labels = [text for text in axes.texts if text.get_text().isdecimal()]
+            boxes = [label.get_window_extent() for label in labels]
+            assert len(boxes) == count + 1
+            assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+            assert boxes[-1].y0 == pytest.approx(boxes[0].y0), "back in the first row"
