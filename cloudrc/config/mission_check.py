@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import MAX_WAYPOINTS, Mission, Steps
 from cloudrc.geometry import fence
+from cloudrc.geometry.clearance import Array
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
     find_crossed_pipe,
@@ -20,7 +21,6 @@ from cloudrc.geometry.placement import (
     find_overlapped_pipe,
     outside_fence,
 )
-from cloudrc.geometry.robot import Array
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 

@@ -20,8 +20,8 @@ from cloudrc.config.problems import Problem as ConfigProblem
 from cloudrc.config.problems import from_pydantic
 from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeLimit, Waypoint
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.clearance import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.placement import find_crossed_pipe
-from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Start, Vector
 from cloudrc.teleop.service import MissionService
