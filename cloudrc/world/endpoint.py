@@ -40,7 +40,7 @@ from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.handshake import HandshakeLog, ServerHandshake
 from cloudrc.tunnel.keys import KeyRing
-from cloudrc.tunnel.session import make_session
+from cloudrc.tunnel.session import Session
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Touch
 from cloudrc.world.robot import CATCH_UP_NS, Robot, SimulationClock
@@ -248,7 +248,7 @@ class WorldEndpoint:
         """
         self.robot, self._sensors, self._identity = robot, sensors, identity
         self._clock, self._pace = SimulationClock(start_ns), PaceMonitor()
-        self._session = make_session(Direction.UPLINK, identity.ring)
+        self._session = Session(Direction.UPLINK, identity.ring)
         self._door = ServerHandshake(
             self._session, identity.nonce, identity.clock_id, command_age_max_ns
         )
@@ -309,7 +309,7 @@ class WorldEndpoint:
         """Handle one datagram. Count and drop an invalid datagram."""
         world_ns = self._follow(now_ns)
         try:
-            kind, _, epoch, counter, body = self._session.open(data)
+            kind, epoch, counter, body = self._session.open(data)
             if kind == COMMAND:
                 self._receive_command(epoch, counter, body, now_ns, world_ns)
             elif kind == Kind.HELLO:

@@ -10,7 +10,7 @@ import pytest
 
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.tunnel.codec import Direction
-from cloudrc.tunnel.session import make_session
+from cloudrc.tunnel.session import Session
 from tests.flights.conftest import bare_world, ring
 
 PACKAGE = Path(__file__).parents[2] / "cloudrc"
@@ -51,7 +51,7 @@ def test_a_sealed_end_runs_and_sends_strangers_nothing() -> None:
 
 
 def test_what_has_keys_is_always_sealed() -> None:
-    assert make_session(Direction.UPLINK, ring()).sealed
+    assert Session(Direction.UPLINK, ring()).sealed
     assert bare_world(ring=ring()).sealed
     assert not bare_world().sealed
 
@@ -78,9 +78,9 @@ def test_only_the_drivers_that_ask_send_what_an_end_says() -> None:
     assert "socket" not in names
 
 
-def test_nobody_but_the_tunnel_makes_an_unsealed_session() -> None:
-    assert calls("UnsealedSession") == {"tunnel/session.py", "cli/bench.py"}
-    assert calls("make_session") == {"world/endpoint.py", "cloud/endpoint.py"}
+def test_only_the_ends_make_a_session() -> None:
+    makers = {"tunnel/session.py", "world/endpoint.py", "cloud/endpoint.py"}
+    assert calls("Session") - {"cli/bench.py", "tunnel/handshake.py"} == makers
 
 
 @pytest.mark.parametrize("end", ["world", "cloud"])
