@@ -137,7 +137,7 @@ def test_only_a_hold_within_a_mission_is_counted_as_held(talk):
 def test_contacts_are_reported_until_the_next_mission_starts(talk):
     """Cloud may die right after the touch; the next cloud must learn of it."""
     ask(talk, 2, Request.END)
-    talk.world._orders.touches.pipes = 1
+    talk.world._orders.pipes = 1
     talk.wait(talk.now_ns + 300 * MS)
     talk.hello(b"another")
     talk.request(3, Request.START, Start.HERE)
