@@ -27,7 +27,7 @@ _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 
 
 class Spheres(NamedTuple):
-    """Spheres in the body frame: centres [m], shape (k, 3), and radii [m], shape (k,)."""
+    """Spheres in the body frame: `positions` of centres, shape (k, 3), and `radii`, shape (k,) [m]."""
 
     positions: Array
     radii: Array
@@ -52,7 +52,7 @@ def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) ->
     Args:
         points: Points in the body frame.
         positions: Positions of the base [m], world frame, shape (n, 3).
-        orientations_wxyz: Orientations of the base, unit quaternions, body to world, shape (n, 4).
+        orientations_wxyz: Orientations, each a unit quaternion, body to world, shape (n, 4).
     """
     w, x, y, z = np.moveaxis(orientations_wxyz, -1, 0)
     rows = (

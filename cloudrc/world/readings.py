@@ -1,7 +1,7 @@
 """The interface between the physics and the onboard part: sensor readings and rotor speeds.
 
 Nothing else passes between the physics (`simulator`) and the onboard part (`low_level`, `guard`,
-`sensors`). Therefore both can run in different processes. This module needs no MuJoCo.
+`sensors`).
 """
 
 from __future__ import annotations
@@ -39,8 +39,6 @@ class Readings(NamedTuple):
     def of(cls, pose: Iterable[float], twist: Iterable[float]) -> Readings:
         """Make readings from the state of a free joint in MuJoCo.
 
-        The axes are the columns of the rotation matrix of the unit quaternion (w, x, y, z).
-
         Args:
             pose: Position [m] and orientation (wxyz, unit) in the world frame, shape (7,).
             twist: Velocity [m/s], world frame; angular velocity [rad/s], body frame; shape (6,).
@@ -51,17 +49,9 @@ class Readings(NamedTuple):
         wx, wy, wz = w * x2, w * y2, w * z2
         xx, xy, xz = x * x2, x * y2, x * z2
         yy, yz, zz = y * y2, y * z2, z * z2
-        axes = (
-            1.0 - yy - zz,
-            xy + wz,
-            xz - wy,
-            xy - wz,
-            1.0 - xx - zz,
-            yz + wx,
-            xz + wy,
-            yz - wx,
-            1.0 - xx - yy,
-        )
+        x_axis = (1.0 - yy - zz, xy + wz, xz - wy)
+        y_axis = (xy - wz, 1.0 - xx - zz, yz + wx)
+        axes = (*x_axis, *y_axis, xz + wy, yz - wx, 1.0 - xx - yy)
         # One per physics step: the class's own constructor takes twice the time.
         return _new(cls, ((px, py, pz), (w, x, y, z), (vx, vy, vz), (p, q, r), axes))
 

@@ -36,13 +36,7 @@ class Observer(Protocol):
 
 
 class Robot:
-    """Runs the ticks of physics, guard and low-level controller.
-
-    Attributes:
-        simulator: The physics.
-        guard: The guard.
-        observers: See every step, command, request and session; called in the order of the list.
-    """
+    """Runs the ticks of physics, guard and low-level controller, and tells its `observers`."""
 
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         self.simulator = simulator

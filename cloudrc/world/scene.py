@@ -25,14 +25,13 @@ ROBOT_PREFIX = "robot/"
 ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 """Names of a robot's actuators. Every tuple of four rotor values has the same order."""
 TIMESTEP = 0.002
-"""Step of the physics and of the onboard part [s].
-Source: docs/reference/plant.md, "Physics step"."""
+"""Step of the physics [s]. Source: docs/reference/plant.md, "Physics step"."""
 INERTIA = (0.0121, 0.0116, 0.0226)
 """Inertia about x, y, z for which the attitude gains were tuned [kg m^2]: the pelican's inertia."""
 TIP = (0.40, 0.0, 0.17)
 """Position of the arm's tip, from which clearance is computed [m], body frame."""
 SHOWN = 6
-"""Largest number of differences that one message lists [1]."""
+"""Largest number of differences that one message lists."""
 FOLDER = Path(__file__).parent
 _GRAVITY = "gravity [m/s^2]"
 _NO_GL = {"", "disable", "disabled", "off", "false", "0"}

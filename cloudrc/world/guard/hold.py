@@ -58,7 +58,7 @@ class PositionHold:
     """Brakes the robot (`brakes`), holds it where it came to rest, or lets it descend there."""
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Set the box for hold points [m], world frame, and the speed cap `speed_max` [m/s]."""
+        """Hold between `low` and `high` [m], world frame, no faster than `speed_max` [m/s]."""
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
         self._hold_point: Vector | None = None
@@ -173,7 +173,7 @@ class TakeOff:
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
-        """Set the corners of the fence [m], shape (3,); the robot is on the ground."""
+        """Set the corners of the fence, `low` and `high` [m]; the robot is on the ground."""
         (ax, ay, az), (bx, by, bz) = low, high
         self._low = (ax + TAKE_OFF_MARGIN, ay + TAKE_OFF_MARGIN, az)
         self._high = (bx - TAKE_OFF_MARGIN, by - TAKE_OFF_MARGIN, bz)

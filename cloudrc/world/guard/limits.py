@@ -55,7 +55,7 @@ def stopping_distance(speed: float, reaction: float) -> float:
 
 
 def clamp(value: float, low: float, high: float) -> float:
-    """Limit `value` to the interval from `low` to `high`, all in one unit; NaN becomes `low`."""
+    """Limit `value` to the interval from `low` to `high`, in any unit; NaN becomes `low`."""
     if value >= high:
         return high
     return value if value > low else low
@@ -79,7 +79,7 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
 def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
     """Tell whether `limit_to_fence` changes nothing up to RECHECK_DISTANCE from `position`.
 
-    The arguments are those of `limit_to_fence`.
+    `velocity`, `position`, `low` and `high` are as in `limit_to_fence` [m/s], [m].
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if vx > 0.0:
@@ -182,8 +182,8 @@ def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float
     """Limit how fast the reference [m/s] sinks, so that the robot does not turn over.
 
     Args:
-        reference: Wanted reference.
-        before: Reference of the last tick, at most `speed_max` long.
+        reference: Wanted reference [m/s].
+        before: Reference of the last tick [m/s], at most `speed_max` long.
         climb: Vertical velocity of the robot [m/s].
         speed_max: Largest speed of the result [m/s].
     """
