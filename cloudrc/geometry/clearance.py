@@ -27,7 +27,7 @@ _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 
 
 class Spheres(NamedTuple):
-    """Spheres in the body frame: `positions` of centres, shape (k, 3), and `radii`, shape (k,) [m]."""
+    """Spheres in the body frame: `positions`, shape (k, 3), and `radii`, shape (k,) [m]."""
 
     positions: Array
     radii: Array
