@@ -91,6 +91,13 @@ def landing(limits: Limits = LIMITS):
     return guard
 
 
+def stopped(guard, now_ns=0):
+    """Return the guard after an emergency stop."""
+    guard.stop(now_ns)
+    assert guard.state is GuardState.ESTOP
+    return guard
+
+
 def states(guard):
     """Return the states entered since the last call."""
     return [change.state for change in guard.take_changes()]
