@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from math import isfinite, nan
-from typing import Any, TypeVar
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
@@ -39,7 +38,6 @@ INSTEAD = {
 }
 """Kind of plug-in -> what cloud does when the plug-in fails."""
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
-Result = TypeVar("Result")
 
 
 class DelayMeter:
@@ -159,8 +157,14 @@ class ControlLoop:
         if self._undated:
             self.faults += [fault._replace(stamp_ns=now_ns) for fault in self._undated]
             self._undated.clear()
-        self._ask("estimator", now_ns, None, self._delays.observe, telemetry, now_ns)
-        self._ask("predictor", now_ns, None, self._predictor.observe, telemetry.odometry)
+        try:
+            self._delays.observe(telemetry, now_ns)
+        except BaseException as error:
+            self._note("estimator", error, now_ns)
+        try:
+            self._predictor.observe(telemetry.odometry)
+        except BaseException as error:
+            self._note("predictor", error, now_ns)
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
@@ -176,24 +180,33 @@ class ControlLoop:
         """
         basis, delays = self._basis, self._delays
         assert basis is not None, "check `ready` first"
-        horizon = self._ask("estimator", now_ns, self._horizon, delays.horizon, now_ns)
-        self._horizon = horizon
-        estimate = self._ask("predictor", now_ns, basis, self._predict, basis, horizon)
+        try:
+            self._horizon = delays.horizon(now_ns)
+        except BaseException as error:
+            self._note("estimator", error, now_ns)
+        horizon = self._horizon
+        estimate = self._predict(basis, horizon, now_ns)
         if self._is_echo_silent(now_ns, horizon):
             self.counts["frozen"] += 1
             output = STAND_STILL
         else:
-            steer = self._steer, estimate, setpoint, dt
-            output = self._ask("controller", now_ns, STAND_STILL, *steer)
-        velocity, yaw_rate, *terms = output
+            output = self._steer(estimate, setpoint, dt, now_ns)
+        velocity, yaw_rate, proportional, integral, derivative = output
         hold_ns = now_ns - self._basis_arrival_ns
         command = _new(Command, (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate))
-        self._ask("predictor", now_ns, None, self._predictor.commanded, command)
+        try:
+            self._predictor.commanded(command)
+        except BaseException as error:
+            self._note("predictor", error, now_ns)
         _, position, orientation, predicted_velocity, _ = estimate
-        before = (now_ns, epoch, counter, basis.stamp_ns, horizon, delays.rtt, delays.loop_delay)
-        places = (basis.position, position, orientation, predicted_velocity, setpoint.position)
-        after = (setpoint.waypoint, velocity, yaw_rate, *terms)
-        return command, _new(Control, (*before, *places, *after))
+        # fmt: off
+        control = _new(Control, (
+            now_ns, epoch, counter, basis.stamp_ns, horizon, delays.rtt, delays.loop_delay,
+            basis.position, position, orientation, predicted_velocity, setpoint.position,
+            setpoint.waypoint, velocity, yaw_rate, proportional, integral, derivative,
+        ))
+        # fmt: on
+        return command, control
 
     def take_faults(self) -> list[Fault]:
         """Return the faults since the last call."""
@@ -203,23 +216,35 @@ class ControlLoop:
     # A sum is finite only if all its terms are finite. It may overflow, but a robot cannot fly
     # numbers of that size anyway.
 
-    def _predict(self, basis: Odometry, horizon: float) -> Odometry:
-        estimate = self._predictor.predict(basis, horizon)
-        position, velocity = _triple(estimate.position), _triple(estimate.velocity)
-        w, x, y, z = estimate.orientation_wxyz
-        orientation = (float(w), float(x), float(y), float(z))
-        if not isfinite(sum(position) + sum(velocity) + sum(orientation)):
-            raise ValueError(f"it returned {estimate}")
-        stamp_ns, rate = estimate.stamp_ns, estimate.angular_velocity_body
-        return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
+    def _predict(self, basis: Odometry, horizon: float, now_ns: int) -> Odometry:
+        try:
+            estimate = self._predictor.predict(basis, horizon)
+            position, velocity = _triple(estimate.position), _triple(estimate.velocity)
+            w, x, y, z = estimate.orientation_wxyz
+            orientation = (float(w), float(x), float(y), float(z))
+            if not isfinite(sum(position) + sum(velocity) + sum(orientation)):
+                raise ValueError(f"it returned {estimate}")
+            stamp_ns, rate = estimate.stamp_ns, estimate.angular_velocity_body
+            return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
+        except BaseException as error:
+            self._note("predictor", error, now_ns)
+            return basis
 
-    def _steer(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
-        output = self._controller.update(estimate, setpoint, dt)
-        velocity, yaw_rate = _triple(output.velocity), float(output.yaw_rate)
-        if not isfinite(sum(velocity) + yaw_rate):
-            raise ValueError(f"it returned {output}")
-        terms = _triple(output.proportional), _triple(output.integral)
-        return _new(ControlOutput, (velocity, yaw_rate, *terms, _triple(output.derivative)))
+    def _steer(
+        self, estimate: Odometry, setpoint: Setpoint, dt: float, now_ns: int
+    ) -> ControlOutput:
+        try:
+            output = self._controller.update(estimate, setpoint, dt)
+            velocity, yaw_rate = _triple(output.velocity), float(output.yaw_rate)
+            if not isfinite(sum(velocity) + yaw_rate):
+                raise ValueError(f"it returned {output}")
+            proportional, integral = _triple(output.proportional), _triple(output.integral)
+            derivative = _triple(output.derivative)
+            terms = (velocity, yaw_rate, proportional, integral, derivative)
+            return _new(ControlOutput, terms)
+        except BaseException as error:
+            self._note("controller", error, now_ns)
+            return STAND_STILL
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
         """Whether no new echo has come for too long; the first echo has the same time limit."""
@@ -228,16 +253,6 @@ class ControlLoop:
         elif self._echoed_ns == NEVER_NS:
             self._echoed_ns = now_ns
         return now_ns - self._echoed_ns > horizon * 1e9 + FREEZE_NS
-
-    def _ask(
-        self, kind: str, now_ns: int, otherwise: Result, ask: Callable[..., Result], *about: Any
-    ) -> Result:
-        """Call a plug-in; return `otherwise` if it fails."""
-        try:
-            return ask(*about)
-        except BaseException as error:
-            self._note(kind, error, now_ns)
-            return otherwise
 
     def _note(self, kind: str, error: BaseException, now_ns: int, instead: str = "") -> None:
         """Count a failure of a plug-in, and report the first failure of its kind.

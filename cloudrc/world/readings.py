@@ -49,9 +49,17 @@ class Readings(NamedTuple):
         wx, wy, wz = w * x2, w * y2, w * z2
         xx, xy, xz = x * x2, x * y2, x * z2
         yy, yz, zz = y * y2, y * z2, z * z2
-        x_axis = (1.0 - yy - zz, xy + wz, xz - wy)
-        y_axis = (xy - wz, 1.0 - xx - zz, yz + wx)
-        axes = (*x_axis, *y_axis, xz + wy, yz - wx, 1.0 - xx - yy)
+        axes = (
+            1.0 - yy - zz,
+            xy + wz,
+            xz - wy,
+            xy - wz,
+            1.0 - xx - zz,
+            yz + wx,
+            xz + wy,
+            yz - wx,
+            1.0 - xx - yy,
+        )
         # One per physics step: the class's own constructor takes twice the time.
         return _new(cls, ((px, py, pz), (w, x, y, z), (vx, vy, vz), (p, q, r), axes))
 

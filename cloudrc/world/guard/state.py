@@ -161,7 +161,9 @@ class Guard:
             or NaN; "future" for a basis that is not yet measured; "stale" for one that is too old.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
-        if not all(abs(value) <= COMMAND_MAX for value in (*velocity, yaw_rate)):
+        x, y, z = velocity
+        most = COMMAND_MAX
+        if not (abs(x) <= most and abs(y) <= most and abs(z) <= most and abs(yaw_rate) <= most):
             self._note_invalid(now_ns)
             return "range"
         limits = self._limits
