@@ -17,7 +17,6 @@ from cloudrc.world.guard.hold import (
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot
-from cloudrc.world.simulator import Simulator
 from tests.world.guard.conftest import (
     LIMITS,
     MS,
@@ -248,11 +247,6 @@ def test_a_take_off_within_one_tick_knows_its_ground():
 
 
 # With a simulated robot
-
-
-@pytest.fixture(scope="module")
-def simulator():
-    return Simulator("pelican", "empty")
 
 
 def broken_off(simulator, ticks, velocity, ended):
