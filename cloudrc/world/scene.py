@@ -12,7 +12,7 @@ import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +33,6 @@ TIP = (0.40, 0.0, 0.17)
 SHOWN = 6
 """Largest number of differences that one message lists."""
 FOLDER = Path(__file__).parent
-_GRAVITY = "gravity [m/s^2]"
 _NO_GL = {"", "disable", "disabled", "off", "false", "0"}
 
 
@@ -139,41 +138,28 @@ def _check(model: Any, robot_path: Path, scene_path: Path) -> None:
         raise BadInputError(
             f"{scene_path}: option timestep is {model.opt.timestep}, not {TIMESTEP}"
         )
-    differs = [fact for fact in _facts(model) if not fact.fits]
-    if differs:
-        found = "; ".join(
-            f"{fact.name} is {fact.found:.4g}, not {fact.wanted}" for fact in differs[:SHOWN]
-        )
-        found += f"; and {len(differs) - SHOWN} more" * (len(differs) > SHOWN)
-        of_scene = all(fact.name == _GRAVITY for fact in differs)
-        where = scene_path if of_scene else robot_path
-        raise BadInputError(f"{where}: the onboard controller is not made for it: {found}")
+    gravity = _compare("gravity [m/s^2]", -model.opt.gravity[2:], [GRAVITY], 0.02 * GRAVITY)
+    for path, differs in ((robot_path, _robot_differences(model)), (scene_path, gravity)):
+        if differs:
+            more = [f"and {len(differs) - SHOWN} more"] if len(differs) > SHOWN else []
+            found = "; ".join(differs[:SHOWN] + more)
+            raise BadInputError(f"{path}: the onboard controller is not made for it: {found}")
 
 
-class _Fact(NamedTuple):
-    """A number of a model, the values for which the controller is made, and whether it fits."""
-
-    name: str
-    found: float
-    wanted: str
-    fits: bool
-
-
-def _near(name: str, found: Iterable[float], wanted: Iterable[float], slack: float) -> list[_Fact]:
-    """Compare values of the model with those that the controller assumes.
+def _compare(name: str, found: Iterable[float], wanted: Iterable[float], slack: float) -> list[str]:
+    """Describe values of the model that differ by more than `slack` from the controller's values.
 
     A name with AXIS stands for three values, about or along x, y and z.
     """
     return [
-        _Fact(
-            name.replace("AXIS", axis), have, f"{want:g} +- {slack:.2g}", abs(have - want) <= slack
-        )
+        f"{name.replace('AXIS', axis)} is {have:.4g}, not {want:g} +- {slack:.2g}"
         for axis, have, want in zip("xyz", found, wanted, strict=False)
+        if not abs(have - want) <= slack
     ]
 
 
-def _facts(model: Any) -> list[_Fact]:
-    """Compare a model with what the onboard controller and the rotors assume.
+def _robot_differences(model: Any) -> list[str]:
+    """Compare a robot with what the onboard controller and the rotors assume.
 
     The tolerances of mass and inertia: the velocity loop compensates for a weight that differs by
     1 N, and the attitude gains work for an inertia that differs by half.
@@ -181,56 +167,53 @@ def _facts(model: Any) -> list[_Fact]:
     base = model.jnt_bodyid[0]
     turned, centre = _axes(model.body_iquat[base]), model.body_ipos[base]
     inertia = np.diag(turned @ np.diag(model.body_inertia[base]) @ turned.T)
-    facts = [
-        *_near("mass [kg]", model.body_mass[[base]], [MASS], 0.1 * MASS),
-        *_near(_GRAVITY, -model.opt.gravity[2:], [GRAVITY], 0.02 * GRAVITY),
-        *_near("centre of mass, AXIS [m]", centre[:2], (0.0, 0.0), 0.01),
-        *_near("centre of mass, z [m]", centre[2:], [0.0], 0.03),
-        *(
-            fact
-            for axis, found, wanted in zip("xyz", inertia, INERTIA, strict=True)
-            for fact in _near(f"inertia about {axis} [kg m^2]", [found], [wanted], 0.5 * wanted)
-        ),
-        _Fact("damping of the base", max(model.dof_damping), "0", not model.dof_damping.any()),
-        *_near("tip, AXIS [m]", model.site(f"{ROBOT_PREFIX}tip").pos, TIP, 0.01),
-    ]
+    differs = _compare("mass [kg]", model.body_mass[[base]], [MASS], 0.1 * MASS)
+    differs += _compare("centre of mass, AXIS [m]", centre[:2], (0.0, 0.0), 0.01)
+    differs += _compare("centre of mass, z [m]", centre[2:], [0.0], 0.03)
+    for axis, found, wanted in zip("xyz", inertia, INERTIA, strict=True):
+        differs += _compare(f"inertia about {axis} [kg m^2]", [found], [wanted], 0.5 * wanted)
+    if model.dof_damping.any():
+        differs.append(f"damping of the base is {max(model.dof_damping):.4g}, not 0")
+    differs += _compare("tip, AXIS [m]", model.site(f"{ROBOT_PREFIX}tip").pos, TIP, 0.01)
     for number, (x, y) in enumerate(((ARM, 0.0), (0.0, ARM), (-ARM, 0.0), (0.0, -ARM))):
-        facts += _rotor_facts(model, number, (x, y, HEIGHT), 1 if x else -1)
-    return facts
+        differs += _rotor_differences(model, number, (x, y, HEIGHT), 1 if x else -1)
+    return differs
 
 
-def _axes(quaternion: Any) -> Any:
-    axes = np.empty(9)
-    mujoco.mju_quat2Mat(axes, quaternion)
-    return axes.reshape(3, 3)
-
-
-def _rotor_facts(
+def _rotor_differences(
     model: Any, number: int, place: tuple[float, float, float], sign: int
-) -> list[_Fact]:
+) -> list[str]:
     """Compare one actuator with the rotor at `place` [m], body frame.
 
     `sign` is the sign of the rotor's reaction torque about z.
     """
-    name, transmission = ROTORS[number], model.actuator_trntype[number]
-    if transmission != mujoco.mjtTrn.mjTRN_SITE:
-        return [_Fact(f"{name} transmission", transmission, "a site", False)]
+    name = ROTORS[number]
+    if model.actuator_trntype[number] != mujoco.mjtTrn.mjTRN_SITE:
+        return [f"{name} transmission is {model.actuator_trntype[number]}, not a site"]
     site, gear = model.actuator_trnid[number, 0], model.actuator_gear[number]
-    axes = _axes(model.site_quat[site])
-    torque = (0.0, 0.0, sign * TORQUE_RATIO)
-    facts = [
-        *_near(f"{name} place, AXIS [m]", model.site_pos[site], place, 0.01),
-        *_near(f"{name} gear, thrust along AXIS", axes @ gear[:3], (0.0, 0.0, 1.0), 0.01),
-        *_near(f"{name} gear, torque about AXIS [m]", axes @ gear[3:], torque, 0.001),
-        *_near(f"{name} gain", model.actuator_gainprm[number, :1], [1.0], 0.01),
+    axes, torque = _axes(model.site_quat[site]), (0.0, 0.0, sign * TORQUE_RATIO)
+    differs = [
+        *_compare(f"{name} place, AXIS [m]", model.site_pos[site], place, 0.01),
+        *_compare(f"{name} gear, thrust along AXIS", axes @ gear[:3], (0.0, 0.0, 1.0), 0.01),
+        *_compare(f"{name} gear, torque about AXIS [m]", axes @ gear[3:], torque, 0.001),
+        *_compare(f"{name} gain", model.actuator_gainprm[number, :1], [1.0], 0.01),
     ]
     for kind in ("bias", "dyn"):
-        found = getattr(model, f"actuator_{kind}type")[number]
-        facts.append(_Fact(f"{name} {kind}type", found, "0 (none)", found == 0))
+        if found := getattr(model, f"actuator_{kind}type")[number]:
+            differs.append(f"{name} {kind}type is {found}, not 0 (none)")
     for kind in ("ctrl", "force"):
         low, high = getattr(model, f"actuator_{kind}range")[number]
-        free = not getattr(model, f"actuator_{kind}limited")[number]
-        wide = f"at least {THRUST_MAX:.3g}, the largest thrust"
-        facts.append(_Fact(f"{name} {kind}range, end [N]", high, wide, free or high >= THRUST_MAX))
-        facts.append(_Fact(f"{name} {kind}range, begin [N]", low, "0 or less", free or low <= 0.0))
-    return facts
+        if getattr(model, f"actuator_{kind}limited")[number]:
+            if high < THRUST_MAX:
+                wide = f"at least {THRUST_MAX:.3g}, the largest thrust"
+                differs.append(f"{name} {kind}range, end [N] is {high:.4g}, not {wide}")
+            if low > 0.0:
+                differs.append(f"{name} {kind}range, begin [N] is {low:.4g}, not 0 or less")
+    return differs
+
+
+def _axes(quaternion: Any) -> Any:
+    """Return the rotation matrix of a quaternion."""
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, quaternion)
+    return axes.reshape(3, 3)
