@@ -36,8 +36,7 @@ CRUISE_SPEED = 1.0
 SETTLE_TIME = 4.0
 """Expected extra time for the beginning and the end of a leg [s]."""
 LEG_PATIENCE = 3.0
-"""Time limit of a leg, divided by the leg's expected time [1].
-Source: docs/reference/faults.md, "F28"."""
+"""Limit of a leg, divided by its expected time [1]. Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
 """Mission number of a cloud that flies only one mission."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)
@@ -119,20 +118,15 @@ def build_cloud(
 
 def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:
     """Build the uplink and the downlink of the emulated network."""
-    return (
-        LinkDirection(link_profile(experiment.uplink), experiment.seed, uplink=True),
-        LinkDirection(link_profile(experiment.downlink), experiment.seed, uplink=False),
-    )
+    profiles, seed = (experiment.uplink, experiment.downlink), experiment.seed
+    up, down = map(link_profile, profiles)
+    return LinkDirection(up, seed, uplink=True), LinkDirection(down, seed, uplink=False)
 
 
 def build_plan(experiment: ResolvedExperiment) -> Plan:
     """Turn the experiment's mission into legs."""
-    return mission_plan(
-        experiment.mission,
-        experiment.criteria.time_limit_s,
-        experiment.seed,
-        speed_max=experiment.guard.speed_max_mps,
-    )
+    limit, speed_max = experiment.criteria.time_limit_s, experiment.guard.speed_max_mps
+    return mission_plan(experiment.mission, limit, experiment.seed, speed_max=speed_max)
 
 
 def mission_plan(

@@ -16,9 +16,8 @@ from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
 class LinkChanged(NamedTuple):
     """Driver, in real time only: the conditions of the link towards this end. Topic /link.
 
-    World records the uplink, cloud the downlink: at the start, after every change, and again when
-    a session or a mission begins. The time line of a profile may change values over time; the
-    record holds the requested values at the start of the time line.
+    World records the uplink, cloud the downlink: at the start, after every change, and when a
+    session or a mission begins. Values are those requested at the start of the profile's time line.
 
     Attributes:
         uplink: True for the uplink, False for the downlink.
@@ -50,22 +49,18 @@ class LinkChanged(NamedTuple):
 class LinkChecked(NamedTuple):
     """Driver, in real time only: one judged quantity of the link. Topic /link_check.
 
-    Cloud judges the uplink, world the downlink. Both use the tunnel's own datagrams of the last
-    60 s at most.
+    Cloud judges the uplink, world the downlink, by the tunnel's datagrams of the last 60 s.
 
     Attributes:
         uplink: True for the uplink, False for the downlink.
         quantity: Judged: "mean", "deviation", "round_trip", "loss", "reordered", "duplicated".
-            For information only: "datagrams" (needed, received); "time_line" (not judged in
-            flight); "rate" (single datagrams cannot measure a rate); "correlation" (requested of
-            netem, which has none).
+            For information: "datagrams" (needed, received), "time_line", "rate", "correlation".
         asked: Expected value: delays [s], shares in [0, 1].
         measured: Measured value, likewise.
         low: Lowest accepted value, likewise.
         high: Highest accepted value, likewise.
-        verdict: "ok", "off", "open" or "told". "open": the datagrams were too few, a deviation is
-            being checked a second time, or the ends woke too late to judge the link. "told": for
-            information only.
+        verdict: "ok", "off", "open" (too few datagrams, a second look, or ends that woke too late)
+            or "told" (for information).
         datagrams: Number of datagrams behind the measurement.
     """
 
@@ -112,8 +107,8 @@ class GroundTruth(NamedTuple):
 class Arrival(NamedTuple):
     """Either end: a telemetry or command datagram arrived, late ones included.
 
-    A repeated datagram is recorded while there are fewer repeated than sent datagrams; after that
-    it is only counted. Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
+    A repeated datagram is recorded while fewer are repeated than sent; after that it is only
+    counted. Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
 
     Attributes:
         uplink: True for telemetry at cloud, False for commands at world.
@@ -204,8 +199,7 @@ class Control(NamedTuple):
         basis_stamp_ns: Stamp of the odometry used [ns], world's clock.
         horizon: Prediction horizon [s]: the delay estimate, clamped.
         rtt: Last round trip, without the hold time on world [s]; NaN before the first echo.
-        loop_delay: Last `now - echo_stamp`, the paper's tau_n, with the hold time [s]; NaN before
-            the first echo.
+        loop_delay: Last `now - echo_stamp`, the paper's tau_n, with the hold time [s]; or NaN.
         measured: Position in the odometry used [m], shape (3,).
         position: Predicted position for `basis_stamp_ns + horizon` [m], shape (3,).
         orientation_wxyz: Predicted orientation, unit quaternion, shape (4,).
@@ -265,9 +259,8 @@ class Fault(NamedTuple):
     """Either end: a problem that did not stop the flight. Topic /fault.
 
     Attributes:
-        code: One word: "estimator_failed", "predictor_failed", "controller_failed", "recorder",
-            "link_check", "wall_clock", or "late" (cloud missed periods, or world is slower than
-            real time).
+        code: One word, such as "predictor_failed", "recorder", "link_check", or "late" (cloud
+            missed periods, or world is slower than real time).
         text: What is wrong, where, and what to do.
     """
 
@@ -281,8 +274,7 @@ class Counted(NamedTuple):
 
     Attributes:
         end: "world", "cloud" or "link".
-        name: Name of the counter, such as "received", "sent", "malformed", "late", "stale",
-            "repeated", "old_epoch", "range", "recorder_dropped".
+        name: Name of the counter, such as "sent", "malformed", "late", "stale", "range".
         total: Value since the start.
     """
 

@@ -112,8 +112,7 @@ def parse(data: bytes) -> KeySet:
 def write(keys: KeySet) -> str:
     """Return the text of a key file."""
     lines = ["# A key of cloudrc's tunnel: keep it secret. Made by 'cloudrc key new'."]
-    named = zip(("current", "previous"), keys.accepted, strict=False)
-    lines += [f"{name} {key.text()}" for name, key in named]
+    lines += [f"{name} {key.text()}" for name, key in keys._asdict().items() if key is not None]
     return "\n".join(lines) + "\n"
 
 

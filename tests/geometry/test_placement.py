@@ -49,17 +49,13 @@ def refusals(*positions: Vector, start: str = "spawn", scene: str = "pipes", **m
         # The arm's tip is at x + .40, z + .17: from x = -.81 on it is within .04 m of the wall.
         ((-0.82, 0.0, 0.8), 0, -1),
         ((-0.80, 0.0, 0.8), 0, 0),
-        # Beyond that the tip is outside and the arm goes through the wall.
-        ((-0.60, 0.0, 0.8), 0, 0),
-        # Turned along the pipe, the arm is clear.
-        ((-0.80, 0.0, 0.8), math.pi / 2, -1),
+        ((-0.60, 0.0, 0.8), 0, 0),  # the arm goes through the wall
+        ((-0.80, 0.0, 0.8), math.pi / 2, -1),  # along the pipe
         # The rims of the rotors, .338 from the axis, in the lower part of the bore.
         ((-1.0, 0.0, 0.29), math.pi / 2, -1),
         ((-1.0, 0.0, 0.25), math.pi / 2, 0),
-        # At (0, 0) the rear rotor is in the outside of pipe 1.
-        ((0.0, 0.0, 0.8), 0, 0),
-        # Behind the board.
-        ((8.235, -6.422, 0.7), 0, -1),
+        ((0.0, 0.0, 0.8), 0, 0),  # the rear rotor is in the outside of pipe 1
+        ((8.235, -6.422, 0.7), 0, -1),  # behind the board
     ],
 )
 def test_overlaps(position: Vector, yaw: float, pipe: int) -> None:

@@ -451,6 +451,9 @@ def test_impossible_commands_now_and_then_only_count():
         guard.accept_command(BAD, now_ns)
         now_ns = feed(guard, now_ns, 26)
     assert guard.state is TRACK
+    for _ in range(5):
+        guard.accept_command(BAD, now_ns)
+    assert guard.state is LAND
     on_ground, at_rest = armed(), tracking()
     at_rest.end_mission(0)
     for guard, state in ((on_ground, GROUND), (at_rest, HOLD)):  # nor without a mission
