@@ -1,7 +1,6 @@
 """Build world, cloud and link from an experiment, and convert its values to SI units.
 
-World and cloud do not import each other, and drivers know only the contract of an endpoint. This
-module connects world, cloud and link.
+World and cloud do not import each other, and drivers know only the contract of an endpoint.
 """
 
 from __future__ import annotations
@@ -37,8 +36,7 @@ CRUISE_SPEED = 1.0
 SETTLE_TIME = 4.0
 """Expected extra time for the beginning and the end of a leg [s]."""
 LEG_PATIENCE = 3.0
-"""Time limit of a leg, divided by the leg's expected time [1].
-Source: docs/reference/faults.md, "F28"."""
+"""Limit of a leg, divided by its expected time [1]. Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
 """Mission number of a cloud that flies only one mission."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)
@@ -52,11 +50,7 @@ def build_world(
 ) -> WorldEndpoint:
     """Build world's end: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 
-    Args:
-        experiment: The experiment.
-        identity: The identity of this end.
-        clock: Monotonic clock of this end [ns]. It is read last, because compiling a scene takes
-            a while.
+    The monotonic clock [ns] is read last, because compiling a scene takes a while.
     """
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.guard.limits import Limits
@@ -105,9 +99,8 @@ def build_cloud(
         experiment: The experiment.
         identity: The identity of this end.
         clock: Monotonic clock of this end [ns].
-        teleop: The source of setpoints. None for an internal source, which starts the mission at
-            once.
-        make_loop: Makes the control loop. It takes the arguments of `ControlLoop`.
+        teleop: The source of setpoints; None for one in this process, which starts at once.
+        make_loop: Makes the control loop from the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud
     loop = make_loop(
@@ -125,32 +118,24 @@ def build_cloud(
 
 def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:
     """Build the uplink and the downlink of the emulated network."""
-    return (
-        LinkDirection(link_profile(experiment.uplink), experiment.seed, uplink=True),
-        LinkDirection(link_profile(experiment.downlink), experiment.seed, uplink=False),
-    )
+    profiles, seed = (experiment.uplink, experiment.downlink), experiment.seed
+    up, down = map(link_profile, profiles)
+    return LinkDirection(up, seed, uplink=True), LinkDirection(down, seed, uplink=False)
 
 
 def build_plan(experiment: ResolvedExperiment) -> Plan:
     """Turn the experiment's mission into legs."""
-    return mission_plan(
-        experiment.mission,
-        experiment.criteria.time_limit_s,
-        experiment.seed,
-        speed_max=experiment.guard.speed_max_mps,
-    )
+    limit, speed_max = experiment.criteria.time_limit_s, experiment.guard.speed_max_mps
+    return mission_plan(experiment.mission, limit, experiment.seed, speed_max=speed_max)
 
 
 def mission_plan(
     mission: schema.Mission, time_limit: float, seed: int = 0, *, speed_max: float = inf
 ) -> Plan:
-    """Turn a mission into legs.
+    """Turn a checked mission into legs.
 
-    Args:
-        mission: A checked mission.
-        time_limit: Time limit of the whole mission [s].
-        seed: Seed of random steps.
-        speed_max: Largest speed that the guard allows [m/s].
+    `time_limit` [s] is that of the whole mission, `seed` that of random steps, `speed_max` [m/s]
+    the guard's cap.
     """
     if mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
@@ -164,14 +149,11 @@ def mission_plan(
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
     """Convert one direction of a link profile to SI units, and read its trace and its table.
 
-    Args:
-        direction: One direction, as in the profile's file.
-        file_max: Largest trace or table that is read [bytes].
-
     Raises:
-        BadInputError: If a trace or table cannot be read.
+        BadInputError: If a trace or table cannot be read, or is longer than `file_max` bytes.
     """
-    file = direction.trace
+    trace = read_trace(Path(direction.trace), file_max) if direction.trace else None
+    table = direction.distribution == "table" and direction.table
     return DirectionProfile(
         delay=direction.delay_ms * 1e-3,
         jitter=direction.jitter_ms * 1e-3,
@@ -185,18 +167,10 @@ def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> Direc
         rate=_scaled(direction.rate_kbit, 1e3),
         queue_packets=direction.queue_packets,
         changes=tuple(_change(change) for change in direction.changes),
-        trace=None
-        if file is None
-        else replace(read_trace(Path(file), file_max), loop=direction.loop),
+        trace=None if trace is None else replace(trace, loop=direction.loop),
         blackouts=tuple(Blackout(b.start_s, b.duration_s) for b in direction.blackouts),
-        table=_table(direction, file_max),
+        table=read_table(Path(table), file_max) if table else (),
     )
-
-
-def _table(direction: schema.Direction, file_max: int) -> tuple[float, ...]:
-    if direction.distribution != "table" or direction.table is None:
-        return ()
-    return read_table(Path(direction.table), file_max)
 
 
 def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: float) -> Leg:
@@ -232,15 +206,10 @@ def _change(change: schema.Change) -> Change:
 
 
 def _loss(loss: float | schema.GilbertElliott) -> Loss:
-    if isinstance(loss, schema.GilbertElliott):
-        return GilbertElliott(
-            loss.bad_start,
-            loss.bad_end,
-            loss.loss_bad,
-            loss.loss_good,
-            loss.delay_bad_ms * 1e-3,
-        )
-    return loss
+    if not isinstance(loss, schema.GilbertElliott):
+        return loss
+    shares = (loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good)
+    return GilbertElliott(*shares, loss.delay_bad_ms * 1e-3)
 
 
 def _scaled(value: float | None, factor: float) -> float | None:

@@ -10,11 +10,8 @@ knows whether time is virtual or real:
     send(endpoint.take_datagrams())
     keep(endpoint.take_records())
 
-Rules for drivers:
-
-- `now_ns` never falls.
-- All datagrams that a driver reads in one wake get the same `now_ns`. From this an endpoint knows
-  which datagrams waited in the socket while its process was stalled.
+`now_ns` never falls. All datagrams that a driver reads in one wake get the same `now_ns`: so an
+endpoint knows what waited in the socket while its process was stalled.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Errors that a user can fix: one line that says what is wrong, where, and what to do next.
-
-Texts from foreign code and files may be long and may contain any characters. Two functions of this
-module turn such a text into one printable line.
-"""
+"""Errors that a user can fix: one line that says what is wrong, where, and what to do next."""
 
 from __future__ import annotations
 

@@ -22,12 +22,7 @@ class TooLongError(ValueError):
 
 
 def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | None:
-    """Identify the version of a file with one system call; return None if the file does not exist.
-
-    Args:
-        path: The file.
-        follow: Whether to follow a symbolic link.
-    """
+    """Identify the version of a file with one system call; None if it does not exist."""
     try:
         status = os.stat(path, follow_symlinks=follow)
     except OSError:
@@ -36,11 +31,7 @@ def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | 
 
 
 def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
-    """Read a whole file that another process has written, without waiting.
-
-    Args:
-        path: The file.
-        size_max: Largest allowed size [bytes].
+    """Read a whole file of at most `size_max` bytes, without waiting for another process.
 
     Raises:
         OSError: If the file cannot be read.
@@ -64,7 +55,7 @@ def open_file(path: Path) -> FileIO:
         OSError: If the file cannot be opened.
         ValueError: If `path` is not a regular file but, for example, a pipe.
     """
-    file = FileIO(path, opener=_at_once)
+    file = FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         return file
     file.close()
@@ -74,9 +65,8 @@ def open_file(path: Path) -> FileIO:
 def readable_by_others(path: Path) -> bool:
     """Check whether other users can read a file of this user; a missing file is not readable.
 
-    A file that belongs to this user must be closed to the group, too. A file of another owner may
-    be open to the group, because Kubernetes gives a Secret's files to root and lets the pod's group
-    read them.
+    A file of another owner may be open to the group: Kubernetes gives a Secret's files to root and
+    lets the pod's group read them.
     """
     try:
         status = path.stat()
@@ -90,12 +80,8 @@ def readable_by_others(path: Path) -> bool:
 def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
     """Write a file under a temporary name, and rename the complete file to `path`.
 
-    Other users may write to the folder. Therefore a symbolic link at `path` is replaced and not
-    followed, and nobody can guess the temporary name.
-
-    Args:
-        path: The file; an existing file is replaced.
-        mode: Permissions of the new file from its creation, minus the umask.
+    `mode` are the permissions from its creation, minus the umask. Other users may write to the
+    folder: a symbolic link at `path` is replaced, and nobody can guess the temporary name.
 
     Raises:
         OSError: If the file cannot be written; an existing file then stays unchanged.
@@ -116,7 +102,3 @@ def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
     """Write a whole file through `atomic_file`."""
     with atomic_file(path, mode) as file:
         file.write(data)
-
-
-def _at_once(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK)

@@ -1,7 +1,6 @@
 """The messages between world, cloud and teleoperation.
 
-Messages are immutable named tuples in SI units. Making a named tuple takes a quarter of the time of
-a frozen dataclass, and the loops make a dozen messages every 10 ms.
+Messages are named tuples in SI units: making one takes a quarter of the time of a frozen dataclass.
 
 - Stamps: integer nanoseconds on the monotonic clock of the named end. Only stamps of the same clock
   may be subtracted.
@@ -126,8 +125,7 @@ class Telemetry(NamedTuple):
         touch_speed: Speed of the tip at its first contact with the board in this mission [m/s]; NaN
             before the first contact.
         mission_id: Mission that was started last, as in `OperatorRequest`; 0 if none.
-        reached: Number of waypoints reached in that mission, as far as world knows, or
-            `MISSION_OVER`.
+        reached: Number of waypoints of that mission reached, as far as world knows.
         cause: Why the guard is in its state; after touch-down in LAND, why the robot landed.
     """
 
@@ -173,8 +171,7 @@ class OperatorRequest(NamedTuple):
     """A request of the operator to the robot, repeated until telemetry shows its number.
 
     Attributes:
-        number: Number of the request, above the number of every request that the robot has carried
-            out.
+        number: Number above that of every request that the robot has carried out.
         request: Kind of the request.
         start: Where the mission starts from; used with `Request.START` only.
         mission_id: Number of the mission, below 2^63.
@@ -182,8 +179,7 @@ class OperatorRequest(NamedTuple):
             early.
         basis_stamp_ns: Stamp of cloud's newest odometry when cloud forwarded the request [ns],
             world's clock; `NEVER_NS` before the first odometry.
-        epoch: Session that teleop saw when it made the request; 0 for none. Only cloud uses the
-            epoch; the robot does not get it.
+        epoch: Session that teleop saw when it made the request; 0 for none. Only cloud uses it.
     """
 
     number: int

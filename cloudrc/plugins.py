@@ -54,18 +54,12 @@ def signature(kind: str, name: str) -> inspect.Signature:
     try:
         return inspect.signature(build, eval_str=True)
     except Exception as error:
-        raise BadInputError(
-            f"{_one(kind)} {name!r}: annotations of build() cannot be read: {error}"
-        ) from error
+        text = f"{_one(kind)} {name!r}: annotations of build() cannot be read: {error}"
+        raise BadInputError(text) from error
 
 
 def load(kind: str, name: str, **parameters: Any) -> Any:
-    """Build a plug-in.
-
-    Args:
-        kind: One of `PACKAGES`.
-        name: Configuration name, or the path of a file.
-        **parameters: Arguments of its `build`.
+    """Build a plug-in by the `parameters` of its `build`; see `find`.
 
     Raises:
         BadInputError: If the plug-in does not exist, or its `build` fails.
@@ -78,14 +72,9 @@ def load(kind: str, name: str, **parameters: Any) -> Any:
 
 
 def find(kind: str, name: str) -> Any:
-    """Import a plug-in.
+    """Import a plug-in of a kind of `PACKAGES`, by its configuration name or the path of a file.
 
-    Args:
-        kind: One of `PACKAGES`.
-        name: Configuration name, or the path of a file.
-
-    Returns:
-        The plug-in's module, or the object of its entry point.
+    Return the plug-in's module, or the object of its entry point.
     """
     try:
         if is_path(name):
@@ -98,9 +87,8 @@ def find(kind: str, name: str) -> Any:
     except CloudrcError:
         raise
     except Exception as error:  # as in load
-        raise BadInputError(
-            f"{_one(kind)} {name!r} cannot be imported: {_reason(error)}"
-        ) from error
+        text = f"{_one(kind)} {name!r} cannot be imported: {_reason(error)}"
+        raise BadInputError(text) from error
     raise BadInputError(unknown_name_text(_one(kind), name, names(kind)))
 
 
@@ -136,12 +124,8 @@ def _shipped(kind: str) -> list[str]:
         raise BadInputError(unknown_name_text("kind of plug-in", kind, list(PACKAGES)))
     if not PACKAGES[kind]:
         return []
-    package = importlib.import_module(PACKAGES[kind])
-    return [
-        module.name
-        for module in pkgutil.iter_modules(package.__path__)
-        if not module.ispkg and not module.name.startswith("_")
-    ]
+    modules = pkgutil.iter_modules(importlib.import_module(PACKAGES[kind]).__path__)
+    return [module.name for module in modules if not module.name.startswith("_")]
 
 
 def _installed(kind: str) -> dict[str, EntryPoint]:

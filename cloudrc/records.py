@@ -1,8 +1,9 @@
 """The records of a run, which world, cloud and the drivers make during a flight.
 
-A record is a named tuple. Its first field is `stamp_ns`, on the clock of the end that made the
-record. The docstring of each record begins with its maker: an end, or the driver that runs the end.
-`record/` turns records into MCAP topics, columns and a hash; `metrics/` turns them into numbers.
+A record is a named tuple. Its first field is `stamp_ns`, when it was made [ns], on the clock of the
+end that made it. `epoch` and `counter` are those of a datagram's header. The docstring of each
+record begins with its maker: an end, or the driver that runs the end. `record/` turns records into
+MCAP topics, columns and a hash; `metrics/` turns them into numbers.
 """
 
 from __future__ import annotations
@@ -15,12 +16,10 @@ from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
 class LinkChanged(NamedTuple):
     """Driver, in real time only: the conditions of the link towards this end. Topic /link.
 
-    World records the uplink, cloud the downlink: at the start, after every change, and again when
-    a session or a mission begins. The time line of a profile may change values over time; the
-    record holds the requested values at the start of the time line.
+    World records the uplink, cloud the downlink: at the start, after every change, and when a
+    session or a mission begins. Values are those requested at the start of the profile's time line.
 
     Attributes:
-        stamp_ns: When this end recorded the conditions [ns], own clock.
         uplink: True for the uplink, False for the downlink.
         shaper: "relay" or "netem".
         cause: Why the link changed, in words; "" at the start.
@@ -50,23 +49,18 @@ class LinkChanged(NamedTuple):
 class LinkChecked(NamedTuple):
     """Driver, in real time only: one judged quantity of the link. Topic /link_check.
 
-    Cloud judges the uplink, world the downlink. Both use the tunnel's own datagrams of the last
-    60 s at most.
+    Cloud judges the uplink, world the downlink, by the tunnel's datagrams of the last 60 s.
 
     Attributes:
-        stamp_ns: Time of the check [ns], own clock.
         uplink: True for the uplink, False for the downlink.
         quantity: Judged: "mean", "deviation", "round_trip", "loss", "reordered", "duplicated".
-            For information only: "datagrams" (needed, received); "time_line" (not judged in
-            flight); "rate" (single datagrams cannot measure a rate); "correlation" (requested of
-            netem, which has none).
+            For information: "datagrams" (needed, received), "time_line", "rate", "correlation".
         asked: Expected value: delays [s], shares in [0, 1].
         measured: Measured value, likewise.
         low: Lowest accepted value, likewise.
         high: Highest accepted value, likewise.
-        verdict: "ok", "off", "open" or "told". "open": the datagrams were too few, a deviation is
-            being checked a second time, or the ends woke too late to judge the link. "told": for
-            information only.
+        verdict: "ok", "off", "open" (too few datagrams, a second look, or ends that woke too late)
+            or "told" (for information).
         datagrams: Number of datagrams behind the measurement.
     """
 
@@ -87,14 +81,7 @@ Source: docs/reference/control.md, "Real-time factor"."""
 
 
 class TelemetrySent(NamedTuple):
-    """World: telemetry was sent. Topics /odometry and /telemetry.
-
-    Attributes:
-        stamp_ns: Time of sending [ns], world's clock.
-        epoch: Session of the datagram.
-        counter: Counter in the datagram's header.
-        telemetry: The message, as sent.
-    """
+    """World: telemetry was sent. Topics /odometry and /telemetry."""
 
     stamp_ns: int
     epoch: int
@@ -106,7 +93,6 @@ class GroundTruth(NamedTuple):
     """World: the true state, at every odometry. Topics /ground_truth and /reference.
 
     Attributes:
-        stamp_ns: Time of the state [ns], world's clock.
         odometry: True pose and twist.
         tip_force: Force on the touch sensor [N].
         reference: Velocity that the guard lets the low-level controller follow [m/s], shape (3,).
@@ -121,14 +107,11 @@ class GroundTruth(NamedTuple):
 class Arrival(NamedTuple):
     """Either end: a telemetry or command datagram arrived, late ones included.
 
-    A repeated datagram is recorded while there are fewer repeated than sent datagrams; after that
-    it is only counted. Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
+    A repeated datagram is recorded while fewer are repeated than sent; after that it is only
+    counted. Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
 
     Attributes:
-        stamp_ns: Time of arrival [ns], receiver's clock.
         uplink: True for telemetry at cloud, False for commands at world.
-        epoch: Epoch in the datagram's header.
-        counter: Counter in the datagram's header.
         delay: One-way delay [s]; NaN if the two ends cannot prove that they share a clock.
         used: True if the datagram became the newest; False if it was late, stale, repeated or
             rejected.
@@ -145,11 +128,9 @@ class Arrival(NamedTuple):
 class CommandApplied(NamedTuple):
     """World: a command was applied for the first time. Topic /command_applied.
 
+    Epoch and counter identify the `Control` record of the command.
+
     Attributes:
-        stamp_ns: When the low-level controller first saw the command [ns], world's clock.
-        epoch: Epoch in the command's header.
-        counter: Counter in the command's header; epoch and counter identify the `Control` record
-            of the command.
         basis_stamp_ns: Stamp of the odometry from which the command was computed [ns], world's
             clock.
         velocity: Commanded velocity, before the caps [m/s], shape (3,).
@@ -166,9 +147,8 @@ class GuardChange(NamedTuple):
     """World: the guard changed its state. Topic /guard.
 
     Attributes:
-        stamp_ns: Time of the change [ns], world's clock.
         state: The new state.
-        cause: Why the state changed: "mission started", "command age 0.252 s above 0.250 s".
+        cause: Why the state changed: "command age 0.252 s above 0.250 s".
     """
 
     stamp_ns: int
@@ -180,7 +160,6 @@ class Contact(NamedTuple):
     """World: the robot began to touch something. Topic /contact.
 
     Attributes:
-        stamp_ns: Time of the contact [ns], world's clock.
         body: Name of the touched body of the scene: pipe_1, board, floor.
         position: Position of the base just before [m], world frame, shape (3,).
         velocity: Velocity of the base just before [m/s], world frame, shape (3,).
@@ -200,7 +179,6 @@ class SessionOpened(NamedTuple):
     """Either end: a session began under a new epoch. Topic /session.
 
     Attributes:
-        stamp_ns: Time of the start [ns], own clock.
         end: "world" or "cloud".
         epoch: The new epoch.
         cause: Why the session began: "cloud said hello", "mission starts from spawn".
@@ -218,14 +196,10 @@ class Control(NamedTuple):
     Topics /estimated_odometry, /setpoint_position, /cmd_vel, /delay_estimate and /pid.
 
     Attributes:
-        stamp_ns: Stamp of the command [ns], cloud's clock.
-        epoch: Session of the command.
-        counter: Counter in the command's header.
         basis_stamp_ns: Stamp of the odometry used [ns], world's clock.
         horizon: Prediction horizon [s]: the delay estimate, clamped.
         rtt: Last round trip, without the hold time on world [s]; NaN before the first echo.
-        loop_delay: Last `now - echo_stamp`, the paper's tau_n, with the hold time [s]; NaN before
-            the first echo.
+        loop_delay: Last `now - echo_stamp`, the paper's tau_n, with the hold time [s]; or NaN.
         measured: Position in the odometry used [m], shape (3,).
         position: Predicted position for `basis_stamp_ns + horizon` [m], shape (3,).
         orientation_wxyz: Predicted orientation, unit quaternion, shape (4,).
@@ -268,7 +242,6 @@ class MissionEvent(NamedTuple):
     """Cloud: an event of the mission. Topic /mission.
 
     Attributes:
-        stamp_ns: Time of the event [ns], cloud's clock.
         event: One of `UNDER_WAY`, or the outcome of the mission: "done", "cancelled", "timed_out",
             "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped", "taken_over",
             "end_lost".
@@ -286,10 +259,8 @@ class Fault(NamedTuple):
     """Either end: a problem that did not stop the flight. Topic /fault.
 
     Attributes:
-        stamp_ns: Time of the problem [ns], own clock.
-        code: One word: "estimator_failed", "predictor_failed", "controller_failed", "recorder",
-            "link_check", "wall_clock", or "late" (cloud missed periods, or world is slower than
-            real time).
+        code: One word, such as "predictor_failed", "recorder", "link_check", or "late" (cloud
+            missed periods, or world is slower than real time).
         text: What is wrong, where, and what to do.
     """
 
@@ -302,10 +273,8 @@ class Counted(NamedTuple):
     """Either end: the value of a counter, once a second. Topic /count.
 
     Attributes:
-        stamp_ns: Time of the reading [ns], own clock.
         end: "world", "cloud" or "link".
-        name: Name of the counter, such as "received", "sent", "malformed", "late", "stale",
-            "repeated", "old_epoch", "range", "recorder_dropped".
+        name: Name of the counter, such as "sent", "malformed", "late", "stale", "range".
         total: Value since the start.
     """
 
@@ -319,7 +288,6 @@ class Lateness(NamedTuple):
     """Driver, in real time only: how late a deadline was handled. Topic /lateness.
 
     Attributes:
-        stamp_ns: When the deadline was handled [ns], own clock.
         end: "world" or "cloud".
         lateness: Time from the deadline to its handling [s].
         busy: Duration of the handling [s].
@@ -334,18 +302,7 @@ class Lateness(NamedTuple):
 
 
 Record: TypeAlias = (
-    TelemetrySent
-    | GroundTruth
-    | Arrival
-    | CommandApplied
-    | GuardChange
-    | Contact
-    | SessionOpened
-    | Control
-    | MissionEvent
-    | Fault
-    | Counted
-    | LinkChanged
-    | LinkChecked
-    | Lateness
+    (TelemetrySent | GroundTruth | Arrival | CommandApplied | GuardChange | Contact)
+    | (SessionOpened | Control | MissionEvent | Fault | Counted)
+    | (LinkChanged | LinkChecked | Lateness)
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -13,22 +14,11 @@ from tools import evidence
 
 
 @pytest.mark.parametrize(
-    ("measured", "relation", "asked"),
-    [
-        (0.252 + 1e-10, "<=", 0.252),
-        (0.12, ">=", 0.12),
-        (0, "==", 0),
-    ],
-)
-def test_a_number_within_its_limit_passes(
-    figure: Callable[..., None], measured: float, relation: str, asked: float
-) -> None:
-    figure("number", measured, relation, asked)
-
-
-@pytest.mark.parametrize(
     ("measured", "relation", "asked", "said"),
     [
+        (0.252 + 1e-10, "<=", 0.252, ""),
+        (0.12, ">=", 0.12, ""),
+        (0, "==", 0, ""),
         (0.253, "<=", 0.252, "number: 0.253 s, asked <= 0.252 s"),
         (0.1, ">=", 0.12, "number: 0.1 s, asked >= 0.12 s"),
         (1, "==", 0, "number: 1 s, asked == 0 s"),
@@ -38,7 +28,7 @@ def test_a_number_within_its_limit_passes(
 def test_a_number_beyond_its_limit_fails_its_test(
     figure: Callable[..., None], measured: float | None, relation: str, asked: float, said: str
 ) -> None:
-    with pytest.raises(AssertionError, match=said):
+    with pytest.raises(AssertionError, match=said) if said else nullcontext():
         figure("number", measured, relation, asked, "s")
 
 

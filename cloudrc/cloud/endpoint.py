@@ -28,7 +28,7 @@ from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake, HandshakeLog
 from cloudrc.tunnel.keys import Key, KeyRing
-from cloudrc.tunnel.session import NO_EPOCH, make_session
+from cloudrc.tunnel.session import NO_EPOCH, Session
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class CloudEndpoint:
         self._loop = loop
         self.teleop = teleop
         self._identity = identity
-        self._session = make_session(Direction.DOWNLINK, identity.ring)
+        self._session = Session(Direction.DOWNLINK, identity.ring)
         self._handshake = ClientHandshake(identity.nonce, identity.clock_id)
         self._complaints = HandshakeLog()
         self._channel = Channel(newest_wins)
@@ -232,7 +232,7 @@ class CloudEndpoint:
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
         """Handle one datagram. Count and drop an invalid datagram."""
         try:
-            kind, _, epoch, counter, body = self._session.open(data)
+            kind, epoch, counter, body = self._session.open(data)
             if kind == TELEMETRY:
                 self._receive_telemetry(epoch, counter, body, now_ns)
             elif kind == Kind.ACCEPT:
@@ -305,14 +305,12 @@ class CloudEndpoint:
             self._heard_ns = now_ns
         self._counts[outcome] += 1
         used = outcome == USED
-        delay = nan
+        telemetry, delay = codec.decode_telemetry(body), nan
         if self._clock_is_shared:
-            stamp_ns, slip_ns = codec.decode_stamps(body)
-            delay = (now_ns - stamp_ns - slip_ns) * 1e-9
+            delay = (now_ns - telemetry.stamp_ns - telemetry.slip_ns) * 1e-9
         if outcome != REPEATED or not self._channel.is_flooded:
             self._records.append(_new(Arrival, (now_ns, True, epoch, counter, delay, used)))
         if used:
-            telemetry = codec.decode_telemetry(body)
             self.guard = telemetry.guard
             self._alarm.see(telemetry.guard, telemetry.mission)
             self._loop.observe(telemetry, now_ns)

@@ -6,8 +6,7 @@ and reports the first failure of each plug-in. The loop never stops.
 
 While no echo shows that the robot flies the commands, the loop freezes: it commands zero velocity
 and does not call the controller. Therefore no integral winds up, and no predictor assumes motion
-that the robot did not fly. A frozen loop continues to send commands, because only the echo of a new
-command ends the freeze.
+that the robot did not fly. Only the echo of a new command ends the freeze.
 
 The loop measures all ages on cloud's own clock and compares world's stamps only with each other,
 so it needs no clock synchronisation.
@@ -28,6 +27,17 @@ from cloudrc.records import Control, Fault
 
 HORIZON_MAX = 1.0
 """Longest horizon of a prediction [s]. Source: docs/reference/control.md, "Predictors"."""
+FREEZE_NS = 400_000_000
+"""Time without a new echo, in addition to the horizon, after which the loop freezes [ns].
+Source: docs/reference/plant.md, "Frozen reference"."""
+STAND_STILL = ControlOutput(ZERO, 0.0)
+INSTEAD = {
+    "estimator": "cloud uses the last good horizon",
+    "predictor": "cloud uses the last sample without a prediction",
+    "controller": "cloud commands zero velocity",
+}
+"""Kind of plug-in -> what cloud does when the plug-in fails."""
+_new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class DelayMeter:
@@ -42,40 +52,26 @@ class DelayMeter:
     def __init__(self, estimator: Estimator, counts: Counter[str]) -> None:
         """Use `estimator`, and count clamped horizons in `counts`."""
         self._estimator, self._counts = estimator, counts
-        self.newest_echo_ns = NEVER_NS
-        self._stamp_ns = 0
-        self.rtt = nan
-        self.loop_delay = nan
+        self._stamp_ns, self.newest_echo_ns = 0, NEVER_NS
+        self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process new telemetry at its arrival.
+        """Process new telemetry at its arrival `now_ns` [ns].
 
         A repeated echo is no sample. While the downlink is silent, world repeats the echo of the
         same command; the growing age of that command would corrupt the estimate.
-
-        Args:
-            telemetry: The newest telemetry.
-            now_ns: Cloud's clock [ns].
         """
         self._stamp_ns = telemetry.stamp_ns
-        if telemetry.echo_stamp_ns <= self.newest_echo_ns:
+        echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
+        if echo_ns <= self.newest_echo_ns:
             return
-        self.newest_echo_ns = telemetry.echo_stamp_ns
-        loop_ns = now_ns - telemetry.echo_stamp_ns
-        applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
-        self.loop_delay = loop_ns * 1e-9
-        self.rtt = (loop_ns - telemetry.echo_hold_ns) * 1e-9
-        applied_minus_stamp = (applied_ns - telemetry.echo_stamp_ns) * 1e-9
+        self.newest_echo_ns, loop_ns = echo_ns, now_ns - echo_ns
+        self.loop_delay, self.rtt = loop_ns * 1e-9, (loop_ns - hold_ns) * 1e-9
+        applied_minus_stamp = (telemetry.stamp_ns - hold_ns - echo_ns) * 1e-9
         self._estimator.update(DelaySample(self.loop_delay, self.rtt, applied_minus_stamp))
 
     def horizon(self, now_ns: int) -> float:
-        """Return the horizon for a command that leaves now, from the newest odometry.
-
-        Args:
-            now_ns: Cloud's clock [ns].
-
-        Returns:
-            Horizon [s], in [0, 1].
+        """Return the horizon for a command that leaves at `now_ns` [ns], in [0, 1] s.
 
         Raises:
             ValueError: If the estimator's horizon is not finite.
@@ -87,13 +83,6 @@ class DelayMeter:
             raise ValueError(f"its horizon is {horizon}")
         self._counts["horizon_clamped"] += 1
         return min(max(horizon, 0.0), HORIZON_MAX)
-
-
-FREEZE_NS = 400_000_000
-"""Time without a new echo, in addition to the horizon, after which the loop freezes [ns].
-Source: docs/reference/plant.md, "Frozen reference"."""
-STAND_STILL = ControlOutput(ZERO, 0.0)
-_new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class ControlLoop:
@@ -114,8 +103,7 @@ class ControlLoop:
 
         The constructor does not catch exceptions of the plug-ins, because nothing flies yet.
         """
-        self._build_estimator = build_estimator
-        self._predictor = predictor
+        self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
         self.faults: list[Fault] = []
         self.counts: Counter[str] = Counter()
@@ -132,25 +120,24 @@ class ControlLoop:
         except BaseException as error:
             self._note("estimator", error, NEVER_NS)
             estimator = Estimator()  # it has no estimate, so the horizon stays 0
-        self._reset("predictor", self._predictor.reset)
-        self._reset("controller", self._controller.reset)
+        self._reset("predictor", self._predictor)
+        self._reset("controller", self._controller)
         self._begin(estimator)
 
     def _begin(self, estimator: Estimator) -> None:
         self._delays = DelayMeter(estimator, self.counts)
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
-        self._horizon = 0.0
-        self._echoed_ns = NEVER_NS
+        self._horizon, self._echoed_ns = 0.0, NEVER_NS
 
     def start_mission(self) -> None:
         """Reset the controller at the start of a mission within the session."""
-        self._reset("controller", self._controller.reset)
+        self._reset("controller", self._controller)
         self._echoed_ns = NEVER_NS
 
-    def _reset(self, kind: str, reset: Callable[[], None]) -> None:
+    def _reset(self, kind: str, plugin: Predictor | Controller) -> None:
         try:
-            reset()
+            plugin.reset()
         except BaseException as error:
             self._note(kind, error, NEVER_NS, "cloud goes on using it")
 
@@ -182,7 +169,7 @@ class ControlLoop:
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
     ) -> tuple[Command, Control]:
-        """Compute the command that is due now.
+        """Compute the command that is due at `now_ns` [ns], and the record of this period.
 
         Args:
             setpoint: The setpoint.
@@ -191,55 +178,40 @@ class ControlLoop:
             epoch: Epoch of the session, for the record.
             counter: Counter of the command, for the record.
         """
-        basis = self._basis
+        basis, delays = self._basis, self._delays
         assert basis is not None, "check `ready` first"
-        horizon = self._choose_horizon(now_ns)
+        try:
+            self._horizon = delays.horizon(now_ns)
+        except BaseException as error:
+            self._note("estimator", error, now_ns)
+        horizon = self._horizon
         estimate = self._predict(basis, horizon, now_ns)
         if self._is_echo_silent(now_ns, horizon):
             self.counts["frozen"] += 1
             output = STAND_STILL
         else:
             output = self._steer(estimate, setpoint, dt, now_ns)
+        velocity, yaw_rate, proportional, integral, derivative = output
         hold_ns = now_ns - self._basis_arrival_ns
-        velocity, yaw_rate = output.velocity, output.yaw_rate
         command = _new(Command, (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate))
         try:
             self._predictor.commanded(command)
         except BaseException as error:
             self._note("predictor", error, now_ns)
-        fields = (
-            now_ns,
-            epoch,
-            counter,
-            basis.stamp_ns,
-            horizon,
-            self._delays.rtt,
-            self._delays.loop_delay,
-            basis.position,
-            estimate.position,
-            estimate.orientation_wxyz,
-            estimate.velocity,
-            setpoint.position,
-            setpoint.waypoint,
-            velocity,
-            yaw_rate,
-            output.proportional,
-            output.integral,
-            output.derivative,
-        )
-        return command, _new(Control, fields)
+        _, position, orientation, predicted_velocity, _ = estimate
+        # fmt: off
+        control = _new(Control, (
+            now_ns, epoch, counter, basis.stamp_ns, horizon, delays.rtt, delays.loop_delay,
+            basis.position, position, orientation, predicted_velocity, setpoint.position,
+            setpoint.waypoint, velocity, yaw_rate, proportional, integral, derivative,
+        ))
+        # fmt: on
+        return command, control
 
     def take_faults(self) -> list[Fault]:
         """Return the faults since the last call."""
         faults, self.faults = self.faults, []
         return faults
-
-    def _choose_horizon(self, now_ns: int) -> float:
-        try:
-            self._horizon = self._delays.horizon(now_ns)
-        except BaseException as error:
-            self._note("estimator", error, now_ns)
-        return self._horizon
 
     # A sum is finite only if all its terms are finite. It may overflow, but a robot cannot fly
     # numbers of that size anyway.
@@ -266,8 +238,10 @@ class ControlLoop:
             velocity, yaw_rate = _triple(output.velocity), float(output.yaw_rate)
             if not isfinite(sum(velocity) + yaw_rate):
                 raise ValueError(f"it returned {output}")
-            terms = _triple(output.proportional), _triple(output.integral)
-            return _new(ControlOutput, (velocity, yaw_rate, *terms, _triple(output.derivative)))
+            proportional, integral = _triple(output.proportional), _triple(output.integral)
+            derivative = _triple(output.derivative)
+            terms = (velocity, yaw_rate, proportional, integral, derivative)
+            return _new(ControlOutput, terms)
         except BaseException as error:
             self._note("controller", error, now_ns)
             return STAND_STILL
@@ -291,21 +265,9 @@ class ControlLoop:
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:
-            fault = Fault(now_ns, code, _explain(kind, error, instead))
+            what = f"the {kind} failed ({describe_error(error)}); {instead or INSTEAD[kind]}"
+            fault = Fault(now_ns, code, f"{what}; fix cloud.{kind} or choose another")
             (self._undated if now_ns == NEVER_NS else self.faults).append(fault)
-
-
-_INSTEAD = {
-    "estimator": "cloud uses the last good horizon",
-    "predictor": "cloud uses the last sample without a prediction",
-    "controller": "cloud commands zero velocity",
-}
-"""Kind of plug-in -> what cloud does when the plug-in fails."""
-
-
-def _explain(kind: str, error: BaseException, instead: str) -> str:
-    what = f"the {kind} failed ({describe_error(error)}); {instead or _INSTEAD[kind]}"
-    return f"{what}; fix cloud.{kind} or choose another"
 
 
 def _triple(numbers: Vector) -> Vector:

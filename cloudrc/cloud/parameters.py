@@ -12,11 +12,7 @@ from cloudrc.messages import Vector
 
 
 def not_negative(name: str, value: object) -> float:
-    """Return `value` if it is a finite number >= 0, in any unit.
-
-    Raises:
-        ValueError: If `value` is no finite number or is negative.
-    """
+    """Return `value` if it is a finite number >= 0, in any unit; else raise ValueError."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ValueError(f"{name}: {value!r} is not a number")
     if not isfinite(value) or value < 0:
@@ -25,11 +21,7 @@ def not_negative(name: str, value: object) -> float:
 
 
 def positive(name: str, value: object) -> float:
-    """Return `value` if it is a finite number > 0, in any unit.
-
-    Raises:
-        ValueError: If `value` is no finite number or is not above 0.
-    """
+    """Return `value` if it is a finite number > 0, in any unit; else raise ValueError."""
     number = not_negative(name, value)
     if number == 0:
         raise ValueError(f"{name}: {value!r} must be above 0")
@@ -37,11 +29,7 @@ def positive(name: str, value: object) -> float:
 
 
 def gain(name: str, value: object) -> float:
-    """Return `value` if it is a valid gain of an average [1]: above 0, at most 1.
-
-    Raises:
-        ValueError: If `value` is not a number above 0 and at most 1.
-    """
+    """Return `value` if it is a gain [1], above 0 and at most 1; else raise ValueError."""
     number = positive(name, value)
     if number > 1:
         raise ValueError(f"{name}: {value!r} must be at most 1")
@@ -49,11 +37,7 @@ def gain(name: str, value: object) -> float:
 
 
 def vector(name: str, value: object) -> Vector:
-    """Return `value` as a tuple if it consists of three finite numbers >= 0, one per axis.
-
-    Raises:
-        ValueError: If `value` is not three finite numbers >= 0.
-    """
+    """Return `value` as a tuple if it is three finite numbers >= 0; else raise ValueError."""
     if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 3:
         raise ValueError(f"{name}: {value!r} must be three numbers, for x, y and z")
     x, y, z = (

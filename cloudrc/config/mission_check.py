@@ -14,6 +14,7 @@ import numpy as np
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Mission, Steps
 from cloudrc.geometry import fence
+from cloudrc.geometry.clearance import Array
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
     find_crossed_pipe,
@@ -21,7 +22,6 @@ from cloudrc.geometry.placement import (
     find_overlapped_pipe,
     outside_fence,
 )
-from cloudrc.geometry.robot import Array
 from cloudrc.geometry.scene import Scene
 
 _YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"

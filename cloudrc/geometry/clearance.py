@@ -1,34 +1,76 @@
-"""Compute the distance between the robot and the walls of the pipes.
+"""Represent the robot by points, and compute their distance from the walls of the pipes.
 
 A pipe is an ideal hollow cylinder with flat ends. The physics builds each pipe from flat staves,
 which deviate from the cylinder by up to 3.2 mm.
 
-Source: docs/reference/plant.md, "Staves".
+Source: docs/reference/plant.md, "Robot", "Key points for clearance", "Staves".
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cloudrc.geometry.robot import Array, Spheres, key_points, place_points
 from cloudrc.geometry.scene import Pipe, Scene
+
+Array = NDArray[np.float64]
+
+# Dimensions of the robot [m], body frame. The arm points along +x; heights are along z.
+BASE_HALF = (0.05, 0.05, 0.10)
+ARM_LENGTH, ARM_HEIGHT, ARM_RADIUS = 0.40, 0.17, 0.01
+ROTOR_ARM, ROTOR_HEIGHT, ROTOR_RADIUS, ROTOR_HALF_THICKNESS = 0.21, 0.05, 0.128, 0.0025
+ROD_RADIUS, ROD_BOTTOM, ROD_TOP = 0.05, 0.06, 0.18
 
 _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 
 
-def distance_to_pipe(pipe: Pipe, points: Array) -> Array:
-    """Compute the signed distance of points to a pipe's wall.
+class Spheres(NamedTuple):
+    """Spheres in the body frame: `positions`, shape (k, 3), and `radii`, shape (k,) [m]."""
 
-    In the plane of s (along the axis) and r (distance from the axis) the wall is a rectangle. The
-    result is the distance to that rectangle.
+    positions: Array
+    radii: Array
+
+
+def key_points() -> Spheres:
+    """Return the 225 points that determine the clearance: arm, rotors, base box, top rod."""
+    return _points(_box(2, 2, 2), arm=9)
+
+
+def robot_points() -> Spheres:
+    """Return points of the whole robot, dense enough to find every overlap with a wall.
+
+    Neighbouring points are at most 0.034 m apart, less than the 0.038 m of a wall's thickness.
+    """
+    return _points(_box(4, 4, 7), arm=21)
+
+
+def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) -> Array:
+    """Transform points to the world frame [m], shape (n, k, 3).
 
     Args:
-        pipe: The hollow cylinder.
-        points: Points [m], world frame, shape (..., 3).
+        points: Points in the body frame.
+        positions: Positions of the base [m], world frame, shape (n, 3).
+        orientations_wxyz: Orientations, each a unit quaternion, body to world, shape (n, 4).
+    """
+    w, x, y, z = np.moveaxis(orientations_wxyz, -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    rotation = np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    placed: Array = points.positions @ rotation.transpose(0, 2, 1)
+    placed += positions[:, None, :]
+    return placed
 
-    Returns:
-        Distance [m], shape (...): negative inside the wall, positive outside and in the bore.
+
+def distance_to_pipe(pipe: Pipe, points: Array) -> Array:
+    """Compute the distance of points [m], world frame, shape (..., 3), to a pipe's wall.
+
+    In the plane of s (along the axis) and r (distance from the axis) the wall is a rectangle. The
+    result is the distance to that rectangle [m], shape (...): negative inside the wall.
     """
     relative = points - np.asarray(pipe.centre)
     s = relative @ np.asarray(pipe.axis)
@@ -74,31 +116,20 @@ def clearance_per_pipe(
 
 
 def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) -> Array:
-    """Compute the robot's distance from the wall of the nearest pipe.
+    """Compute the robot's distance from the nearest wall of `clearance_per_pipe` [m], shape (n,).
 
-    Args:
-        scene: The scene.
-        positions: Positions of the base [m], world frame, shape (n, 3).
-        orientations_wxyz: Orientations of the base, unit quaternions, body to world, shape (n, 4).
-
-    Returns:
-        Distance [m], negative in a wall, infinite in a scene without pipes, shape (n,).
+    The distance is infinite in a scene without pipes.
     """
-    nearest: Array = clearance_per_pipe(scene, positions, orientations_wxyz).min(
-        axis=1, initial=np.inf
-    )
+    distances = clearance_per_pipe(scene, positions, orientations_wxyz)
+    nearest: Array = distances.min(axis=1, initial=np.inf)
     return nearest
 
 
 def pipe_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:
-    """Find the pipe whose bore contains the base.
+    """Find the first pipe whose bore contains the base, by index; -1 for none, shape (n,).
 
-    Args:
-        scene: The scene.
-        positions: Positions of the base [m], world frame, shape (n, 3).
-
-    Returns:
-        Index of the first such pipe, or -1, shape (n,).
+    In a bore |s| <= half the length and r < the inner radius; see `distance_to_pipe`. `positions`
+    are those of the base [m], world frame, shape (n, 3).
     """
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     result = np.full(len(at), -1, dtype=np.int64)
@@ -111,14 +142,24 @@ def pipe_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:
     return result
 
 
-def inside_pipe(scene: Scene, positions: ArrayLike) -> NDArray[np.bool_]:
-    """Tell whether the base is in a bore: |s| <= half the length, r < the inner radius.
+def _points(box: Array, arm: int) -> Spheres:
+    along = np.linspace(0, ARM_LENGTH, arm)
+    parts = [np.stack([along, np.zeros(arm), np.full(arm, ARM_HEIGHT)], axis=1)]
+    for x, y in ((ROTOR_ARM, 0), (0, ROTOR_ARM), (-ROTOR_ARM, 0), (0, -ROTOR_ARM)):
+        for side in (-ROTOR_HALF_THICKNESS, ROTOR_HALF_THICKNESS):
+            parts.append(_ring(x, y, ROTOR_HEIGHT + side, ROTOR_RADIUS, 24))
+    parts += [box, *(_ring(0, 0, z, ROD_RADIUS, 8) for z in (ROD_BOTTOM, ROD_TOP))]
+    positions = np.concatenate(parts)
+    return Spheres(positions, np.where(np.arange(len(positions)) < arm, ARM_RADIUS, 0.0))
 
-    Args:
-        scene: The scene.
-        positions: Positions of the base [m], world frame, shape (n, 3).
 
-    Returns:
-        True where the base is in a bore, shape (n,).
-    """
-    return pipe_index(scene, positions) >= 0
+def _ring(x: float, y: float, z: float, radius: float, count: int) -> Array:
+    angle = np.arange(count) * (2 * np.pi / count)
+    return np.stack(
+        [x + radius * np.cos(angle), y + radius * np.sin(angle), np.full(count, z)], axis=1
+    )
+
+
+def _box(nx: int, ny: int, nz: int) -> Array:
+    axes = [np.linspace(-half, half, n) for half, n in zip(BASE_HALF, (nx, ny, nz), strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -6,7 +6,7 @@ from cloudrc.messages import Vector
 
 LOW: Vector = (-3.0, -8.5, 0.0)
 HIGH: Vector = (9.2, 5.5, 2.5)
-"""Opposite corners of the box in which the robot's base stays [m], world frame.
+"""Opposite corners of the fence [m], world frame.
 Source: docs/reference/plant.md, "Fence of the guard"."""
 FLOOR_MARGIN = 0.35
 """Smallest height of a hold point above the fence's floor [m]. At a smaller height, a tilted robot
@@ -21,11 +21,3 @@ INNER_HIGH: Vector = (HIGH[0] - WALL_MARGIN, HIGH[1] - WALL_MARGIN, HIGH[2] - WA
 def inside(position: Vector) -> bool:
     """Tell whether a base at `position` [m], world frame, shape (3,), is inside the fence."""
     return all(low <= value <= high for low, value, high in zip(LOW, position, HIGH, strict=True))
-
-
-def clamp(position: Vector) -> Vector:
-    """Return the point inside the fence nearest to `position` [m], world frame, shape (3,)."""
-    x, y, z = (
-        min(max(value, low), high) for low, value, high in zip(LOW, position, HIGH, strict=True)
-    )
-    return x, y, z

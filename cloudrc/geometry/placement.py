@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cloudrc.geometry import fence
-from cloudrc.geometry.clearance import clearance_per_pipe
-from cloudrc.geometry.robot import Array, robot_points
+from cloudrc.geometry.clearance import Array, clearance_per_pipe, robot_points
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
@@ -17,47 +16,39 @@ more than 32 mm, the steady error of a hover with the published gains."""
 STEP_MIN = 0.02
 """Shortest step along a way [m]; without it, the check of a way near a wall would never end."""
 _SEARCH = 1.5  # [m] largest distance of a suggested legal point
-_AT_ONCE = 50  # [1] candidates whose ways are looked at together
-_FAR = 1e3  # [m] positions beyond it would overflow
+_AT_ONCE = 50  # candidates whose ways are looked at together
+_FAR = 1e3  # [m] limit of coordinates, so that no square overflows
 
 
 def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]:
-    """Tell which positions are outside the box in which the guard lets the robot fly.
+    """Tell which positions [m], world frame, shape (n, 3), are where the guard does not fly.
 
-    Args:
-        positions: Positions of the base [m], world frame, shape (n, 3).
-        slack: Positions up to this distance outside the box still count as inside [m], shape () or
-            (n,).
+    Positions up to `slack` [m], shape () or (n,), outside the guard's box still count as inside.
     """
+    positions = np.clip(positions, -_FAR, _FAR)
     nearest = np.clip(positions, fence.INNER_LOW, fence.INNER_HIGH)
-    near = np.all(np.abs(positions) < _FAR, axis=1)
-    beyond = np.linalg.norm(np.where(near[:, None], positions - nearest, _FAR), axis=1)
-    outside: NDArray[np.bool_] = beyond > np.asarray(slack) + 1e-9
+    outside: NDArray[np.bool_] = (
+        np.linalg.norm(positions - nearest, axis=1) > np.asarray(slack) + 1e-9
+    )
     return outside
 
 
 def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
-    """Find the pipe whose wall the robot, rotors included, would touch.
+    """Find the pipe within `CLEARANCE_MIN` of the level robot, by index; -1 for none, shape (n,).
 
     Args:
         scene: The scene; its board does not count.
         positions: Positions of the base [m], world frame, shape (n, 3).
-        yaws: Headings of the level robot [rad], shape (n,).
-
-    Returns:
-        Index of the nearest pipe if its distance is below `CLEARANCE_MIN`, else -1, shape (n,).
+        yaws: Headings of the robot [rad], shape (n,).
     """
-    result = np.full(len(positions), -1, dtype=np.int64)
-    near = np.flatnonzero(np.all(np.abs(positions) < _FAR, axis=1))
-    if len(near) == 0 or not scene.pipes:
-        return result
-    distance = _distances(scene, positions[near], yaws[near])
-    result[near] = np.where(distance.min(axis=1) < CLEARANCE_MIN, distance.argmin(axis=1), -1)
-    return result
+    if not scene.pipes:
+        return np.full(len(positions), -1, dtype=np.int64)
+    distance = _distances(scene, np.clip(positions, -_FAR, _FAR), yaws)
+    return np.where(distance.min(axis=1) < CLEARANCE_MIN, distance.argmin(axis=1), -1)
 
 
 def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
-    """Find the pipe that the robot, level and with yaw 0, would touch on a straight way.
+    """Find the first pipe that the robot, level and with yaw 0, would touch on a straight way.
 
     The check moves along each way in steps as long as the robot's distance from the nearest wall.
     A robot that begins nearer to a wall than `CLEARANCE_MIN` may move away from that wall.
@@ -68,26 +59,25 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
         ends: Ends of the ways [m], world frame, likewise, shape (n, 3).
 
     Returns:
-        Index of the first such pipe, or -1, shape (n,).
+        Index of the pipe, or -1, shape (n,).
     """
     result = np.full(len(starts), -1, dtype=np.int64)
     length = np.linalg.norm(ends - starts, axis=1)
     flown = np.zeros(len(starts))
-    least = np.full(len(starts), CLEARANCE_MIN)
+    least = np.full(len(starts), np.inf)
     flying = np.arange(len(starts) if scene.pipes else 0)
-    first = True
     while len(flying):
         share = flown[flying] / np.maximum(length[flying], 1e-12)
         at = starts[flying] + share[:, None] * (ends - starts)[flying]
         distances = _distances(scene, at, np.zeros(len(at)))
         nearest = distances.min(axis=1)
-        if first:  # where the robot is, it may be
-            least, first = np.minimum(least, nearest - STEP_MIN), False
+        if np.isinf(least).any():  # where the robot begins, it may be
+            least = np.minimum(CLEARANCE_MIN, nearest - STEP_MIN)
         touching = nearest < least[flying]
         result[flying[touching]] = distances[touching].argmin(axis=1)
-        is_over = touching | (flown[flying] >= length[flying])
-        step = np.maximum(nearest - CLEARANCE_MIN, STEP_MIN)[~is_over]
-        flying = flying[~is_over]
+        going = ~touching & (flown[flying] < length[flying])
+        step = np.maximum(nearest - CLEARANCE_MIN, STEP_MIN)[going]
+        flying = flying[going]
         flown[flying] = np.minimum(flown[flying] + step, length[flying])
     return result
 
@@ -95,7 +85,7 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
 def find_nearest_legal(
     scene: Scene, position: Vector, yaw: float, before: Vector | None = None
 ) -> Vector | None:
-    """Find a legal point near a position.
+    """Find a point within 1.5 m that the guard lets the robot reach and that overlaps no pipe.
 
     The search goes along x, y and z, and towards and away from the axes of the pipes. All
     candidates are whole centimetres, so that the checked point is printed without rounding.
@@ -105,10 +95,6 @@ def find_nearest_legal(
         position: Position of the base [m], world frame, shape (3,).
         yaw: Heading [rad].
         before: Start of the straight way to the point [m], shape (3,); None if it is unknown.
-
-    Returns:
-        A point that the guard lets the robot reach and that overlaps no pipe [m], shape (3,);
-        None if there is no such point within 1.5 m.
     """
     start = np.clip(position, fence.INNER_LOW, fence.INNER_HIGH)
     directions = [*np.eye(3), *-np.eye(3)]

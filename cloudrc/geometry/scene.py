@@ -1,7 +1,7 @@
 """Read the pipes, the board and the floor of a scene from its MJCF file.
 
-The file describes the bodies for MuJoCo. For programs without a physics engine, the file repeats
-the ideal shapes as numbers: `<custom><numeric name="pipe_1" data="..."/>`, in metres, world frame.
+For programs without MuJoCo, the file repeats the ideal shapes as numbers:
+`<custom><numeric name="pipe_1" data="..."/>`, in metres, world frame.
 
 | name | data |
 |---|---|
@@ -87,64 +87,44 @@ def load_scene(name: str) -> Scene:
         BadInputError: If the file does not exist, or its numbers do not fit the table in the
             docstring of this module.
     """
-    return read_scene(Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml")
-
-
-def read_scene(path: Path) -> Scene:
-    """Read the scene in an MJCF file.
-
-    Raises:
-        BadInputError: If the file does not exist, or its numbers do not fit the table.
-    """
+    path = Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml"
     try:
         root = ElementTree.parse(path).getroot()
+        numerics = [(n.get("name", ""), n.get("data", "")) for n in root.iterfind("custom/numeric")]
+        pipes = tuple(_pipe(name, data) for name, data in numerics if name.startswith("pipe_"))
+        board, floor = None, 0.0
+        for name, data in numerics:
+            if name == "board":
+                x, *spans = _numbers(name, data, 5)
+                board = Board(x, (spans[0], spans[1]), (spans[2], spans[3]))
+            elif name == "floor":
+                (floor,) = _numbers(name, data, 1)
+        frame = root.find("./worldbody/frame[@name='spawn']")
+        x, y, z = SPAWN if frame is None else _numbers("spawn", frame.get("pos", "0 0 0"), 3)
     except OSError as error:
         raise BadInputError(f"scene {path.name}: cannot be read: {error.strerror}") from error
     except ElementTree.ParseError as error:
         raise BadInputError(f"scene {path.name}: not readable as XML: {error}") from error
-    pipes: list[Pipe] = []
-    board, floor = None, 0.0
-    for element in root.findall("./custom/numeric"):
-        name = element.get("name", "")
-        if name.startswith("pipe_"):
-            pipes.append(_pipe(path, name, _numbers(path, element, 9)))
-        elif name == "board":
-            x, *spans = _numbers(path, element, 5)
-            board = Board(x, (spans[0], spans[1]), (spans[2], spans[3]))
-        elif name == "floor":
-            (floor,) = _numbers(path, element, 1)
-    frame = root.find("./worldbody/frame[@name='spawn']")
-    spawn = SPAWN if frame is None else _place(path, frame.get("pos", "0 0 0"))
-    return Scene(path.stem, tuple(pipes), board, floor, spawn)
+    except ValueError as error:
+        raise BadInputError(f"scene {path.name}: {error}") from None
+    return Scene(path.stem, pipes, board, floor, (x, y, z))
 
 
-def _pipe(path: Path, name: str, data: list[float]) -> Pipe:
-    cx, cy, cz, ax, ay, az, length, inner, outer = data
+def _pipe(name: str, data: str) -> Pipe:
+    cx, cy, cz, ax, ay, az, length, inner, outer = _numbers(name, data, 9)
     norm = math.hypot(ax, ay, az)
     if norm == 0 or length <= 0 or not 0 < inner < outer:
-        raise BadInputError(
-            f"scene {path.name}: {name}: needs an axis that is not zero, a length above 0 and "
-            "0 < inner < outer radius"
+        raise ValueError(
+            f"{name}: needs an axis that is not zero, a length above 0 and 0 < inner < outer radius"
         )
     return Pipe(name, (cx, cy, cz), (ax / norm, ay / norm, az / norm), length, inner, outer)
 
 
-def _place(path: Path, text: str) -> Vector:
+def _numbers(name: str, data: str, count: int) -> list[float]:
     try:
-        x, y, z = map(float, text.split())
-    except ValueError:
-        raise BadInputError(f"scene {path.name}: spawn: pos must be 3 numbers: {text!r}") from None
-    return x, y, z
-
-
-def _numbers(path: Path, element: ElementTree.Element, count: int) -> list[float]:
-    text = element.get("data", "")
-    try:
-        numbers = [float(word) for word in text.split()]
+        numbers = [float(word) for word in data.split()]
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise BadInputError(
-            f"scene {path.name}: {element.get('name')}: data must be {count} numbers: {text!r}"
-        )
+        raise ValueError(f"{name}: data must be {count} numbers: {data!r}")
     return numbers

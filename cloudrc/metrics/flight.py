@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.config.schema import Criteria
-from cloudrc.geometry.clearance import clearance, inside_pipe, pipe_index
+from cloudrc.geometry.clearance import clearance, pipe_index
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording, Table
@@ -121,7 +121,7 @@ class Flight:
         """Whether the base is inside a pipe, per row of `truth`; empty without pipes."""
         if not len(self.clearance):
             return np.zeros(0, dtype=bool)
-        return inside_pipe(self.scene, self.truth["position"])
+        return pipe_index(self.scene, self.truth["position"]) >= 0
 
     @cached_property
     def pipes_flown(self) -> int:

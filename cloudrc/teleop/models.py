@@ -18,7 +18,7 @@ from cloudrc.config.problems import Problem as ConfigProblem
 from cloudrc.config.problems import from_pydantic
 from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeLimit, Waypoint
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH
+from cloudrc.geometry.clearance import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
 from cloudrc.teleop.store import SHOWN, Order
 from cloudrc.teleop.wire import Leg, Plan

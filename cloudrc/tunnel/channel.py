@@ -1,8 +1,4 @@
-"""Classify the datagrams of one stream by their counters: used, late or repeated.
-
-By default a datagram is used only if it is newer than all earlier ones. The published code uses the
-last to arrive.
-"""
+"""Classify the datagrams of one stream by their counters: used, late or repeated."""
 
 from __future__ import annotations
 
@@ -10,11 +6,8 @@ WINDOW = 1024
 """Number of counters below the newest that a channel remembers [datagrams]."""
 _MASK = (1 << WINDOW) - 1
 
-
 # Outcomes of a datagram, which name the counts.
-USED = "used"
-LATE = "late"
-REPEATED = "repeated"
+USED, LATE, REPEATED = "used", "late", "repeated"
 
 
 class Channel:
@@ -39,10 +32,7 @@ class Channel:
 
     @property
     def is_flooded(self) -> bool:
-        """Whether there are more repeats than sent datagrams.
-
-        No link repeats so many datagrams, so the caller need not record each repeat.
-        """
+        """Whether there are more repeats than sent datagrams; no link repeats so many."""
         return self._repeats > self._newest + 1
 
     def take(self, counter: int) -> str:

@@ -1,12 +1,11 @@
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
 A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body with a fixed
-length for each kind, and a 16-byte tag. This module defines only the layout; `session` seals and
-opens datagrams. `check` and the decoders raise no exception except DecodeError.
+length for each kind, and a 16-byte tag; `session` seals and opens datagrams. The functions raise
+no exception except DecodeError.
 
 The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
-nonce of the cipher. The nonce is unique, because no two datagrams of one direction and epoch have
-the same kind and counter.
+nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
 
 Deviation: the paper's tunnel sends pickled ROS messages. They have 1 kB and can execute code.
 """
@@ -30,14 +29,11 @@ from cloudrc.messages import (
 )
 
 VERSION = 6
-"""Version of the wire format. Each release of cloudrc uses one version and refuses all others.
-
-Version 1 had no tags; version 2 had no basis stamp in requests; version 3 had no cause of the
-guard's state; in version 4 a challenge was shorter than its answer; version 5 had a choice of
-ciphers and several keys in an epoch.
-"""
+"""Version of the wire format. Each release of cloudrc uses one version and refuses all others."""
 DATAGRAM_MAX = 512
 """Size of the receive buffer [bytes]: every valid datagram is shorter, longer ones are refused."""
+NUMBER_MAX = 2**32 - 1
+"""Highest number of an operator request."""
 
 
 class Kind(IntEnum):
@@ -70,18 +66,13 @@ class DecodeError(ValueError):
 
 Header: TypeAlias = tuple[int, int, int, int, int]
 """Version, direction, epoch, kind and counter."""
-Datagram: TypeAlias = tuple[int, int, int, int, bytes]
-"""Kind, direction, epoch and counter from the header, and the body."""
 
 
 class Hello(NamedTuple):
     """Cloud's request for a session.
 
-    Attributes:
-        nonce: 16 bytes that identify the requested session.
-        clock: 16 bytes that identify cloud's monotonic clock.
-        cookie: Cookie from world's challenge, 13 bytes; zeros before the first challenge.
-        epoch: Newest epoch that cloud has had; world continues from this epoch.
+    It names the session and cloud's monotonic clock by 16 random bytes each. The cookie of 13 bytes
+    is that of world's challenge, or zeros. World continues from `epoch`, cloud's newest.
     """
 
     nonce: bytes
@@ -91,52 +82,36 @@ class Hello(NamedTuple):
 
 
 class Accept(NamedTuple):
-    """World's acceptance; the header holds the epoch of the session.
-
-    Attributes:
-        nonce: Nonce of the answered hello.
-        world_nonce: 16 bytes that identify world's process.
-        clock: 16 bytes that identify world's monotonic clock.
-    """
+    """World's acceptance: the hello's nonce, 16 bytes for world's process, 16 for its clock."""
 
     nonce: bytes
     world_nonce: bytes
     clock: bytes
 
 
-_HEADER = struct.Struct("<BBIxBQ")  # the pad byte is 0
-_TELEMETRY = struct.Struct("<q3d4d3d3ddqqqIdIQHBB")
-_STAMPS = struct.Struct(f"<q{struct.calcsize('<3d4d3d3ddqq')}xq")
-_COMMAND = struct.Struct("<qqq3dd")
-_OPERATOR = struct.Struct("<IBBQHq")
-# The greetings are as long as in version 5: a link with a limited rate delays all as before.
-_HELLO = struct.Struct("<16s16s13sI")
-_ACCEPT = struct.Struct("<16s16s16sx")
-_CHALLENGE = struct.Struct("<13s36x")  # as long as the hello that answers it
-_BUSY = struct.Struct("<16sx")
 COOKIE_SIZE = 13
 """Size of a cookie [bytes]."""
-
-NUMBER_MAX = 2**32 - 1
-"""Highest number of an operator request."""
-
-_new = tuple.__new__  # makes a named tuple four times as fast as its class does
-_unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
-HEADER_SIZE = _HEADER.size
-BODY_SIZES = {
-    Kind.HELLO: _HELLO.size,
-    Kind.ACCEPT: _ACCEPT.size,
-    Kind.CHALLENGE: _CHALLENGE.size,
-    Kind.BUSY: _BUSY.size,
-    Kind.TELEMETRY: _TELEMETRY.size,
-    Kind.COMMAND: _COMMAND.size,
-    Kind.OPERATOR: _OPERATOR.size,
-    Kind.ALIVE: 0,
+_HEADER = struct.Struct("<BBIxBQ")  # the pad byte is 0
+_BODIES = {
+    Kind.HELLO: struct.Struct("<16s16s13sI"),
+    Kind.ACCEPT: struct.Struct("<16s16s16sx"),
+    Kind.CHALLENGE: struct.Struct("<13s36x"),  # as long as the hello that answers it
+    Kind.BUSY: struct.Struct("<16sx"),
+    Kind.TELEMETRY: struct.Struct("<q3d4d3d3ddqqqIdIQHBB"),
+    Kind.COMMAND: struct.Struct("<qqq3dd"),
+    Kind.OPERATOR: struct.Struct("<IBBQHq"),
+    Kind.ALIVE: struct.Struct(""),
 }
+_HELLO, _ACCEPT, _CHALLENGE, _BUSY, _TELEMETRY, _COMMAND, _OPERATOR, _ = _BODIES.values()
+BODY_SIZES = {kind: body.size for kind, body in _BODIES.items()}
 LAST_GREETING = int(Kind.BUSY)
-TAG_SIZE = 16
+HEADER_SIZE, TAG_SIZE = _HEADER.size, 16
 SIZES = {int(kind): HEADER_SIZE + size + TAG_SIZE for kind, size in BODY_SIZES.items()}
+
+_GUARD_STATES, _CAUSES = tuple(GuardState), tuple(Cause)
+_new = tuple.__new__  # makes a named tuple four times as fast as its class does
 _size_of = SIZES.get
+_unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
 
 
 def encode_header(kind: int, direction: int, epoch: int, counter: int) -> bytes:
@@ -145,12 +120,11 @@ def encode_header(kind: int, direction: int, epoch: int, counter: int) -> bytes:
 
 
 def check(data: bytes) -> Header:
-    """Decode a datagram's header and check version, direction, kind and length.
-
-    The header is not authenticated yet.
+    """Decode a datagram's header, which is not authenticated yet.
 
     Raises:
-        DecodeError: "version" for a wrong version, "malformed" for any other error.
+        DecodeError: "version" for a wrong version; "malformed" for a wrong direction, kind or
+            length.
     """
     size = len(data)
     if size < HEADER_SIZE:
@@ -212,12 +186,6 @@ def decode_telemetry(body: bytes) -> Telemetry:
     # fmt: on
 
 
-def decode_stamps(body: bytes) -> tuple[int, int]:
-    """Decode only the stamp and the slip [ns] of a TELEMETRY datagram."""
-    stamp_ns, slip_ns = _STAMPS.unpack_from(body)
-    return stamp_ns, slip_ns
-
-
 def encode_command(command: Command) -> bytes:
     """Encode the body of a COMMAND datagram."""
     stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate = command
@@ -232,20 +200,16 @@ def decode_command(body: bytes) -> Command:
 
 def encode_operator(request: OperatorRequest) -> bytes:
     """Encode the body of an OPERATOR datagram; the header holds the request's epoch."""
-    number, kind, start, mission_id, reached, basis_stamp_ns, _ = request
-    return _OPERATOR.pack(number, kind, start, mission_id, reached, basis_stamp_ns)
+    return _OPERATOR.pack(*request[:-1])
 
 
 def decode_operator(body: bytes) -> OperatorRequest:
     """Decode the body of an OPERATOR datagram."""
     number, kind, start, mission_id, reached, basis_stamp_ns = _OPERATOR.unpack(body)
-    if mission_id >> 63:  # a recording holds signed 64-bit integers
+    # A recording holds signed 64-bit integers.
+    if mission_id >> 63 or kind >= len(Request) or start >= len(Start):
         raise DecodeError("malformed")
-    try:
-        kind_and_start = Request(kind), Start(start)
-    except ValueError:
-        raise DecodeError("malformed") from None
-    return OperatorRequest(number, *kind_and_start, mission_id, reached, basis_stamp_ns)
+    return OperatorRequest(number, Request(kind), Start(start), mission_id, reached, basis_stamp_ns)
 
 
 def encode_hello(hello: Hello) -> bytes:
@@ -268,9 +232,10 @@ def decode_accept(body: bytes) -> Accept:
     return Accept(*_ACCEPT.unpack(body))
 
 
-def encode_challenge(cookie: bytes) -> bytes:
-    """Encode the body of a CHALLENGE datagram: a cookie, then zeros."""
-    return _CHALLENGE.pack(cookie)
+encode_challenge: Callable[[bytes], bytes] = _CHALLENGE.pack
+"""Encode the body of a CHALLENGE datagram: a cookie, then zeros."""
+encode_busy: Callable[[bytes], bytes] = _BUSY.pack
+"""Encode the body of a BUSY datagram: the nonce of the answered hello."""
 
 
 def decode_challenge(body: bytes) -> bytes:
@@ -278,14 +243,6 @@ def decode_challenge(body: bytes) -> bytes:
     return body[:COOKIE_SIZE]
 
 
-def encode_busy(nonce: bytes) -> bytes:
-    """Encode the body of a BUSY datagram: the nonce of the answered hello."""
-    return _BUSY.pack(nonce)
-
-
 def decode_busy(body: bytes) -> bytes:
     """Decode the nonce from the body of a BUSY datagram."""
     return body[:-1]
-
-
-_GUARD_STATES, _CAUSES = tuple(GuardState), tuple(Cause)

@@ -7,16 +7,11 @@
                                         <--    ACCEPT (nonce, world's nonce, clock), a new epoch
                                             or BUSY (nonce)
 
-Every greeting (hello or answer) has a tag by a pre-shared key. World does not answer a hello
-without a valid tag, and authenticates its answer with the key of the hello. A hello with a cookie
-is answered once per counter. No answer is longer than its hello.
-
-The cookie is a MAC over a time slot of two seconds. So world stores nothing for a hello without a
-cookie, and a captured hello is useless after four seconds.
-
-World sends at most ten challenges per second. An attacker who repeats a captured hello can use up
-only these challenges. The true cloud can use the same challenges, because a challenge names no
-receiver.
+Every greeting has a tag by a pre-shared key; world authenticates its answer with the key of the
+hello. No answer is longer than its hello. The cookie is a MAC over a time slot, so world stores
+nothing for a hello without a cookie, and a captured hello is useless after two slots. A hello with
+a cookie is answered once per counter. World sends at most ten challenges per second, which name no
+receiver: the true cloud can use those that somebody else has provoked.
 
 The cloud with the session keeps it while world hears this cloud: at least one new sealed datagram
 per `command_age_max`. Otherwise another cloud can get a session under the next epoch. Epochs rise
@@ -34,21 +29,9 @@ from collections import deque
 from typing import NamedTuple
 
 from cloudrc.records import Fault
+from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, Channel
-from cloudrc.tunnel.codec import (
-    COOKIE_SIZE,
-    LAST_GREETING,
-    VERSION,
-    Accept,
-    DecodeError,
-    Hello,
-    Kind,
-    encode_accept,
-    encode_busy,
-    encode_challenge,
-    encode_hello,
-    peek,
-)
+from cloudrc.tunnel.codec import Accept, DecodeError, Hello, Kind
 from cloudrc.tunnel.session import NO_EPOCH, Session
 
 EPOCH_MAX = 2**32 - 1
@@ -63,7 +46,7 @@ REPEATS_MAX = 3
 """How often world repeats its acceptance to a cloud that it does not hear."""
 CLOUDS_MAX = 64
 """Number of nonces of which world remembers the newest counter."""
-NO_COOKIE = bytes(COOKIE_SIZE)
+NO_COOKIE = bytes(codec.COOKIE_SIZE)
 """Cookie of the first hello."""
 REPLIES_MAX = 3
 """Largest number of challenges that cloud answers between two periodic hellos."""
@@ -79,13 +62,7 @@ def is_newer(epoch: int, than: int) -> bool:
 
 
 class HelloAnswer(NamedTuple):
-    """World's answer to a hello.
-
-    Attributes:
-        outcome: Name under which the hello is counted.
-        datagrams: Datagrams to send: none or one.
-        opened: Whether the hello has opened a new session.
-    """
+    """World's answer to a hello: name of its count, datagrams, and whether it opened a session."""
 
     outcome: str
     datagrams: list[bytes]
@@ -136,19 +113,13 @@ class ServerHandshake:
         self.hear(now_ns)
 
     def receive_hello(self, hello: Hello, counter: int, now_ns: int) -> HelloAnswer:
-        """Answer the hello that `Session.open` has just verified.
-
-        Args:
-            hello: Body of the hello.
-            counter: Counter in the header of the hello.
-            now_ns: Monotonic clock [ns].
-        """
+        """Answer at `now_ns` [ns] the hello that `Session.open` has just verified."""
         session, key = self._session, self._session.greeting_key
         if not self._has_cookie(hello, now_ns):
             if now_ns - self._challenged_ns < CHALLENGE_NS:
                 return HelloAnswer("unanswered", [])
             self._challenged_ns = now_ns
-            challenge = encode_challenge(self._cookie(now_ns))
+            challenge = codec.encode_challenge(self._cookie(now_ns))
             return HelloAnswer("hello", [session.greet(Kind.CHALLENGE, challenge, key)])
         if counter <= self._counters.get(hello.nonce, -1):
             return HelloAnswer(REPEATED, [])
@@ -157,7 +128,9 @@ class ServerHandshake:
             if self._keeps_epoch(now_ns):  # cloud takes the answer's key as the key of the epoch
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
-            return HelloAnswer("busy", [session.greet(Kind.BUSY, encode_busy(hello.nonce), key)])
+            return HelloAnswer(
+                "busy", [session.greet(Kind.BUSY, codec.encode_busy(hello.nonce), key)]
+            )
         self._incumbent = hello
         if is_newer(hello.epoch, self._epoch):
             self._epoch = hello.epoch
@@ -174,12 +147,8 @@ class ServerHandshake:
     def _keeps_epoch(self, now_ns: int) -> bool:
         """Decide whether the cloud with the session keeps its epoch or gets the next epoch.
 
-        The cloud gets the next epoch in these cases:
-
-        - The session has no epoch any more.
-        - The hello has the newest key, and the epoch has an older key.
-        - The cloud has asked more than `REPEATS_MAX` times, and either world does not hear it or
-          the hello has another key than the epoch.
+        It gets the next epoch if the epoch has ended or has an older key than the hello's, or if it
+        has asked often although world does not hear it or its hello has another key than the epoch.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -204,29 +173,22 @@ class ServerHandshake:
 
     def _accept(self) -> bytes:
         accept = Accept(self._incumbent.nonce, self._nonce, self._clock)
-        return self._session.greet(Kind.ACCEPT, encode_accept(accept))
+        return self._session.greet(Kind.ACCEPT, codec.encode_accept(accept))
 
     def _cookie(self, now_ns: int, slots_ago: int = 0) -> bytes:
         slot = now_ns // COOKIE_NS - slots_ago
-        return hmac.digest(self._cookies, b"%d" % slot, hashlib.sha256)[:COOKIE_SIZE]
+        return hmac.digest(self._cookies, b"%d" % slot, hashlib.sha256)[: codec.COOKIE_SIZE]
 
     def _has_cookie(self, hello: Hello, now_ns: int) -> bool:
-        return any(
-            hmac.compare_digest(hello.cookie, self._cookie(now_ns, slots_ago))
-            for slots_ago in (0, 1)
-        )
+        cookies = (self._cookie(now_ns), self._cookie(now_ns, slots_ago=1))
+        return any(hmac.compare_digest(hello.cookie, cookie) for cookie in cookies)
 
 
 class ClientHandshake:
     """Cloud's side of the handshake: make hellos and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes) -> None:
-        """Begin without a session.
-
-        Args:
-            nonce: 16 bytes that identify this process, new at every start.
-            clock: 16 bytes that identify the monotonic clock of this process.
-        """
+        """Begin without a session; `nonce` and `clock` are as in `ServerHandshake`."""
         self._seed, self._clock = nonce, clock
         self._nonce, self._nonces = nonce, 0
         self._epoch = NO_EPOCH  # the newest one
@@ -262,15 +224,9 @@ class ClientHandshake:
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
         """Handle an acceptance; return cloud's and world's nonce for the new epoch, or None.
 
-        Cloud accepts another world process only while cloud asks for a session, because a late
-        datagram of a dead world process may arrive. If cloud has accepted a dead process
-        nevertheless, the living process counts as old. When the living process answers again, cloud
-        asks under a new nonce.
-
-        Args:
-            epoch: Epoch in the header.
-            accept: Body of the datagram.
-            asks: Whether cloud asks for a session, because it has none or does not hear world.
+        Cloud accepts another world process only while cloud asks for a session (`asks`), because a
+        late datagram of a dead process may arrive. If cloud has accepted a dead process even so,
+        the living process counts as old; when it answers again, cloud asks under a new nonce.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):
@@ -288,7 +244,7 @@ class ClientHandshake:
         return accept.nonce + accept.world_nonce
 
     def _hello(self) -> bytes:
-        return encode_hello(Hello(self._nonce, self._clock, self._cookie, self._epoch))
+        return codec.encode_hello(Hello(self._nonce, self._clock, self._cookie, self._epoch))
 
 
 VERSION_TEXT = "peer speaks v{}, we speak v{}: run the same version of cloudrc at both ends"
@@ -303,7 +259,6 @@ class HandshakeLog:
     """Log why there is no session: each reason once, until the next session begins."""
 
     def __init__(self) -> None:
-        """Begin with nothing logged."""
         self._logged: set[str] = set()
 
     def forget(self) -> None:
@@ -311,25 +266,17 @@ class HandshakeLog:
         self._logged.clear()
 
     def about(self, outcome: str, data: bytes, now_ns: int) -> list[Fault]:
-        """Log at `now_ns` [ns] why a datagram was refused while there is no session.
-
-        Args:
-            outcome: Text of the DecodeError.
-            data: The datagram.
-            now_ns: Own clock [ns].
-        """
+        """Log at `now_ns` [ns] why a datagram was refused; `outcome` is the DecodeError's text."""
         if outcome == "version":
-            text = VERSION_TEXT.format(data[0], VERSION)
-            return self.say("version", text, now_ns)
-        if outcome == "tag" and peek(data)[0] <= LAST_GREETING:
+            return self.say("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)
+        if outcome == "tag" and codec.peek(data)[0] <= codec.LAST_GREETING:
             return self.say("key", KEY_TEXT, now_ns)
         return []
 
     def say(self, code: str, text: str, now_ns: int) -> list[Fault]:
         """Log a fault at `now_ns` [ns] unless the same text has been logged.
 
-        The comparison uses the text, not the code. Otherwise a forged datagram with a wrong version
-        could hide that the true peer has a wrong version.
+        The text counts, not the code: a forged datagram must not hide the true peer's version.
         """
         if text in self._logged:
             return []

@@ -1,8 +1,7 @@
 """Pre-shared keys, and the text of a key file.
 
-The text form of a `Key` object hides the secret, and a `Key` cannot be pickled. The tunnel uses
-keys that HKDF-SHA256 (RFC 5869) derives from the pre-shared key; each derived key is bound to the
-wire version and to one use.
+The text form of a `Key` hides the secret. The tunnel uses keys that
+HKDF-SHA256 (RFC 5869) derives from the pre-shared key, each bound to the wire version and one use.
 """
 
 from __future__ import annotations
@@ -10,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import hmac
 from dataclasses import dataclass
-from typing import NamedTuple, NoReturn
+from functools import cached_property
+from typing import NamedTuple
 
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
@@ -22,29 +22,31 @@ KEY_SIZE = 32
 _LABEL = b"cloudrc %d " % VERSION
 
 
+@dataclass(frozen=True, repr=False)
 class Key:
     """A secret pre-shared key of 32 bytes.
 
-    Attributes:
-        name: Short public name that distinguishes two keys.
+    Raises:
+        ValueError: If the secret is not 32 bytes long, or if all bytes are zero; the message does
+            not contain the secret.
     """
 
-    __slots__ = ("_secret", "_tag_key", "name")
+    _secret: bytes
 
-    def __init__(self, secret: bytes) -> None:
-        """Make a key from its bytes.
-
-        Raises:
-            ValueError: If the secret is not 32 bytes long, or if all bytes are zero; the message
-                does not contain the secret.
-        """
-        if len(secret) != KEY_SIZE:
-            raise ValueError(f"a key has {KEY_SIZE} bytes, not {len(secret)}")
-        if not any(secret):
+    def __post_init__(self) -> None:
+        if len(self._secret) != KEY_SIZE:
+            raise ValueError(f"a key has {KEY_SIZE} bytes, not {len(self._secret)}")
+        if not any(self._secret):
             raise ValueError("an all-zero key is refused: everybody knows it")
-        self._secret = secret
-        self._tag_key = self.derive(b"", b"greeting")
-        self.name = self.derive(b"", b"name")[:4].hex()
+
+    @cached_property
+    def name(self) -> str:
+        """Short public name that distinguishes two keys."""
+        return self.derive(b"", b"name")[:4].hex()
+
+    @cached_property
+    def _tag_key(self) -> bytes:
+        return self.derive(b"", b"greeting")
 
     def derive(self, salt: bytes, use: bytes) -> bytes:
         """Derive 32 bytes for one use."""
@@ -62,26 +64,12 @@ class Key:
         """Return the secret as hexadecimal text; use it only to write a key file."""
         return self._secret.hex()
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Key) and hmac.compare_digest(self._secret, other._secret)
-
-    def __hash__(self) -> int:
-        return hash(self.name)
-
     def __repr__(self) -> str:
         return f"<key {self.name}>"
 
-    def __reduce__(self) -> NoReturn:
-        raise TypeError("a key is not pickled")
-
 
 class KeySet(NamedTuple):
-    """The content of a key file.
-
-    Attributes:
-        current: The key to use.
-        previous: The previous key, which is still accepted; None if there is none.
-    """
+    """The content of a key file: the key to use, and perhaps its predecessor, still accepted."""
 
     current: Key
     previous: Key | None = None
@@ -115,19 +103,16 @@ def parse(data: bytes) -> KeySet:
         fields = {name: value for name, value in pairs}
     except ValueError:
         raise ValueError(f"neither {KEY_SIZE} bytes nor lines of 'name value'") from None
-    if "current" not in fields or len(fields) != len(pairs) or fields.keys() - _FIELDS:
+    known = {"current", "previous", "overlap_s", "previous_until_s"}
+    if "current" not in fields or len(fields) != len(pairs) or fields.keys() - known:
         raise ValueError("expected the line 'current' and optionally 'previous', each once")
-    return KeySet(
-        _key(fields["current"]), _key(fields["previous"]) if "previous" in fields else None
-    )
+    return KeySet(*(_key(fields[name]) for name in ("current", "previous") if name in fields))
 
 
 def write(keys: KeySet) -> str:
     """Return the text of a key file."""
     lines = ["# A key of cloudrc's tunnel: keep it secret. Made by 'cloudrc key new'."]
-    lines.append(f"current {keys.current.text()}")
-    if keys.previous is not None:
-        lines.append(f"previous {keys.previous.text()}")
+    lines += [f"{name} {key.text()}" for name, key in keys._asdict().items() if key is not None]
     return "\n".join(lines) + "\n"
 
 
@@ -139,6 +124,3 @@ def _key(text: str) -> Key:
     if len(secret) != KEY_SIZE:
         raise ValueError(f"a key has {2 * KEY_SIZE} hexadecimal digits")
     return Key(secret)
-
-
-_FIELDS = {"current", "previous", "overlap_s", "previous_until_s"}

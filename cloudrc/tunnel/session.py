@@ -1,19 +1,15 @@
 """Seal outgoing datagrams and open incoming ones under the keys of one end's session.
 
 Each direction of an epoch has one key, derived by HKDF from a pre-shared key, both ends' nonces and
-the epoch. If one of these inputs changes, captured datagrams become worthless. One key is enough
-for an epoch: 2^32 datagrams take over a year. A datagram changes no state before its tag is
-verified.
+the epoch. One key is enough for an epoch: 2^32 datagrams take over a year. A datagram changes no
+state before its tag is verified.
 
-Each kind of datagram has its own counter, so that greetings and probes do not change the counters
-of telemetry and commands. Counters restart with every epoch, except the counters of greetings
-without an epoch. These continue, because the link draws impairments by the counter: a repeated
-counter would always get the same draw.
+Counters restart with every epoch, except those of greetings without an epoch: the link draws
+impairments by the counter, and a repeated counter would always get the same draw.
 
-Two ends in one process may use an unsealed session: virtual time has no wire to protect, and
-sealing would take a twentieth of the flight's time. Drivers with a socket refuse an unsealed
-session (`Endpoint.sealed`). So a missing key is an error at the start, and never leads to plaintext
-on a wire.
+Two ends in one process need no keys: virtual time has no wire to protect, and sealing would take a
+twentieth of the flight's time. Drivers with a socket refuse such a session (`Endpoint.sealed`), so
+a missing key never leads to plaintext on a wire.
 """
 
 from __future__ import annotations
@@ -25,7 +21,6 @@ from cloudrc.tunnel.codec import (
     HEADER_SIZE,
     LAST_GREETING,
     TAG_SIZE,
-    Datagram,
     DecodeError,
     Direction,
     Kind,
@@ -38,14 +33,15 @@ NO_EPOCH = 0
 """Epoch of an end without a session, and of every hello, challenge and refusal."""
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}
 """Kinds of datagram that belong to no epoch: all greetings except ACCEPT."""
+_PUBLIC_KEY = b"nothing is secret in one process"
 _NO_TAG = bytes(TAG_SIZE)
 
 
 class NoCipher:
-    """Replace the cipher between two ends in one process."""
+    """Replace the cipher between two ends in one process: the tag is zeros."""
 
     def encrypt(self, nonce: bytes, body: bytes, header: bytes) -> bytes:
-        """Append zeros instead of a tag."""
+        """Append zeros."""
         return body + _NO_TAG
 
     def decrypt(self, nonce: bytes, data: bytes, header: bytes) -> bytes:
@@ -58,25 +54,25 @@ class Session:
 
     Attributes:
         epoch: Current epoch; `NO_EPOCH` without a session.
+        sealed: Whether datagrams of the session are encrypted and authenticated.
         ring: The pre-shared keys; `follow_keys` adopts changes.
         greeting_key: Pre-shared key of the last opened greeting.
         epoch_key: Pre-shared key of the epoch.
         is_outdated: Whether the key file has a newer key than the epoch.
     """
 
-    sealed = True
-
-    def __init__(self, sends: Direction, ring: KeyRing) -> None:
+    def __init__(self, sends: Direction, ring: KeyRing | None) -> None:
         """Start without a session.
 
         Args:
             sends: Direction in which this end sends; it opens only datagrams of the other
                 direction.
-            ring: The pre-shared keys.
+            ring: The pre-shared keys; None if both ends are in one process.
         """
-        self.epoch = NO_EPOCH
-        self.ring, self._keys = ring, ring.keys
-        self.greeting_key = self.epoch_key = ring.keys.current
+        self.epoch, self.sealed = NO_EPOCH, ring is not None
+        self.ring = ring or KeyRing(KeySet(Key(_PUBLIC_KEY)))
+        self._keys = self.ring.keys
+        self.greeting_key = self.epoch_key = self._keys.current
         self.is_outdated = False
         self._sends, self._opens = int(sends), 1 - int(sends)
         self._counters = dict.fromkeys(map(int, Kind), 0)
@@ -113,8 +109,8 @@ class Session:
         data = encode_header(kind, self._sends, epoch, counter) + body
         return data + (key or self.epoch_key).tag(data)
 
-    def open(self, data: bytes) -> Datagram:
-        """Verify and decode a datagram; change no state if its tag is wrong.
+    def open(self, data: bytes) -> tuple[int, int, int, bytes]:
+        """Verify a datagram; return its kind, epoch and counter, and its body.
 
         Raises:
             DecodeError: "malformed", "version", "direction" (the direction in which this end
@@ -125,7 +121,7 @@ class Session:
             raise DecodeError("direction")
         self.follow_keys()
         if kind <= LAST_GREETING:
-            return kind, direction, epoch, counter, self._open_greeting(data)
+            return kind, epoch, counter, self._open_greeting(data)
         if epoch != self.epoch or not epoch:
             raise DecodeError("old_epoch")
         try:
@@ -134,7 +130,7 @@ class Session:
             raise DecodeError("tag") from None
         if counter >> 63:  # a recording holds signed 64-bit integers
             raise DecodeError("malformed")
-        return kind, direction, epoch, counter, body
+        return kind, epoch, counter, body
 
     def next_counter(self, kind: int) -> int:
         """Return the counter of the next datagram of this kind."""
@@ -159,31 +155,15 @@ class Session:
 
     def _derive(self, direction: int) -> AESGCM | NoCipher:
         assert self._nonces, "the handshake comes first"
+        if not self.sealed:
+            return NoCipher()
         use = b"session %d %d" % (direction, self.epoch)
         return AESGCM(self.epoch_key.derive(self._nonces, use))
 
 
-class UnsealedSession(Session):
-    """A session for two ends in one process: only its greetings have a tag."""
-
-    sealed = False
-
-    def __init__(self, sends: Direction) -> None:
-        """Start without a session."""
-        super().__init__(sends, KeyRing(KeySet(Key(b"nothing is secret in one process"))))
-
-    def _derive(self, direction: int) -> AESGCM | NoCipher:
-        return NoCipher()
-
-
-def make_session(sends: Direction, ring: KeyRing | None) -> Session:
-    """Make the session of an end: sealed with keys; without keys, unsealed and for one process."""
-    return UnsealedSession(sends) if ring is None else Session(sends, ring)
-
-
-def pair(epoch: int = 1, secret: bytes = b"p" * 32) -> tuple[Session, Session]:
-    """Make world's and cloud's end of a session for tests; equal arguments give equal keys."""
-    ring = KeyRing(KeySet(Key(secret)))
+def pair(epoch: int = 1, secret: bytes | None = b"p" * 32) -> tuple[Session, Session]:
+    """Make both ends of a session, world's first, for tests; None makes unsealed ends."""
+    ring = None if secret is None else KeyRing(KeySet(Key(secret)))
     ends = Session(Direction.UPLINK, ring), Session(Direction.DOWNLINK, ring)
     for end in ends:
         end.begin(epoch, b"cloud".ljust(16) + b"world".ljust(16))

@@ -1,7 +1,11 @@
 """World's end of the tunnel: it receives commands, flies the robot and sends telemetry.
 
 Time advances in `_advance` only. All ticks before a datagram's arrival run before the datagram has
-any effect. Therefore the result does not depend on when the driver wakes up.
+any effect, so the result does not depend on when the driver wakes up.
+
+World's clock follows the machine's monotonic clock and may fall behind: after a stall the robot
+catches up by at most 50 ms per wake. The rest of the stall is slip, by which world's clock lags
+from then on. So the guard never skips a tick, and world's clock never jumps.
 
 World alone assigns epochs. A new epoch begins when a cloud takes control, and when a mission starts
 from the spawn.
@@ -40,33 +44,11 @@ from cloudrc.tunnel.channel import REPEATED, USED, Channel
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.handshake import HandshakeLog, ServerHandshake
 from cloudrc.tunnel.keys import KeyRing
-from cloudrc.tunnel.session import make_session
+from cloudrc.tunnel.session import Session
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Touch
-from cloudrc.world.robot import CATCH_UP_NS, Robot, SimulationClock
+from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
-
-
-class MissionContacts:
-    """What the robot has touched in one mission.
-
-    Attributes:
-        pipes: Number of contacts with pipes.
-        speed: Speed of the tip at its first contact with the board [m/s]; NaN before the first
-            contact.
-    """
-
-    def __init__(self) -> None:
-        self.pipes = 0
-        self.speed = nan
-
-    def note(self, touch: Touch) -> None:
-        """Count a contact that has begun."""
-        if touch.body.startswith("pipe"):
-            self.pipes += 1
-        elif touch.body == "board" and touch.tip and isnan(self.speed):
-            self.speed = hypot(*touch.tip_velocity)
-
 
 START_AGE_MAX_NS = 1_000_000_000
 """Largest age of the telemetry on which a start request is based [ns]. If the experiment allows
@@ -80,67 +62,65 @@ class Orders:
         number: Number of the newest request that was carried out in this session.
         mission_id: The mission that was started last, in any session.
         reached: Number of waypoints of that mission known to be reached; the number never falls.
-        touches: What the robot has touched in this mission.
+        pipes: Number of contacts with pipes in that mission.
+        touch_speed: Speed of the tip at its first contact with the board in that mission [m/s]; NaN
+            before the first contact.
     """
 
     def __init__(
         self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
     ) -> None:
-        """Set the guard and the limits; no request was carried out yet.
+        """Carry out nothing yet; `command_age_max_ns` is the largest age of a command [ns].
 
-        Args:
-            guard: The guard that carries the requests out.
-            counts: Counters of the endpoint; `Orders` counts "start_refused".
-            command_age_max_ns: Largest age of a command's basis [ns].
+        `Orders` counts "start_refused" in `counts`.
         """
         self._guard, self._counts = guard, counts
         self._age_max_ns = max(START_AGE_MAX_NS, command_age_max_ns)
-        self.number = self.mission_id = self.reached = 0
-        self.touches = MissionContacts()
+        self.number = self.mission_id = self.reached = self.pipes = 0
+        self.touch_speed = nan
 
-    def obey(
-        self,
-        request: OperatorRequest,
-        now_ns: int,
-        *,
-        waited: bool,
-    ) -> bool:
-        """Carry out a request, except that the caller has to begin a mission.
+    def note_touch(self, touch: Touch) -> None:
+        """Count a contact that has begun."""
+        if touch.body.startswith("pipe"):
+            self.pipes += 1
+        elif touch.body == "board" and touch.tip and isnan(self.touch_speed):
+            self.touch_speed = hypot(*touch.tip_velocity)
+
+    def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
+        """Carry out a request; return whether the caller must begin a mission.
 
         Args:
             request: The operator's request.
             now_ns: World's clock [ns].
             waited: Whether the request may have waited in the socket during a stall.
 
-        Returns:
-            Whether the caller must begin a mission.
-
         Raises:
             DecodeError: "stale" or "future" for a start that is not recent. Somebody may have
                 delayed the request, and the mission may be over.
         """
-        if request.request is Request.PROGRESS:
-            self._keep_progress(request)
-            return False
-        if request.number <= self.number:
-            return False
-        starts = request.request is Request.START
-        if starts:
-            self._refuse_old(now_ns - request.basis_stamp_ns, waited)
-            # Not carried out, so not confirmed either: the operator must acknowledge first.
-            if self._guard.latched:
-                self._counts["start_refused"] += 1
+        kind, guard = request.request, self._guard
+        starts = kind is Request.START
+        if kind is not Request.PROGRESS:
+            if request.number <= self.number:
                 return False
-        self.number = request.number
-        if starts:
-            self._begin_mission(request)
-        self._keep_progress(request)
-        if request.request is Request.END:
-            self._guard.end_mission(now_ns)
-        elif request.request is Request.ESTOP:
-            self._guard.stop(now_ns)
-        elif request.request is Request.ACKNOWLEDGE:
-            self._guard.acknowledge(now_ns)
+            if starts:
+                self._refuse_old(now_ns - request.basis_stamp_ns, waited)
+                # Not carried out, so not confirmed either: the operator must acknowledge first.
+                if guard.latched:
+                    self._counts["start_refused"] += 1
+                    return False
+            self.number = request.number
+        if starts and (request.mission_id != self.mission_id or request.start is Start.SPAWN):
+            self.mission_id, self.reached = request.mission_id, 0
+            self.pipes, self.touch_speed = 0, nan
+        if request.mission_id == self.mission_id:  # kept on board, for a cloud that restarts
+            self.reached = max(self.reached, request.reached)
+        if kind is Request.END:
+            guard.end_mission(now_ns)
+        elif kind is Request.ESTOP:
+            guard.stop(now_ns)
+        elif kind is Request.ACKNOWLEDGE:
+            guard.acknowledge(now_ns)
         return starts
 
     def _refuse_old(self, age_ns: int, waited: bool) -> None:
@@ -149,36 +129,19 @@ class Orders:
         if age_ns < 0:
             raise DecodeError("future")
 
-    def _begin_mission(self, request: OperatorRequest) -> None:
-        """Reset waypoints and contacts if the mission is new or starts from the spawn."""
-        if request.mission_id != self.mission_id or request.start is Start.SPAWN:
-            self.mission_id, self.reached = request.mission_id, 0
-            self.touches = MissionContacts()
-
-    def _keep_progress(self, request: OperatorRequest) -> None:
-        """Store the mission's progress on board, for a cloud that restarts."""
-        if request.mission_id == self.mission_id:
-            self.reached = max(self.reached, request.reached)
-
 
 REPORT_AGAIN_NS = 10_000_000_000
 """World reports a slowdown as a new fault if none was seen for longer than this [ns]."""
 
 
 class PaceMonitor:
-    """Compares world's clock with the machine's, and reports a world slower than real time.
-
-    A run with such a world is invalid: the robot is slow, not the network.
-    """
+    """Reports a world slower than real time: then the robot is slow, not the network."""
 
     def __init__(self) -> None:
-        self._checked_ns = self._slip_ns = NEVER_NS
-        self._slow_ns = NEVER_NS
+        self._checked_ns = self._slip_ns = self._slow_ns = NEVER_NS
 
     def check(self, now_ns: int, slip_ns: int) -> list[Fault]:
         """Return a fault if world fell behind since the last call, about a second ago.
-
-        The first call only stores the clocks.
 
         Args:
             now_ns: World's clock [ns].
@@ -216,6 +179,8 @@ class WorldIdentity:
 
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
+CATCH_UP_NS = 50_000_000
+"""Longest simulated time by which world catches up in one wake of its loop [ns]."""
 COUNT_PERIOD_NS = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # looking up a member of an enum is slow
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # used in every period
@@ -235,7 +200,7 @@ class WorldEndpoint:
         command_age_max_ns: int,
         start_ns: int = 0,
     ) -> None:
-        """Connect the parts and put the robot on the ground at its spawn.
+        """Connect the parts.
 
         Args:
             robot: The robot, its guard in GROUND.
@@ -247,8 +212,9 @@ class WorldEndpoint:
             start_ns: The monotonic clock now [ns].
         """
         self.robot, self._sensors, self._identity = robot, sensors, identity
-        self._clock, self._pace = SimulationClock(start_ns), PaceMonitor()
-        self._session = make_session(Direction.UPLINK, identity.ring)
+        self._tick_ns, self._slip_ns = start_ns, 0  # world's clock and its lag
+        self._pace = PaceMonitor()
+        self._session = Session(Direction.UPLINK, identity.ring)
         self._door = ServerHandshake(
             self._session, identity.nonce, identity.clock_id, command_age_max_ns
         )
@@ -279,7 +245,7 @@ class WorldEndpoint:
     @property
     def slip_ns(self) -> int:
         """Lag of world's clock behind the monotonic clock [ns]."""
-        return self._clock.slip_ns
+        return self._slip_ns
 
     @property
     def sealed(self) -> bool:
@@ -288,7 +254,7 @@ class WorldEndpoint:
 
     def next_deadline_ns(self) -> int:
         """Return when the next odometry is due [ns], monotonic clock."""
-        return self._odometry_ns + self._clock.slip_ns
+        return self._odometry_ns + self._slip_ns
 
     def handle_deadline(self, now_ns: int) -> None:
         """Run every tick up to and including `now_ns`, and send the telemetry that becomes due."""
@@ -309,7 +275,7 @@ class WorldEndpoint:
         """Handle one datagram. Count and drop an invalid datagram."""
         world_ns = self._follow(now_ns)
         try:
-            kind, _, epoch, counter, body = self._session.open(data)
+            kind, epoch, counter, body = self._session.open(data)
             if kind == COMMAND:
                 self._receive_command(epoch, counter, body, now_ns, world_ns)
             elif kind == Kind.HELLO:
@@ -330,16 +296,19 @@ class WorldEndpoint:
 
         Datagrams that arrive at a wake after a stall may have waited in the socket.
         """
-        world_ns = now_ns - self._clock.slip_ns
-        behind_ns = world_ns - self._clock.tick_ns
+        world_ns = now_ns - self._slip_ns
+        behind_ns = world_ns - self._tick_ns
         if behind_ns > self._command_age_max_ns:
             self._stalled_wake_ns = now_ns
             self._counts["stalls"] += 1
-        return self._clock.follow(now_ns) if behind_ns > CATCH_UP_NS else world_ns
+        if behind_ns <= CATCH_UP_NS:
+            return world_ns
+        self._slip_ns += behind_ns - CATCH_UP_NS
+        return now_ns - self._slip_ns
 
     def _advance(self, until_ns: int) -> None:
         """Run all ticks before `until_ns` [ns], world's clock."""
-        clock, tick_ns = self._clock, self._clock.tick_ns
+        tick_ns = self._tick_ns
         if tick_ns < until_ns and self._waiting is not None:
             self._apply(tick_ns)
         while tick_ns < until_ns:
@@ -347,7 +316,7 @@ class WorldEndpoint:
                 self._send_telemetry(tick_ns)
             odometry_ns = self._odometry_ns
             stop_ns = odometry_ns if odometry_ns < until_ns else until_ns
-            tick_ns = clock.tick_ns = self.robot.run(tick_ns, stop_ns)
+            tick_ns = self._tick_ns = self.robot.run(tick_ns, stop_ns)
 
     def _apply(self, now_ns: int) -> None:
         """Record that the waiting command takes effect at this tick."""
@@ -373,7 +342,7 @@ class WorldEndpoint:
         if simulator.touches:
             for touch in simulator.take_contacts():
                 records.append(Contact(now_ns, **touch._asdict()))
-                self._orders.touches.note(touch)
+                orders.note_touch(touch)
         if epoch := self._session.epoch:
             known = (
                 now_ns,
@@ -381,11 +350,11 @@ class WorldEndpoint:
                 tip_force,
                 self._echo_stamp_ns,
                 now_ns - self._applied_ns if self._applied_ns >= 0 else 0,
-                self._clock.slip_ns,
+                self._slip_ns,
                 orders.number,
                 guard.state,
-                orders.touches.pipes,
-                orders.touches.speed,
+                orders.pipes,
+                orders.touch_speed,
                 orders.mission_id,
                 orders.reached,
                 guard.cause,
@@ -399,7 +368,7 @@ class WorldEndpoint:
             self._counts["held_seconds"] += guard.armed and guard.state is HOLD
             for name, count in sorted((self._counts | guard.counts).items()):
                 records.append(Counted(now_ns, "world", name, count))
-            records += self._pace.check(now_ns, self._clock.slip_ns)
+            records += self._pace.check(now_ns, self._slip_ns)
         self._odometry_ns += ODOMETRY_PERIOD_NS
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
@@ -421,14 +390,14 @@ class WorldEndpoint:
         self._waiting = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._complaints.forget()
-        epoch, now_ns = self._session.epoch, self._clock.tick_ns
+        epoch, now_ns = self._session.epoch, self._tick_ns
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
         for observer in self.robot.observers:
             observer.see_session(now_ns)
 
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
         """Carry out an operator request; a mission from the spawn begins a new epoch."""
-        tick_ns, waited = self._clock.tick_ns, now_ns == self._stalled_wake_ns
+        tick_ns, waited = self._tick_ns, now_ns == self._stalled_wake_ns
         number = self._orders.number
         starts = self._orders.obey(request, tick_ns, waited=waited)
         if starts and request.start is Start.SPAWN:
@@ -451,8 +420,13 @@ class WorldEndpoint:
             self._door.hear(now_ns)
         if outcome == USED:
             self._advance(world_ns)
-            stalled = now_ns == self._stalled_wake_ns
-            outcome = "stale" if stalled else self._offer(command) or USED
+            if now_ns == self._stalled_wake_ns:
+                outcome = "stale"
+            else:
+                rejection = guard.accept_command(command, self._tick_ns)
+                outcome = rejection or USED
+                for observer in self.robot.observers:
+                    observer.see_command(command, rejection, self._tick_ns)
         used = outcome == USED
         delay = (now_ns - command.stamp_ns) * 1e-9 if self._clock_is_shared else nan
         if outcome != REPEATED or not self._channel.is_flooded:
@@ -460,14 +434,6 @@ class WorldEndpoint:
         if used and guard.state is TRACK:
             self._waiting = (epoch, counter, command)
         self._counts[outcome] += 1
-
-    def _offer(self, command: Command) -> str | None:
-        """Give the guard a command; return the reason of a rejection, None if accepted."""
-        tick_ns = self._clock.tick_ns
-        rejection = self.robot.guard.accept_command(command, tick_ns)
-        for observer in self.robot.observers:
-            observer.see_command(command, rejection, tick_ns)
-        return rejection
 
     def _send(self, kind: int, body: bytes) -> None:
         self._datagrams.append(self._session.seal(kind, body))

@@ -1,8 +1,9 @@
 """The onboard low-level controller, which makes the robot follow a velocity at 500 Hz.
 
 A velocity PID gives the force that the robot needs. Geometric attitude control turns the thrust
-axis towards that force. The allocation splits thrust and torque over four rotors. All of this uses
-plain floats, because it runs in every physics step.
+axis towards that force. The allocation splits thrust and torque over four rotors. Vectors and
+torques are plain floats, because this runs in every physics step.
+
 Source: docs/reference/plant.md, "Low-level controller".
 Deviation: the published code assumes dt = 10 ms but runs every 2 ms. This module uses the true
 step, and its gains are converted so that the effect is the same.
@@ -24,12 +25,9 @@ GRAVITY = 9.81
 """Gravity that the controller assumes [m/s^2]; the physics uses 9.8066 m/s^2.
 Source: docs/reference/plant.md, "Gravity"."""
 TILT_GAIN, YAW_GAIN = 1.0, 0.035
-"""Attitude gains (k_R): torque per attitude error [N m]. TILT_GAIN is for x and y, YAW_GAIN for z.
-Source: docs/reference/plant.md, "Low-level controller"."""
+"""Attitude gains (k_R) about x and y, and about z: torque per attitude error [N m]."""
 TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
-"""Rate gains (k_w): torque per angular velocity [N m s]. TILT_RATE_GAIN is for x and y,
-YAW_RATE_GAIN for z.
-Source: docs/reference/plant.md, "Low-level controller"."""
+"""Rate gains (k_w) about x and y, and about z: torque per angular velocity [N m s]."""
 THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
 """Largest thrust of one rotor [N]."""
 TINY = 1e-9
@@ -82,25 +80,16 @@ class LowLevel:
     def update(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
         """Compute the rotor speeds that make the robot follow a velocity; call it every `dt`.
 
-        Args:
-            readings: State of the base.
-            velocity_reference: Wanted velocity [m/s], world frame, shape (3,).
-
-        Returns:
-            Front, left, back, right [rad/s], each in [0, 1838].
+        `velocity_reference` is the wanted velocity [m/s], world frame, shape (3,).
         """
         force = self.force(readings.velocity, velocity_reference)
         return allocate(attitude(force, readings))
 
     def brake(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
-        """Compute the rotor speeds as `update` does, but keep the integral constant.
+        """Follow `velocity_reference` [m/s] as `update` does, but keep the integral constant.
 
         Deviation: the published controller always integrates. Its integral winds up while the robot
         brakes, and pushes the robot back for a second afterwards.
-
-        Args:
-            readings: State of the base.
-            velocity_reference: Wanted velocity [m/s], world frame, shape (3,).
         """
         integral = self._integral
         speeds = self.update(readings, velocity_reference)
@@ -108,23 +97,14 @@ class LowLevel:
         return speeds
 
     def force(self, velocity: Vector, reference: Vector) -> Vector:
-        """Compute the force that the robot needs, and advance the integral by `dt`.
+        """Compute the force that the robot needs [N], and advance the integral by `dt`.
 
-        e = v - v_ref;  F = -(Kp · e + Ki · int(e dt) + Kd · de/dt) + (0, 0, m · g).
-        int(e dt) is clamped.
-        Source: docs/reference/plant.md, "Low-level controller".
-
-        Args:
-            velocity: Velocity of the base [m/s], world frame, shape (3,).
-            reference: Wanted velocity [m/s], world frame, shape (3,).
-
-        Returns:
-            Force [N], world frame, shape (3,).
+        e = v - v_ref;  F = -(Kp · e + Ki · int(e dt) + Kd · de/dt) + (0, 0, m · g), with a clamped
+        integral; `velocity` v and `reference` v_ref are in [m/s]; the frame is the world.
         """
         px, py, pz, ix, iy, iz, dx, dy, dz = self._gains
         limit_xy, limit_z, dt = self._limits
-        vx, vy, vz = velocity
-        rx, ry, rz = reference
+        (vx, vy, vz), (rx, ry, rz) = velocity, reference
         # The opposite sign of the equation saves a negation per term.
         ex, ey, ez = error = (rx - vx, ry - vy, rz - vz)
         # After a reset there is no last error: the rate is 0.
@@ -148,23 +128,15 @@ class LowLevel:
 
 
 def attitude(force: Vector, readings: Readings) -> Effort:
-    """Turn the thrust axis towards `force`, nose along +x.
+    """Turn the thrust axis towards `force` [N], world frame, nose along +x.
 
     z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
     e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R · e_R + k_w · w);
     thrust = F · (R z).
     The code works in the body frame, where the wanted axes are the rows of Q.
-    Source: docs/reference/plant.md, "Low-level controller", with yaw and yaw rate reference 0.
     Deviation: if a collision has turned the robot beyond NOSE_COSINE_MIN or YAW_SINE_MAX (yaw error
     above 17 degrees), the tilt is corrected about the body's present axes. With e_R the correction
     would be off by half the yaw error, and would point the wrong way beyond 90 degrees.
-
-    Args:
-        force: Wanted force [N], world frame, shape (3,).
-        readings: State of the base.
-
-    Returns:
-        Thrust [N] and torque [N m], body frame, shape (4,).
     """
     fx, fy, fz = force
     _, _, _, (p, q, r), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings
@@ -198,13 +170,6 @@ def allocate(effort: Effort) -> RotorSpeeds:
 
     f = T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km) for front, left,
     back, right; w = sqrt(f/kf), limited to [0, 1838 rad/s].
-    Source: docs/reference/plant.md, "Low-level controller".
-
-    Args:
-        effort: Thrust [N] and torque [N m], body frame, shape (4,).
-
-    Returns:
-        Front, left, back, right [rad/s].
     """
     thrust, roll, pitch, yaw = effort
     roll, pitch, yaw = roll / _TWO_ARMS, pitch / _TWO_ARMS, yaw / _FOUR_RATIOS

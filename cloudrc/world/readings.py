@@ -1,7 +1,7 @@
 """The interface between the physics and the onboard part: sensor readings and rotor speeds.
 
 Nothing else passes between the physics (`simulator`) and the onboard part (`low_level`, `guard`,
-`sensors`). Therefore both can run in different processes. This module needs no MuJoCo.
+`sensors`).
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ class Readings(NamedTuple):
     @classmethod
     def of(cls, pose: Iterable[float], twist: Iterable[float]) -> Readings:
         """Make readings from the state of a free joint in MuJoCo.
-
-        The axes are the columns of the rotation matrix of the unit quaternion (w, x, y, z).
 
         Args:
             pose: Position [m] and orientation (wxyz, unit) in the world frame, shape (7,).

@@ -1,13 +1,4 @@
-"""The robot in its scene, and the simulation clock.
-
-In every tick the simulator gives sensor readings to the onboard part (guard and low-level
-controller) and gets four rotor speeds back. Nothing else passes between the two.
-
-World's clock follows the machine's monotonic clock and may fall behind. After a stall the
-simulation catches up by at most 50 ms per wake. The rest of the stall is slip: world's clock lags
-by the slip from then on. Therefore the guard never skips a tick. A stalled machine makes world
-slow, but world's clock never jumps.
-"""
+"""The robot: in every tick, guard and low-level controller turn readings into rotor speeds."""
 
 from __future__ import annotations
 
@@ -25,33 +16,6 @@ STEP_NS = 2_000_000
 Source: docs/reference/plant.md, "Physics step"."""
 STEP = STEP_NS * 1e-9
 """Duration of a tick [s]."""
-CATCH_UP_NS = 50_000_000
-"""Longest simulated time by which world catches up in one wake of its loop [ns]."""
-
-
-class SimulationClock:
-    """World's clock; `tick_ns` is the next tick to run [ns], `slip_ns` its total lag [ns]."""
-
-    def __init__(self, start_ns: int) -> None:
-        """Set world's clock to `start_ns` of the machine's monotonic clock [ns]."""
-        self.tick_ns = start_ns
-        self.slip_ns = 0
-
-    def follow(self, now_ns: int) -> int:
-        """Convert a monotonic time to world time; increase the slip if the wake is over 50 ms late.
-
-        Args:
-            now_ns: The machine's monotonic clock [ns].
-
-        Returns:
-            World time [ns], at most 50 ms after the next tick.
-        """
-        excess = now_ns - self.slip_ns - self.tick_ns - CATCH_UP_NS
-        if excess > 0:
-            self.slip_ns += excess
-        return now_ns - self.slip_ns
-
-
 TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 
 
@@ -59,13 +23,7 @@ class Observer(Protocol):
     """Sees what a robot receives and does, and changes nothing. Times are on world's clock [ns]."""
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
-        """See a step of the physics that has ended.
-
-        Args:
-            now_ns: Beginning of the step.
-            readings: Readings at the beginning of the step, the input of the guard's tick.
-            rotor_speeds: Commanded rotor speeds [rad/s], shape (4,).
-        """
+        """See a step of the physics: when it began, from which readings, with which commands."""
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
         """See a command after the guard's answer; `rejection` is None for an accepted command."""
@@ -78,13 +36,7 @@ class Observer(Protocol):
 
 
 class Robot:
-    """Runs the ticks of physics, guard and low-level controller.
-
-    Attributes:
-        simulator: The physics.
-        guard: The guard.
-        observers: See every step, command, request and session; called in the order of the list.
-    """
+    """Runs the ticks of physics, guard and low-level controller, and tells its `observers`."""
 
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         self.simulator = simulator
@@ -99,11 +51,7 @@ class Robot:
         self.guard.put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run all ticks from `tick_ns` (included) to `until_ns` (excluded), world's clock.
-
-        Returns:
-            The next tick to run [ns].
-        """
+        """Run all ticks from `tick_ns` to before `until_ns`; return the next tick, all [ns]."""
         simulator, guard, low_level = self.simulator, self.guard, self._low_level
         observers = self.observers
         ticks = range(tick_ns, until_ns, STEP_NS)

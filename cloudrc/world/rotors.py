@@ -1,8 +1,7 @@
 """The rotors: they turn commanded speeds into thrusts and a drag wrench.
 
-The code uses plain floats, because it runs in every physics step. The order of the rotors is always
-front (+x), left (+y), back, right. The reaction torque about z is positive for front and back, and
-negative for left and right.
+The order of the rotors is always front (+x), left (+y), back, right. The reaction torque about z is
+positive for front and back, and negative for left and right.
 Source: docs/reference/plant.md, "Robot".
 """
 
@@ -19,10 +18,8 @@ TORQUE_RATIO = 0.016
 """Reaction torque about the rotor's axis per thrust [m]; km in the published model."""
 SPEED_MAX = 1838.0
 """Largest rotor speed [rad/s]."""
-TIME_CONSTANT_UP = 0.0125
-"""Time constant of a rotor that speeds up [s]."""
-TIME_CONSTANT_DOWN = 0.025
-"""Time constant of a rotor that slows down [s]."""
+TIME_CONSTANT_UP, TIME_CONSTANT_DOWN = 0.0125, 0.025
+"""Time constants of a rotor that speeds up and of one that slows down [s]."""
 DRAG_COEFFICIENT = 8.06428e-5
 """Drag per rotor speed and per velocity across the axis [N s^2/m]."""
 ARM = 0.21
@@ -41,11 +38,7 @@ joint requires the wrench's force in the world frame [N] and its torque in the b
 
 
 class Rotors:
-    """Four rotors with lag, thrust and drag.
-
-    Attributes:
-        speeds: Front, left, back, right [rad/s].
-    """
+    """Four rotors with lag, thrust and drag; `speeds` are front, left, back, right [rad/s]."""
 
     def __init__(self, dt: float) -> None:
         """Set the duration of a step, `dt` [s]; the rotors are stopped."""
@@ -64,10 +57,6 @@ class Rotors:
         (u + q · h - r · y, v + r · x - p · h). The hubs have x = (l, 0, -l, 0), y = (0, l, 0, -l).
         The sum of r x F over the hubs is the torque (-h · Fy, h · Fx, sum of x · Fy - y · Fx).
         Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
-
-        Args:
-            commands: Commanded speeds [rad/s], shape (4,).
-            readings: State of the base, for the drag; there is no wind.
         """
         up, down, k = self._up, self._down, THRUST_COEFFICIENT
         front, left, back, right = self.speeds

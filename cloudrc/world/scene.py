@@ -1,10 +1,8 @@
 """Compile a robot and a scene into one MuJoCo model.
 
 The robot may be a user's own model. The onboard controller and the rotors assume fixed numbers,
-such as the mass. A robot with other numbers would fly badly or not at all. Therefore this module
-refuses such a robot, and the message lists the differences.
-
-The other modules of `world` do not import the package `mujoco`; they use this module's import.
+such as the mass; a robot with other numbers is refused, and the message lists the differences.
+The other modules of `world` use this module's import of the package `mujoco`.
 """
 
 from __future__ import annotations
@@ -12,9 +10,9 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,14 +25,13 @@ ROBOT_PREFIX = "robot/"
 ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 """Names of a robot's actuators. Every tuple of four rotor values has the same order."""
 TIMESTEP = 0.002
-"""Step of the physics and of the onboard part [s].
-Source: docs/reference/plant.md, "Physics step"."""
+"""Step of the physics [s]. Source: docs/reference/plant.md, "Physics step"."""
 INERTIA = (0.0121, 0.0116, 0.0226)
 """Inertia about x, y, z for which the attitude gains were tuned [kg m^2]: the pelican's inertia."""
 TIP = (0.40, 0.0, 0.17)
 """Position of the arm's tip, from which clearance is computed [m], body frame."""
 SHOWN = 6
-"""Largest number of differences that one message lists [1]."""
+"""Largest number of differences that one message lists."""
 FOLDER = Path(__file__).parent
 _NO_GL = {"", "disable", "disabled", "off", "false", "0"}
 
@@ -61,9 +58,8 @@ def import_mujoco() -> Any:
             f"the simulator needs MuJoCo ({error}); run: pip install 'cloudrc[world]'"
         ) from None
     finally:
-        if wanted is None:
-            del os.environ["MUJOCO_GL"]
-        else:
+        del os.environ["MUJOCO_GL"]
+        if wanted is not None:
             os.environ["MUJOCO_GL"] = wanted
     return mujoco
 
@@ -74,11 +70,11 @@ mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 
 def model_path(kind: str, name: str) -> Path:
-    """Find the file of a robot or scene.
+    """Find the file of a robot or scene by its shipped name or the path of an .xml file.
 
     Args:
         kind: "robots" or "scenes".
-        name: A shipped file's name without .xml, or the path of an .xml file.
+        name: The name or path.
 
     Raises:
         BadInputError: If the file does not exist; the message lists the shipped ones.
@@ -91,20 +87,15 @@ def model_path(kind: str, name: str) -> Path:
 
 
 def compile_model(robot: str, scene: str) -> Any:
-    """Attach the robot to the scene's frame `spawn` and compile both.
+    """Attach the robot to the scene's frame `spawn` and compile both into an `MjModel`.
 
     Static bodies are fused, which halves the time of a step but loses the names of the bodies.
     Therefore each geom of the scene gets the name BODY/NUMBER, by which a contact finds its body.
-
-    Args:
-        robot: Name or path of the robot's file.
-        scene: Name or path of the scene's file.
-
-    Returns:
-        An `MjModel`; the robot's names begin with `robot/`.
+    The robot's names begin with `robot/`. Both arguments are names or paths of files.
 
     Raises:
-        BadInputError: If a file is missing, cannot be read or does not compile.
+        BadInputError: If a file is missing, cannot be read, does not compile or does not fit the
+            onboard controller.
     """
     robot_path, scene_path = model_path("robots", robot), model_path("scenes", scene)
     try:
@@ -147,95 +138,82 @@ def _check(model: Any, robot_path: Path, scene_path: Path) -> None:
         raise BadInputError(
             f"{scene_path}: option timestep is {model.opt.timestep}, not {TIMESTEP}"
         )
-    differs = [what for what in _facts(model) if not what.fits]
-    if differs:
-        found = "; ".join(
-            f"{what.name} is {what.found:.4g}, not {what.wanted}" for what in differs[:SHOWN]
-        )
-        found += f"; and {len(differs) - SHOWN} more" * (len(differs) > SHOWN)
-        where = (
-            scene_path if all(what.name == "gravity [m/s^2]" for what in differs) else robot_path
-        )
-        raise BadInputError(f"{where}: the onboard controller is not made for it: {found}")
+    gravity = _compare("gravity [m/s^2]", -model.opt.gravity[2:], [GRAVITY], 0.02 * GRAVITY)
+    for path, differs in ((robot_path, _robot_differences(model)), (scene_path, gravity)):
+        if differs:
+            more = [f"and {len(differs) - SHOWN} more"] if len(differs) > SHOWN else []
+            found = "; ".join(differs[:SHOWN] + more)
+            raise BadInputError(f"{path}: the onboard controller is not made for it: {found}")
 
 
-class _Fact(NamedTuple):
-    """A number of a model that the onboard controller relies on.
+def _compare(name: str, found: Iterable[float], wanted: Iterable[float], slack: float) -> list[str]:
+    """Describe values of the model that differ by more than `slack` from the controller's values.
 
-    Attributes:
-        name: Name of the number, with the unit.
-        found: Value in the model.
-        wanted: Values for which the controller is made, in words.
-        fits: Whether the value is near enough.
+    A name with AXIS stands for three values, about or along x, y and z.
     """
-
-    name: str
-    found: float
-    wanted: str
-    fits: bool
-
-
-def _near(name: str, found: float, wanted: float, tolerance: float) -> _Fact:
-    """Compare a value of the model with the value that the controller assumes."""
-    words = f"{wanted:g} +- {tolerance:.2g}"
-    return _Fact(name, found, words, abs(found - wanted) <= tolerance)
+    return [
+        f"{name.replace('AXIS', axis)} is {have:.4g}, not {want:g} +- {slack:.2g}"
+        for axis, have, want in zip("xyz", found, wanted, strict=False)
+        if not abs(have - want) <= slack
+    ]
 
 
-def _facts(model: Any) -> Iterator[_Fact]:
-    """Compare a model with what the onboard controller and the rotors assume.
+def _robot_differences(model: Any) -> list[str]:
+    """Compare a robot with what the onboard controller and the rotors assume.
 
     The tolerances of mass and inertia: the velocity loop compensates for a weight that differs by
     1 N, and the attitude gains work for an inertia that differs by half.
     """
     base = model.jnt_bodyid[0]
-    yield _near("mass [kg]", model.body_mass[base], MASS, 0.1 * MASS)
-    yield _near("gravity [m/s^2]", -model.opt.gravity[2], GRAVITY, 0.02 * GRAVITY)
-    for axis, offset, most in zip("xyz", model.body_ipos[base], (0.01, 0.01, 0.03), strict=True):
-        yield _near(f"centre of mass, {axis} [m]", offset, 0.0, most)
-    axes = np.empty(9)
-    mujoco.mju_quat2Mat(axes, model.body_iquat[base])
-    turned = axes.reshape(3, 3)
+    turned, centre = _axes(model.body_iquat[base]), model.body_ipos[base]
     inertia = np.diag(turned @ np.diag(model.body_inertia[base]) @ turned.T)
+    differs = _compare("mass [kg]", model.body_mass[[base]], [MASS], 0.1 * MASS)
+    differs += _compare("centre of mass, AXIS [m]", centre[:2], (0.0, 0.0), 0.01)
+    differs += _compare("centre of mass, z [m]", centre[2:], [0.0], 0.03)
     for axis, found, wanted in zip("xyz", inertia, INERTIA, strict=True):
-        yield _near(f"inertia about {axis} [kg m^2]", found, wanted, 0.5 * wanted)
-    yield _Fact("damping of the base", max(model.dof_damping), "0", not model.dof_damping.any())
-    tip = model.site(f"{ROBOT_PREFIX}tip").pos
-    for axis, found, wanted in zip("xyz", tip, TIP, strict=True):
-        yield _near(f"tip, {axis} [m]", found, wanted, 0.01)
-    places = ((ARM, 0.0), (0.0, ARM), (-ARM, 0.0), (0.0, -ARM))
-    for number, (x, y) in enumerate(places):
-        yield from _rotor_facts(model, number, (x, y, HEIGHT), 1 if x else -1)
+        differs += _compare(f"inertia about {axis} [kg m^2]", [found], [wanted], 0.5 * wanted)
+    if model.dof_damping.any():
+        differs.append(f"damping of the base is {max(model.dof_damping):.4g}, not 0")
+    differs += _compare("tip, AXIS [m]", model.site(f"{ROBOT_PREFIX}tip").pos, TIP, 0.01)
+    for number, (x, y) in enumerate(((ARM, 0.0), (0.0, ARM), (-ARM, 0.0), (0.0, -ARM))):
+        differs += _rotor_differences(model, number, (x, y, HEIGHT), 1 if x else -1)
+    return differs
 
 
-def _rotor_facts(
+def _rotor_differences(
     model: Any, number: int, place: tuple[float, float, float], sign: int
-) -> Iterator[_Fact]:
+) -> list[str]:
     """Compare one actuator with the rotor at `place` [m], body frame.
 
     `sign` is the sign of the rotor's reaction torque about z.
     """
     name = ROTORS[number]
     if model.actuator_trntype[number] != mujoco.mjtTrn.mjTRN_SITE:
-        yield _Fact(f"{name} transmission", model.actuator_trntype[number], "a site", False)
-        return
-    site = model.actuator_trnid[number, 0]
-    for axis, found, wanted in zip("xyz", model.site_pos[site], place, strict=True):
-        yield _near(f"{name} place, {axis} [m]", found, wanted, 0.01)
-    axes = np.empty(9)
-    mujoco.mju_quat2Mat(axes, model.site_quat[site])
-    gear = model.actuator_gear[number]
-    thrust, torque = axes.reshape(3, 3) @ gear[:3], axes.reshape(3, 3) @ gear[3:]
-    for axis, found, wanted in zip("xyz", thrust, (0.0, 0.0, 1.0), strict=True):
-        yield _near(f"{name} gear, thrust along {axis}", found, wanted, 0.01)
-    for axis, found, wanted in zip("xyz", torque, (0.0, 0.0, sign * TORQUE_RATIO), strict=True):
-        yield _near(f"{name} gear, torque about {axis} [m]", found, wanted, 0.001)
-    yield _near(f"{name} gain", model.actuator_gainprm[number, 0], 1.0, 0.01)
+        return [f"{name} transmission is {model.actuator_trntype[number]}, not a site"]
+    site, gear = model.actuator_trnid[number, 0], model.actuator_gear[number]
+    axes, torque = _axes(model.site_quat[site]), (0.0, 0.0, sign * TORQUE_RATIO)
+    differs = [
+        *_compare(f"{name} place, AXIS [m]", model.site_pos[site], place, 0.01),
+        *_compare(f"{name} gear, thrust along AXIS", axes @ gear[:3], (0.0, 0.0, 1.0), 0.01),
+        *_compare(f"{name} gear, torque about AXIS [m]", axes @ gear[3:], torque, 0.001),
+        *_compare(f"{name} gain", model.actuator_gainprm[number, :1], [1.0], 0.01),
+    ]
     for kind in ("bias", "dyn"):
-        found = getattr(model, f"actuator_{kind}type")[number]
-        yield _Fact(f"{name} {kind}type", found, "0 (none)", found == 0)
+        if found := getattr(model, f"actuator_{kind}type")[number]:
+            differs.append(f"{name} {kind}type is {found}, not 0 (none)")
     for kind in ("ctrl", "force"):
         low, high = getattr(model, f"actuator_{kind}range")[number]
-        free = not getattr(model, f"actuator_{kind}limited")[number]
-        wide = f"at least {THRUST_MAX:.3g}, the largest thrust"
-        yield _Fact(f"{name} {kind}range, end [N]", high, wide, free or high >= THRUST_MAX)
-        yield _Fact(f"{name} {kind}range, begin [N]", low, "0 or less", free or low <= 0.0)
+        if getattr(model, f"actuator_{kind}limited")[number]:
+            if high < THRUST_MAX:
+                wide = f"at least {THRUST_MAX:.3g}, the largest thrust"
+                differs.append(f"{name} {kind}range, end [N] is {high:.4g}, not {wide}")
+            if low > 0.0:
+                differs.append(f"{name} {kind}range, begin [N] is {low:.4g}, not 0 or less")
+    return differs
+
+
+def _axes(quaternion: Any) -> Any:
+    """Return the rotation matrix of a quaternion."""
+    axes = np.empty(9)
+    mujoco.mju_quat2Mat(axes, quaternion)
+    return axes.reshape(3, 3)

@@ -16,13 +16,7 @@ class Sensors:
     def __init__(
         self, position_noise: float, velocity_noise: float, rng: np.random.Generator
     ) -> None:
-        """Set the noise.
-
-        Args:
-            position_noise: Standard deviation per axis [m]; 0 for no noise.
-            velocity_noise: Standard deviation per axis [m/s]; 0 for no noise.
-            rng: Random number generator of the noise.
-        """
+        """Set the deviations per axis, `position_noise` [m] and `velocity_noise` [m/s]; 0: none."""
         self._position_noise, self._velocity_noise = position_noise, velocity_noise
         self._rng = rng
         self._exact = position_noise == velocity_noise == 0.0

@@ -1,11 +1,7 @@
 """The physics: it turns commanded rotor speeds into readings and contacts.
 
-The rotors (lag, thrust, drag) are computed in plain floats; `mj_step` does the rest. `struct`
-reads and writes MuJoCo's arrays through memory views: writing four elements takes a quarter of the
-time of a numpy slice assignment, and reading is a little faster than `tolist`.
-
-`replay` is for the benchmark: it replays the recorded controls of a flight in C, at the speed of
-raw `mj_step`. Its end state equals the simulator's bit by bit, so the comparison is fair.
+`struct` accesses MuJoCo's arrays through memory views: writing four elements takes a quarter of the
+time of a numpy slice assignment.
 """
 
 from __future__ import annotations
@@ -36,11 +32,9 @@ _readings_of = Readings.of  # looking up a class method binds it anew each time
 
 
 class State(NamedTuple):
-    """The whole state of the physics; `replay` starts from it.
+    """The state of the physics, from which `replay` starts: `mjSTATE_FULLPHYSICS`, shape (n,).
 
-    Attributes:
-        physics: The state `mjSTATE_FULLPHYSICS`: time [s], positions, velocities, shape (n,).
-        warmstart: Accelerations that the contact solver starts from, shape (nv,).
+    `warmstart` are the accelerations that the contact solver starts from, shape (nv,).
     """
 
     physics: npt.NDArray[np.float64]
@@ -101,8 +95,8 @@ class Simulator:
     def step(self, rotor_speeds: RotorSpeeds) -> None:
         """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
 
-        Thrust kf · w^2 and drag use the rotor speeds at the end of the step. The drag uses the
-        velocity at the beginning of the step.
+        Thrust and drag use the rotor speeds at the end of the step, and the drag uses the velocity
+        at its beginning.
         """
         before, data = self.readings, self._data
         controls = self._rotors.step(rotor_speeds, before)
@@ -117,7 +111,10 @@ class Simulator:
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
         contacts = data.ncon
         if contacts or self._contacts:
-            self._check_contacts(contacts, before)
+            # Look at once if their number has changed, else only every few steps.
+            if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
+                self._note_contacts(before)
+            self._contacts = contacts
 
     @property
     def touch_age(self) -> float:
@@ -139,17 +136,11 @@ class Simulator:
         return touches
 
     def state(self) -> State:
-        """Return a copy of the state, from which `replay` can start and with which it can end."""
+        """Return a copy of the state of the physics."""
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
         mujoco.mj_getState(self.model, self._data, physics, spec)
         return State(physics, self._data.qacc_warmstart.copy())
-
-    def _check_contacts(self, contacts: int, before: Readings) -> None:
-        """Note the contacts at once if their number has changed, else only every few steps."""
-        if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
-            self._note_contacts(before)
-        self._contacts = contacts
 
     def _note_contacts(self, before: Readings) -> None:
         """Note the new contacts, which MuJoCo found in the state `before` the step."""
@@ -181,15 +172,9 @@ def _velocity_at(readings: Readings, offset: Vector) -> Vector:
 
 
 def replay(model: Any, start: State, tape: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Replay a `Simulator.tape` with `mujoco.rollout`, in one thread.
+    """Replay a `Simulator.tape` without a reset at the speed of raw `mj_step`, for the benchmark.
 
-    Args:
-        model: `Simulator.model`.
-        start: `Simulator.state()` at the beginning of the tape.
-        tape: Thrusts [N] and applied wrench [N], [N m] of every step, without a reset in between.
-
-    Returns:
-        The physics of `Simulator.state()` at the end, shape (n,).
+    Return the physics of `Simulator.state()` at the end, which are equal bit by bit, shape (n,).
     """
     from mujoco import rollout
 

@@ -1,112 +1,253 @@
-"""The control loop: delays from telemetry, and when the loop freezes."""
+"""The control loop: delays, when it freezes, and that it goes on whatever a plug-in does."""
 
+from collections import Counter
+from math import inf, nan
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
+from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import Estimator
+from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.cloud.estimators.split import build as split
 from cloudrc.cloud.predictors import Predictor
+from cloudrc.cloud.predictors.last_sample import LastSample
+from cloudrc.drivers.process import from_line, to_line
 from cloudrc.messages import ZERO
-from tests.cloud.conftest import MS, Integrating, command, loop, telemetry
+from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
+
+ONE = (1.0, 0.0, 0.0)
 
 
-def test_round_trip_and_loop_delay_differ_by_the_hold():
+# Delays
+
+
+def test_a_command_names_its_basis_and_its_delays():
     a_loop = loop()
     a_loop.observe(telemetry(100, echo_ms=1000, hold_ms=7), 1090 * MS)
-    _, control = command(a_loop, 1092)
-    assert control.loop_delay == pytest.approx(0.090)
-    assert control.rtt == pytest.approx(0.083)
-    assert control.horizon == pytest.approx(0.090)
-
-
-def test_a_command_names_its_basis_and_how_long_it_was_held():
-    a_loop = loop()
-    a_loop.observe(telemetry(100), 1090 * MS)
-    sent, _ = command(a_loop, 1094)
+    sent, control = command(a_loop, 1094)
     assert (sent.basis_stamp_ns, sent.basis_hold_ns) == (100 * MS, 4 * MS)
     assert sent.velocity == pytest.approx((0.8, 0.0, 0.0))  # published gain, 1 m away
+    assert control.loop_delay == control.horizon == pytest.approx(0.090)
+    assert control.rtt == pytest.approx(0.083)
 
 
 def test_a_repeated_echo_is_no_sample():
     """While the downlink is silent, world echoes the same command with a growing age."""
-    a_loop = loop()
-    a_loop.observe(telemetry(100, echo_ms=1000), 1090 * MS)
+    a_loop = loop(heard_ms=1090, echo_ms=1000)
     for k in range(1, 2000):
         a_loop.observe(telemetry(100 + 10 * k, echo_ms=1000, hold_ms=10 * k), (1090 + 10 * k) * MS)
-    _, control = command(a_loop, 21_090)
-    assert control.horizon == pytest.approx(0.090)
+    assert command(a_loop, 21_090)[1].horizon == pytest.approx(0.090)
 
 
 def test_split_counts_how_long_cloud_has_held_the_odometry():
     a_loop = loop(estimator=split)
     # Applied at 95 ms of world's clock, 5 ms before the odometry, sent at 1000 ms of cloud's.
     a_loop.observe(telemetry(100, echo_ms=1000, hold_ms=5), 1090 * MS)
-    _, control = command(a_loop, 1093)
-    assert control.horizon == pytest.approx((1093 - 100 + 95 - 1000) * 1e-3)
+    assert command(a_loop, 1093)[1].horizon == pytest.approx((1093 - 100 + 95 - 1000) * 1e-3)
 
 
 @pytest.mark.parametrize(("horizon", "clamped"), [(3.0, 1.0), (-0.5, 0.0)])
 def test_a_horizon_out_of_range_is_clamped_and_counted(horizon, clamped):
     class Wild(Estimator):
-        def update(self, sample):
-            pass
-
         def horizon(self, age):
             return horizon
 
-    a_loop = loop(estimator=Wild)
-    a_loop.observe(telemetry(100), 1090 * MS)
-    _, control = command(a_loop, 1094)
-    assert control.horizon == clamped
-    assert a_loop.counts["horizon_clamped"] == 1
+    a_loop = loop(estimator=Wild, heard_ms=1090)
+    assert command(a_loop, 1094)[1].horizon == clamped
+    assert a_loop.counts == {"horizon_clamped": 1}
+
+
+def test_a_new_session_forgets_what_was_measured():
+    a_loop = loop(heard_ms=1090, echo_ms=1000)
+    a_loop.reset()
+    assert not a_loop.ready
+    a_loop.observe(telemetry(200), 1190 * MS)
+    assert command(a_loop, 1194)[1].horizon == 0.0
+
+
+# The frozen loop
 
 
 def test_a_silent_echo_freezes_after_horizon_plus_400_ms():
+    told = []
+
+    class Listening(LastSample):
+        def commanded(self, command):
+            told.append(command.velocity)
+
     controller = Integrating()
-    a_loop = loop(controller=controller)
-    a_loop.observe(telemetry(100, echo_ms=1000), 1100 * MS)  # a horizon of 100 ms
-    assert command(a_loop, 1500)[0].velocity == (1.0, 0.0, 0.0)
+    a_loop = loop(predictor=Listening(), controller=controller, heard_ms=1100, echo_ms=1000)
+    assert command(a_loop, 1500)[0].velocity == ONE  # a horizon of 100 ms
     assert command(a_loop, 1501)[0][3:] == (ZERO, 0.0)
-    assert a_loop.counts["frozen"] == 1
-    assert controller.asked == 1
+    assert (a_loop.counts["frozen"], controller.asked) == (1, 1)
     # Telemetry alone does not help, an echo does.
     a_loop.observe(telemetry(500, echo_ms=1000, hold_ms=400), 1510 * MS)
     assert command(a_loop, 1510)[0].velocity == ZERO
     a_loop.observe(telemetry(510, echo_ms=1420), 1520 * MS)
-    assert command(a_loop, 1520)[0].velocity == (1.0, 0.0, 0.0)
+    assert command(a_loop, 1520)[0].velocity == ONE
+    assert told == [ONE, ZERO, ZERO, ONE], "the predictor hears what is flown"
 
 
 def test_the_first_echo_has_as_much_time():
-    a_loop = loop(controller=Integrating())
-    a_loop.observe(telemetry(100), 1100 * MS)
-    assert command(a_loop, 2000)[0].velocity == (1.0, 0.0, 0.0)
-    assert command(a_loop, 2400)[0].velocity == (1.0, 0.0, 0.0)
-    assert command(a_loop, 2401)[0].velocity == ZERO
+    a_loop = loop(controller=Integrating(), heard_ms=1100)
+    flown = [command(a_loop, now_ms)[0].velocity for now_ms in (2000, 2400, 2401)]
+    assert flown == [ONE, ONE, ZERO]
     a_loop.start_mission()
-    assert command(a_loop, 2410)[0].velocity == (1.0, 0.0, 0.0)
+    assert command(a_loop, 2410)[0].velocity == ONE
 
 
-def test_while_frozen_the_predictor_gets_commands_of_zero():
-    told = []
+# Plug-ins may raise and return anything.
 
-    class Listening(Predictor):
+
+class Bad(Estimator, Predictor, Controller):
+    """A plug-in of every kind that raises `error`."""
+
+    error: BaseException | type[BaseException] = RuntimeError("out of\nluck")
+
+    def update(self, *arguments):
+        raise self.error
+
+    horizon = observe = predict = update
+
+
+class Leaving(Bad):
+    error = SystemExit("enough")
+
+
+class Closing(Bad):
+    error = GeneratorExit
+
+
+class WordlessError(Exception):
+    def __str__(self):
+        raise SystemExit("no words")
+
+
+class Speechless(Bad):
+    error = WordlessError
+
+
+class Verbose(Bad):
+    error = ValueError("no caf\udce9 " + "x" * 100_000)
+
+
+class OutOfShape(Bad):
+    def horizon(self, age):
+        return (0.1,)
+
+    def predict(self, odometry, horizon):
+        return odometry._replace(position=(1.0, 2.0), velocity=(0.0, 0.0, 0.0, 0.0))
+
+    def update(self, *arguments):
+        return ControlOutput((0.1, 0.2), 0.0, proportional=(1.0, 2.0, 3.0, 4.0))
+
+
+class NotFinite(OutOfShape):
+    def horizon(self, age):
+        return nan
+
+    def predict(self, odometry, horizon):
+        return odometry._replace(position=(inf, 0.0, 0.0))
+
+    def update(self, *arguments):
+        return ControlOutput((0.0, nan, 0.0), 0.0)
+
+
+@pytest.mark.parametrize("bad", [Bad, Leaving, Closing, Speechless, Verbose, OutOfShape, NotFinite])
+@pytest.mark.parametrize("kind", ["estimator", "predictor", "controller"])
+def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
+    a_loop = loop(**{kind: bad if kind == "estimator" else bad()})
+    for k in range(3):
+        a_loop.observe(telemetry(100 + 10 * k), (1090 + 10 * k) * MS)
+        sent, control = command(a_loop, 1094 + 10 * k)
+    assert control.position == HERE  # the last sample, not moved
+    assert sent.velocity == (ZERO if kind == "controller" else pytest.approx((0.8, 0.0, 0.0)))
+    assert a_loop.counts[f"{kind}_failed"] >= 3
+    (fault,) = a_loop.take_faults()
+    assert fault.code == f"{kind}_failed"
+    assert "\n" not in fault.text
+    assert len(fault.text.encode()) < 2200
+    assert fault.text.endswith(f"fix cloud.{kind} or choose another")
+
+
+ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
+WRONG = ((0.1, 0.2), (0.1, 0.2, 0.3, 0.4), "abc", None, (None,) * 3)
+
+
+@pytest.mark.parametrize(
+    "output",
+    [
+        *(ANY._replace(**{field: w}) for w in WRONG for field in ("velocity", "derivative")),
+        SimpleNamespace(velocity=(0.1, 0.2, 0.3), yaw_rate=0.0),  # without its terms
+    ],
+)
+def test_an_output_that_is_not_three_numbers_is_not_flown(output):
+    class Odd(Controller):
+        def update(self, *arguments):
+            return output
+
+    a_loop = loop(controller=Odd(), heard_ms=1090)
+    assert command(a_loop, 1094)[0].velocity == ZERO
+    assert a_loop.counts["controller_failed"] == 1
+
+
+def test_arrays_and_generators_become_plain_numbers():
+    class Arrays(Estimator, Predictor, Controller):
+        def horizon(self, age):
+            return np.float32(0.5)
+
+        def update(self, *arguments):
+            return ANY._replace(velocity=np.array([1, 2, 3]), integral=(n for n in (4, 5, 6)))
+
         def predict(self, odometry, horizon):
-            return odometry
+            return odometry._replace(position=np.array(odometry.position, np.float32))
 
-        def commanded(self, command):
-            told.append(command.velocity)
-
-    a_loop = loop(predictor=Listening(), controller=Integrating())
-    a_loop.observe(telemetry(100, echo_ms=1000), 1100 * MS)
-    command(a_loop, 1200)
-    command(a_loop, 1600)
-    assert told == [(1.0, 0.0, 0.0), ZERO]
+    sent, control = command(loop(Arrays, Arrays(), Arrays(), heard_ms=1090), 1094)
+    assert sent.velocity == (1.0, 2.0, 3.0)
+    assert (control.horizon, control.position, control.integral) == (0.5, HERE, (4.0, 5.0, 6.0))
+    assert str(from_line(to_line(control))) == str(control)
 
 
-def test_a_new_session_forgets_what_was_measured():
-    a_loop = loop()
-    a_loop.observe(telemetry(100, echo_ms=1000), 1090 * MS)
+def test_a_failing_reset_is_reported_with_the_next_telemetry():
+    times = Counter()
+
+    class Once:
+        """Begins once, and again raises."""
+
+        def reset(self):
+            times[type(self)] += 1
+            if times[type(self)] > 1:
+                raise RuntimeError("not again")
+
+    class Mean(Once, RunningMean):
+        def __init__(self):
+            self.reset()
+            super().__init__()
+
+    class Sample(Once, LastSample):
+        pass
+
+    class Steady(Once, Integrating):
+        pass
+
+    a_loop = loop(Mean, Sample(), Steady())
+    a_loop.start_mission()
     a_loop.reset()
-    assert not a_loop.ready
-    a_loop.observe(telemetry(200), 1190 * MS)
-    _, control = command(a_loop, 1194)
-    assert control.horizon == 0.0
+    assert a_loop.take_faults() == []
+    a_loop.observe(telemetry(100, echo_ms=1000), 1090 * MS)
+    sent, control = command(a_loop, 1094)
+    assert (sent.velocity, control.horizon) == (ONE, 0.0)
+    faults = {fault.code: (fault.stamp_ns, fault.text) for fault in a_loop.take_faults()}
+    assert set(faults) == {"estimator_failed", "predictor_failed", "controller_failed"}
+    assert {stamp_ns for stamp_ns, _ in faults.values()} == {1090 * MS}
+    assert "cloud goes on using it" in faults["controller_failed"][1]
+
+
+def test_ctrl_c_in_a_plug_in_ends_the_program():
+    class Interrupted(Bad):
+        error = KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        command(loop(controller=Interrupted(), heard_ms=1090), 1094)

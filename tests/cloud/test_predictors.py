@@ -20,24 +20,11 @@ SAMPLE = Odometry(
     velocity=(0.5, -1.0, 2.0),
     angular_velocity_body=(0.0, 0.0, pi / 2),
 )
-TURNING = [constant_velocity, commanded_velocity, constant_acceleration]
-
-
-def command(velocity):
-    return Command(0, 0, 0, velocity, 0.0)
-
-
-def accelerate(predictor, velocities, period_ns=10_000_000):
-    """Let the predictor observe these x velocities; return the last sample."""
-    for k, velocity in enumerate(velocities):
-        sample = SAMPLE._replace(stamp_ns=k * period_ns, velocity=(velocity, 0.0, 0.0))
-        predictor.observe(sample)
-    return sample
 
 
 def test_last_sample_moves_nothing_but_the_stamp():
-    prediction = last_sample.build().predict(SAMPLE, 0.1)
-    assert prediction == SAMPLE._replace(stamp_ns=1_100_000_000)
+    moved = SAMPLE._replace(stamp_ns=1_100_000_000)
+    assert last_sample.build().predict(SAMPLE, 0.1) == moved
 
 
 def test_constant_velocity_is_equation_3():
@@ -48,74 +35,60 @@ def test_constant_velocity_is_equation_3():
     assert prediction.angular_velocity_body == SAMPLE.angular_velocity_body
 
 
-@pytest.mark.parametrize("module", TURNING)
-def test_a_quarter_turn_about_z_takes_one_second_at_half_pi(module):
-    prediction = module.build().predict(SAMPLE, 1.0)
-    assert prediction.orientation_wxyz == pytest.approx((HALF, 0.0, 0.0, HALF))
-
-
-@pytest.mark.parametrize("module", TURNING)
-def test_the_rate_turns_about_the_axes_of_the_body(module):
-    rolled = SAMPLE._replace(orientation_wxyz=(HALF, HALF, 0.0, 0.0))
-    prediction = module.build().predict(rolled, 1.0)
-    # q * exp(z): about the world's z axis it would be (.5, .5, .5, .5).
-    assert prediction.orientation_wxyz == pytest.approx((0.5, 0.5, -0.5, 0.5))
-
-
-@pytest.mark.parametrize("module", TURNING)
-def test_a_body_that_does_not_turn_keeps_its_orientation(module):
-    still = SAMPLE._replace(angular_velocity_body=(0.0, 0.0, 0.0))
-    assert module.build().predict(still, 1.0).orientation_wxyz == UPRIGHT
+@pytest.mark.parametrize("module", [constant_velocity, commanded_velocity, constant_acceleration])
+@pytest.mark.parametrize(
+    ("before", "rate", "after"),
+    [
+        (UPRIGHT, pi / 2, (HALF, 0.0, 0.0, HALF)),  # a quarter turn in 1 s
+        # About the body's axes: about the world's z axis it would be (.5, .5, .5, .5).
+        ((HALF, HALF, 0.0, 0.0), pi / 2, (0.5, 0.5, -0.5, 0.5)),
+        (UPRIGHT, 0.0, UPRIGHT),
+    ],
+)
+def test_the_rate_turns_about_the_axes_of_the_body(module, before, rate, after):
+    turning = SAMPLE._replace(orientation_wxyz=before, angular_velocity_body=(0.0, 0.0, rate))
+    assert module.build().predict(turning, 1.0).orientation_wxyz == pytest.approx(after)
 
 
 def test_commanded_velocity_uses_the_last_command():
     predictor = commanded_velocity.build()
-    predictor.commanded(command((9.0, 9.0, 9.0)))
-    predictor.commanded(command((1.0, 0.0, -2.0)))
-    prediction = predictor.predict(SAMPLE, 0.2)
-    assert prediction.position == pytest.approx((1.2, 2.0, 2.6))
-    assert prediction.velocity == SAMPLE.velocity
+    for velocity, position in (
+        ((9.0, 9.0, 9.0), (2.8, 3.8, 4.8)),
+        ((1.0, 0.0, -2.0), (1.2, 2.0, 2.6)),
+    ):
+        predictor.commanded(Command(0, 0, 0, velocity, 0.0))
+        prediction = predictor.predict(SAMPLE, 0.2)
+        assert prediction.position == pytest.approx(position)
+        assert prediction.velocity == SAMPLE.velocity
+    for fresh in (predictor, commanded_velocity.build()):
+        fresh.reset()
+        assert fresh.predict(SAMPLE, 0.2).position == SAMPLE.position
 
 
-def test_commanded_velocity_stands_still_without_a_command():
-    predictor = commanded_velocity.build()
-    assert predictor.predict(SAMPLE, 0.2).position == SAMPLE.position
-    predictor.commanded(command((1.0, 0.0, 0.0)))
-    predictor.reset()
-    assert predictor.predict(SAMPLE, 0.2).position == SAMPLE.position
+def accelerated(velocities, window=0.05, more=()):
+    """Return a prediction by 0.1 s after these x velocities, 10 ms apart."""
+    predictor = constant_acceleration.build(window=window)
+    for k, velocity in enumerate(velocities):
+        newest = SAMPLE._replace(stamp_ns=k * 10_000_000, velocity=(velocity, 0.0, 0.0))
+        predictor.observe(newest)
+    for stamp_ns in more:
+        predictor.observe(newest._replace(stamp_ns=stamp_ns, velocity=(5.0, 5.0, 5.0)))
+    return predictor.predict(newest, 0.1)
 
 
 def test_constant_acceleration_uses_recent_velocities():
-    predictor = constant_acceleration.build()
-    newest = accelerate(predictor, [0.0, 0.1, 0.2])  # 10 m/s^2
-    prediction = predictor.predict(newest, 0.1)
+    prediction = accelerated([0.0, 0.1, 0.2])  # 10 m/s^2
     # x: 1 + .2 * .1 + .5 * 10 * .01; v: .2 + 10 * .1
     assert prediction.position == pytest.approx((1.07, 2.0, 3.0))
     assert prediction.velocity == pytest.approx((1.2, 0.0, 0.0))
     assert prediction.stamp_ns == 120_000_000
+    assert accelerated([0.0, 0.1, 0.2], more=(20_000_000, 5_000_000)) == prediction, "late stamps"
 
 
-def test_constant_acceleration_ignores_a_repeated_or_late_stamp():
-    predictor, other = constant_acceleration.build(), constant_acceleration.build()
-    newest = accelerate(predictor, [0.0, 0.1, 0.2])
-    accelerate(other, [0.0, 0.1, 0.2])
-    predictor.observe(newest._replace(velocity=(5.0, 5.0, 5.0)))
-    predictor.observe(newest._replace(stamp_ns=5_000_000, velocity=(5.0, 5.0, 5.0)))
-    assert predictor.predict(newest, 0.1) == other.predict(newest, 0.1)
-
-
-def test_constant_acceleration_forgets_samples_before_its_window():
-    predictor = constant_acceleration.build(window=0.02)
-    newest = accelerate(predictor, [0.0, 5.0, 6.0, 6.0, 6.0])
-    assert predictor.predict(newest, 0.1).velocity == pytest.approx((6.0, 0.0, 0.0))
-
-
-def test_constant_acceleration_starts_anew_after_a_gap():
-    predictor = constant_acceleration.build()
-    accelerate(predictor, [0.0, 1.0])
-    late = SAMPLE._replace(stamp_ns=10_000_000_000, velocity=(3.0, 0.0, 0.0))
-    predictor.observe(late)
-    assert predictor.predict(late, 0.1).velocity == pytest.approx((3.0, 0.0, 0.0))
+def test_constant_acceleration_forgets_samples_before_its_window_or_a_gap():
+    settled = accelerated([0.0, 5.0, 6.0, 6.0, 6.0], window=0.02)
+    assert settled.velocity == pytest.approx((6.0, 0.0, 0.0))
+    assert accelerated([0.0, 1.0], more=(10_000_000_000,)).velocity == pytest.approx((1.0, 0, 0))
 
 
 @pytest.mark.parametrize("window", [0.0, -0.1, float("nan"), "short"])

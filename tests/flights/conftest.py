@@ -31,7 +31,7 @@ from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.session import Session, make_session
+from cloudrc.tunnel.session import Session
 from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
 
 MS = 1_000_000
@@ -115,7 +115,7 @@ class BareCloud:
     """A cloud process that sends hellos and commands on request."""
 
     def __init__(self, nonce: bytes, keys: KeyRing | None) -> None:
-        self.session: Session = make_session(Direction.DOWNLINK, keys)
+        self.session = Session(Direction.DOWNLINK, keys)
         self.handshake = ClientHandshake(nonce.ljust(16), CLOCK)
         self.heard: list[str] = []
 
@@ -135,7 +135,7 @@ class BareCloud:
     def receive(self, data: bytes) -> bytes | None:
         """Take an answer of world; what is to be sent because of it, if anything."""
         try:
-            kind, _, epoch, _, body = self.session.open(data)
+            kind, epoch, _, body = self.session.open(data)
         except DecodeError as error:
             self.heard.append(str(error))
             return None
@@ -300,7 +300,7 @@ class Talk:
         heard = []
         for data in self.world.take_datagrams():
             try:
-                kind, _, epoch, _, body = self.session.open(data)
+                kind, epoch, _, body = self.session.open(data)
             except DecodeError:
                 continue
             if kind in kinds:

@@ -120,7 +120,7 @@ def test_limited_commands_and_a_missions_holds_are_counted(talk: Talk) -> None:
 def test_contacts_are_reported_until_the_next_mission_starts(talk: Talk) -> None:
     """Cloud may die right after the touch; the next cloud must learn of it."""
     ask(talk, 2, Request.END)
-    talk.world._orders.touches.pipes = 1
+    talk.world._orders.pipes = 1
     talk.wait(talk.now_ns + 300 * MS)
     talk.hello(b"another")
     for number, mission_id, contacts in ((3, 0, 1), (4, 7, 0)):

@@ -13,10 +13,11 @@ from cloudrc.geometry.clearance import (
     clearance,
     clearance_per_pipe,
     distance_to_pipe,
-    inside_pipe,
+    key_points,
     pipe_index,
+    place_points,
+    robot_points,
 )
-from cloudrc.geometry.robot import key_points, place_points, robot_points
 from cloudrc.geometry.scene import Pipe, Scene, load_scene
 
 PIPES = load_scene("pipes")
@@ -43,11 +44,11 @@ def test_distance_to_a_hollow_cylinder(point: tuple[float, ...], distance: float
     assert found == pytest.approx([distance], abs=1e-9)
 
 
+PLACES = st.tuples(*[st.floats(-4, 4)] * 3)
+
+
 @settings(max_examples=50, deadline=None)
-@given(
-    st.tuples(*[st.floats(-4, 4)] * 3),
-    st.tuples(*[st.floats(-4, 4)] * 3),
-)
+@given(PLACES, PLACES)
 def test_distance_changes_no_faster_than_the_point(
     one: tuple[float, ...], other: tuple[float, ...]
 ) -> None:
@@ -55,8 +56,9 @@ def test_distance_changes_no_faster_than_the_point(
     assert abs(a - b) <= math.dist(one, other) + 1e-9
 
 
-@pytest.mark.parametrize(("height", "expected"), [(0.8, (0.217, 0.326, 0.320)),
-                                                  (0.7, (0.246, 0.365, 0.320))])  # fmt: skip
+@pytest.mark.parametrize(
+    ("height", "expected"), [(0.8, (0.217, 0.326, 0.320)), (0.7, (0.246, 0.365, 0.320))]
+)
 def test_clearance_on_the_axis_is_that_of_the_plant(
     height: float, expected: tuple[float, ...]
 ) -> None:
@@ -64,9 +66,7 @@ def test_clearance_on_the_axis_is_that_of_the_plant(
     at = [(x, y, height) for x, y, _ in (pipe.centre for pipe in PIPES.pipes)]
     found = clearance(PIPES, at, [LEVEL] * 3)
     assert found == pytest.approx(expected, abs=2e-3)
-    per_pipe = clearance_per_pipe(PIPES, at, [LEVEL] * 3)
-    assert per_pipe.shape == (3, 3)
-    assert np.array_equal(np.diag(per_pipe), found)
+    assert np.array_equal(np.diag(clearance_per_pipe(PIPES, at, [LEVEL] * 3)), found)
 
 
 def test_clearance_turns_with_the_robot() -> None:
@@ -82,18 +82,10 @@ def test_clearance_turns_with_the_robot() -> None:
 
 def test_the_spawn_trap() -> None:
     """Straight above the spawn the rear rotor is in the wall of pipe 1; x = .2 is clear."""
-    heights = np.arange(0.1, 1.6, 0.01)
-    at = np.stack([np.zeros_like(heights), np.zeros_like(heights), heights], axis=1)
-    facing = np.tile(LEVEL, (len(at), 1))
-    assert clearance(PIPES, at, facing).min() == pytest.approx(-0.019, abs=1e-3)
-    # The overlap is 0.338 - (1 - 0.7) = 0.038 deep, as thick as the wall; its middle is deepest.
-    aside = at + np.array([0.2, 0, 0])
-    assert clearance(PIPES, aside, facing).min() == pytest.approx(0.162, abs=2e-3)
-
-
-def test_the_tip_touches_at_the_contact_pose() -> None:
-    tip = place_points(key_points(), np.array([[8.135, -6.422, 0.7]]), np.array([LEVEL]))[0, 8]
-    assert tip == pytest.approx((8.535, -6.422, 0.87))
+    at = np.array([(0.0, 0.0, height) for height in np.arange(0.1, 1.6, 0.01)])
+    for aside, nearest in ((0.0, -0.019), (0.2, 0.162)):
+        found = clearance(PIPES, at + np.array((aside, 0, 0)), np.tile(LEVEL, (len(at), 1)))
+        assert found.min() == pytest.approx(nearest, abs=2e-3)
 
 
 def test_clearance_is_infinite_in_an_empty_scene() -> None:
@@ -106,30 +98,31 @@ def test_a_batch_gives_the_same_as_single_poses() -> None:
     at = rng.uniform((-2, -8, 0), (9, 4, 2), (333, 3))
     facing = rng.normal(size=(333, 4))
     facing /= np.linalg.norm(facing, axis=1)[:, None]
-    together = clearance(PIPES, at, facing)
     alone = [clearance(PIPES, at[i], facing[i])[0] for i in range(0, 333, 50)]
-    assert together[::50] == pytest.approx(alone, abs=1e-12)
+    assert clearance(PIPES, at, facing)[::50] == pytest.approx(alone, abs=1e-12)
 
 
-def test_rotation_is_that_of_the_quaternion() -> None:
-    # A third of a turn about (1, 1, 1) takes x to y, y to z, z to x.
-    placed = place_points(key_points(), np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
-    assert placed == pytest.approx(key_points().positions[:, [2, 0, 1]])
-
-
-def test_points_are_those_of_the_plant() -> None:
+def test_points_are_those_of_the_plant_and_turn_with_the_robot() -> None:
     points = key_points()
-    assert points.positions.shape == (225, 3)
-    assert np.abs(points.positions[:, 0]).max() == pytest.approx(0.4)
-    assert points.positions[:, 1].max() == pytest.approx(0.338)
-    assert (points.positions[:, 2].min(), points.positions[:, 2].max()) == (-0.1, 0.18)
+    assert (points.positions.shape, len(robot_points().radii)) == ((225, 3), 341)
+    assert points.positions.max(axis=0) == pytest.approx((0.4, 0.338, 0.18))
+    assert points.positions[:, 2].min() == -0.1
     assert sorted(set(points.radii)) == [0, 0.01]
-    assert len(robot_points().radii) == 21 + 8 * 24 + 2 * 8 + 4 * 4 * 7
+    # A third of a turn about (1, 1, 1) takes x to y, y to z, z to x.
+    placed = place_points(points, np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
+    assert placed == pytest.approx(points.positions[:, [2, 0, 1]])
+    tip = place_points(points, np.array([[8.135, -6.422, 0.7]]), np.array([LEVEL]))[0, 8]
+    assert tip == pytest.approx((8.535, -6.422, 0.87))  # at the contact pose
 
 
 def test_inside_a_pipe_is_in_its_bore_and_between_its_ends() -> None:
-    at = [(-1, 2.5, 0.8), (-1, 2.501, 0.8), (-1, 0, 0.8 + 0.661), (-1, 0, 0.8 + 0.663),
-          (5.66, -6.42, 0.8), (0.5, 0, 0.7)]  # fmt: skip
-    assert inside_pipe(PIPES, at).tolist() == [True, False, True, False, True, False]
-    assert pipe_index(PIPES, at).tolist() == [0, -1, 0, -1, 2, -1]
-    assert inside_pipe(Scene("empty"), at).tolist() == [False] * 6
+    places = {
+        (-1, 2.5, 0.8): 0,
+        (-1, 2.501, 0.8): -1,
+        (-1, 0, 1.461): 0,
+        (-1, 0, 1.463): -1,
+        (5.66, -6.42, 0.8): 2,
+        (0.5, 0, 0.7): -1,
+    }
+    assert pipe_index(PIPES, list(places)).tolist() == list(places.values())
+    assert set(pipe_index(Scene("empty"), list(places))) == {-1}

@@ -9,56 +9,47 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
-from cloudrc.geometry.scene import Board, Scene, load_scene, read_scene
+from cloudrc.geometry.scene import Board, Scene, load_scene
 
 
 def test_pipes_are_those_of_the_plant() -> None:
+    """Source: docs/reference/plant.md, "Scene"."""
     scene = load_scene("pipes")
-    assert [pipe.name for pipe in scene.pipes] == ["pipe_1", "pipe_2", "pipe_3"]
-    ends = [
-        [tuple(c + sign * 2.5 * a for c, a in zip(pipe.centre, pipe.axis, strict=True)) for sign in
-         (-1, 1)]
-        for pipe in scene.pipes
-    ]  # fmt: skip
-    # Source: docs/reference/plant.md, "Scene".
-    expected = [
-        [(-1, 2.5, 0.8), (-1, -2.5, 0.8)],
-        [(-0.8334, -2.8682, 0.8), (2.7534, -6.3518, 0.8)],
-        [(3.160, -6.418, 0.8), (8.160, -6.422, 0.8)],
-    ]
-    for pipe, found, wanted in zip(scene.pipes, ends, expected, strict=True):
+    expected = {
+        "pipe_1": ((-1, 2.5, 0.8), (-1, -2.5, 0.8)),
+        "pipe_2": ((-0.8334, -2.8682, 0.8), (2.7534, -6.3518, 0.8)),
+        "pipe_3": ((3.160, -6.418, 0.8), (8.160, -6.422, 0.8)),
+    }
+    assert [pipe.name for pipe in scene.pipes] == list(expected)
+    for pipe in scene.pipes:
         assert (pipe.length, pipe.inner, pipe.outer) == (5.0, 0.662, 0.700)
         assert math.hypot(*pipe.axis) == pytest.approx(1, abs=1e-12)
-        for one, other in zip(found, wanted, strict=True):
-            assert one == pytest.approx(other, abs=5e-4)
-    assert scene.board == Board(8.535, (-6.82, -6.02), (0.025, 1.225))
-    assert scene.floor == 0
-
-
-def test_the_empty_scene_has_no_obstacles() -> None:
+        for half, end in zip((-2.5, 2.5), expected[pipe.name], strict=True):
+            found = [c + half * a for c, a in zip(pipe.centre, pipe.axis, strict=True)]
+            assert found == pytest.approx(end, abs=5e-4)
+    assert (scene.board, scene.floor) == (Board(8.535, (-6.82, -6.02), (0.025, 1.225)), 0)
     assert load_scene("empty") == Scene("empty")
 
 
-def scene_file(folder: Path, body: str) -> Path:
+def scene_file(folder: Path, numbers: str, world: str = "") -> str:
     path = folder / "mine.xml"
-    path.write_text(f"<mujoco><custom>{body}</custom></mujoco>")
-    return path
+    path.write_text(f"<mujoco><custom>{numbers}</custom><worldbody>{world}</worldbody></mujoco>")
+    return str(path)
 
 
-def test_only_the_axis_is_normalised(tmp_path: Path) -> None:
-    scene = read_scene(
-        scene_file(
-            tmp_path,
-            '<numeric name="pipe_a" data="0 0 1  0 3 4  2 .5 .6"/>'
-            '<numeric name="floor" data="-.1"/><numeric name="other" data="1 2"/>',
-        )
+def test_a_scene_of_ones_own_is_read(tmp_path: Path) -> None:
+    numbers = (
+        '<numeric name="pipe_a" data="0 0 1  0 3 4  2 .5 .6"/>'
+        '<numeric name="floor" data="-.1"/><numeric name="other" data="1 2"/>'
     )
+    scene = load_scene(scene_file(tmp_path, numbers, '<frame name="spawn" pos="1 2 3"/>'))
     assert scene.pipes[0].axis == pytest.approx((0, 0.6, 0.8))
     assert (scene.name, scene.floor, scene.board) == ("mine", -0.1, None)
+    assert scene.spawn == (1, 2, 3)
 
 
 @pytest.mark.parametrize(
-    ("body", "reason"),
+    ("numbers", "reason"),
     [
         ('<numeric name="pipe_1" data="1 2 3"/>', "pipe_1: data must be 9 numbers"),
         ('<numeric name="pipe_1" data="0 0 0 0 0 0 5 .6 .7"/>', "pipe_1: needs an axis"),
@@ -68,12 +59,14 @@ def test_only_the_axis_is_normalised(tmp_path: Path) -> None:
         ("<numeric", "not readable as XML"),
     ],
 )
-def test_bad_numbers_are_named(tmp_path: Path, body: str, reason: str) -> None:
+def test_bad_numbers_are_named(tmp_path: Path, numbers: str, reason: str) -> None:
     with pytest.raises(BadInputError, match=r"scene mine\.xml: .*" + reason):
-        read_scene(scene_file(tmp_path, body))
+        load_scene(scene_file(tmp_path, numbers))
 
 
-def test_a_missing_scene_is_refused() -> None:
+def test_a_bad_spawn_and_a_missing_scene_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="spawn: data must be 3 numbers: '1 2'"):
+        load_scene(scene_file(tmp_path, "", '<frame name="spawn" pos="1 2"/>'))
     with pytest.raises(BadInputError, match="No such file"):
         load_scene("nowhere")
 
@@ -82,5 +75,3 @@ def test_the_fence_is_a_closed_box() -> None:
     assert fence.inside((9.2, 5.5, 2.5))
     assert fence.inside((-3, -8.5, 0))
     assert not fence.inside((0, 0, -1e-9))
-    assert fence.clamp((20, -20, 1)) == (9.2, -8.5, 1)
-    assert fence.clamp((1, 2, 1.5)) == (1, 2, 1.5)

@@ -53,7 +53,7 @@ class Doorstep:
     def answer(self, *given: Any, **named: Any) -> tuple[int, int, bytes]:
         """Return kind, epoch and body of the answer to a hello."""
         (data,) = self.receive_hello(*given, **named).datagrams
-        kind, _, epoch, _, body = self.cloud.open(data)
+        kind, epoch, _, body = self.cloud.open(data)
         return kind, epoch, body
 
     def cookie(self) -> bytes:

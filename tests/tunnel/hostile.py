@@ -6,12 +6,12 @@ Run by itself it is a coverage-guided fuzzer (libFuzzer's flags):
 
 Four ways to be hostile, in turns: bytes as they come; a sealed frame of the session with some bytes
 changed; one cut short or made longer; one sealed properly, with a key that is not ours. Now and
-then time passes, by a step that the fuzzer's bytes choose, and both ends do what is due: they hear
-each other, or nothing but what somebody has captured and sends again.
+then time passes, and both ends hear each other, or nothing but what was captured.
 """
 
 from __future__ import annotations
 
+import atexit
 import resource
 import sys
 from collections.abc import Iterable
@@ -59,11 +59,14 @@ class Target:
         self.frames += [self.world._session.seal(Kind.TELEMETRY, telemetry) for _ in range(3)]
         self.known, self.first = frozenset(self.frames), tuple(self.frames)
         self.strangers = pair(1, b"s" * 32)
+        self.drain()
+        self.before = self.state()
+        self.tried = self.asked = self.told = 0
+
+    def drain(self) -> None:
         for end in (self.world, self.cloud):
             end.take_records()
             end.take_datagrams()
-        self.before = self.state()
-        self.tried = self.asked = self.told = 0
 
     def give(self, datagrams: Iterable[bytes], end: object) -> None:
         for data in datagrams:
@@ -71,8 +74,7 @@ class Target:
 
     def state(self) -> tuple:
         """Return all state that an accepted datagram would change."""
-        accepted = ("used", "late", "repeated", "stale", "hello", "busy", "accept_ignored",
-                    "unanswered")  # fmt: skip
+        accepted = "used late repeated stale hello busy accept_ignored unanswered".split()
         ends = (self.world, self.cloud)
         return (
             [[end._counts[name] for name in accepted] for end in ends],
@@ -116,9 +118,7 @@ class Target:
             for end in (self.world, self.cloud):
                 self.give(self.captured, end)
             assert self.state()[1:] == before, "what was captured was let through again"
-        for end in (self.world, self.cloud):
-            end.take_records()
-            end.take_datagrams()
+        self.drain()
 
     def due(self, end: object) -> list[bytes]:
         """Return the datagrams that an end sends now."""
@@ -135,9 +135,7 @@ class Target:
         assert set(asked) <= {Kind.HELLO}
         told = self.cloud.take_records()
         self.told += len(told)
-        assert not told or self.cloud._wants_session(self.now_ns), (
-            "a session that is heard has no faults"
-        )
+        assert not told or self.cloud._wants_session(self.now_ns), "a session has no faults"
         assert self.told <= TOLD_MAX, "the user is told the same again"
         assert all(isinstance(one, Fault) and one.code in ("version", "key") for one in told)
 
@@ -185,14 +183,12 @@ def main() -> None:
         if target.tried == 100_000 and not begin:
             begin.append(memory())
 
-    import atexit
-
+    @atexit.register
     def report() -> None:
         target.check()
         grown = memory() - begin[0] if begin else 0.0
         print(f"hostile {target.tried} accepted 0 memory {grown:+.1f} MiB", flush=True)
 
-    atexit.register(report)
     atheris.Setup(sys.argv, one)
     atheris.Fuzz()
 

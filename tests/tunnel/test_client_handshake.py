@@ -24,63 +24,58 @@ NEXT_WORLD = b"v" * 16
 STRANGER = KeyRing(KeySet(Key(b"x" * 32)))
 
 
+class Asking:
+    """A cloud's handshake with short ways to try it."""
+
+    def __init__(self) -> None:
+        self.handshake = ClientHandshake(NONCE, CLOCK)
+
+    def hello(self) -> Hello:
+        return codec.decode_hello(self.handshake.make_hello())
+
+    def accepts(
+        self, epoch: int, world: bytes = WORLD, nonce: bytes = NONCE, *, asks: bool = True
+    ) -> bytes | None:
+        return self.handshake.receive_accept(epoch, Accept(nonce, world, CLOCK), asks=asks)
+
+
 @pytest.fixture
-def handshake() -> ClientHandshake:
-    return ClientHandshake(NONCE, CLOCK)
+def cloud() -> Asking:
+    return Asking()
 
 
-def hello(handshake: ClientHandshake) -> Hello:
-    return codec.decode_hello(handshake.make_hello())
-
-
-def accepted(
-    handshake: ClientHandshake,
-    epoch: int,
-    world: bytes = WORLD,
-    nonce: bytes = NONCE,
-    *,
-    asks: bool = True,
-) -> bytes | None:
-    return handshake.receive_accept(epoch, Accept(nonce, world, CLOCK), asks=asks)
-
-
-def test_a_hello_has_nonce_clock_cookie_and_newest_epoch(handshake: ClientHandshake) -> None:
-    assert hello(handshake) == Hello(NONCE, CLOCK, NO_COOKIE, 0)
-    assert accepted(handshake, 3) == NONCE + WORLD
-    answer = handshake.answer_challenge(b"1" * 13)
+def test_a_hello_has_nonce_clock_cookie_and_newest_epoch(cloud: Asking) -> None:
+    assert cloud.hello() == Hello(NONCE, CLOCK, NO_COOKIE, 0)
+    assert cloud.accepts(3, nonce=b"m" * 16) is None
+    assert cloud.accepts(3) == NONCE + WORLD
+    answer = cloud.handshake.answer_challenge(b"1" * 13)
     assert answer is not None
-    assert codec.decode_hello(answer) == hello(handshake) == Hello(NONCE, CLOCK, b"1" * 13, 3)
+    assert codec.decode_hello(answer) == cloud.hello() == Hello(NONCE, CLOCK, b"1" * 13, 3)
+    assert cloud.handshake.is_refused(NONCE)
+    assert not cloud.handshake.is_refused(b"m" * 16)
 
 
-def test_repeated_challenges_get_a_limited_number_of_answers(handshake: ClientHandshake) -> None:
-    assert handshake.answer_challenge(b"0" * 13) is None  # it has not asked
-    handshake.make_hello()
-    answers = [handshake.answer_challenge(b"%013d" % n) for n in range(50)]
-    assert sum(answer is not None for answer in answers) == REPLIES_MAX
-    handshake.make_hello()
-    assert handshake.answer_challenge(b"%013d" % 49)
+def test_repeated_challenges_get_a_limited_number_of_answers(cloud: Asking) -> None:
+    answer = cloud.handshake.answer_challenge
+    assert answer(b"0" * 13) is None, "it has not asked"
+    cloud.hello()
+    assert sum(answer(b"%013d" % n) is not None for n in range(50)) == REPLIES_MAX
+    cloud.hello()
+    old = [b"%013d" % n for n in range(REPLIES_MAX)]
+    assert [answer(cookie) for cookie in 100 * old] == 300 * [None], "old ones use up no answers"
+    assert answer(b"1" * 13)
+    assert cloud.hello().cookie == b"1" * 13
 
 
-def test_repeated_old_challenges_use_up_no_answers(handshake: ClientHandshake) -> None:
-    old = [b"old %d" % n for n in range(REPLIES_MAX)]
-    handshake.make_hello()
-    assert all(handshake.answer_challenge(cookie) for cookie in old)
-    handshake.make_hello()
-    assert [handshake.answer_challenge(cookie) for cookie in 100 * old] == 300 * [None]
-    assert handshake.answer_challenge(b"1" * 13)
-    assert [handshake.answer_challenge(cookie) for cookie in old] == REPLIES_MAX * [None]
-    assert hello(handshake).cookie == b"1" * 13
-
-
-def test_the_memory_of_cookies_and_worlds_is_bounded(handshake: ClientHandshake) -> None:
+def test_the_memory_of_cookies_and_worlds_is_bounded(cloud: Asking) -> None:
     for number in range(COOKIES_MAX + 1):
-        handshake.make_hello()
-        handshake.answer_challenge(b"%013d" % number)
-        accepted(handshake, 1, b"%016d" % number)
-    assert len(handshake._cookies) == COOKIES_MAX
-    assert handshake.answer_challenge(b"%013d" % 1) is None
-    assert handshake.answer_challenge(b"%013d" % 0)
-    assert len(handshake._old_worlds) == WORLDS_MAX
+        cloud.hello()
+        cloud.handshake.answer_challenge(b"%013d" % number)
+        cloud.accepts(1, b"%016d" % number)
+    assert len(cloud.handshake._cookies) == COOKIES_MAX
+    assert cloud.handshake.answer_challenge(b"%013d" % 1) is None
+    assert cloud.handshake.answer_challenge(b"%013d" % 0)
+    assert len(cloud.handshake._old_worlds) == WORLDS_MAX
 
 
 @pytest.mark.parametrize(
@@ -92,76 +87,54 @@ def test_the_memory_of_cookies_and_worlds_is_bounded(handshake: ClientHandshake)
     ],
 )
 def test_of_one_world_only_a_newer_epoch_counts(
-    handshake: ClientHandshake, known: int, epoch: int, counts: bool
+    cloud: Asking, known: int, epoch: int, counts: bool
 ) -> None:
-    handshake._world, handshake._epoch = WORLD, known
-    assert (accepted(handshake, epoch) is not None) == counts
+    cloud.handshake._world, cloud.handshake._epoch = WORLD, known
+    assert (cloud.accepts(epoch) is not None) == counts
 
 
 @pytest.mark.promise("old-datagrams-do-nothing")
-def test_a_dead_world_does_not_come_back(handshake: ClientHandshake) -> None:
-    accepted(handshake, 3)
-    assert accepted(handshake, 1, NEXT_WORLD, asks=False) is None, "cloud hears its world"
-    assert accepted(handshake, 4, asks=False)
-    assert accepted(handshake, 5, asks=False)
-    assert accepted(handshake, 1, NEXT_WORLD), "a new process may begin with epoch 1"
-    assert accepted(handshake, 9) is None
-    assert accepted(handshake, 5, NEXT_WORLD, hello(handshake).nonce)
+def test_a_dead_world_does_not_come_back(cloud: Asking) -> None:
+    cloud.accepts(3)
+    assert cloud.accepts(1, NEXT_WORLD, asks=False) is None, "cloud hears its world"
+    assert cloud.accepts(4, asks=False)
+    assert cloud.accepts(5, asks=False)
+    assert cloud.accepts(1, NEXT_WORLD), "a new process may begin with epoch 1"
+    assert cloud.accepts(9) is None
+    assert cloud.accepts(5, NEXT_WORLD, cloud.hello().nonce)
 
 
-def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(handshake: ClientHandshake) -> None:
+def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(cloud: Asking) -> None:
     """Cloud has accepted a late datagram of a dead world while it heard nobody."""
-    accepted(handshake, 3, NEXT_WORLD)
-    accepted(handshake, 9)
-    assert accepted(handshake, 3, NEXT_WORLD) is None  # alive, and answers
-    nonce = hello(handshake).nonce
+    cloud.accepts(3, NEXT_WORLD)
+    cloud.accepts(9)
+    assert cloud.accepts(3, NEXT_WORLD) is None  # alive, and answers
+    nonce = cloud.hello().nonce
     assert nonce != NONCE
-    assert accepted(handshake, 9) is None  # the late datagram again
-    assert accepted(handshake, 4, NEXT_WORLD, nonce)
-    assert hello(handshake).nonce == nonce
+    assert cloud.accepts(9) is None  # the late datagram again
+    assert cloud.accepts(4, NEXT_WORLD, nonce)
+    assert cloud.hello().nonce == nonce
 
 
-def test_answers_for_another_nonce_are_ignored(handshake: ClientHandshake) -> None:
-    assert accepted(handshake, 3, nonce=b"m" * 16) is None
-    assert handshake.is_refused(NONCE)
-    assert not handshake.is_refused(b"m" * 16)
-
-
-def faults(bare: Bare) -> list[Fault]:
-    return [record for record in bare.world.take_records() if isinstance(record, Fault)]
-
-
-@pytest.mark.parametrize(
-    ("data", "code", "text"),
-    [
-        (lambda: bytes([5]) + Bare(ring()).cloud("a").hello()[1:], "version", "v5, we speak v6: "),
-        (lambda: BareCloud(b"a", STRANGER).hello(), "key", "same key file"),
-    ],
-)
-def test_another_version_or_key_is_logged_once(data: object, code: str, text: str) -> None:
-    bare, hello = Bare(ring()), data()  # type: ignore[operator]
-    for _ in range(3):
-        bare.world.receive_datagram(hello, 0)
-    (fault,) = faults(bare)
-    assert (fault.code, text in fault.text) == (code, True)
-    assert bare.world.take_datagrams() == []
-
-
-def test_within_a_session_garbage_is_only_counted() -> None:
-    bare = Bare(ring())
-    bare.send(bare.cloud("a").hello())
-    bare.world.receive_datagram(BareCloud(b"b", STRANGER).hello(), 0)
-    assert faults(bare) == []
-    assert bare.world._counts["tag"] == 1
-
-
-def test_only_another_version_and_a_wrong_key_are_logged() -> None:
-    for outcome in ("malformed", "direction", "old_epoch"):
-        assert HandshakeLog().about(outcome, bytes(16), 0) == []
-    for kind in Kind:
-        data = codec.encode_header(kind, 1, 1, 1)
-        said = [Fault(7, "key", KEY_TEXT)] if kind <= Kind.BUSY else []
-        assert HandshakeLog().about("tag", data, 7) == said
+def test_another_version_or_key_is_logged_once() -> None:
+    old = bytes([5]) + Bare(ring()).cloud("a").hello()[1:]
+    stranger = BareCloud(b"a", STRANGER).hello()
+    for data, code, text in (
+        (old, "version", "v5, we speak v6: "),
+        (stranger, "key", "same key file"),
+    ):
+        bare = Bare(ring())
+        for _ in range(3):
+            bare.world.receive_datagram(data, 0)
+        (fault,) = [one for one in bare.world.take_records() if isinstance(one, Fault)]
+        assert fault.code == code
+        assert text in fault.text
+        assert bare.world.take_datagrams() == []
+        bare.send(bare.cloud("a").hello())
+        bare.world.take_records()
+        bare.world.receive_datagram(data, 0)
+        assert bare.world.take_records() == [], "within a session garbage is only counted"
+        assert bare.world._counts["tag"] + bare.world._counts["version"] == 4
 
 
 def test_a_text_is_logged_once_in_a_session() -> None:
@@ -172,3 +145,8 @@ def test_a_text_is_logged_once_in_a_session() -> None:
     assert log.say("version", fault.text, 8) == []
     log.forget()
     assert log.say("version", fault.text, 9) == [Fault(9, "version", fault.text)]
+    for outcome in ("malformed", "direction", "old_epoch"):
+        assert log.about(outcome, bytes(16), 0) == []
+    for kind in Kind:
+        said = [Fault(7, "key", KEY_TEXT)] if kind <= Kind.BUSY else []
+        assert HandshakeLog().about("tag", codec.encode_header(kind, 1, 1, 1), 7) == said

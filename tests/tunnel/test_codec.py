@@ -50,7 +50,7 @@ requests = st.builds(
     st.integers(0, 2**63 - 1),
     st.integers(0, 2**16 - 1),
     st.integers(-1, 2**63 - 1),
-    epoch=st.just(0),  # not in the datagram's body
+    st.integers(0, 9),
 )
 
 
@@ -80,32 +80,16 @@ COME_BACK = {
 def test_every_body_comes_back_as_it_was(name, data):
     strategy, encode, decode = COME_BACK[name]
     message = data.draw(strategy)
-    assert decode(encode(message)) == message
-
-
-@given(telemetries)
-@settings(max_examples=20, deadline=None)
-def test_the_stamps_of_telemetry_can_be_read_alone(telemetry):
-    stamps_ns = codec.decode_stamps(codec.encode_telemetry(telemetry))
-    assert stamps_ns == (telemetry.stamp_ns, telemetry.slip_ns)
-
-
-def test_the_epoch_of_a_request_is_not_in_its_body():
-    said = OperatorRequest(1, Request.END)
-    assert codec.encode_operator(said._replace(epoch=7)) == codec.encode_operator(said)
+    again = decode(encode(message))
+    if isinstance(message, OperatorRequest):
+        message = message._replace(epoch=0)  # not in the datagram's body
+    assert again == message
 
 
 def test_the_header_has_the_documented_layout():
     data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788)
     assert data == bytes([6, 1, 4, 3, 2, 1, 0, 6]) + bytes.fromhex("8877665544332211")
     assert codec.peek(data) == (Kind.COMMAND, 0x01020304, 0x1122334455667788)
-
-
-def test_a_direction_that_does_not_exist_is_refused():
-    data = bytearray(datagram(Kind.ALIVE, b""))
-    data[1] = 2
-    with pytest.raises(DecodeError, match=r"^malformed$"):
-        codec.check(bytes(data))
 
 
 def test_no_answer_is_longer_than_its_hello():
@@ -115,61 +99,50 @@ def test_no_answer_is_longer_than_its_hello():
     assert max(codec.SIZES.values()) <= codec.DATAGRAM_MAX
 
 
+def outcome(read, data):
+    try:
+        read(bytes(data))
+    except DecodeError as error:
+        return str(error)
+    return "fine"
+
+
 @pytest.mark.parametrize("kind", list(Kind))
-def test_every_wrong_length_is_refused(kind):
+def test_every_wrong_length_direction_and_version_is_refused(kind):
     whole = datagram(kind, bytes(codec.BODY_SIZES[kind]))
-    codec.check(whole)
+    assert outcome(codec.check, whole) == "fine"
     for length in (*range(len(whole)), len(whole) + 1, 2048):
-        with pytest.raises(DecodeError, match=r"^malformed$"):
-            codec.check(whole[:length].ljust(length, b"\0"))
-
-
-def test_every_other_version_is_refused_by_name():
-    data = bytearray(datagram(Kind.COMMAND, bytes(codec.BODY_SIZES[Kind.COMMAND])))
+        assert outcome(codec.check, whole[:length].ljust(length, b"\0")) == "malformed"
+    assert outcome(codec.check, bytes([whole[0], 2]) + whole[2:]) == "malformed"
     for version in {*range(256)} - {codec.VERSION}:
-        data[0] = version
-        with pytest.raises(DecodeError, match=r"^version$"):
-            codec.check(bytes(data))
+        assert outcome(codec.check, bytes([version]) + whole[1:]) == "version"
+    for size in range(codec.HEADER_SIZE + 1):
+        assert outcome(codec.peek, whole[:size]) == ("malformed" if size < 16 else "fine")
 
 
 @given(st.binary(max_size=400))
 @settings(max_examples=100, deadline=None)
 def test_garbage_raises_nothing_but_decode_errors(data):
-    for read in (codec.check, codec.peek):
-        try:
-            read(data)
-        except DecodeError:
-            pass
+    assert {outcome(codec.check, data), outcome(codec.peek, data)} <= {"fine", *REFUSED}
 
 
-@pytest.mark.parametrize(("offset", "value"), [(4, 9), (5, 9)])
-def test_a_request_that_does_not_exist_is_refused(offset, value):
-    body = bytearray(codec.encode_operator(OperatorRequest(1, Request.START, Start.HERE)))
-    body[offset] = value
-    with pytest.raises(DecodeError, match=r"^malformed$"):
-        codec.decode_operator(bytes(body))
+REFUSED = {"malformed", "version"}
+LARGEST = codec.encode_operator(OperatorRequest(1, Request.PROGRESS, Start.HERE, 2**63 - 1))
+TELEMETRY = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
 
 
-def test_a_mission_that_no_recording_can_name_is_refused():
-    largest = OperatorRequest(1, Request.START, Start.HERE, mission_id=2**63 - 1)
-    assert codec.decode_operator(codec.encode_operator(largest)) == largest
-    for mission_id in (2**63, 2**64 - 1):
-        with pytest.raises(DecodeError, match=r"^malformed$"):
-            codec.decode_operator(codec.encode_operator(largest._replace(mission_id=mission_id)))
-
-
-@pytest.mark.parametrize(("place", "field", "kind"), [(-2, 7, GuardState), (-1, -1, Cause)])
-def test_an_unknown_state_or_cause_of_the_guard_is_refused(place, field, kind):
-    body = bytearray(codec.BODY_SIZES[Kind.TELEMETRY])
-    body[place] = max(kind)
-    assert codec.decode_telemetry(bytes(body))[field] is max(kind)
-    for wrong in (max(kind) + 1, 200):
-        body[place] = wrong
-        with pytest.raises(DecodeError, match=r"^malformed$"):
-            codec.decode_telemetry(bytes(body))
-
-
-def test_peek_refuses_a_datagram_shorter_than_a_header():
-    for size in range(codec.HEADER_SIZE):
-        with pytest.raises(DecodeError, match=r"^malformed$"):
-            codec.peek(bytes(size))
+@pytest.mark.parametrize(
+    ("decode", "body", "offset", "largest"),
+    [
+        (codec.decode_operator, LARGEST, 4, max(Request)),
+        (codec.decode_operator, LARGEST, 5, max(Start)),
+        (codec.decode_operator, LARGEST, 13, 0x7F),  # a mission that no recording can name
+        (codec.decode_telemetry, TELEMETRY, -2, max(GuardState)),
+        (codec.decode_telemetry, TELEMETRY, -1, max(Cause)),
+    ],
+)
+def test_a_value_that_does_not_exist_is_refused(decode, body, offset, largest):
+    changed = bytearray(body)
+    for value, said in ((largest, "fine"), (largest + 1, "malformed"), (255, "malformed")):
+        changed[offset] = value
+        assert outcome(decode, changed) == said

@@ -22,12 +22,9 @@ def turned(orientation, rate=ZERO):
 AT_REST = turned(UPRIGHT)
 
 
-def test_at_rest_the_force_is_the_weight_of_the_assumed_mass():
-    assert LowLevel().force(ZERO, ZERO) == pytest.approx((0, 0, WEIGHT))
-
-
-def test_hover_is_508_rad_per_s_on_every_rotor():
+def test_hover_carries_the_assumed_mass_with_508_rad_per_s():
     # 10.3005 / 4 = 2.575125 N; / 9.9865e-6 = 257860.6; root 507.80.
+    assert LowLevel().force(ZERO, ZERO) == pytest.approx((0, 0, WEIGHT))
     assert LowLevel().update(AT_REST, ZERO) == pytest.approx((507.80,) * 4, abs=0.005)
 
 
@@ -40,14 +37,8 @@ def test_proportional_and_integral_force_oppose_the_error():
 def test_the_derivative_is_that_of_the_error():
     # A reference that jumps by .1 m/s within 2 ms: .3 * .1 / .002 = 15 N, .5 * .1 / .002 = 25 N.
     low_level = LowLevel(gain_p=ZERO, gain_i=ZERO)
-    low_level.force(ZERO, ZERO)
-    assert low_level.force(ZERO, (0.1, 0.0, 0.1)) == pytest.approx((15, 0, WEIGHT + 25))
-    assert low_level.force(ZERO, (0.1, 0.0, 0.1)) == pytest.approx((0, 0, WEIGHT))
-
-
-def test_the_first_error_has_no_rate():
-    low_level = LowLevel(gain_p=ZERO, gain_i=ZERO)
-    assert low_level.force((1.0, 1.0, 1.0), ZERO) == pytest.approx((0, 0, WEIGHT))
+    assert low_level.force((0.1, 0.1, 0.1), (0.1, 0.0, 0.0)) == pytest.approx((0, 0, WEIGHT))
+    assert low_level.force((0.1, 0.1, 0.1), (0.2, 0.0, 0.1)) == pytest.approx((15, 0, WEIGHT + 25))
 
 
 @pytest.mark.parametrize(("limit", "force"), [(0.10, 0.1), (0.30, 0.3)])

@@ -69,21 +69,17 @@ def test_mass_centre_and_inertia_are_the_sum_of_the_parts(pipes):
     assert axes @ np.diag(pipes.body_inertia[BASE]) @ axes.T == pytest.approx(inertia, abs=1e-9)
 
 
-@pytest.mark.parametrize(("rotor", "x", "y", "sign"), [
-    ("front", 0.21, 0, 1), ("left", 0, 0.21, -1), ("back", -0.21, 0, 1), ("right", 0, -0.21, -1),
-])  # fmt: skip
-def test_rotors_push_along_z_where_they_are(pipes, rotor, x, y, sign):
-    actuator = pipes.actuator(f"robot/rotor_{rotor}")
-    site = pipes.site(actuator.trnid[0])
-    assert site.pos.tolist() == pytest.approx([x, y, 0.05])
-    assert actuator.gear.tolist() == [0, 0, 1, 0, 0, sign * 0.016]
-
-
 def test_readers_without_mujoco_see_what_is_compiled(pipes):
     told = facts("pipes")
     assert list(told) == ["pipe_1", "pipe_2", "pipe_3", "board"]
     for name, numbers in told.items():
         assert pipes.numeric(name).data.tolist() == numbers
+    x, y_min, y_max, z_min, z_max = told["board"]
+    assert (x, y_min, y_max, z_min, z_max) == (8.535, -6.82, -6.02, 0.025, 1.225)
+    geoms = [pipes.geom(number) for number in range(pipes.ngeom)]
+    (board,) = [geom for geom in geoms if geom.name.startswith("board/")]
+    assert (board.pos - board.size).tolist() == pytest.approx([x, y_min, z_min])
+    assert (board.pos + board.size)[1:].tolist() == pytest.approx([y_max, z_max])
 
 
 @pytest.mark.parametrize(
@@ -118,16 +114,6 @@ def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
     assert np.sum(directions, axis=0) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
-def test_the_board_is_where_the_numbers_say(pipes):
-    x, y_min, y_max, z_min, z_max = facts("pipes")["board"]
-    assert (x, y_min, y_max, z_min, z_max) == (8.535, -6.82, -6.02, 0.025, 1.225)
-    geoms = [pipes.geom(number) for number in range(pipes.ngeom)]
-    (board,) = [geom for geom in geoms if geom.name.startswith("board/")]
-    low, high = board.pos - board.size, board.pos + board.size
-    assert low.tolist() == pytest.approx([x, y_min, z_min])
-    assert high[1:].tolist() == pytest.approx([y_max, z_max])
-
-
 def touched_at(scene: str) -> set[str]:
     """Return the bodies that the robot touches at its spawn, without the floor."""
     simulator = Simulator("pelican", scene)
@@ -135,22 +121,23 @@ def touched_at(scene: str) -> set[str]:
     return {touch.body for touch in simulator.take_contacts()}
 
 
-def test_the_spawn_is_free_but_straight_above_is_pipe_1(scene_at):
-    assert touched_at("pipes") == set()
-    # The rear rotor's rim reaches x = -.338; pipe 1's outside is at -1 + .7 = -.3.
-    assert touched_at(scene_at(0.0, 0.0, 0.75)) == {"pipe_1"}
-    for height in (0.3, 0.5, 0.75, 1.0):
-        assert touched_at(scene_at(0.2, 0.0, height)) == set()
-
-
-def test_the_tip_meets_the_board_with_the_base_at_8_135(scene_at):
-    assert touched_at(scene_at(8.134, -6.42, 0.7)) == set()
-    assert touched_at(scene_at(8.136, -6.42, 0.7)) == {"board"}
+@pytest.mark.parametrize(
+    ("place", "touched"),
+    [
+        ((0.0, 0.0, 0.1), set()),
+        # The rear rotor's rim reaches x = -.338; pipe 1's outside is at -1 + .7 = -.3.
+        ((0.0, 0.0, 0.75), {"pipe_1"}),
+        *(((0.2, 0.0, height), set()) for height in (0.3, 0.5, 0.75, 1.0)),
+        ((8.134, -6.42, 0.7), set()),  # the tip meets the board with the base at 8.135
+        ((8.136, -6.42, 0.7), {"board"}),
+    ],
+)
+def test_what_the_robot_touches(scene_at, place, touched):
+    assert touched_at(scene_at(*place)) == touched
 
 
 def test_a_contact_has_the_stiffness_and_friction_of_the_scene(scene_at):
-    simulator = Simulator("pelican", scene_at(8.136, -6.42, 0.7))
-    contact = simulator._data.contact
+    contact = Simulator("pelican", scene_at(8.136, -6.42, 0.7))._data.contact
     assert contact.solref[0].tolist() == [0.005, 1.0]
     assert contact.friction[0, 0] == 0.6
 
@@ -229,9 +216,10 @@ def test_a_scene_that_cannot_be_flown_in_is_refused(tmp_path, scene, message):
 
 
 def test_an_unknown_name_lists_the_available_ones():
-    with pytest.raises(BadInputError, match=r"no robot named 'pelikan'; available: pelican"):
-        compile_model("pelikan", "pipes")
-    with pytest.raises(BadInputError, match=r"no scene named 'tubes'; available: empty, pipes"):
-        compile_model("pelican", "tubes")
-    with pytest.raises(BadInputError, match="no scene named"):
-        compile_model("pelican", "/nowhere/scene.xml")
+    for robot, scene, message in (
+        ("pelikan", "pipes", r"no robot named 'pelikan'; available: pelican"),
+        ("pelican", "tubes", r"no scene named 'tubes'; available: empty, pipes"),
+        ("pelican", "/nowhere/scene.xml", "no scene named"),
+    ):
+        with pytest.raises(BadInputError, match=message):
+            compile_model(robot, scene)

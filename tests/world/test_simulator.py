@@ -42,14 +42,6 @@ def test_rotors_are_faster_up_than_down():
     assert off == pytest.approx(800.0 * exp(-0.5))
 
 
-def test_the_lag_does_not_depend_on_the_step():
-    coarse, fine = Rotors(0.01), Rotors(0.002)
-    coarse.step((100.0,) * 4, AT_REST)
-    for _ in range(5):
-        fine.step((100.0,) * 4, AT_REST)
-    assert fine.speeds == pytest.approx(coarse.speeds)
-
-
 def test_thrust_grows_with_the_square_of_the_speed():
     # 9.9865e-6 * 500^2 = 2.496625 N.
     assert steady((500.0, 1000.0, 0.0, 250.0), AT_REST)[:4] == pytest.approx(
@@ -90,21 +82,17 @@ def test_drag_is_the_sum_over_the_rotors(speeds, quaternion, velocity, rate):
     assert wrench == pytest.approx([*(rotation @ force), *torque], abs=1e-9)
 
 
-def test_it_stands_at_its_spawn():
+def test_it_stands_at_its_spawn_and_falls_from_the_air(scene_at):
     simulator = Simulator("pelican", "pipes")
     assert simulator.readings == Readings.of((0.0, 0.0, 0.1, *UPRIGHT), (*ZERO, *ZERO))
-    for _ in range(500):
-        simulator.step((0.0,) * 4)
-    assert simulator.readings.position == pytest.approx((0, 0, 0.1), abs=1e-3)
-    assert simulator.take_contacts() == []
-
-
-def test_free_fall_then_thrust(scene_at):
-    simulator = Simulator("pelican", scene_at(0, 0, 5, "empty"))
+    falling = Simulator("pelican", scene_at(0, 0, 5, "empty"))
     for _ in range(100):
         simulator.step((0.0,) * 4)
-    assert simulator.readings.velocity[2] == pytest.approx(-9.8066 * 0.2, rel=1e-4)
-    assert simulator.tip_force() == 0.0
+        falling.step((0.0,) * 4)
+    assert simulator.readings.position == pytest.approx((0, 0, 0.1), abs=1e-3)
+    assert simulator.take_contacts() == []
+    assert falling.readings.velocity[2] == pytest.approx(-9.8066 * 0.2, rel=1e-4)
+    assert falling.tip_force() == 0.0
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -125,25 +113,20 @@ def test_the_torque_allocated_is_the_torque_that_turns(scene_at, axis, sign):
     assert change[axis] == pytest.approx(sign * 0.02 * 0.0875 / inertia, rel=0.1)
 
 
-def test_hover_without_position_feedback_drifts_26_mm_per_s(scene_at):
-    # The arm's moment of .01 kg * .2 m * 9.81 m/s^2 tilts the robot by .0196 rad (k_R = 1), that is
-    # .204 N forward. The integral takes .1 N of it; the rest drives it on at 4 v = .104 N.
+@pytest.mark.parametrize(
+    ("limit", "reference", "duration", "velocity", "slack"),
+    [
+        # The arm's moment of .01 kg * .2 m * 9.81 m/s^2 tilts the robot by .0196 rad (k_R = 1),
+        # that is .204 N forward. The integral takes .1 N; the rest drives it at 4 v = .104 N.
+        (0.10, ZERO, 10.0, (0.026, 0.0, 0.0), 0.002),
+        (0.30, ZERO, 25.0, ZERO, 0.001),
+        (0.30, (0.5, -0.3, 0.2), 8.0, (0.5, -0.3, 0.2), 0.05),
+    ],
+)
+def test_a_velocity_is_followed(scene_at, limit, reference, duration, velocity, slack):
     simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))
-    fly(simulator, LowLevel(), ZERO, 10.0)
-    assert simulator.readings.velocity == pytest.approx((0.026, 0, 0), abs=0.002)
-    assert simulator.readings.orientation_wxyz == pytest.approx((1, 0, 0, 0), abs=0.02)
-
-
-def test_with_the_higher_integral_limit_it_stands_still(scene_at):
-    simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))
-    fly(simulator, LowLevel(integral_limit_xy=0.30), ZERO, 25.0)
-    assert simulator.readings.velocity == pytest.approx(ZERO, abs=0.001)
-
-
-def test_a_velocity_is_followed(scene_at):
-    simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))
-    fly(simulator, LowLevel(integral_limit_xy=0.30), (0.5, -0.3, 0.2), 8.0)
-    assert simulator.readings.velocity == pytest.approx((0.5, -0.3, 0.2), abs=0.05)
+    fly(simulator, LowLevel(integral_limit_xy=limit), reference, duration)
+    assert simulator.readings.velocity == pytest.approx(velocity, abs=slack)
 
 
 def test_reset_gives_the_same_flight_again():

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import atan2, hypot, inf, remainder, tau
+from operator import add
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.parameters import not_negative, vector
-from cloudrc.messages import ZERO, Odometry, Quaternion, Setpoint, Vector
+from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
 UNLIMITED: Vector = (inf, inf, inf)
 
@@ -38,24 +39,9 @@ class Pid(Controller):
         velocity_max: Vector,
         speed_max: float,
     ) -> None:
-        """Set gains and limits; the integral is zero. An infinite limit limits nothing.
-
-        Args:
-            gain_p: Velocity per position error [1/s], shape (3,).
-            gain_i: Velocity per integral of the position error [1/s^2], shape (3,).
-            gain_d: Reduction of the velocity per measured velocity [1], shape (3,).
-            gain_yaw: Yaw rate per yaw error [1/s].
-            integral_limit: Limit of the integral term per axis [m/s], shape (3,).
-            velocity_max: Limit of the velocity per axis [m/s], shape (3,).
-            speed_max: Limit of the speed [m/s].
-        """
-        self._gain_p = gain_p
-        self._gain_i = gain_i
-        self._gain_d = gain_d
-        self._gain_yaw = gain_yaw
-        self._integral_limit = integral_limit
-        self._velocity_max = velocity_max
-        self._speed_max = speed_max
+        self._gain_p, self._gain_i, self._gain_d = gain_p, gain_i, gain_d
+        self._gain_yaw, self._integral_limit = gain_yaw, integral_limit
+        self._velocity_max, self._speed_max = velocity_max, speed_max
         self._proportional_only = gain_i == ZERO and gain_d == ZERO
         self._limited = velocity_max != UNLIMITED or speed_max != inf
         self._integral = ZERO
@@ -65,17 +51,10 @@ class Pid(Controller):
         self._integral = ZERO
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
-        """Compute one command: u = P · e + I · (integral of e) - D · v, then the limits.
+        """Compute one command after `dt` [s]: u = P · e + I · (integral of e) - D · v, limited.
 
-        The three returned terms are not limited, so that their sum is the velocity only if no limit
-        acts. The integral contains the errors of all earlier updates, not the present error.
-
-        Source: the paper, eq. (5).
-
-        Args:
-            estimate: Predicted position [m] and velocity [m/s], world frame.
-            setpoint: Position [m], yaw [rad].
-            dt: Time since the last call [s], > 0.
+        The three returned terms are not limited. The integral contains the errors of all earlier
+        updates, not the present error. Source: the paper, eq. (5).
         """
         px, py, pz = estimate.position
         sx, sy, sz = setpoint.position
@@ -87,13 +66,16 @@ class Pid(Controller):
             vx, vy, vz = estimate.velocity
             gx, gy, gz = self._gain_d
             derivative = (-gx * vx, -gy * vy, -gz * vz)
-            wanted = _sum(proportional, integral, derivative)
+            x, y, z = map(add, map(add, proportional, integral), derivative)
+            wanted = (x, y, z)
         velocity = self._limit(wanted) if self._limited else wanted
         if not self._proportional_only:
             self._integrate((ex, ey, ez), wanted, velocity, dt)
-        yaw_rate = (
-            self._yaw_rate(estimate.orientation_wxyz, setpoint.yaw) if self._gain_yaw else 0.0
-        )
+        yaw_rate = 0.0
+        if self._gain_yaw:
+            w, x, y, z = estimate.orientation_wxyz
+            measured = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            yaw_rate = self._gain_yaw * remainder(setpoint.yaw - measured, tau)
         return ControlOutput(velocity, yaw_rate, proportional, integral, derivative)
 
     def _limit(self, wanted: Vector) -> Vector:
@@ -110,29 +92,12 @@ class Pid(Controller):
 
     def _integrate(self, error: Vector, wanted: Vector, velocity: Vector, dt: float) -> None:
         """Add `error` [m] over `dt` [s] to the integral on each axis where it causes no windup."""
+        terms = zip(self._integral, self._gain_i, self._integral_limit, strict=True)
         x, y, z = (
             max(min(term + gain * e * dt, limit), -limit) if v == u or e * u < 0 else term
-            for term, gain, e, u, v, limit in zip(
-                self._integral,
-                self._gain_i,
-                error,
-                wanted,
-                velocity,
-                self._integral_limit,
-                strict=True,
-            )
+            for (term, gain, limit), e, u, v in zip(terms, error, wanted, velocity, strict=True)
         )
         self._integral = (x, y, z)
-
-    def _yaw_rate(self, orientation_wxyz: Quaternion, yaw: float) -> float:
-        """Return the yaw error [rad], wrapped to at most half a turn, times the gain."""
-        w, x, y, z = orientation_wxyz
-        measured = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        return self._gain_yaw * remainder(yaw - measured, tau)
-
-
-def _sum(a: Vector, b: Vector, c: Vector) -> Vector:
-    return (a[0] + b[0] + c[0], a[1] + b[1] + c[1], a[2] + b[2] + c[2])
 
 
 def build(
@@ -152,8 +117,7 @@ def build(
         gain_p: Proportional gain per axis [1/s], shape (3,).
         gain_i: Integral gain per axis [1/s^2], shape (3,).
         gain_d: Derivative gain per axis [1], shape (3,).
-        gain_yaw: Gain of the yaw [1/s]; 0 commands no yaw rate, because the published low-level
-            controller always holds the yaw at 0.
+        gain_yaw: Gain of the yaw [1/s]; the published low-level controller ignores the yaw rate.
         integral_limit: Largest integral term per axis [m/s], shape (3,); None: no limit.
         velocity_max: Largest velocity per axis [m/s], shape (3,); None: no limit.
         speed_max: Largest speed [m/s]; the limit keeps the direction. None: no limit. With an
@@ -161,8 +125,7 @@ def build(
             does not know.
 
     Raises:
-        ValueError: If a parameter is infinite, NaN or negative; the message names the
-            parameter.
+        ValueError: If a parameter is infinite, NaN or negative; the message names it.
     """
     return Pid(
         vector("gain_p", gain_p),

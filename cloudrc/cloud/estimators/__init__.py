@@ -34,13 +34,10 @@ class Estimator:
         raise NotImplementedError
 
     def horizon(self, age: float) -> float:
-        """Return the horizon for a command that leaves now, from the newest odometry.
+        """Return the horizon for a command that leaves now [s]; 0 before the first sample.
 
         Args:
-            age: Now on cloud's clock minus the odometry's stamp on world's clock [s]. This is the
+            age: Now on cloud's clock minus the newest odometry's stamp on world's clock [s]: the
                 sum of uplink delay, time in cloud, and the unknown clock offset cloud - world.
-
-        Returns:
-            Horizon [s]; 0 before the first sample.
         """
         raise NotImplementedError

@@ -14,11 +14,7 @@ class Ewma(Estimator):
     """Exponentially weighted moving average of the loop delay; starts with the first sample."""
 
     def __init__(self, gain: float) -> None:
-        """Set the gain; there is no sample yet.
-
-        Args:
-            gain: Weight of a new sample [1], above 0 and at most 1.
-        """
+        """Set the weight of a new sample, `gain` [1]."""
         self._gain = gain
         self._average: float | None = None
 

@@ -15,11 +15,7 @@ class CappedRunningMean(Estimator):
     """Running mean whose gain falls to 1/count_max and then stays constant."""
 
     def __init__(self, count_max: int) -> None:
-        """Set `count_max`; there is no sample yet.
-
-        Args:
-            count_max: Number of samples after which the gain stays at 1/count_max.
-        """
+        """Set the number of samples after which the gain stays at 1/count_max."""
         self._count_max = count_max
         self._count = 0
         self._mean = 0.0

@@ -21,11 +21,7 @@ class Split(Estimator):
     """Exact age of the newest odometry, plus an exponential average of `applied_minus_stamp`."""
 
     def __init__(self, gain: float) -> None:
-        """Set the gain; there is no sample yet.
-
-        Args:
-            gain: Weight of a new sample of the downlink [1], above 0 and at most 1.
-        """
+        """Set the weight of a new sample of the downlink, `gain` [1]."""
         self._gain = gain
         self._applied_minus_stamp: float | None = None
 

@@ -31,30 +31,19 @@ class Predictor:
         """Reset the predictor at the start of a session."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate `odometry` by `horizon`.
-
-        Args:
-            odometry: Newest sample. Position [m], velocity [m/s], world frame.
-            horizon: Time from the sample to the predicted state [s], >= 0.
-
-        Returns:
-            The predicted sample; its `stamp_ns` is later than that of `odometry` by `horizon`.
-        """
+        """Return the newest sample, extrapolated by `horizon` [s], >= 0, with a later stamp."""
         raise NotImplementedError
 
 
 def rotate_ahead(
     orientation_wxyz: Quaternion, angular_velocity_body: Vector, horizon: float
 ) -> Quaternion:
-    """Rotate an orientation at a constant body rate.
+    """Rotate an orientation at a constant body rate for `horizon` [s].
 
     Args:
         orientation_wxyz: Unit quaternion, body to world, shape (4,).
         angular_velocity_body: Angular velocity [rad/s], body frame, shape (3,).
         horizon: Duration of the rotation [s].
-
-    Returns:
-        Unit quaternion, body to world, shape (4,).
     """
     x, y, z = angular_velocity_body
     rate = sqrt(x * x + y * y + z * z)

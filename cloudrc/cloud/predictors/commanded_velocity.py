@@ -29,13 +29,9 @@ class CommandedVelocity(Predictor):
         self._commanded = ZERO
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate a sample: p + u · tau; the velocity stays as measured.
+        """Extrapolate a sample by `horizon`, tau [s]: p + u · tau; the velocity stays as measured.
 
         Source: the authors' published code. The orientation turns as in the other predictors.
-
-        Args:
-            odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.
-            horizon: tau [s], >= 0.
         """
         px, py, pz = odometry.position
         ux, uy, uz = self._commanded

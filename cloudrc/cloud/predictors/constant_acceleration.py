@@ -17,11 +17,7 @@ class ConstantAcceleration(Predictor):
     """Measured velocity plus the acceleration between the ends of a short window."""
 
     def __init__(self, window: float) -> None:
-        """Set the window; the acceleration is zero.
-
-        Args:
-            window: Longest time between the two compared velocities [s].
-        """
+        """Set `window`, the longest time between the two compared velocities [s]."""
         self._window_ns = round(window * 1e9)
         self._recent: deque[Odometry] = deque()
         self._acceleration = ZERO
@@ -47,14 +43,10 @@ class ConstantAcceleration(Predictor):
         self._acceleration = ZERO
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate a sample: p + v · tau + a · tau^2 / 2, v + a · tau.
+        """Extrapolate a sample by `horizon`, tau [s]: p + v · tau + a · tau^2 / 2, v + a · tau.
 
         Source: the paper, eq. (3b), for the velocity.
         Deviation: eq. (3a) as printed has no acceleration in the position.
-
-        Args:
-            odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.
-            horizon: tau [s], >= 0.
         """
         px, py, pz = odometry.position
         vx, vy, vz = odometry.velocity

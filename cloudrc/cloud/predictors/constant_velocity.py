@@ -13,14 +13,10 @@ class ConstantVelocity(Predictor):
     """Predicts with the measured velocity; the orientation keeps turning at the measured rate."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate a sample: p + v · tau, v + a · tau with a = 0.
+        """Extrapolate a sample by `horizon`, tau [s]: p + v · tau, v + a · tau with a = 0.
 
         Source: the paper, eq. (3a), and eq. (3b) with a = 0, because the robot does not measure its
         acceleration.
-
-        Args:
-            odometry: Position [m], velocity [m/s], world frame; angular velocity [rad/s], body.
-            horizon: tau [s], >= 0.
         """
         px, py, pz = odometry.position
         vx, vy, vz = velocity = odometry.velocity

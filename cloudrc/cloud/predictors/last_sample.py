@@ -14,13 +14,7 @@ class LastSample(Predictor):
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Return the sample with a stamp that is later by `horizon` [s]."""
-        return Odometry(
-            odometry.stamp_ns + round(horizon * 1e9),
-            odometry.position,
-            odometry.orientation_wxyz,
-            odometry.velocity,
-            odometry.angular_velocity_body,
-        )
+        return odometry._replace(stamp_ns=odometry.stamp_ns + round(horizon * 1e9))
 
 
 def build() -> LastSample:

@@ -11,8 +11,14 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from cloudrc.geometry.clearance import pipe_index
-from cloudrc.geometry.robot import ARM_HEIGHT, ARM_LENGTH, ARM_RADIUS, Spheres, place_points
+from cloudrc.geometry.clearance import (
+    ARM_HEIGHT,
+    ARM_LENGTH,
+    ARM_RADIUS,
+    Spheres,
+    pipe_index,
+    place_points,
+)
 from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import first_touch

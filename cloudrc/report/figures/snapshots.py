@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from cloudrc.geometry import robot as body
+from cloudrc.geometry import clearance as body
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import Board, Pipe
 from cloudrc.metrics.flight import Array

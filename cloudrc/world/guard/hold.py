@@ -55,20 +55,10 @@ falls from a small height, at low speed."""
 
 
 class PositionHold:
-    """Brakes the robot, holds it where it came to rest, or lets it descend from that point.
-
-    Attributes:
-        brakes: Whether the robot still brakes and has no hold point yet.
-    """
+    """Brakes the robot (`brakes`), holds it where it came to rest, or lets it descend there."""
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Set the limits; there is no hold point yet.
-
-        Args:
-            low: Lower corner of the box for hold points [m], world frame, shape (3,).
-            high: Upper corner [m], shape (3,).
-            speed_max: Speed cap [m/s]; if it is below HOLD_SPEED_MAX, it limits the position hold.
-        """
+        """Hold between `low` and `high` [m], world frame, no faster than `speed_max` [m/s]."""
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
         self._hold_point: Vector | None = None
@@ -80,7 +70,7 @@ class PositionHold:
         self._hold_point, self.brakes = None, False
 
     def follow(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
-        """Return the next reference for braking, holding or descending.
+        """Return the next reference for braking, holding or descending [m/s], world frame.
 
         Args:
             reference: Reference of the last tick [m/s], world frame, shape (3,).
@@ -95,21 +85,14 @@ class PositionHold:
         dx, dy, dz = hx - x, hy - y, 0.0 if sink else hz - z
         ix, iy, iz = self._integral
         if hypot(dx, dy, dz) < INTEGRAL_RANGE:
-            self._integral = self._integrate((dx, dy, dz), dt)
+            gain, most = INTEGRAL_GAIN * dt, INTEGRAL_MAX
+            x, y, z = ix + gain * dx, iy + gain * dy, iz + gain * dz
+            self._integral = clamp(x, -most, most), clamp(y, -most, most), clamp(z, -most, most)
         back_x = POSITION_GAIN * dx - DAMPING_GAIN * vx + ix
         back_y = POSITION_GAIN * dy - DAMPING_GAIN * vy + iy
         back_z = 0.0 if sink else POSITION_GAIN * dz - DAMPING_GAIN * vz + iz
         x, y, z = limit_length((back_x, back_y, back_z), self._speed_max)
         return step_towards(reference, (x, y, z - sink), BRAKE * dt)
-
-    def _integrate(self, distance: Vector, dt: float) -> Vector:
-        """Integrate the distance from the hold point, `distance` [m], shape (3,), over `dt` [s]."""
-        (ix, iy, iz), (dx, dy, dz), gain = self._integral, distance, INTEGRAL_GAIN * dt
-        return (
-            clamp(ix + gain * dx, -INTEGRAL_MAX, INTEGRAL_MAX),
-            clamp(iy + gain * dy, -INTEGRAL_MAX, INTEGRAL_MAX),
-            clamp(iz + gain * dz, -INTEGRAL_MAX, INTEGRAL_MAX),
-        )
 
     def _brake(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
         """Slow the reference down. Set the hold point once the robot is at rest."""
@@ -126,14 +109,10 @@ class PositionHold:
 
 
 def brake_start(reference: Vector, velocity: Vector) -> Vector:
-    """Return the reference for the start of braking, which is slower than the robot.
+    """Return the reference for the start of braking [m/s], which is slower than the robot.
 
-    The robot follows the reference with a delay. If the reference were faster than the robot when
-    braking starts, the robot would first speed up.
-
-    Args:
-        reference: Finite reference of the last tick [m/s], shape (3,).
-        velocity: Velocity of the robot [m/s], world frame, shape (3,).
+    The robot follows late: if the reference were faster, it would first speed up. `reference` is
+    the finite one of the last tick, `velocity` that of the robot [m/s], world frame, shape (3,).
     """
     start = velocity if hypot(*velocity) < hypot(*reference) else reference
     speed = hypot(*start)
@@ -153,8 +132,7 @@ class Descent:
     """Detects touch-down, and whether a descent may still stop in the air.
 
     After an acknowledgement a descent stops in the air only if the robot sinks freely and is high
-    enough. A robot that stands on something or flies too low would scrape along the ground or into
-    a pipe, so it continues its descent to touch-down.
+    enough; otherwise it would scrape along the ground or into a pipe.
 
     Attributes:
         speed: Speed of the descent [m/s].
@@ -162,12 +140,7 @@ class Descent:
     """
 
     def __init__(self, floor: float, speed_max: float) -> None:
-        """Set the limits of descents.
-
-        Args:
-            floor: Lowest height of a hold point [m].
-            speed_max: Speed cap [m/s]; if it is below LAND_SPEED, it is the speed of the descent.
-        """
+        """Set `floor`, the lowest height of a hold point [m], and the cap `speed_max` [m/s]."""
         self._floor, self.speed = floor, min(LAND_SPEED, speed_max)
         self._still_speed = min(STILL_SPEED, STILL_SHARE * self.speed)
         self.begin(0)
@@ -182,12 +155,9 @@ class Descent:
         return self.acknowledged and free
 
     def is_over(self, now_ns: int, reference: Vector, readings: Readings) -> bool:
-        """Take the motion of this tick into account; tell whether the robot has touched down.
+        """Note the motion of this tick at `now_ns` [ns]; tell whether the robot has touched down.
 
-        Args:
-            now_ns: World's clock [ns].
-            reference: Reference of the last tick [m/s], world frame, shape (3,).
-            readings: Readings of the onboard sensors.
+        `reference` is that of the last tick [m/s].
         """
         if reference[2] > -0.5 * self.speed or abs(readings.velocity[2]) >= self._still_speed:
             self._moved_ns = now_ns
@@ -195,25 +165,15 @@ class Descent:
 
 
 class TakeOff:
-    """Detects when the robot has left the ground, and whether the robot may take off.
+    """Detects when the robot has left the ground (`over`), and whether it may take off.
 
-    Before take-off a robot in HOLD would scrape along the floor, so the rotors stop instead.
-
-    A robot whose rotors were stopped in the air may still fall, or lie outside the fence, when the
-    operator acknowledges. This robot may take off once it lies still, inside the fence and at least
-    TAKE_OFF_MARGIN from the fence's walls.
-
-    Attributes:
-        over: Whether the robot has left the ground.
+    Before take-off a robot in HOLD would scrape along the floor, so the rotors stop instead. A
+    robot whose rotors were stopped in the air may still fall, or lie outside the fence, when the
+    operator acknowledges. It may take off once it lies still, TAKE_OFF_MARGIN inside the fence.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
-        """Set the fence; the robot is on the ground.
-
-        Args:
-            low: Lower corner of the fence [m], shape (3,).
-            high: Upper corner [m], shape (3,).
-        """
+        """Set the corners of the fence, `low` and `high` [m]; the robot is on the ground."""
         (ax, ay, az), (bx, by, bz) = low, high
         self._low = (ax + TAKE_OFF_MARGIN, ay + TAKE_OFF_MARGIN, az)
         self._high = (bx - TAKE_OFF_MARGIN, by - TAKE_OFF_MARGIN, bz)
@@ -233,33 +193,24 @@ class TakeOff:
     def forget(self, *, stopped: bool = False) -> None:
         """Reset to the state before take-off, because the robot stands or falls to the ground.
 
-        Args:
-            stopped: Whether the rotors may have been stopped in the air or on an obstacle.
+        `stopped`: the rotors may have been stopped in the air or on an obstacle.
         """
         self.over = False
         if stopped:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Note where the robot stands or, while it flies, whether it has left the ground.
-
-        Args:
-            readings: Readings of the onboard sensors.
-            flies: Whether the rotors turn.
-        """
+        """Note where the robot stands or, while it `flies`, whether it has left the ground."""
         height = readings.position[2]
         if flies:
             self.over, self._stopped = not abs(height - self._height) < LIFT_OFF_HEIGHT, False
         else:
             self._height = height
             if self._stopped:
-                self._count_still_ticks(readings)
-
-    def _count_still_ticks(self, readings: Readings) -> None:
-        low, position, high = self._low, readings.position, self._high
-        inside = all(map(le, low, position)) and all(map(le, position, high))
-        at_rest = inside and hypot(*readings.velocity) < STILL_SPEED
-        self._still_ticks = self._still_ticks + 1 if at_rest else 0
+                at = readings.position
+                inside = all(map(le, self._low, at)) and all(map(le, at, self._high))
+                at_rest = inside and hypot(*readings.velocity) < STILL_SPEED
+                self._still_ticks = self._still_ticks + 1 if at_rest else 0
 
     def may_end(self, readings: Readings) -> bool:
         """Tell whether the robot is still on the ground and slow enough to stop its rotors."""

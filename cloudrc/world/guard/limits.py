@@ -1,9 +1,8 @@
 """The limits of the guard, and the arithmetic that keeps a velocity reference within them.
 
-World alone sets the limits. Each limit is finite and above 0: no value switches a limit off.
-
-The functions are pure. For any input, NaN and infinity included, each returns a finite result
-within its bound. For this purpose, every comparison is false for NaN.
+World alone sets the limits. Each limit is finite and above 0: no value switches a limit off. For
+any input, NaN and infinity included, each function returns a finite result within its bound; so
+every comparison is written for the case that it is false for NaN.
 `tests/world/guard/test_proof.py` proves the bounds of the scalar functions for all 64-bit floats.
 """
 
@@ -56,10 +55,7 @@ def stopping_distance(speed: float, reaction: float) -> float:
 
 
 def clamp(value: float, low: float, high: float) -> float:
-    """Limit `value` to the interval from `low` to `high`; all three in any unit.
-
-    NaN becomes `low`.
-    """
+    """Limit `value` to the interval from `low` to `high`, in any unit; NaN becomes `low`."""
     if value >= high:
         return high
     return value if value > low else low
@@ -68,35 +64,22 @@ def clamp(value: float, low: float, high: float) -> float:
 def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
     """Return the largest reference speed towards a face of the fence [m/s].
 
-    The largest v with t · v + v^2/6 <= d is 2 · d / (t + sqrt(t^2 + 2 · d/3)). This form avoids
-    cancellation. If the robot is beyond the face, v is negative, so that the robot returns.
-
-    Args:
-        distance: Distance to the face minus the margin, d of the formula [m].
-        reaction: t of the formula [s].
+    The largest v with t · v + v^2/6 <= d is 2 · d / (t + sqrt(t^2 + 2 · d/3)), for the distance d
+    to the face minus the margin [m] and the reaction time t [s]. Beyond the face v is negative, so
+    that the robot returns.
     """
     if distance > FAR:
         return inf
     if distance > 0.0:
-        return (
-            2.0
-            * distance
-            / (reaction + sqrt(reaction * reaction + 4.0 * STOP_COEFFICIENT * distance))
-        )
+        root = sqrt(reaction * reaction + 4.0 * STOP_COEFFICIENT * distance)
+        return 2.0 * distance / (reaction + root)
     return max(RETURN_GAIN * distance, -RETURN_SPEED_MAX) if distance < 0.0 else 0.0
 
 
 def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether the fence is too far away to limit a velocity.
+    """Tell whether `limit_to_fence` changes nothing up to RECHECK_DISTANCE from `position`.
 
-    The answer is True if `limit_to_fence` leaves the velocity unchanged at every point that is less
-    than RECHECK_DISTANCE from `position`.
-
-    Args:
-        velocity: Reference [m/s], world frame, shape (3,).
-        position: Position of the base [m], world frame, shape (3,).
-        low: Lower corner of the fence, margins taken off [m], shape (3,).
-        high: Upper corner, margins taken off [m], shape (3,).
+    `velocity`, `position`, `low` and `high` are as in `limit_to_fence` [m/s], [m].
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if vx > 0.0:
@@ -128,7 +111,7 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
         velocity: Finite reference [m/s], world frame, shape (3,).
         position: Position of the base [m], world frame, shape (3,).
         low: Lower corner of the fence, margins taken off [m], shape (3,).
-        high: Upper corner, margins taken off [m], shape (3,).
+        high: Upper corner, likewise.
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if not z >= az - FLOOR_MARGIN + LOW_HEIGHT:
@@ -142,10 +125,7 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
 
 
 def limit_length(a: Vector, length_max: float) -> Vector:
-    """Shorten `a` [m/s] to a length of at most `length_max` [m/s] and keep its direction.
-
-    The result is zero if a component is NaN or infinite.
-    """
+    """Shorten `a` [m/s] to at most `length_max` [m/s]; zero if a component is NaN or infinite."""
     x, y, z = a
     largest = max(abs(x), abs(y), abs(z))
     if largest > length_max:
@@ -173,15 +153,10 @@ def step_towards(start: Vector, end: Vector, step: float) -> Vector:
 
 
 def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
-    """Limit how much a velocity speeds up from `before` to `after`; slowing down is not limited.
+    """Limit how much a velocity [m/s] speeds up in a tick to `step` [m/s]; it may slow down freely.
 
-    The fence may turn one axis back while another axis speeds up. Then each axis may be within the
-    cap, while the speed of all axes together is above the cap.
-
-    Args:
-        before: Finite velocity of the last tick [m/s], shape (3,).
-        after: Finite wanted velocity [m/s], shape (3,).
-        step: Largest speed-up [m/s].
+    The fence may turn one axis back while another one speeds up: then each axis is within the cap,
+    but not all together. `before` and `after` are finite.
     """
     (ax, ay, az), (bx, by, bz) = before, after
     x, y, z = growth(ax, bx), growth(ay, by), growth(az, bz)
@@ -204,11 +179,11 @@ def growth(before: float, after: float) -> float:
 
 
 def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float) -> Vector:
-    """Limit how fast the reference sinks, so that the robot does not turn over.
+    """Limit how fast the reference [m/s] sinks, so that the robot does not turn over.
 
     Args:
-        reference: Wanted reference [m/s], world frame, shape (3,).
-        before: Reference of the last tick [m/s], at most `speed_max` long, shape (3,).
+        reference: Wanted reference [m/s].
+        before: Reference of the last tick [m/s], at most `speed_max` long.
         climb: Vertical velocity of the robot [m/s].
         speed_max: Largest speed of the result [m/s].
     """
@@ -278,11 +253,9 @@ class Limits:
 
     @property
     def ramp_ns(self) -> int:
-        """How long the acceleration of the reference is limited to BRAKE after a HOLD [ns].
+        """How long the reference speeds up by at most BRAKE after a HOLD [ns]: up to the speed cap.
 
-        This time, the ramp, is long enough to reach the speed cap. The ramp ends by time only, not
-        when the reference reaches its command: the first commands after a silence may be zero, and
-        the reference reaches zero at once.
+        The ramp ends by time only: the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)

@@ -77,7 +77,6 @@ class Guard:
     """
 
     def __init__(self, limits: Limits) -> None:
-        """Set the limits; the state is GROUND."""
         self._limits = limits
         self._speed_max = limits.speed_max * rules.ROUNDING_FACTOR
         self._low, self._high = limits.inner_corners()
@@ -155,25 +154,16 @@ class Guard:
         self._wanted, self.yaw_rate = ZERO, 0.0
 
     def accept_command(self, command: Command, now_ns: int) -> str | None:
-        """Accept or reject a command that arrived through the tunnel.
-
-        Args:
-            command: A command; its numbers may have any value, even NaN.
-            now_ns: World's clock [ns].
+        """Accept or reject at `now_ns` [ns] a command, whose numbers may have any value, even NaN.
 
         Returns:
             None if the command is accepted, else the reason: "range" for a value that is too large
-            or NaN; "future" for a basis that is not yet measured; "stale" for a basis that is too
-            old.
+            or NaN; "future" for a basis that is not yet measured; "stale" for one that is too old.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
-        if not (
-            abs(x) <= COMMAND_MAX
-            and abs(y) <= COMMAND_MAX
-            and abs(z) <= COMMAND_MAX
-            and abs(yaw_rate) <= COMMAND_MAX
-        ):
+        most = COMMAND_MAX
+        if not (abs(x) <= most and abs(y) <= most and abs(z) <= most and abs(yaw_rate) <= most):
             self._note_invalid(now_ns)
             return "range"
         limits = self._limits
@@ -225,15 +215,11 @@ class Guard:
             self._enter(LAND, now_ns, Cause.IMPOSSIBLE, IMPOSSIBLE)
 
     def step(self, now_ns: int, readings: Readings, dt: float) -> Vector | None:
-        """Advance by one tick and return the reference for the low-level controller.
-
-        Args:
-            now_ns: World's clock [ns].
-            readings: Readings of the onboard sensors.
-            dt: Time since the last tick [s].
+        """Advance by one tick of `dt` [s] at `now_ns` [ns].
 
         Returns:
-            Velocity reference [m/s], shape (3,); None while the rotors are stopped.
+            Velocity reference for the low-level controller [m/s], shape (3,); None while the rotors
+            are stopped.
         """
         # The usual case: the same command as in the last tick, far from the fence.
         if now_ns <= self._steady_until_ns and self.reference is self._wanted:
@@ -266,9 +252,8 @@ class Guard:
             inside = rules.limit_to_fence(reference, position, self._low, self._high)
             if inside != reference:
                 self.counts["limited_fence"] += 1
-                inside = rules.limit_growth(
-                    self.reference, inside, self._limits.acceleration_max * dt
-                )
+                step = self._limits.acceleration_max * dt
+                inside = rules.limit_growth(self.reference, inside, step)
                 reference = rules.limit_length(inside, self._speed_max)
         if now_ns < self._ramp_until_ns:
             reference = rules.limit_growth(self.reference, reference, rules.BRAKE * dt)

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from math import frexp, hypot, sqrt
 from random import Random
 
+import pytest
 import z3
 
 from cloudrc.geometry import fence
@@ -23,6 +24,7 @@ from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.readings import Readings
 from cloudrc.world.robot import Robot
+from cloudrc.world.simulator import Simulator
 
 MS = 1_000_000
 TICK = 2 * MS
@@ -91,9 +93,22 @@ def landing(limits: Limits = LIMITS):
     return guard
 
 
+def stopped(guard, now_ns=0):
+    """Return the guard after an emergency stop."""
+    guard.stop(now_ns)
+    assert guard.state is GuardState.ESTOP
+    return guard
+
+
 def states(guard):
     """Return the states entered since the last call."""
     return [change.state for change in guard.take_changes()]
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    """Return the robot in the empty scene."""
+    return Simulator("pelican", "empty")
 
 
 PERIOD_NS = 10 * MS

@@ -1,92 +1,72 @@
-"""How the guard is armed, limits commands, and enters HOLD."""
+"""How the guard is armed, limits commands, enters and leaves HOLD, lands, and stops."""
 
+from dataclasses import replace
 from itertools import pairwise
-from math import hypot, inf, nan, nextafter
+from math import dist, hypot, inf, nan, nextafter
 
 import pytest
 
-from cloudrc.messages import ZERO, GuardState
-from cloudrc.world.guard.hold import BRAKE_MAX, HOLD_SPEED_MAX
-from cloudrc.world.guard.limits import COMMAND_MAX, Limits
+from cloudrc.messages import ZERO, Cause, GuardState
+from cloudrc.world.guard.hold import BRAKE_MAX, HOLD_SPEED_MAX, LAND_SPEED, STILL_SPEED
+from cloudrc.world.guard.limits import COMMAND_MAX
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import (
+    DT,
     HERE,
     LIMITS,
     MS,
     SECOND,
+    TICK,
     armed,
     command,
     feed,
     holding,
+    landing,
     run,
     sensed,
-    states,
+    stopped,
     tracking,
 )
 from tests.world.guard.test_arithmetic import SPECIAL
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 BEYOND = [value for value in (*SPECIAL, 1e308, -1e308) if abs(value) > COMMAND_MAX]
+LOW, SINKS = (1.0, 2.0, 0.1), (0.0, 0.0, -0.5)
+BAD = command((nan, 0.0, 0.0))
+
+
+def told(guard):
+    """Return the last change of the state: time, state, words."""
+    change = guard.take_changes()[-1]
+    assert guard.state is change.state
+    return tuple(change)
 
 
 # Arming
-
-
-def test_at_first_nothing_is_armed_and_nothing_flown():
-    guard = Guard(LIMITS)
-    assert (guard.state, guard.armed, guard.reference, guard.yaw_rate) == (GROUND, False, ZERO, 0.0)
-    assert guard.changes == []
 
 
 @pytest.mark.promise("only-the-operator-arms")
 def test_fresh_commands_alone_never_arm():
     guard = Guard(LIMITS)
     assert guard.accept_command(command(), 0) is None
-    assert guard.state is GROUND
     assert run(guard, 0, 10 * MS) == [None] * 5  # the rotors are stopped
-
-
-def test_a_started_mission_waits_for_its_first_command():
-    guard = armed()
-    assert run(guard, 0, 10 * MS) == [None] * 5
-    guard.accept_command(command(basis_ns=10 * MS), 10 * MS)
-    assert guard.state is TRACK
-    assert [change.cause for change in guard.take_changes()] == ["fresh command"]
-
-
-def test_commands_from_before_the_start_are_not_flown():
-    guard = Guard(LIMITS)
-    guard.accept_command(command(), 0)
-    guard.start_mission(1 * MS)
-    assert run(guard, 1 * MS, 3 * MS) == [None]
-
-
-def test_a_second_start_within_a_mission_forgets_nothing():
-    guard = tracking()
+    assert (guard.state, guard.armed, guard.reference, guard.yaw_rate) == (GROUND, False, ZERO, 0.0)
+    assert (guard.changes, guard.cause) == ([], Cause.SPAWN)
     guard.start_mission(10 * MS)
-    run(guard, 10 * MS, 20 * MS)
-    assert guard.state is TRACK
-
-
-def test_the_fence_changes_the_reference_within_the_cap():
-    """Beyond the margin it returns in one axis while another axis speeds up."""
-    guard = tracking((0.0, 6.0, 0.0))
-    before = ZERO
-    for k in range(40):
-        now_ns, x = 2 * MS * k, -2.8 - 0.01 * k
-        after = guard.step(now_ns, sensed((x, -3.0, 1.3), (-5.0, 0.0, 0.0)), 0.002)
-        assert hypot(*(b - a for a, b in zip(before, after, strict=True))) <= 0.024 + 1e-15
-        before = after
-    assert before[0] > 0.2
-    assert before[1] > 0.3
+    assert run(guard, 10 * MS, 12 * MS) == [None], "a command from before the start is not flown"
+    guard.accept_command(command(basis_ns=12 * MS), 12 * MS)
+    assert told(guard) == (12 * MS, TRACK, "fresh command")
+    guard.start_mission(20 * MS)
+    run(guard, 20 * MS, 30 * MS)
+    assert guard.state is TRACK, "a second start within a mission forgets nothing"
 
 
 def test_put_on_the_ground_nothing_is_armed_or_remembered():
     guard = tracking()
     run(guard, 0, 10 * MS)
     guard.put_on_ground(10 * MS, "mission starts from spawn")
-    assert guard.take_changes()[-1] == (10 * MS, GROUND, "mission starts from spawn")
-    assert (guard.state, guard.armed, guard.reference) == (GROUND, False, ZERO)
+    assert told(guard) == (10 * MS, GROUND, "mission starts from spawn")
+    assert (guard.cause, guard.armed, guard.reference) == (Cause.SPAWN, False, ZERO)
     guard.accept_command(command(basis_ns=10 * MS), 10 * MS)
     assert guard.state is GROUND
 
@@ -101,9 +81,8 @@ def test_a_command_with_an_absurd_value_is_rejected(bad, axis):
     before = run(guard, 0, 100 * MS)[-1]
     values = [1.0, 1.0, 1.0, 0.1]
     values[axis] = bad
-    assert (
-        guard.accept_command(command(tuple(values[:3]), 100 * MS, values[3]), 100 * MS) == "range"
-    )
+    absurd = command(tuple(values[:3]), 100 * MS, values[3])
+    assert guard.accept_command(absurd, 100 * MS) == "range"
     assert run(guard, 100 * MS, 102 * MS) == [before]
     assert guard.yaw_rate == 0.0
 
@@ -125,35 +104,30 @@ def test_the_speed_is_capped_and_keeps_its_direction():
     assert guard.counts["limited_speed"] == 61
 
 
-@pytest.mark.parametrize("most", [COMMAND_MAX, -COMMAND_MAX])
-def test_a_too_fast_command_in_range_is_shortened(most):
-    guard = armed()
-    assert guard.accept_command(command((most, most, most), yaw_rate=most), 0) is None
-    assert guard.counts == {"limited_speed": 1, "limited_yaw_rate": 1}
-
-
-@pytest.mark.parametrize(("asked", "allowed"), [(0.4, 0.4), (7.0, 1.0), (-7.0, -1.0)])
+@pytest.mark.parametrize(
+    ("asked", "allowed"), [(0.4, 0.4), (7.0, 1.0), (-7.0, -1.0), (COMMAND_MAX, 1.0)]
+)
 def test_the_yaw_rate_is_capped(asked, allowed):
     guard = armed()
     for _ in range(2):
-        guard.accept_command(command(yaw_rate=asked), 0)
+        assert guard.accept_command(command((asked, asked, asked), yaw_rate=asked), 0) is None
     assert guard.yaw_rate == allowed
     assert guard.counts["limited_yaw_rate"] == 2 * (asked != allowed)
+    assert guard.counts["limited_speed"] == 2 * (abs(asked) > 6.0)
     guard.forget_commands()
     assert guard.yaw_rate == 0.0
 
 
 def test_the_reference_changes_within_the_acceleration_cap():
     references = run(tracking((3.0, 4.0, 0.0)), 0, 200 * MS, position=(1.0, -3.0, 1.3))
-    assert references[0] == pytest.approx((12 * 0.002 * 0.6, 12 * 0.002 * 0.8, 0.0))
+    assert references[0] == pytest.approx((12 * DT * 0.6, 12 * DT * 0.8, 0.0))
     assert references[-1] == pytest.approx((1.44, 1.92, 0.0))  # 12 m/s^2 for 0.2 s
 
 
 def test_one_command_is_slowed_more_and_more_near_the_fence():
     guard = tracking((0.0, 2.0, 0.0))
     feed(guard, 0, 30, (0.0, 2.0, 0.0), position=(1.0, 0.0, 1.3))
-    assert guard.reference == (0.0, 2.0, 0.0)
-    assert guard.counts == {}
+    assert (guard.reference, guard.counts) == ((0.0, 2.0, 0.0), {})
     flown = []
     for k, y in enumerate((3.0, 4.0, 4.5, 5.0, 5.4)):  # no faster than a robot can move
         start_ns = (300 + 40 * k) * MS
@@ -162,6 +136,29 @@ def test_one_command_is_slowed_more_and_more_near_the_fence():
     assert flown[1:] == sorted(flown[1:], reverse=True)
     assert flown[-1] <= 0.0
     assert guard.counts == {"limited_fence": 4}
+
+
+def test_the_fence_changes_the_reference_within_the_cap():
+    """Beyond the margin it returns in one axis while another axis speeds up."""
+    guard = tracking((0.0, 6.0, 0.0))
+    before = ZERO
+    for k in range(40):
+        after = guard.step(2 * MS * k, sensed((-2.8 - 0.01 * k, -3.0, 1.3), (-5.0, 0.0, 0.0)), DT)
+        assert dist(before, after) <= 0.024 + 1e-15
+        before = after
+    assert before[0] > 0.2
+    assert before[1] > 0.3
+
+
+def test_a_command_into_the_floor_ends_above_it():
+    guard = tracking((0.0, 0.0, -2.0))
+    lower = run(guard, 0, 200 * MS, (1.0, 2.0, 0.40))[-1][2]
+    assert 0.2 * -lower + lower * lower / 6 == pytest.approx(0.05)
+    assert run(guard, 200 * MS, 210 * MS, (1.0, 2.0, 0.34))[-1][2] == 0.0
+
+
+def test_the_first_reading_may_be_anything():
+    assert tracking().step(0, sensed((nan, nan, nan), (nan, inf, -inf)), DT) is not None
 
 
 # From TRACK to HOLD
@@ -173,16 +170,14 @@ def test_hold_begins_with_the_first_tick_after_the_age_limit():
     run(guard, 0, 252 * MS)
     assert guard.state is TRACK
     run(guard, 252 * MS, 254 * MS)
-    assert guard.state is HOLD
-    assert guard.take_changes()[-1].cause == "command age 0.252 s above 0.250 s"
-
-
-def test_a_new_session_holds_at_once_and_says_why():
-    guard = tracking()
-    run(guard, 0, 10 * MS)
+    assert told(guard) == (252 * MS, HOLD, "command age 0.252 s above 0.250 s")
+    assert guard.cause is Cause.SILENCE
+    feed(guard, 2 * SECOND, 20)
+    assert told(guard)[1:] == (TRACK, "10 fresh commands within 0.090 s")
+    assert guard.cause is Cause.COMMANDS
     guard.forget_commands()
-    run(guard, 10 * MS, 12 * MS)
-    assert guard.take_changes()[-1][1:] == (HOLD, "new session")
+    run(guard, 2200 * MS, 2202 * MS)
+    assert told(guard) == (2200 * MS, HOLD, "new session")
 
 
 def test_hold_brakes_at_once_and_then_holds_the_position():
@@ -198,22 +193,19 @@ def test_hold_brakes_at_once_and_then_holds_the_position():
     assert run(guard, 904 * MS, 906 * MS, (1.02, 2.0, 1.3))[0][0] < 0.0
     far = run(guard, 906 * MS, 2 * SECOND, (3.0, 2.0, 1.3))[-1]
     assert far == pytest.approx((-HOLD_SPEED_MAX, 0.0, 0.0))
+    assert run(guard, 2 * SECOND, 3 * SECOND, HERE, (0.0, 0.2, 0.0))[-1][1] < -0.2, "it is damped"
 
 
-def test_a_robot_that_lags_its_reference_brakes_from_where_it_is():
+def test_the_reference_brakes_from_the_robot_and_no_harder_than_its_limit():
     guard = tracking((5.0, 0.0, 0.0))
     run(guard, 0, 252 * MS, velocity=(0.2, 0.0, 0.0))
     assert guard.reference[0] > 2.5
     run(guard, 252 * MS, 254 * MS, velocity=(0.2, 0.0, 0.0))
     assert hypot(*guard.reference) <= 0.2
-
-
-def test_the_reference_brakes_no_harder_than_its_limit():
     guard = tracking((3.0, 0.0, 0.0))
     run(guard, 0, 252 * MS, velocity=(3.0, 0.0, 0.0))
     references = run(guard, 252 * MS, 1200 * MS, velocity=(3.0, 0.0, 0.0))
-    steps = [a[0] - b[0] for a, b in pairwise(references)]
-    assert max(steps) <= BRAKE_MAX * 0.002 * (1 + 1e-9)
+    assert max(a[0] - b[0] for a, b in pairwise(references)) <= BRAKE_MAX * DT * (1 + 1e-9)
 
 
 def test_the_next_hold_has_a_new_hold_point():
@@ -221,46 +213,391 @@ def test_the_next_hold_has_a_new_hold_point():
     now_ns = feed(guard, 2 * SECOND, 20, (0.0, 0.0, 0.0))
     assert guard.state is TRACK
     elsewhere = run(guard, now_ns, now_ns + 2 * SECOND, (3.0, 2.0, 1.3))
-    assert guard.state is HOLD
-    assert set(elsewhere) == {ZERO}
-
-
-def test_a_command_into_the_floor_ends_above_it():
-    guard = tracking((0.0, 0.0, -2.0))
-    lower = run(guard, 0, 200 * MS, (1.0, 2.0, 0.40))[-1][2]
-    assert 0.2 * -lower + lower * lower / 6 == pytest.approx(0.05)
-    assert run(guard, 200 * MS, 210 * MS, (1.0, 2.0, 0.34))[-1][2] == 0.0
-
-
-def test_position_hold_is_damped():
-    guard = holding()
-    assert run(guard, 2 * SECOND, 3 * SECOND, HERE, (0.0, 0.2, 0.0))[-1][1] < -0.2
+    assert (guard.state, set(elsewhere)) == (HOLD, {ZERO})
 
 
 def test_after_the_end_of_a_mission_it_holds_despite_commands():
     guard = tracking()
     guard.end_mission(10 * MS)
-    assert guard.take_changes()[-1] == (10 * MS, HOLD, "mission ended")
+    assert told(guard) == (10 * MS, HOLD, "mission ended")
     assert guard.armed is False
     feed(guard, 20 * MS, 300)
-    assert guard.state is HOLD
-    assert states(guard) == []
-
-
-# Slow robots
+    assert (guard.state, guard.changes) == (HOLD, [])
+    guard.start_mission(4 * SECOND)
+    feed(guard, 4 * SECOND, 9)
+    assert guard.state is HOLD, "the next mission leaves HOLD as any other"
+    feed(guard, 4090 * MS, 1)
+    assert guard.state is TRACK
 
 
 def test_a_low_speed_cap_holds_for_hold_and_land_too():
-    guard = tracking(limits=Limits(LIMITS.fence_low, LIMITS.fence_high, speed_max=0.2))
+    guard = tracking(limits=replace(LIMITS, speed_max=0.2))
     run(guard, 0, 2 * SECOND)
     fastest = max(hypot(*r) for r in run(guard, 2 * SECOND, 4 * SECOND, (5.0, -2.0, 0.4)))
     assert fastest <= 0.2
     for _ in range(5):
-        guard.accept_command(command((nan, 0.0, 0.0)), 4 * SECOND)
+        guard.accept_command(BAD, 4 * SECOND)
     down = run(guard, 4 * SECOND, 6 * SECOND, (5.0, -2.0, 0.4), (0.0, 0.0, -0.1))
     assert max(hypot(*r) for r in down) <= 0.2
 
 
-def test_the_first_reading_may_be_anything():
+# From HOLD to TRACK
+
+
+@pytest.mark.parametrize(
+    ("stamps_ms", "state"),
+    [
+        ([*range(9)], HOLD),
+        ([*range(10)], TRACK),
+        ([*range(9), 500], TRACK),
+        ([*range(9), 500 + 1 / MS], HOLD),
+        ([56 * k for k in range(30)], HOLD),
+    ],
+)
+def test_ten_fresh_commands_within_half_a_second_end_a_hold(stamps_ms, state):
+    guard = holding()
+    for _ in range(30):
+        assert guard.accept_command(command(basis_ns=0), 2 * SECOND - 1) == "stale"
+    for stamp_ms in stamps_ms:
+        now_ns = 2 * SECOND + round(stamp_ms * MS)
+        guard.accept_command(command(basis_ns=now_ns), now_ns)
+    assert guard.state is state
+
+
+def until_track(guard, start_ns):
+    """Return when a stream of fresh commands from `start_ns` on ends the HOLD [ns], or None."""
+    for now_ns in range(start_ns, start_ns + 3 * SECOND, 10 * MS):
+        guard.accept_command(command(basis_ns=now_ns), now_ns)
+        if guard.state is TRACK:
+            return now_ns
+    return None
+
+
+def test_from_one_hold_or_track_to_the_next_it_takes_a_second():
+    start_ns = 10 * SECOND
+    guard = armed(now_ns=start_ns)
+    feed(guard, start_ns, 300)
+    guard.end_mission(start_ns + 3 * SECOND)
+    guard.start_mission(start_ns + 3 * SECOND)
+    # From 750 ms on the commands stay fresh until a second has passed.
+    assert until_track(guard, start_ns + 3 * SECOND) == start_ns + 3750 * MS
+    guard = armed(now_ns=start_ns)
+    feed(guard, start_ns, 1)
+    guard.forget_commands()
+    run(guard, start_ns + 10 * MS, start_ns + 12 * MS)
+    assert guard.state is HOLD
+    assert until_track(guard, start_ns + 20 * MS) == start_ns + 1000 * MS
+
+
+def test_commands_from_before_a_hold_do_not_count():
+    guard = holding()
+    feed(guard, 2 * SECOND, 9)
+    guard.forget_commands()
+    feed(guard, 2100 * MS, 9)
+    assert guard.state is HOLD
+
+
+@pytest.mark.parametrize(("speed_max", "ramp_s"), [(6.0, 2.0), (4.5, 1.5), (1.5, 1.0)])
+def test_after_a_hold_the_ramp_lasts_until_the_cap(speed_max, ramp_s):
+    """A first command of zero, or one that the reference reaches, does not end the ramp."""
+    guard = holding(replace(LIMITS, speed_max=speed_max))
+    feed(guard, 2 * SECOND, 10, ZERO)
+    assert guard.state is TRACK
+    ends_ns = 2 * SECOND + 90 * MS + round(ramp_s * SECOND)
+    for begin_ns, rate in ((ends_ns - 20 * MS, 3.0), (ends_ns, 12.0)):
+        feed(guard, begin_ns - 10 * MS, 1, ZERO)
+        assert guard.reference == ZERO, "slowing down is as fast as ever"
+        feed(guard, begin_ns, 1, (1.0, 0.0, 0.0))
+        assert guard.reference[0] == pytest.approx(rate * 0.01)
+
+
+def test_after_a_hold_slowing_down_has_no_ramp():
+    guard = holding()
+    now_ns = feed(guard, 2 * SECOND, 30, (1.0, 0.0, 0.0))
+    before = guard.reference[0]
+    feed(guard, now_ns, 1, ZERO)
+    assert before - guard.reference[0] == pytest.approx(12.0 * 0.01)
+
+
+def test_after_a_hold_the_return_to_the_fence_has_the_ramp():
+    """The ramp limits every change of the reference, also that of the fence."""
+    guard = holding()
+    outside = (LIMITS.inner_corners()[1][0] + 0.15, 1.0, 2.0)
+    now_ns = feed(guard, 2 * SECOND, 10, ZERO, position=outside)
+    guard.reference = ZERO
+    guard.counts.clear()
+    flown = [ZERO, *run(guard, now_ns, now_ns + 20 * MS, outside)]
+    assert guard.counts["limited_fence"] == 10
+    for before, after in pairwise(flown):
+        assert dist(before, after) == pytest.approx(3.0 * DT)
+        assert after[0] < before[0]
+
+
+def test_a_reset_to_the_ground_forgets_the_last_hold_and_its_ramp():
+    guard = holding()
+    now_ns = feed(guard, 2 * SECOND, 20)
+    guard.put_on_ground(now_ns, "from spawn")
+    guard.start_mission(now_ns)
+    feed(guard, now_ns, 1, (0.0, 0.0, 1.0))
+    assert guard.state is TRACK
+    assert guard.reference[2] == pytest.approx(12.0 * 0.01)
+
+
+def test_an_unstable_link_does_not_make_the_state_chatter():
+    """Fresh commands just long enough to resume, then silence, repeatedly for 20 s."""
     guard = tracking()
-    assert guard.step(0, sensed((nan, nan, nan), (nan, inf, -inf)), 0.002) is not None
+    now_ns = 0
+    while now_ns < 20 * SECOND:
+        # The basis has the largest allowed age: each burst gives one tick of TRACK.
+        for _ in range(12):
+            guard.accept_command(command(basis_ns=now_ns - 249 * MS), now_ns)
+            run(guard, now_ns, now_ns + 10 * MS)
+            now_ns += 10 * MS
+        run(guard, now_ns, now_ns + 20 * MS)
+        now_ns += 20 * MS
+    stamps = [change.stamp_ns for change in guard.take_changes()[1:]]
+    assert len(stamps) > 20
+    assert min(c - a for a, c in zip(stamps, stamps[2:], strict=False)) >= 1 * SECOND
+
+
+def test_short_blackouts_are_over_within_a_second():
+    for silent_ms in range(260, 1000, 40):
+        guard = tracking()
+        back_ns = silent_ms * MS
+        run(guard, 0, back_ns)
+        while guard.state is HOLD:
+            back_ns = feed(guard, back_ns, 1)
+        assert back_ns <= (silent_ms + 1000) * MS
+
+
+# To LAND
+
+
+def test_a_minute_of_hold_in_a_mission_ends_in_land():
+    """Repeated starts do not delay it."""
+    guard = holding()
+    for second in range(2, 60):
+        guard.start_mission(second * SECOND)
+        run(guard, second * SECOND, second * SECOND + TICK)
+    run(guard, 60 * SECOND, 60_254 * MS)
+    assert guard.state is HOLD
+    run(guard, 60_254 * MS, 60_256 * MS)
+    assert told(guard) == (60_254 * MS, LAND, "held for 60 s without the cloud")
+    assert (guard.cause, guard.armed) == (Cause.ALONE, False)
+    aside = run(guard, 60_256 * MS, 62 * SECOND, (1.2, 2.0, 1.0), (0.0, 0.0, -0.5))[-1]
+    assert aside == pytest.approx((-0.16, 0.0, -LAND_SPEED)), "it keeps the hold point"
+
+
+def test_a_mission_on_the_ground_waits_a_minute_for_its_cloud():
+    """Then the state is LAND, without a touch-down."""
+    guard = armed()
+    guard.accept_command(command(basis_ns=-300 * MS), SECOND)  # a stale command does not count
+    assert run(guard, 0, 60 * SECOND + TICK)[-1] is None
+    assert (guard.state, guard.armed) == (GROUND, True)
+    assert run(guard, 60 * SECOND + TICK, 60 * SECOND + 2 * TICK) == [None]
+    assert told(guard) == (60 * SECOND + TICK, LAND, "held for 60 s without the cloud")
+    feed(guard, 61 * SECOND, 20)
+    assert (guard.state, guard.armed) == (LAND, False)
+    guard.acknowledge(62 * SECOND)
+    assert guard.state is GROUND
+
+
+def test_with_fresh_commands_it_waits_until_it_may_take_off():
+    """A robot that slides after a stop may not take off."""
+    guard = stopped(Guard(LIMITS))
+    guard.acknowledge(0)
+    guard.start_mission(0)
+    for second in range(1, 120):
+        guard.accept_command(command(basis_ns=second * SECOND), second * SECOND)
+        run(guard, second * SECOND, second * SECOND + 3 * TICK, velocity=(0.2, 0.0, 0.0))
+    assert (guard.state, guard.armed) == (GROUND, True)
+
+
+def test_a_hold_that_sinks_to_its_point_does_not_land():
+    """It moves like a descent and stands still as if on an obstacle."""
+    guard = holding()
+    down = run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 2.2))
+    assert (down[-1], guard.state) == ((0.0, 0.0, -LAND_SPEED), HOLD)
+
+
+def test_hold_between_missions_has_no_limit():
+    guard = tracking()
+    guard.end_mission(10 * MS)
+    for minute in range(1, 10):
+        run(guard, minute * 60 * SECOND, minute * 60 * SECOND + 10 * MS)
+    assert guard.state is HOLD
+    guard.start_mission(600 * SECOND)  # the minute counts from the next start
+    run(guard, 659 * SECOND, 659 * SECOND + 2 * MS)
+    assert guard.state is HOLD
+    run(guard, 661 * SECOND, 661 * SECOND + 2 * MS)
+    assert guard.state is LAND
+
+
+@pytest.mark.parametrize("bad", [BAD, command((1e308, 0.0, 0.0)), command(basis_ns=1 << 60)])
+def test_five_impossible_commands_within_a_second_land(bad):
+    guard = tracking((0.5, 0.0, 0.0))
+    for k in range(5):
+        assert guard.state is TRACK
+        guard.accept_command(bad, k * 250 * MS)
+        if k < 4:
+            feed(guard, k * 250 * MS, 24, (0.5, 0.0, 0.0))
+    assert told(guard) == (1000 * MS, LAND, "5 impossible commands within 1 s")
+    assert guard.cause is Cause.IMPOSSIBLE
+
+
+def test_impossible_commands_now_and_then_only_count():
+    guard, now_ns = tracking(), 0
+    for _ in range(20):
+        guard.accept_command(BAD, now_ns)
+        now_ns = feed(guard, now_ns, 26)
+    assert guard.state is TRACK
+    for _ in range(5):
+        guard.accept_command(BAD, now_ns)
+    assert guard.state is LAND
+    on_ground, at_rest = armed(), tracking()
+    at_rest.end_mission(0)
+    for guard, state in ((on_ground, GROUND), (at_rest, HOLD)):  # nor without a mission
+        for k in range(50):
+            guard.accept_command(BAD, k * MS)
+        assert guard.state is state
+
+
+def test_land_sinks_slowly_and_stops_the_rotors_when_it_stands():
+    guard = landing()
+    cause = guard.cause
+    down = run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 0.6), SINKS)
+    assert down[-1] == pytest.approx((0.0, 0.0, -LAND_SPEED), abs=0.7)
+    assert down[-1][2] == -LAND_SPEED
+    assert None not in down
+    stood = run(guard, 4 * SECOND, 5 * SECOND, LOW)
+    assert stood.index(None) * TICK == 398 * MS  # it moved until 3.998 s
+    assert set(stood[stood.index(None) :]) == {None}
+    assert guard.reference == ZERO
+    assert told(guard) == (4398 * MS, LAND, "touched down, rotors stopped")
+    assert guard.cause is cause, "why it landed"
+    guard.acknowledge(5 * SECOND)
+    assert told(guard) == (5 * SECOND, GROUND, "acknowledged")
+
+
+def test_after_touch_down_it_may_slide_off_an_obstacle():
+    guard = landing()
+    run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 0.6), SINKS)
+    run(guard, 4 * SECOND, 5 * SECOND, (1.0, 2.0, 0.5))
+    run(guard, 5 * SECOND, 6 * SECOND, (1.0, 2.0, 0.3), (0.0, 0.0, -1.0))
+    guard.acknowledge(6 * SECOND)
+    guard.start_mission(6 * SECOND)
+    feed(guard, 6 * SECOND, 1, position=(1.0, 2.0, 0.3))
+    assert guard.state is GROUND
+    run(guard, 7 * SECOND, 8 * SECOND, LOW)
+    feed(guard, 8 * SECOND, 1, position=LOW)
+    assert guard.state is TRACK
+
+
+@pytest.mark.parametrize(
+    ("climb", "down_ms"),
+    # At 3 m/s^2 the reference needs 83 ms to reach half the speed of the descent.
+    [(0.0, 482), (STILL_SPEED, None), (-STILL_SPEED, None)],
+)
+def test_a_robot_that_moves_has_not_touched_down(climb, down_ms):
+    stood = run(landing(), 2 * SECOND, 4 * SECOND, (1.0, 2.0, 1.0), (0.0, 0.0, climb))
+    assert (stood.index(None) * TICK == down_ms * MS) if down_ms else (None not in stood)
+
+
+def test_land_from_a_fast_descent_touches_down():
+    guard = tracking((0.0, 0.0, -2.0))
+    assert run(guard, 0, 100 * MS, (1.0, 2.0, 1.0))[-1][2] == pytest.approx(-LAND_SPEED)
+    for _ in range(5):
+        guard.accept_command(BAD, 100 * MS)
+    stood = run(guard, 100 * MS, 2 * SECOND, (1.0, 2.0, 1.0))
+    assert 400 * MS <= stood.index(None) * TICK < 1 * SECOND
+
+
+def test_a_short_stop_of_a_descent_is_no_touch_down():
+    guard = landing()
+    run(guard, 2 * SECOND, 4 * SECOND, velocity=SINKS)
+    for k in range(10):
+        start_ns = 4 * SECOND + k * 400 * MS
+        assert None not in run(guard, start_ns, start_ns + 390 * MS)
+        assert None not in run(guard, start_ns + 390 * MS, start_ns + 400 * MS, HERE, (0, 0, -0.3))
+
+
+def test_land_from_track_descends_where_the_robot_is():
+    guard, elsewhere = holding(), (3.0, 2.0, 1.0)
+    now_ns = feed(guard, 2 * SECOND, 20, ZERO, position=elsewhere)
+    assert guard.state is TRACK
+    for _ in range(5):
+        guard.accept_command(BAD, now_ns)
+    down = run(guard, now_ns, now_ns + 1 * SECOND, elsewhere, (0.0, 0.0, -LAND_SPEED))
+    assert (guard.state, down[-1]) == (LAND, (0.0, 0.0, -LAND_SPEED))
+
+
+# Latches
+
+
+@pytest.mark.promise("only-the-operator-arms")
+@pytest.mark.parametrize("make", [landing, lambda: stopped(tracking())])
+def test_only_an_acknowledgement_leads_out_of_a_latch(make):
+    guard = make()
+    state = guard.state
+    assert guard.latched
+    guard.start_mission(3 * SECOND)
+    feed(guard, 3 * SECOND, 100)
+    guard.end_mission(4 * SECOND)
+    assert (guard.state, guard.armed) == (state, False)
+
+
+@pytest.mark.parametrize("make", [lambda: Guard(LIMITS), armed, tracking, holding, landing])
+def test_the_emergency_stop_works_from_everywhere_at_once(make):
+    guard = stopped(make(), 3 * SECOND)
+    assert run(guard, 3 * SECOND, 3 * SECOND + 10 * MS) == [None] * 5
+    assert guard.reference == ZERO
+    assert told(guard) == (3 * SECOND, ESTOP, "emergency stop")
+    stopped(guard, 4 * SECOND)
+    assert guard.take_changes() == []
+
+
+def test_an_acknowledged_stop_is_on_the_ground_and_arms_nothing():
+    guard = stopped(tracking())
+    guard.acknowledge(1 * SECOND)
+    assert (guard.state, guard.armed, guard.latched) == (GROUND, False, False)
+    feed(guard, 1 * SECOND, 20)
+    run(guard, 1 * SECOND, 2 * SECOND)
+    assert guard.state is GROUND
+    guard.start_mission(2 * SECOND)
+    feed(guard, 2 * SECOND, 1)
+    assert guard.state is TRACK
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity", "cause"),
+    [
+        (LOW, ZERO, Cause.ACKNOWLEDGED),
+        (LOW, SINKS, Cause.STILL_FIRST),
+        ((9e9, 2.0, 0.1), ZERO, Cause.STILL_FIRST),
+    ],
+)
+def test_an_acknowledgement_names_the_condition_of_a_take_off(position, velocity, cause):
+    guard = stopped(tracking())
+    run(guard, 1 * SECOND, 2 * SECOND, position, velocity)
+    guard.acknowledge(2 * SECOND)
+    assert told(guard) == (2 * SECOND, GROUND, cause.words)
+    assert guard.cause is cause
+
+
+def test_a_landing_that_is_acknowledged_in_the_air_holds():
+    guard = landing()
+    run(guard, 2 * SECOND, 3 * SECOND, velocity=SINKS)
+    guard.acknowledge(3 * SECOND)
+    run(guard, 3 * SECOND, 3 * SECOND + TICK, velocity=SINKS)
+    assert told(guard) == (3 * SECOND, HOLD, "acknowledged before touch-down")
+    assert run(guard, 3 * SECOND + TICK, 5 * SECOND)[-1] == ZERO
+    feed(guard, 5 * SECOND, 100)
+    assert guard.state is HOLD
+
+
+@pytest.mark.parametrize("make", [lambda: Guard(LIMITS), armed, tracking, holding])
+def test_in_other_states_an_acknowledgement_does_nothing(make):
+    guard = make()
+    before = guard.state, guard.armed, len(guard.changes)
+    guard.acknowledge(2 * SECOND)
+    assert (guard.state, guard.armed, len(guard.changes)) == before
