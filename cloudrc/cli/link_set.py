@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.find_run import find_local_run, link_folder_of, no_run_error, run_argument
 from cloudrc.cli.output import format_document, output_argument, print_line
-from cloudrc.cluster.tools import ClusterError
+from cloudrc.cluster.client import DEFAULT_RELEASE, ClusterError, Release
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.link import LinkParts, ReleasePlace, Sent
+    from cloudrc.cluster.link import LinkParts, Sent
     from cloudrc.config.profile_edit import Edit
     from cloudrc.link.state import LinkState
 
@@ -63,11 +63,7 @@ def execute(options: argparse.Namespace) -> int:
         edit, states = _set_here(options, folder, number)
         took = monotonic() - began
     else:
-        from cloudrc.cluster.client import DEFAULT_RELEASE
-        from cloudrc.cluster.link import ReleasePlace
-
-        release = options.release or DEFAULT_RELEASE
-        place = ReleasePlace(options.context, options.namespace, release)
+        place = Release(options.context, options.namespace, options.release or DEFAULT_RELEASE)
         link, sent = _set_in_cluster(options, place, number)
         took = monotonic() - began
         from cloudrc.cluster.link import keep
@@ -122,7 +118,7 @@ def _set_here(
 
 
 def _set_in_cluster(
-    options: argparse.Namespace, place: ReleasePlace, number: str
+    options: argparse.Namespace, place: Release, number: str
 ) -> tuple[LinkParts, Sent]:
     """Send a new profile to both link containers."""
     from concurrent.futures import ThreadPoolExecutor
@@ -140,7 +136,7 @@ def _set_in_cluster(
     return link, send(place, link, options.profile, options.settings, note)
 
 
-def _link_of(options: argparse.Namespace, where: ReleasePlace) -> LinkParts:
+def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
     """Read the link of the release; if the release has none, raise an error with the reason."""
     from cloudrc.cluster.link import read_link
 

@@ -27,6 +27,7 @@ from cloudrc.cli.link_verify_report import (
     make_report,
     on_correlation,
 )
+from cloudrc.cluster.client import end_process
 from cloudrc.config.document import write_yaml
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.config.schema import Profile
@@ -43,7 +44,7 @@ from cloudrc.link.verify.judge import judge, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
 from cloudrc.tunnel.codec import SIZES
 
-START_LIMIT, STOP_LIMIT = 90.0, 2.0
+START_LIMIT = 90.0
 """Longest time for both processes to start, which a slow disk needs, and to stop [s]."""
 COUNTS_WAIT = 1.3
 """Time until the processes have counted the last probe [s]; they do so once a second."""
@@ -169,7 +170,7 @@ def run_link(
             way.folder = folder / name
             way.folder.mkdir()
             way.process = _start(name, way, shaper)
-            stack.callback(_stop, way.process)
+            stack.callback(end_process, way.process)
         deadline = time.monotonic() + START_LIMIT
         while not all((way.folder / "route").exists() for way in ways.values()):
             for name, way in ways.items():
@@ -209,15 +210,6 @@ def _raise(name: str, code: int, log: str) -> None:
         if code == kind.exit_code:
             raise kind(f"the {name} is not shaped: {words}")
     raise InvalidRunError(f"the {name} is not shaped: its process ended with {code}: {words}")
-
-
-def _stop(process: subprocess.Popen[bytes]) -> None:
-    process.terminate()
-    try:
-        process.wait(STOP_LIMIT)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 @contextlib.contextmanager

@@ -197,8 +197,8 @@ def _here(experiment: ResolvedExperiment, mode: str) -> Flight:
 
 def _in_cluster(experiment: ResolvedExperiment, options: argparse.Namespace) -> Flight:
     """Return the function that flies in the cluster that the flags name."""
+    from cloudrc.cluster.client import program
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files
-    from cloudrc.cluster.tools import program
 
     refuse_local_files(experiment)
     release = release_from_flags(options)

@@ -142,30 +142,16 @@ def test_the_papers_mission_equals_the_shipped_one(tmp_path: Path) -> None:
     assert load_mission(tmp_path / "mission.yaml").waypoints == load_mission("pipes").waypoints
 
 
-def test_the_chart_makes_the_same_job_as_mission_run() -> None:
-    """The Job of `cloudrc mission run` differs only in names and times."""
-    from cloudrc.cluster import jobs as manifest
-    from cloudrc.cluster.client import Release
-
-    follower = manifest.JobSettings(
-        "cloudrc/cloud:0.1.0",
-        "IfNotPresent",
-        (),
-        "http://demo-cloudrc-api:8080",
-        "demo-cloudrc-tokens",
-    )
-    made = manifest.job(Release(None, "lab", "demo"), "m", follower, limit=60.0, queue=False)
+def test_the_chart_makes_the_same_job_as_the_example() -> None:
+    """`cloudrc mission run` fills in the example."""
     (job,) = jobs(ENABLED)
-    theirs, ours = (j["spec"]["template"] for j in (made, job))
-    same = ("app.kubernetes.io/name", "app.kubernetes.io/instance", "app.kubernetes.io/component")
-    assert [theirs["metadata"]["labels"][k] for k in same] == [
-        ours["metadata"]["labels"][k] for k in same
-    ]
+    theirs, ours = (each["spec"]["template"] for each in (EXAMPLES["mission-job"][1], job))
+    same = {"app.kubernetes.io/name", "app.kubernetes.io/component"}
+    assert all(theirs["metadata"]["labels"][k] == ours["metadata"]["labels"][k] for k in same)
+    assert theirs["spec"]["securityContext"] == ours["spec"]["securityContext"]
     (theirs,), (ours,) = (template["spec"]["containers"] for template in (theirs, ours))
-    assert theirs["env"] == ours["env"]
-    assert theirs["securityContext"] == ours["securityContext"]
-    assert theirs["volumeMounts"] == ours["volumeMounts"]
-    assert theirs["resources"] == ours["resources"]
+    for key in ("securityContext", "volumeMounts", "resources"):
+        assert theirs[key] == ours[key]
 
 
 def test_helm_test_flies_and_leaves_nothing() -> None:

@@ -1,8 +1,4 @@
-"""A fake Kubernetes API server with objects in memory, a kubeconfig for it, and fake programs.
-
-kmock does not fit: it does not select by label, and its pytest plug-in needs another one that
-warns in every run.
-"""
+"""A fake Kubernetes API server with objects in memory, a fake teleop, and fake programs."""
 
 from __future__ import annotations
 
@@ -23,25 +19,14 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 import yaml
 
-from cloudrc.cluster import jobs, tools
-from cloudrc.cluster import release as deploy
+from cloudrc.cluster import client, flight, jobs
 from cloudrc.cluster.client import Release, connect
+from cloudrc.cluster.jobs import UID_LABEL
 from cloudrc.link.state import LinkState, from_text
 
 VERSION_KEYS = (
     "buildDate compiler gitCommit gitTreeState gitVersion goVersion major minor platform".split()
 )
-
-
-def _merge(target: dict[str, Any], patch: dict[str, Any]) -> None:
-    """Merge a patch into an object (RFC 7396)."""
-    for key, value in patch.items():
-        if isinstance(value, dict):
-            _merge(target.setdefault(key, {}), value)
-        elif value is None:
-            target.pop(key, None)
-        else:
-            target[key] = value
 
 
 class FakeApi:
@@ -55,14 +40,12 @@ class FakeApi:
         self.version = {"major": "1", "minor": "33"}
         self.lock = threading.RLock()
         self._clock = itertools.count()
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
-        self._server.daemon_threads = True
-        threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
-        self.url = f"http://127.0.0.1:{self._server.server_port}"
+        self.server = serve(lambda request, body: self.answer(request.command, request.path, body))
+        self.url = f"http://127.0.0.1:{self.server.server_port}"
 
     def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+        self.server.shutdown()
+        self.server.server_close()
 
     def put(self, plural: str, namespace: str, body: dict[str, Any]) -> dict[str, Any]:
         metadata = body.setdefault("metadata", {})
@@ -101,7 +84,7 @@ class FakeApi:
             if subresource == "log":
                 return 200, self.logs.get(name, "")
             if method == "PATCH":
-                _merge(self.objects[plural, namespace, name], body)
+                self.objects[plural, namespace, name]["data"] |= body["data"]
             if method == "DELETE":
                 return 200, self.objects.pop((plural, namespace, name))
             return 200, self.objects[plural, namespace, name]
@@ -115,31 +98,61 @@ class FakeApi:
             and wanted.items() <= body["metadata"].get("labels", {}).items()
         ]
 
-    def _handler(self) -> type[BaseHTTPRequestHandler]:
-        api = self
 
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-            disable_nagle_algorithm = True
+def serve(answer: Callable[[BaseHTTPRequestHandler, Any], tuple[int, Any]]) -> ThreadingHTTPServer:
+    """Serve HTTP on a free port; `answer` gets the request and its JSON, and returns a reply."""
 
-            def reply(self) -> None:
-                length = int(self.headers.get("Content-Length") or 0)
-                body = json.loads(self.rfile.read(length)) if length else None
-                code, answer = api.answer(self.command, self.path, body)
-                data = answer.encode() if isinstance(answer, str) else json.dumps(answer).encode()
-                self.send_response(code)
-                kind = "text/plain" if isinstance(answer, str) else "application/json"
-                self.send_header("Content-Type", kind)
-                self.send_header("Content-Length", str(len(data)))
-                self.end_headers()
-                self.wfile.write(data)
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+        disable_nagle_algorithm = True
 
-            do_GET = do_POST = do_DELETE = do_PATCH = reply  # noqa: N815
+        def reply(self) -> None:
+            length = int(self.headers.get("Content-Length") or 0)
+            code, said = answer(self, json.loads(self.rfile.read(length)) if length else None)
+            is_text = isinstance(said, str)
+            data = said.encode() if is_text else json.dumps(said).encode()
+            self.send_response(code)
+            self.send_header("Content-Type", "text/plain" if is_text else "application/json")
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data)
 
-            def log_message(self, *words: Any) -> None:
-                pass
+        do_GET = do_POST = do_DELETE = do_PATCH = reply  # noqa: N815
 
-        return Handler
+        def log_message(self, *words: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    return server
+
+
+class FakeTeleop:
+    """The API and the metrics of a cloud pod, with a record of its requests."""
+
+    def __init__(self) -> None:
+        self.missions: list[dict[str, str]] = []
+        self.posted: list[str] = []
+        self.tokens: set[str | None] = set()
+        self.refuses = False
+        self.server = serve(self._answer)
+        self.port = self.server.server_port
+
+    def _answer(self, request: BaseHTTPRequestHandler, body: Any) -> tuple[int, Any]:
+        if request.path == "/metrics":
+            return 200, 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
+        self.tokens.add(request.headers["Authorization"])
+        if request.command == "GET":
+            return 200, {"missions": self.missions}
+        self.posted.append(request.path)
+        return (409, {"detail": "it is over"}) if self.refuses else (200, {})
+
+    def forwards(self) -> str:
+        """What kubectl prints when it forwards all ports of a pod to this server."""
+        ports = (8080, 9100, 9101, 9102)
+        lines = (f"echo 'Forwarding from 127.0.0.1:{self.port} -> {port}'" for port in ports)
+        return "\n".join([*lines, "exec sleep 60"])
 
 
 def kubeconfig(url: str, namespace: str = "demo") -> str:
@@ -168,6 +181,22 @@ def labels(component: str, release: str = "cloudrc") -> dict[str, str]:
     }
 
 
+SECURE = {"runAsUser": 10001}
+TELEOP = {
+    "name": "teleop",
+    "image": "cloudrc/cloud:0.1.0",
+    "securityContext": {"allowPrivilegeEscalation": False},
+}
+POD = {
+    "containers": [{"name": "cloud"}, TELEOP],
+    "volumes": [
+        {"name": "data", "emptyDir": {}},
+        {"name": "tokens", "secret": {"secretName": "cloudrc-tokens"}},
+    ],
+}
+"""Pod of a component, as in its Deployment."""
+
+
 def pod(
     name: str,
     component: str,
@@ -188,16 +217,9 @@ def pod(
         "lastState": more.pop("last", {}),
     }
     conditions = [{"type": "Ready", "status": str(ready)}, *more.pop("conditions", [])]
-    containers = [{"name": "cloud"}, {"name": "teleop", "image": "cloudrc/cloud:0.1.0"}]
     return {
         "metadata": {"name": name, "labels": {**labels(component), **more.pop("labels", {})}},
-        "spec": {
-            "containers": containers,
-            "volumes": [
-                {"name": "data", "emptyDir": {}},
-                {"name": "tokens", "secret": {"secretName": "cloudrc-tokens"}},
-            ],
-        },
+        "spec": POD,
         "status": {"phase": phase, "conditions": conditions, "containerStatuses": [status]},
     }
 
@@ -206,7 +228,7 @@ def deployment(component: str, **status: Any) -> dict[str, Any]:
     settled = {"observedGeneration": 1, "replicas": 1, "updatedReplicas": 1}
     return {
         "metadata": {"name": f"cloudrc-{component}", "labels": labels(component)},
-        "spec": {"selector": {}, "template": {}},
+        "spec": {"selector": {}, "template": {"spec": {**POD, "securityContext": SECURE}}},
         "status": {**settled, **status},
     }
 
@@ -303,14 +325,6 @@ class Cluster:
         return (self.folder / "asked").read_text().splitlines()
 
 
-def pretended(folder: Path, pretend: Callable[[str, str], Path]) -> Cluster:
-    """Write a release and its fake kubectl into a folder."""
-    script = folder / "kubectl.py"
-    script.write_text(KUBECTL)
-    pretend("kubectl", f'exec {sys.executable} -S {script} {folder} "$@"')
-    return Cluster(folder)
-
-
 TOKEN = "operator-token-of-the-release"
 
 
@@ -321,9 +335,9 @@ def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeApi]:
     path.write_text(kubeconfig(server.url))
     monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", str(path))
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
-    monkeypatch.setattr(tools, "OUTAGE_PERIOD", 0.01)
-    monkeypatch.setattr(deploy, "LOOK_PERIOD", 0.01)
-    monkeypatch.setattr(deploy, "FAILURE_TIME", 0.0)
+    monkeypatch.setattr(client, "OUTAGE_PERIOD", 0.01)
+    monkeypatch.setattr(flight, "LOOK_PERIOD", 0.01)
+    monkeypatch.setattr(flight, "FAILURE_TIME", 0.0)
     yield server
     server.close()
 
@@ -340,7 +354,7 @@ def running(api: FakeApi, release: Release) -> FakeApi:
         api.put("deployments", "demo", deployment(component))
         api.put("pods", "demo", pod(f"{component}-1", component))
     service = {
-        "metadata": {"name": "cloudrc-api", "labels": {"app.kubernetes.io/instance": "cloudrc"}},
+        "metadata": {"name": "cloudrc-api", "labels": labels("cloud")},
         "spec": {"ports": [{"name": "api", "port": 8080, "targetPort": "api"}]},
     }
     api.put("services", "demo", service)
@@ -369,4 +383,55 @@ def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 @pytest.fixture
 def cluster(tmp_path: Path, pretend: Callable[[str, str], Path]) -> Cluster:
     """A release with a running link, and a fake kubectl for it."""
-    return pretended(tmp_path, pretend)
+    script = tmp_path / "kubectl.py"
+    script.write_text(KUBECTL)
+    pretend("kubectl", f'exec {sys.executable} -S {script} {tmp_path} "$@"')
+    return Cluster(tmp_path)
+
+
+@pytest.fixture
+def teleop(running: FakeApi, pretend: Callable[[str, str], Path]) -> Iterator[FakeTeleop]:
+    """A fake API of the release, to which the fake kubectl forwards ports."""
+    fake = FakeTeleop()
+    pretend("kubectl", fake.forwards())
+    yield fake
+    fake.server.shutdown()
+    fake.server.server_close()
+
+
+MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
+
+
+def end(api: FakeApi, name: str, kind: str, **condition: str) -> None:
+    """End a Job: `kind` is "Complete" or "Failed"."""
+    ended = {"type": kind, "status": "True", **condition}
+    api.get("jobs", name)["status"] = {"conditions": [ended]}
+
+
+def start_pod(api: FakeApi, name: str, **given: Any) -> None:
+    """Create the pod of a Job as Kubernetes does."""
+    uid = api.get("jobs", name)["metadata"]["uid"]
+    api.put("pods", "demo", pod(f"{name}-x", "mission", labels={UID_LABEL: uid}, **given))
+
+
+def terminated(exit_code: int, message: str) -> dict[str, Any]:
+    return {"terminated": {"exitCode": exit_code, "message": message}}
+
+
+def at_look(api: FakeApi, number: int, action: Callable[[], None]) -> None:
+    """Call `action` at the n-th request for the Job."""
+    original, looks = api.answer, iter(range(1, 1000))
+    lock = threading.Lock()
+
+    def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
+        with lock:
+            if method == "GET" and "/jobs/" in path and next(looks) == number:
+                action()
+        return original(method, path, body)
+
+    api.answer = answer  # type: ignore[method-assign]
+
+
+def made(api: FakeApi) -> list[dict[str, Any]]:
+    """Return the Jobs."""
+    return [body for (kind, _, _), body in api.objects.items() if kind == "jobs"]

@@ -377,7 +377,7 @@ def values(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def installed(cluster: None, values: Path) -> None:
     """The release that most tests use."""
-    from cloudrc.cluster.release import wait_ready
+    from cloudrc.cluster.flight import wait_ready
 
     kubectl("delete", "jobs", "--all")  # of an earlier session, where the cluster was kept
     began = time.monotonic()

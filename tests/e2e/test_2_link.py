@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 
-from cloudrc.cluster.link import PROFILE, ReleasePlace, send_change
+from cloudrc.cluster.link import PROFILE, Release, send_change
 from cloudrc.link.follow import Handed
 from tests.e2e.conftest import (
     CHART,
@@ -197,7 +197,7 @@ def hand_behind_its_back(component: str, profile: dict[str, Any]) -> None:
     """Hand a profile to one pod's link container alone; `link set` hands it to both."""
     change = {"number": str(time.time_ns()), "cause": "a seeded fault", "restart": False}
     handed = Handed(json.dumps(change), {PROFILE: yaml.safe_dump(profile)})
-    where, name = ReleasePlace(None, NAMESPACE, NAME), str(pod(component)["metadata"]["name"])
+    where, name = Release(None, NAMESPACE, NAME), str(pod(component)["metadata"]["name"])
     told = json.loads(send_change(where, name, handed))
     assert told["change"] == change["number"], told
 

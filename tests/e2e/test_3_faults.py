@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.pods import fetch_recording
-from cloudrc.cluster.release import wait_ready
 from cloudrc.config.load import load_mission
 from cloudrc.record.columns import Recording
 from tests.drivers.conftest import ages_at_hold
