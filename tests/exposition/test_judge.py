@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.exposition.ends import DelayJudge, PredictionJudge
 from cloudrc.exposition.live import LiveMetrics
+from cloudrc.exposition.parts import DelayJudge, PredictionJudge
 from cloudrc.records import CommandApplied, Control
 from tests.exposition.conftest import MS, period
 from tests.flights.conftest import records
