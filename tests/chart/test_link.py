@@ -1,0 +1,114 @@
+"""The link's mode follows the namespace; `helm test` verifies the link."""
+
+from __future__ import annotations
+
+import pytest
+
+from cloudrc.cli.link_verify import RELEASE_TIMEOUT
+from cloudrc.cli.parser import build_parser
+from tests.chart.conftest import (
+    Lookup,
+    Object,
+    a_namespace,
+    containers,
+    holding,
+    notes,
+    nothing,
+    of_kind,
+    pod_specs,
+    render,
+)
+
+
+def modes(lookup: Lookup, values: Object | None = None) -> set[str]:
+    """Return the mode in the arguments of both link containers."""
+    pods = pod_specs(render(values, lookup=lookup))
+    found = (containers(pods[end])["link"]["args"] for end in ("world", "cloud"))
+    return {text for arguments in found for text in arguments if text.startswith("--mode")}
+
+
+@pytest.mark.parametrize(
+    ("lookup", "mode"),
+    [
+        (nothing, "relay"),
+        (a_namespace(), "auto"),
+        (a_namespace("privileged"), "auto"),
+        (a_namespace("baseline"), "relay"),
+        (a_namespace("restricted"), "relay"),
+    ],
+    ids=["unseen", "no label", "privileged", "baseline", "restricted"],
+)
+def test_auto_follows_the_label_of_the_namespace(lookup: Lookup, mode: str) -> None:
+    assert modes(lookup) == {f"--mode={mode}"}
+    for fixed in ("relay", "netem"):
+        assert modes(lookup, {"link": {"mode": fixed}}) == {f"--mode={fixed}"}
+
+
+@pytest.mark.parametrize(
+    ("first", "later"),
+    [
+        # Helm creates the namespace (--create-namespace) after rendering: only an upgrade sees it.
+        (nothing, a_namespace()),
+        (a_namespace(), a_namespace()),
+        (a_namespace("restricted"), a_namespace("restricted")),
+    ],
+    ids=["made by helm", "no label", "restricted"],
+)
+def test_an_upgrade_keeps_the_mode(first: Lookup, later: Lookup) -> None:
+    """It keeps the key and the tokens, too."""
+    installed = render(lookup=first)
+    assert render(lookup=holding(installed, later)) == installed
+
+
+def test_an_upgrade_obeys_a_new_label() -> None:
+    installed = render(lookup=a_namespace())
+    assert modes(holding(installed, a_namespace("restricted"))) == {"--mode=relay"}
+    for deployment in of_kind(installed, "Deployment").values():
+        annotations = deployment["spec"]["template"]["metadata"]["annotations"]
+        assert annotations["cloudrc/link-mode"] == "auto"
+
+
+def test_the_notes_show_mode_and_label_command() -> None:
+    label = "kubectl label namespace lab pod-security.kubernetes.io/enforce=privileged --overwrite"
+    assert "mode relay" in notes()
+    assert label not in notes()
+    for mode in ("netem", "auto"):
+        text = notes({"link": {"mode": mode}}, lookup=a_namespace())
+        assert f"mode {mode}" in text
+        assert label in text
+
+
+def test_the_link_is_a_native_sidecar_for_its_pods_egress() -> None:
+    pods = pod_specs(render())
+    for end, direction, peer in (("world", "uplink", "cloud"), ("cloud", "downlink", "world")):
+        (link,) = pods[end]["initContainers"]
+        assert (link["name"], link["restartPolicy"]) == ("link", "Always")
+        wanted = {f"--direction={direction}", f"--peer=demo-cloudrc-{peer}:7400"}
+        wanted |= {"--end=127.0.0.1:7400", "--profile=/etc/cloudrc-link/profile.yaml"}
+        assert wanted <= set(link["args"])
+        # The kubelet updates only directories in a running container.
+        mounts = {mount["mountPath"]: mount["name"] for mount in link["volumeMounts"]}
+        assert mounts["/etc/cloudrc-link"] == "link"
+        own = containers(pods[end])[end]["args"]
+        assert "--route=/run/cloudrc/route" in set(link["args"]) & set(own)
+
+
+def test_helm_test_verifies_the_link_of_this_release() -> None:
+    objects = render()
+    pods = [thing for thing in objects if thing["kind"] == "Pod"]
+    (test,) = (thing for thing in pods if thing["metadata"]["name"].endswith("-test-link"))
+    annotations, spec = test["metadata"]["annotations"], test["spec"]
+    assert annotations["helm.sh/hook"] == "test"
+    assert int(annotations["helm.sh/hook-weight"]) > 0, "commands flow once a mission has flown"
+    assert "hook-failed" not in annotations["helm.sh/hook-delete-policy"]
+    assert spec["restartPolicy"] == "Never"
+    # Helm waits 300 s for one hook.
+    assert RELEASE_TIMEOUT + 10.0 <= spec["activeDeadlineSeconds"] < 300.0
+    (container,) = spec["containers"]
+    options = build_parser(["link"]).parse_args(container["args"])
+    services = {thing["metadata"]["name"] for thing in objects if thing["kind"] == "Service"}
+    hosts = options.ends.split(",")
+    assert set(hosts) <= services
+    assert {name.rsplit("-", 1)[-1] for name in hosts} == {"world", "cloud"}
+    cloud = containers(pod_specs(objects)["cloud"])["cloud"]
+    assert container["securityContext"] == cloud["securityContext"]
