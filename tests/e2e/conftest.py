@@ -1,9 +1,4 @@
-"""A cluster for the end-to-end tests: made or found, given the images, and taken down again.
-
-The cluster as the tests see it: kubectl and helm, one release, what to save on failure.
-
-What a release costs: the kubelet's own counters, read twice; and how fast the machine is.
-"""
+"""A cluster for the end-to-end tests, the release in it, what to save on failure, and its cost."""
 
 from __future__ import annotations
 
@@ -27,7 +22,10 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc.cli.client import Api
 from cloudrc.cluster.client import Release, connect
-from cloudrc.cluster.pods import api_url, fetch_metrics, operator_token
+from cloudrc.cluster.flight import wait_ready
+from cloudrc.cluster.jobs import run_job
+from cloudrc.cluster.pods import api_url, fetch_metrics, fetch_recording, operator_token
+from cloudrc.errors import CloudrcError
 from tests.drivers.conftest import WORK, slower
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -77,8 +75,12 @@ def read(*words: str) -> Any:
     return json.loads(kubectl("get", *words, "--output=json"))
 
 
-def apply(*documents: Mapping[str, Any]) -> None:
-    kubectl("apply", "--filename=-", given=yaml.safe_dump_all(documents))
+def apply(*documents: dict[str, Any]) -> None:
+    """Apply objects, in the namespace of the tests unless they name another."""
+    for document in documents:
+        if document["kind"] != "Namespace":
+            document["metadata"].setdefault("namespace", NAMESPACE)
+    command("kubectl", "apply", "--filename=-", given=yaml.safe_dump_all(documents))
 
 
 def helm(*words: str, timeout: float = 180.0) -> str:
@@ -94,6 +96,19 @@ def cloudrc(*words: str, timeout: float = 240.0) -> subprocess.CompletedProcess[
         timeout=timeout,
         cwd=ROOT,
     )
+
+
+def in_release(*words: str, timeout: float = 240.0) -> str:
+    """Run our own command line for the tests' release; what it wrote."""
+    done = cloudrc(*words, "-n", NAMESPACE, "--release", NAME, timeout=timeout)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def set_link(*words: str) -> dict[str, Any]:
+    """Set the link of the flight by hand; gives what is in force then."""
+    document: dict[str, Any] = json.loads(in_release("link", "set", *words, "-o", "json"))
+    return document
 
 
 def eventually(
@@ -138,14 +153,9 @@ def identity() -> dict[str, tuple[str, list[int]]]:
 Sample = tuple[str, tuple[tuple[str, str], ...]]
 
 
-def scrapes(component: str) -> dict[str, str]:
-    """What each container of a pod answers to a scrape."""
-    return fetch_metrics(place(), component)
-
-
 def metrics(component: str, container: str = "") -> dict[Sample, float]:
     """Every sample of a container: by name and sorted labels."""
-    text = scrapes(component)[container or component]
+    text = fetch_metrics(place(), component)[container or component]
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(text)
@@ -166,8 +176,8 @@ def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
 
 def missions() -> list[dict[str, Any]]:
     """All missions that the API knows, oldest first."""
-    token = operator_token(connect(None, NAMESPACE, NAME))
-    with api_url(None, NAMESPACE, NAME) as url:
+    token = operator_token(place())
+    with api_url(place()) as url:
         return list(Api(url, lambda: token).get("/v1/missions")["missions"])
 
 
@@ -207,8 +217,6 @@ def job_log(name: str) -> str:
 
 def fly(name: str, waypoints: Sequence[Mapping[str, Any]], limit: float = 60.0) -> None:
     """Fly waypoints by a Job of this name, as `cloudrc mission run` does."""
-    from cloudrc.cluster.jobs import run_job
-
     mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints)}
     run_job(place(), mission, name=name, limit=limit)
 
@@ -218,18 +226,7 @@ def save(folder: Path) -> None:
     for namespace in NAMESPACES:
         _save_texts(folder / namespace, f"--namespace={namespace}")
     for component in ("world", "cloud"):
-        for one in pods(component):
-            name = one["metadata"]["name"]
-            path = f"/var/lib/cloudrc/{component}.mcap"
-            words = [
-                "kubectl",
-                f"--namespace={NAMESPACE}",
-                "exec",
-                name,
-                f"--container={component}",
-            ]
-            with (folder / f"{name}.mcap").open("wb") as file:
-                subprocess.run([*words, "--", "cat", path], stdout=file, stderr=-3, timeout=60)
+        fetch_recording(place(), component, folder / f"{component}.mcap")
 
 
 def _save_texts(folder: Path, where: str) -> None:
@@ -302,22 +299,18 @@ def cluster(request: pytest.FixtureRequest) -> Iterator[None]:
             os.environ["KUBECONFIG"] = str(BUILD / "kubeconfig")
             _create()
         _load()
-        _make_namespace()
-        TIMES["loaded"] = time.monotonic()
+        metadata = {"name": NAMESPACE, "labels": RESTRICTED}
+        apply({"apiVersion": "v1", "kind": "Namespace", "metadata": metadata})
         request.config.stash[UP] = True
         yield
     finally:
         request.config.stash[UP] = False
         if not request.config.getoption("--keep", default=False):
-            _remove(own)
-
-
-def _remove(own: bool) -> None:
-    if own:
-        command("kind", "delete", "cluster", f"--name={CLUSTER}")
-    else:
-        words = ["delete", "namespace", *NAMESPACES, "--ignore-not-found", "--wait=false"]
-        command("kubectl", *words)
+            if own:
+                command("kind", "delete", "cluster", f"--name={CLUSTER}")
+            else:
+                words = ["namespace", *NAMESPACES, "--ignore-not-found", "--wait=false"]
+                command("kubectl", "delete", *words)
 
 
 def _create() -> None:
@@ -336,11 +329,6 @@ def _load() -> None:
         command("make", "kind-load", name, f"IMAGES={IMAGES}", timeout=300)
 
 
-def _make_namespace() -> None:
-    metadata = {"name": NAMESPACE, "labels": RESTRICTED}
-    apply({"apiVersion": "v1", "kind": "Namespace", "metadata": metadata})
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
     report = yield
@@ -348,7 +336,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
         folder = BUILD / re.sub(r"\W+", "-", item.name)
         try:
             save(folder)
-        except (AssertionError, subprocess.SubprocessError, OSError) as error:
+        except (AssertionError, CloudrcError, subprocess.SubprocessError, OSError) as error:
             SUMMARY.append(f"nothing more could be saved of {item.name}: {error}")
         SUMMARY.append(f"{item.name} FAILED: see {folder.relative_to(ROOT)}")
     return report
@@ -377,8 +365,6 @@ def values(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def installed(cluster: None, values: Path) -> None:
     """The release that most tests use."""
-    from cloudrc.cluster.flight import wait_ready
-
     kubectl("delete", "jobs", "--all")  # of an earlier session, where the cluster was kept
     began = time.monotonic()
     helm("upgrade", "--install", NAME, str(CHART), f"--values={values}")
@@ -411,12 +397,10 @@ def usage() -> Usage:
     found: Usage = {}
     for component in ("world", "cloud"):
         one = pod(component)
-        summary = json.loads(command("kubectl", "get", "--raw", _address(one["spec"]["nodeName"])))
+        address = f"/api/v1/nodes/{one['spec']['nodeName']}/proxy/stats/summary"
+        summary = json.loads(command("kubectl", "get", "--raw", address))
         (mine,) = [
-            each
-            for each in summary["pods"]
-            if each["podRef"]["uid"] == one["metadata"]["uid"]
-            and each["podRef"]["namespace"] == NAMESPACE
+            each for each in summary["pods"] if each["podRef"]["uid"] == one["metadata"]["uid"]
         ]
         for container in mine["containers"]:
             cpu = container["cpu"]
@@ -460,7 +444,3 @@ def pace() -> float:
 
 def _is_later(one: Usage, other: Usage) -> bool:
     return all(one[name][0] > other[name][0] for name in other)
-
-
-def _address(node: str) -> str:
-    return f"/api/v1/nodes/{node}/proxy/stats/summary"

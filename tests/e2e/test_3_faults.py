@@ -23,7 +23,6 @@ from tests.e2e.conftest import (
     NAMESPACE,
     CommandFailedError,
     JobEnd,
-    cloudrc,
     eventually,
     fly,
     job_end,
@@ -34,6 +33,7 @@ from tests.e2e.conftest import (
     pod,
     pods,
     read,
+    set_link,
     value,
 )
 
@@ -70,26 +70,18 @@ def fly_until(name: str, line: str, limit: float = 120.0) -> None:
     eventually(lambda: line in job_log(name), f"{name}: {line}", 90.0)
 
 
-def delete(component: str) -> str:
-    """Delete a pod without waiting; its name."""
-    name = str(pod(component)["metadata"]["name"])
-    kubectl("delete", "pod", name, "--wait=false")
-    return name
-
-
-def new_pod(component: str, old: str) -> bool:
-    return any(p["metadata"]["name"] != old for p in pods(component))
-
-
-def lines(end: JobEnd, word: str) -> list[str]:
-    return [line for line in end.log.splitlines() if word in line]
+def replace(component: str) -> None:
+    """Delete a pod, and wait only until there is a new one."""
+    old = pod(component)["metadata"]["name"]
+    kubectl("delete", "pod", old, "--wait=false")
+    eventually(lambda: any(p["metadata"]["name"] != old for p in pods(component)), "a new pod")
 
 
 def check_resumed(end: JobEnd) -> None:
     """Complete, and no waypoint was reached twice or left out, across both pods."""
     assert (end.condition, end.exit_code) == ("Complete", 0), end
     for number in range(1, 8):
-        assert len(lines(end, f"waypoint {number} of 7 reached")) == 1, end.log
+        assert end.log.count(f"waypoint {number} of 7 reached") == 1, end.log
     touched = {
         dict(labels)["body"]: number
         for (name, labels), number in metrics("world").items()
@@ -103,8 +95,8 @@ def test_a_deleted_cloud_is_replaced_and_the_mission_goes_on(
     installed: None, note: Callable[[str], None]
 ) -> None:
     fly_until("bereft", "waypoint 2 of 7 reached")
-    began, old = time.monotonic(), delete("cloud")
-    eventually(lambda: new_pod("cloud", old), "a new cloud pod")
+    began = time.monotonic()
+    replace("cloud")
     eventually(lambda: guard() == "HOLD", "the robot holds", ENDS_IN, every=0.1)
     eventually(lambda: guard() == "TRACK", "the new cloud flies it", COMMANDS_IN + POD_START)
     note(f"cloud pod deleted in flight: flown again after {time.monotonic() - began:.1f} s")
@@ -135,15 +127,15 @@ def lingering() -> Iterator[None]:
 @pytest.mark.full
 def test_an_old_cloud_beside_the_new_one_does_no_harm(installed: None, lingering: None) -> None:
     fly_until("haunted", "waypoint 1 of 7 reached")
-    old = delete("cloud")
-    eventually(lambda: new_pod("cloud", old), "a new cloud pod")
+    replace("cloud")
     eventually(lambda: len(pods("cloud")) == 2, "both are there", 10.0)
     check_resumed(job_end("haunted"))
 
 
+@pytest.mark.full
 def test_a_deleted_world_ends_the_mission_as_failed(installed: None) -> None:
     fly_until("orphaned", "waypoint 1 of 7 reached")
-    delete("world")
+    replace("world")
     end = job_end("orphaned", 90.0)
     assert (end.condition, end.exit_code) == ("Failed", 1), end
     assert "world_restarted" in end.message
@@ -156,11 +148,6 @@ def recording(component: str, folder: Path) -> Recording:
     path = folder / f"{component}.mcap"
     fetch_recording(place(), component, path)
     return Recording.read(path)
-
-
-def set_link(*words: str) -> None:
-    done = cloudrc("link", "set", *words, "-n", NAMESPACE, "--release", NAME)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.full
@@ -223,14 +210,7 @@ def test_a_mission_whose_job_is_deleted_is_cancelled(installed: None) -> None:
 
 @pytest.mark.full
 def test_a_rotated_key_costs_one_hold_at_most(installed: None, tmp_path: Path) -> None:
-    spec = pod("cloud")["spec"]
-    (cloud,) = [each for each in spec["containers"] if each["name"] == "cloud"]
-    mounts = {each["name"]: each["mountPath"] for each in cloud["volumeMounts"]}
-    (secret,) = [
-        volume["secret"]["secretName"]
-        for volume in spec["volumes"]
-        if mounts.get(volume["name"]) == "/etc/cloudrc-secret"
-    ]
+    secret = f"{NAME}-tunnel"
     key = tmp_path / "key"
     key.write_bytes(base64.b64decode(read("secret", secret)["data"]["key"]))
     key.chmod(0o600)
