@@ -6,11 +6,9 @@ import base64
 import itertools
 import json
 import os
-import sys
 import threading
 import uuid
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,6 @@ import yaml
 from cloudrc.cluster import client, flight, jobs
 from cloudrc.cluster.client import Release, connect
 from cloudrc.cluster.jobs import UID_LABEL
-from cloudrc.link.state import LinkState, from_text
 
 VERSION_KEYS = (
     "buildDate compiler gitCommit gitTreeState gitVersion goVersion major minor platform".split()
@@ -30,10 +27,10 @@ VERSION_KEYS = (
 
 
 class FakeApi:
-    """Objects by (plural, namespace, name); `refuse` maps a method and plural to an error."""
+    """Objects of a namespace by (plural, name); `refuse` maps a method and plural to an error."""
 
     def __init__(self) -> None:
-        self.objects: dict[tuple[str, str, str], dict[str, Any]] = {}
+        self.objects: dict[tuple[str, str], dict[str, Any]] = {}
         self.logs: dict[str, str] = {}
         self.refuse: dict[tuple[str, str], tuple[int, str]] = {}
         self.seen: list[str] = []
@@ -47,27 +44,23 @@ class FakeApi:
         self.server.shutdown()
         self.server.server_close()
 
-    def put(self, plural: str, namespace: str, body: dict[str, Any]) -> dict[str, Any]:
-        metadata = body.setdefault("metadata", {})
-        metadata.setdefault("namespace", namespace)
-        metadata.setdefault("uid", str(uuid.uuid4()))
-        metadata.setdefault("generation", 1)
+    def put(self, plural: str, body: dict[str, Any]) -> dict[str, Any]:
         stamp = f"2026-01-01T00:00:{next(self._clock) % 60:02d}Z"
-        metadata.setdefault("creationTimestamp", stamp)
-        body.setdefault("status", {})
+        made = {"uid": str(uuid.uuid4()), "generation": 1, "creationTimestamp": stamp}
+        body = {"status": {}, **body, "metadata": {**made, **body["metadata"]}}
         with self.lock:
-            self.objects[plural, namespace, metadata["name"]] = body
+            self.objects[plural, body["metadata"]["name"]] = body
         return body
 
-    def get(self, plural: str, name: str, namespace: str = "demo") -> dict[str, Any]:
-        return self.objects[plural, namespace, name]
+    def get(self, plural: str, name: str) -> dict[str, Any]:
+        return self.objects[plural, name]
 
     def answer(self, method: str, path: str, body: Any) -> tuple[int, Any]:
         address = urlsplit(path)
         if address.path == "/version/":
             return 200, {**dict.fromkeys(VERSION_KEYS, ""), **self.version}
         parts = address.path.strip("/").split("/")
-        namespace, plural, *rest = parts[parts.index("namespaces") + 1 :]
+        _, plural, *rest = parts[parts.index("namespaces") + 1 :]
         name, subresource = (*rest, "", "")[:2]
         self.seen.append(f"{method} {plural}{'/' + name if name else ''}")
         if (method, plural) in self.refuse:
@@ -75,28 +68,21 @@ class FakeApi:
             return code, {"kind": "Status", "message": message, "code": code}
         with self.lock:
             if method == "POST":
-                return 201, self.put(plural, namespace, body)
+                return 201, self.put(plural, body)
             if not name:
                 selector = parse_qs(address.query).get("labelSelector", [""])[0]
-                return 200, {"items": self._select(plural, namespace, selector)}
-            if (plural, namespace, name) not in self.objects:
+                wanted = dict(term.split("=") for term in selector.split(",") if term)
+                found = [body for (kind, _), body in self.objects.items() if kind == plural]
+                labels = [body["metadata"].get("labels", {}).items() for body in found]
+                pairs = zip(found, labels, strict=True)
+                return 200, {"items": [body for body, own in pairs if wanted.items() <= own]}
+            if (plural, name) not in self.objects:
                 return 404, {"message": f'{plural} "{name}" not found', "code": 404}
             if subresource == "log":
                 return 200, self.logs.get(name, "")
-            if method == "PATCH":
-                self.objects[plural, namespace, name]["data"] |= body["data"]
             if method == "DELETE":
-                return 200, self.objects.pop((plural, namespace, name))
-            return 200, self.objects[plural, namespace, name]
-
-    def _select(self, plural: str, namespace: str, selector: str) -> list[dict[str, Any]]:
-        wanted = dict(term.split("=") for term in selector.split(",") if term)
-        return [
-            body
-            for (kind, place, _), body in self.objects.items()
-            if (kind, place) == (plural, namespace)
-            and wanted.items() <= body["metadata"].get("labels", {}).items()
-        ]
+                return 200, self.objects.pop((plural, name))
+            return 200, self.objects[plural, name]
 
 
 def serve(answer: Callable[[BaseHTTPRequestHandler, Any], tuple[int, Any]]) -> ThreadingHTTPServer:
@@ -117,7 +103,7 @@ def serve(answer: Callable[[BaseHTTPRequestHandler, Any], tuple[int, Any]]) -> T
             self.end_headers()
             self.wfile.write(data)
 
-        do_GET = do_POST = do_DELETE = do_PATCH = reply  # noqa: N815
+        do_GET = do_POST = do_DELETE = reply  # noqa: N815
 
         def log_message(self, *words: Any) -> None:
             pass
@@ -155,10 +141,10 @@ class FakeTeleop:
         return "\n".join([*lines, "exec sleep 60"])
 
 
-def kubeconfig(url: str, namespace: str = "demo") -> str:
+def kubeconfig(url: str) -> str:
     """Build a kubeconfig with two contexts: `here`, the current one, and `elsewhere`."""
     contexts = [
-        {"name": "here", "context": {"cluster": "fake", "user": "me", "namespace": namespace}},
+        {"name": "here", "context": {"cluster": "fake", "user": "me", "namespace": "demo"}},
         {"name": "elsewhere", "context": {"cluster": "fake", "user": "me"}},
     ]
     return yaml.safe_dump(
@@ -233,99 +219,9 @@ def deployment(component: str, **status: Any) -> dict[str, Any]:
     }
 
 
-PROFILE = "uplink: {delay_ms: 45, jitter_ms: 25}\ndownlink: {delay_ms: 45, jitter_ms: 25}\n"
-TRACE = "time_s,delay_ms\n0,40\n1,60\n"
-LABEL = "app.kubernetes.io/component"
-KUBECTL = """
-import json, pathlib, sys
-folder, words = pathlib.Path(sys.argv[1]), sys.argv[2:]
-verb = next(word for word in words if word in ("get", "patch", "exec"))
-with (folder / "asked").open("a") as asked:
-    print(" ".join(" ".join(words).split()), file=asked)
-refused = folder / f"refuse-{verb}"
-if refused.exists():
-    sys.exit(refused.read_text())
-if verb == "get":
-    print((folder / "items.json").read_text())
-elif verb == "patch":
-    (folder / "patched.json").write_text(sys.stdin.read())
-else:
-    pod = words[words.index("exec") + 2]
-    broken, number = folder / f"broken-{pod}", str(len(list(folder.glob(f"handed-{pod}-*"))))
-    if broken.exists() and broken.read_text() in ("", number):
-        sys.exit("Error from server: the pod is gone")
-    document = json.loads(sys.stdin.read())
-    (folder / f"handed-{pod}-{number}.json").write_text(json.dumps(document))
-    change = json.loads(document["change"])
-    place = folder / f"state-{pod}.json"
-    state, cannot = json.loads(place.read_text()), folder / f"cannot-{pod}"
-    if cannot.exists() and cannot.read_text() in document["files"]["profile.yaml"]:
-        state |= {"refused": change["number"], "refusal": "netem cannot do that"}
-    elif not (folder / f"deaf-{pod}").exists():
-        state |= {"change": change["number"], "cause": change["cause"]}
-    place.write_text(json.dumps(state))
-    print(json.dumps(state))
-"""
-
-
-def item(kind: str, name: str, component: str, **rest: Any) -> dict[str, Any]:
-    stamp = "2026-01-01T00:00:00Z"
-    metadata = {"name": name, "labels": {LABEL: component}, "creationTimestamp": stamp}
-    return {"kind": kind, "metadata": metadata, **rest}
-
-
-class Cluster:
-    """The cluster of the fake kubectl, and a record of its calls."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        running = {"status": {"phase": "Running"}}
-        self.items = [
-            item("ConfigMap", "demo-link", "link", data={"profile.yaml": PROFILE}),
-            item("ConfigMap", "demo-experiment", "shared", data={"experiment.yaml": "{}"}),
-            item("Pod", "world-1", "world", **running),
-            item("Pod", "cloud-1", "cloud", **running),
-            item("Pod", "cloud-0", "cloud", **running),
-        ]
-        self.items[-1]["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:01Z"
-        for pod, way in (("world-1", "uplink"), ("cloud-1", "downlink")):
-            asked = {"delay": 0.12}
-            state = asdict(LinkState("netem", "", "auto", way, {}, "", 1, asked=asked))
-            (folder / f"state-{pod}.json").write_text(json.dumps(state))
-        self.tell()
-
-    def tell(self) -> None:
-        (self.folder / "items.json").write_text(json.dumps({"items": self.items}))
-
-    def refuse(self, verb: str, text: str) -> None:
-        (self.folder / f"refuse-{verb}").write_text(text)
-
-    def patched(self) -> dict[str, str]:
-        data: dict[str, str] = json.loads((self.folder / "patched.json").read_text())["data"]
-        return data
-
-    def make(self, what: str, pod: str, how: str = "") -> None:
-        """Make a pod `deaf`, `broken` (at its Nth call), or one that `cannot` apply a text."""
-        (self.folder / f"{what}-{pod}").write_text(how)
-
-    def handed(self, pod: str) -> list[dict[str, Any]]:
-        """Return the changes that a pod received, the newest last."""
-        paths = sorted(self.folder.glob(f"handed-{pod}-*.json"))
-        return [json.loads(path.read_text()) for path in paths]
-
-    def state(self, pod: str) -> LinkState:
-        return from_text((self.folder / f"state-{pod}.json").read_text())
-
-    def kept(self) -> bool:
-        """Whether the ConfigMap was written."""
-        return (self.folder / "patched.json").exists()
-
-    def asked(self) -> list[str]:
-        """Return all command lines of kubectl."""
-        return (self.folder / "asked").read_text().splitlines()
-
-
 TOKEN = "operator-token-of-the-release"
+CONFIG_PLACE = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
+"""Where the client keeps the path of the kubeconfig."""
 
 
 @pytest.fixture
@@ -333,7 +229,7 @@ def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeApi]:
     server = FakeApi()
     path = tmp_path / "kubeconfig"
     path.write_text(kubeconfig(server.url))
-    monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", str(path))
+    monkeypatch.setattr(CONFIG_PLACE, str(path))
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(client, "OUTAGE_PERIOD", 0.01)
     monkeypatch.setattr(flight, "LOOK_PERIOD", 0.01)
@@ -351,16 +247,16 @@ def release(api: FakeApi) -> Release:
 def running(api: FakeApi, release: Release) -> FakeApi:
     """The fake API server with a release that is ready to fly."""
     for component in ("world", "cloud"):
-        api.put("deployments", "demo", deployment(component))
-        api.put("pods", "demo", pod(f"{component}-1", component))
+        api.put("deployments", deployment(component))
+        api.put("pods", pod(f"{component}-1", component))
     service = {
         "metadata": {"name": "cloudrc-api", "labels": labels("cloud")},
         "spec": {"ports": [{"name": "api", "port": 8080, "targetPort": "api"}]},
     }
-    api.put("services", "demo", service)
+    api.put("services", service)
     token = base64.b64encode(TOKEN.encode()).decode()
     tokens = {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}}
-    api.put("secrets", "demo", tokens)
+    api.put("secrets", tokens)
     return api
 
 
@@ -378,15 +274,6 @@ def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         return path
 
     return make
-
-
-@pytest.fixture
-def cluster(tmp_path: Path, pretend: Callable[[str, str], Path]) -> Cluster:
-    """A release with a running link, and a fake kubectl for it."""
-    script = tmp_path / "kubectl.py"
-    script.write_text(KUBECTL)
-    pretend("kubectl", f'exec {sys.executable} -S {script} {tmp_path} "$@"')
-    return Cluster(tmp_path)
 
 
 @pytest.fixture
@@ -411,7 +298,7 @@ def end(api: FakeApi, name: str, kind: str, **condition: str) -> None:
 def start_pod(api: FakeApi, name: str, **given: Any) -> None:
     """Create the pod of a Job as Kubernetes does."""
     uid = api.get("jobs", name)["metadata"]["uid"]
-    api.put("pods", "demo", pod(f"{name}-x", "mission", labels={UID_LABEL: uid}, **given))
+    api.put("pods", pod(f"{name}-x", "mission", labels={UID_LABEL: uid}, **given))
 
 
 def terminated(exit_code: int, message: str) -> dict[str, Any]:
@@ -434,4 +321,4 @@ def at_look(api: FakeApi, number: int, action: Callable[[], None]) -> None:
 
 def made(api: FakeApi) -> list[dict[str, Any]]:
     """Return the Jobs."""
-    return [body for (kind, _, _), body in api.objects.items() if kind == "jobs"]
+    return [body for (kind, _), body in api.objects.items() if kind == "jobs"]

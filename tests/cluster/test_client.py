@@ -20,10 +20,18 @@ from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import find_pod, list_pods
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
-from tests.cluster.conftest import MISSION, FakeApi, end, kubeconfig, pod, start_pod, terminated
+from tests.cluster.conftest import (
+    CONFIG_PLACE,
+    MISSION,
+    FakeApi,
+    end,
+    kubeconfig,
+    pod,
+    start_pod,
+    terminated,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
-PLACE = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
 Pretend = Callable[[str, str], Path]
 
 
@@ -48,7 +56,7 @@ def test_a_missing_kubeconfig_is_reported_with_a_remedy(
     path = tmp_path / "config"
     if text is not None:
         path.write_text(text)
-    monkeypatch.setattr(PLACE, str(path))
+    monkeypatch.setattr(CONFIG_PLACE, str(path))
     with pytest.raises(MissingPrerequisiteError, match="kind create cluster") as caught:
         connect()
     assert "\n" not in str(caught.value)
@@ -94,7 +102,7 @@ def test_a_silent_cluster_is_reported_in_one_sentence(
 ) -> None:
     path = tmp_path / "config"
     path.write_text(kubeconfig("http://127.0.0.1:9"))  # the discard port: nobody listens
-    monkeypatch.setattr(PLACE, str(path))
+    monkeypatch.setattr(CONFIG_PLACE, str(path))
     with pytest.raises(ClusterError, match=r"does not answer.*refused.*kubectl") as caught:
         list_pods(connect(), "cloud")
     assert caught.value.exit_code == 5
@@ -123,8 +131,8 @@ def test_the_newest_pod_of_the_release_is_found(api: FakeApi, release: Release) 
     with pytest.raises(ClusterError, match=r"no release 'cloudrc' in namespace 'demo'; install it"):
         find_pod(release, "cloud")
     for name in ("old", "new", "ending"):
-        api.put("pods", "demo", pod(name, "cloud"))
-    api.put("pods", "demo", pod("other", "cloud", labels={"app.kubernetes.io/instance": "other"}))
+        api.put("pods", pod(name, "cloud"))
+    api.put("pods", pod("other", "cloud", labels={"app.kubernetes.io/instance": "other"}))
     api.get("pods", "ending")["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:59Z"
     assert find_pod(release, "cloud").metadata.name == "new"
 

@@ -112,7 +112,7 @@ def ends(api: FakeApi, kind: str = "Complete", exit_code: int = 0, message: str 
     """Let the Job end at the second look."""
 
     def action() -> None:
-        (name,) = [key[2] for key in api.objects if key[0] == "jobs"]
+        (name,) = [key[1] for key in api.objects if key[0] == "jobs"]
         start_pod(api, name, state=terminated(exit_code, message))
         api.logs[f"{name}-x"] = "waypoint 1 of 1 reached at 3.00 s\n"
         end(api, name, kind)
@@ -159,7 +159,7 @@ def test_a_refused_mission_leaves_no_run(
 def test_the_recording_from_before_a_restart_is_copied(
     ready: FakeApi, tmp_path: Path, capsys: Printed, left: bool
 ) -> None:
-    (key,) = [key for key in ready.objects if key[0] == "pods" and "world" in key[2]]
+    (key,) = [key for key in ready.objects if key[0] == "pods" and "world" in key[1]]
     ready.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
     if left:
         (tmp_path / "left").write_text("before\n")

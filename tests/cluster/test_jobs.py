@@ -137,7 +137,7 @@ def test_follow_ends_when_the_pod_cannot_run(running: FakeApi, release: Release)
         "reason": "FailedCreate",
         "message": "violates PodSecurity",
     }
-    running.put("events", "demo", event)
+    running.put("events", event)
     with pytest.raises(ClusterError, match="violates PodSecurity"):
         follow(release, "first", print, timeout=10.0)
     start_pod(running, "first", state={"waiting": {"reason": "ErrImagePull"}}, ready=False)

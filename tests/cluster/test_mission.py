@@ -19,6 +19,7 @@ from cloudrc.cluster import jobs
 from cloudrc.cluster.client import Release
 from cloudrc.drivers import local
 from tests.cluster.conftest import (
+    CONFIG_PLACE,
     FakeApi,
     at_look,
     end,
@@ -48,7 +49,7 @@ def lands(running: FakeApi, monkeypatch: pytest.MonkeyPatch) -> FakeApi:
     original = jobs.follow
 
     def follow(release: Release, name: str, *given: Any, timeout: float) -> Any:
-        running.objects["jobs", "demo", name]["metadata"]["patience"] = timeout
+        running.objects["jobs", name]["metadata"]["patience"] = timeout
         start_pod(running, name, state=terminated(0, "done"))
         end(running, name, "Complete")
         return original(release, name, *given, timeout=timeout)
@@ -61,7 +62,7 @@ def fly(api: FakeApi, capsys: Printed, code: int = 0) -> str:
     """Call `mission run`, whose Job ends with this code; return the Job's name."""
 
     def land() -> None:
-        *_, (_, _, job) = (key for key in api.objects if key[0] == "jobs")
+        *_, (_, job) = (key for key in api.objects if key[0] == "jobs")
         start_pod(api, job, state=terminated(code, VERDICT[code]))
         api.logs[f"{job}-x"] = f"waypoint 1 of 1 reached\n{VERDICT[code]}\n"
         end(api, job, "Failed" if code else "Complete")
@@ -154,7 +155,7 @@ def test_a_jobs_deadline_follows_the_missions_time_limit(
 ) -> None:
     data = {"experiment.yaml": yaml.safe_dump(given)}
     metadata = {"name": "cloudrc-experiment", "labels": labels("experiment")}
-    lands.put("configmaps", "demo", {"metadata": metadata, "data": data})
+    lands.put("configmaps", {"metadata": metadata, "data": data})
     if given is None:
         lands.refuse["GET", "configmaps"] = 403, "configmaps is forbidden"
     (folder / "one.yaml").write_text(mission)
@@ -169,13 +170,13 @@ def test_a_jobs_deadline_follows_the_missions_time_limit(
 def test_run_waits_until_the_release_is_ready(lands: FakeApi, capsys: Printed) -> None:
     """`helm install` does not wait for the pods."""
     original, looks = lands.answer, 0
-    lands.put("pods", "demo", pod("cloud-1", "cloud", ready=False, phase="Pending"))
+    lands.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending"))
 
     def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
         nonlocal looks
         looks += "/pods" in path
         if looks == 4:
-            lands.put("pods", "demo", pod("cloud-1", "cloud"))
+            lands.put("pods", pod("cloud-1", "cloud"))
         return original(method, path, body)
 
     lands.answer = answer  # type: ignore[method-assign]
@@ -187,7 +188,7 @@ def test_run_waits_until_the_release_is_ready(lands: FakeApi, capsys: Printed) -
 
 
 def test_the_wait_for_a_release_has_a_timeout(running: FakeApi, capsys: Printed) -> None:
-    running.put("pods", "demo", pod("world-1", "world", ready=False))
+    running.put("pods", pod("world-1", "world", ready=False))
     assert main(["mission", "run", "one.yaml", "--timeout", "0.05"]) == 4
     assert "container world is not ready yet" in capsys.readouterr().err
     assert made(running) == []
@@ -256,6 +257,6 @@ def test_a_killed_run_is_ignored(
     assert main(["mission", "list"]) == 0
     assert "no missions in namespace 'demo'" in capsys.readouterr().out
     nowhere = str(tmp_path / "none")
-    monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", nowhere)
+    monkeypatch.setattr(CONFIG_PLACE, nowhere)
     assert main(["mission", "status"]) == 3
     assert re.match(".*no run flies here.*KUBECONFIG.*\n$", capsys.readouterr().err)

@@ -57,7 +57,7 @@ def unscheduled(message: str) -> list[dict[str, str]]:
 def test_a_failure_of_a_pod_is_explained(
     api: FakeApi, release: Release, given: dict[str, Any], expected: str
 ) -> None:
-    api.put("pods", "demo", pod("cloud-1", "cloud", ready=False, phase="Pending", **given))
+    api.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending", **given))
     said = pod_failure(list_pods(release, "cloud")[0])
     assert re.search(expected, said)
     assert "\n" not in said
@@ -85,7 +85,7 @@ def test_the_wait_for_a_release_ends_with_the_cause(
     running: FakeApi, release: Release, body: dict[str, Any], error: type[CloudrcError], words: str
 ) -> None:
     wait_ready(release, timeout=0.0)
-    running.put("pods" if "phase" in body["status"] else "deployments", "demo", body)
+    running.put("pods" if "phase" in body["status"] else "deployments", body)
     with pytest.raises(error, match=words):
         wait_ready(release, timeout=0.03)
 
@@ -94,10 +94,10 @@ def test_a_missing_secret_ends_the_wait_with_a_command(running: FakeApi, release
     def wait_for(name: str) -> None:
         """Make world's pod wait for a Secret, with the kubelet's event."""
         state = waiting("ContainerCreating")
-        running.put("pods", "demo", pod("world-1", "world", ready=False, state=state))
+        running.put("pods", pod("world-1", "world", ready=False, state=state))
         said = f'MountVolume.SetUp failed for volume "secret" : secret "{name}" not found'
         event = {"metadata": {"name": "world-1.1"}, "involvedObject": {}, "message": said}
-        running.put("events", "demo", {**event, "type": "Warning", "reason": "FailedMount"})
+        running.put("events", {**event, "type": "Warning", "reason": "FailedMount"})
 
     wait_for("mine")
     command = "kubectl --namespace=demo create secret generic mine --from-file=key"
@@ -208,7 +208,7 @@ def test_a_failed_port_forward_is_reported(
 def test_a_recording_is_copied_unchanged(
     api: FakeApi, release: Release, pretend: Pretend, tmp_path: Path
 ) -> None:
-    api.put("pods", "demo", pod("world-1", "world"))
+    api.put("pods", pod("world-1", "world"))
     source, target = tmp_path / "source", tmp_path / "world.mcap"
     source.write_bytes(bytes(range(256)) * 100)
     pretend("kubectl", f"echo $@ > {tmp_path}/line; cat {source}")
