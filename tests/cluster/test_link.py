@@ -115,23 +115,18 @@ def test_a_change_reaches_both_pods_and_the_configmap(cluster: Cluster, capsys: 
     assert shown[2].split()[:4] == ["downlink", "netem", "120", "ms"]
 
 
-def test_a_trace_goes_to_the_pods_and_the_configmap(cluster: Cluster, tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text(TRACE)
-    cluster.items[0]["data"] |= {"old.csv": "of a profile before"}
-    assert main(["link", "set", f"uplink.trace={tmp_path / 't.csv'}", "--release", "cloudrc"]) == 0
-    handed = cluster.handed["world-1"]
-    assert set(handed["files"]) == {"profile.yaml", "uplink-t.csv"}
-    assert handed["files"]["uplink-t.csv"] == cluster.kept["uplink-t.csv"] == TRACE
-
-
 def test_a_local_trace_is_stored_beside_the_profile(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "my trace.csv").write_text(TRACE)
     setting = [f"uplink.trace={tmp_path / 'my trace.csv'}"]
+    cluster.items[0]["data"] |= {"old.csv": "of a profile before"}
+    assert main(["link", "set", *setting, "-n", "demo"]) == 0
+    handed = cluster.handed["world-1"]
+    assert set(handed["files"]) == {"profile.yaml", "uplink-my_trace.csv"}
+    assert handed["files"]["uplink-my_trace.csv"] == cluster.kept["uplink-my_trace.csv"] == TRACE
     made, new = with_files({"profile.yaml": PROFILE}, None, setting)
     assert made.restart
-    assert new["uplink-my_trace.csv"] == TRACE
     assert yaml.safe_load(new["profile.yaml"])["uplink"]["trace"] == "uplink-my_trace.csv"
     # The profile now has the name of the file beside it.
     again, newer = with_files({**new, "change.json": "{}"}, None, ["downlink.loss=0.1"])

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,7 @@ NAMESPACE = "cloudrc-e2e"
 NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring", f"{NAMESPACE}-bad")
 """All that these tests make."""
 NAME = "cloudrc"
+ENDS = ("world", "cloud")
 RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
 SUMMARY: list[str] = []
 """Lines that are printed at the end."""
@@ -142,7 +142,7 @@ def pod(component: str) -> dict[str, Any]:
 def identity() -> dict[str, tuple[str, list[int]]]:
     """What changes when a pod is replaced or a container starts again."""
     found = {}
-    for component in ("world", "cloud"):
+    for component in ENDS:
         one = pod(component)
         status = one["status"]
         containers = [*status.get("initContainerStatuses", []), *status["containerStatuses"]]
@@ -153,14 +153,23 @@ def identity() -> dict[str, tuple[str, list[int]]]:
 Sample = tuple[str, tuple[tuple[str, str], ...]]
 
 
-def metrics(component: str, container: str = "") -> dict[Sample, float]:
-    """Every sample of a container: by name and sorted labels."""
-    text = fetch_metrics(place(), component)[container or component]
+def scrapes(component: str) -> dict[str, str]:
+    """What each container of a pod answers to a scrape."""
+    return fetch_metrics(place(), component)
+
+
+def samples(text: str) -> dict[Sample, float]:
+    """Every sample of a scrape: by name and sorted labels."""
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(text)
         for sample in family.samples
     }
+
+
+def metrics(component: str) -> dict[Sample, float]:
+    """Every sample of world or cloud."""
+    return samples(scrapes(component)[component])
 
 
 def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
@@ -225,7 +234,7 @@ def save(folder: Path) -> None:
     """Keep what helps to understand a failure: of each namespace in a folder of its own."""
     for namespace in NAMESPACES:
         _save_texts(folder / namespace, f"--namespace={namespace}")
-    for component in ("world", "cloud"):
+    for component in ENDS:
         fetch_recording(place(), component, folder / f"{component}.mcap")
 
 
@@ -380,59 +389,23 @@ def prometheus_image(cluster: None) -> str:
 
 
 @dataclass
-class Cost:
-    """Processor [cores] and memory [bytes]: in all, and of each container."""
+class Usage:
+    """What the release has used up to an instant [s]."""
 
-    cpu: float
+    at: float
+    cpu: dict[str, float]
+    """Container -> processor time [s]."""
     memory: float
-    containers: dict[str, tuple[float, float]]
-
-
-Usage = dict[str, tuple[float, float, float]]
-"""Container -> instant [s], processor time used so far [s], memory [bytes]."""
+    """Of all containers [bytes]."""
 
 
 def usage() -> Usage:
-    """Read the counters of all containers of the release."""
-    found: Usage = {}
-    for component in ("world", "cloud"):
-        one = pod(component)
-        address = f"/api/v1/nodes/{one['spec']['nodeName']}/proxy/stats/summary"
-        summary = json.loads(command("kubectl", "get", "--raw", address))
-        (mine,) = [
-            each for each in summary["pods"] if each["podRef"]["uid"] == one["metadata"]["uid"]
-        ]
-        for container in mine["containers"]:
-            cpu = container["cpu"]
-            found[f"{component}/{container['name']}"] = (
-                datetime.fromisoformat(cpu["time"].replace("Z", "+00:00")).timestamp(),
-                cpu["usageCoreNanoSeconds"] * 1e-9,
-                container["memory"]["workingSetBytes"],
-            )
-    return found
-
-
-def cost_between(before: Usage, after: Usage) -> Cost:
-    """What was used per second from one reading to a later one."""
-    newest = after if _is_later(after, before) else later(before)
-    containers = {
-        name: ((used - before[name][1]) / (at - before[name][0]), memory)
-        for name, (at, used, memory) in newest.items()
-        if name in before
-    }
-    cpu, memory = (sum(each[i] for each in containers.values()) for i in (0, 1))
-    return Cost(cpu, memory, containers)
-
-
-def later(before: Usage) -> Usage:
-    """Read the counters once the kubelet has measured all containers again."""
-
-    def look() -> Usage | None:
-        now = usage()
-        return now if _is_later(now, before) else None
-
-    found: Usage = eventually(look, "the kubelet has measured again", 30.0)
-    return found
+    """Read what each process of the release says of itself."""
+    texts = {f"{end}/{name}": text for end in ENDS for name, text in scrapes(end).items()}
+    found = {name: samples(text) for name, text in texts.items()}
+    cpu = {name: value(each, "process_cpu_seconds_total") for name, each in found.items()}
+    memory = [value(each, "process_resident_memory_bytes") for each in found.values()]
+    return Usage(time.monotonic(), cpu, sum(memory))
 
 
 @cache  # measured where the release flies; later its pods may just be replaced
@@ -440,7 +413,3 @@ def pace() -> float:
     """How much slower than nominal the release's own interpreter is at its own work; at least 1."""
     words = ("exec", pod("world")["metadata"]["name"], "--container=world", "--")
     return slower(kubectl(*words, "python", "-c", WORK))
-
-
-def _is_later(one: Usage, other: Usage) -> bool:
-    return all(one[name][0] > other[name][0] for name in other)

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from cloudrc.cluster.pods import fetch_metrics
 from tests.e2e.conftest import (
     EXAMPLES,
     TIMES,
@@ -23,8 +22,8 @@ from tests.e2e.conftest import (
     kubectl,
     metrics,
     missions,
-    place,
     pod,
+    scrapes,
     value,
 )
 from tests.e2e.neighbours import Prometheus, install_prometheus, promtool, stranger
@@ -112,7 +111,7 @@ def test_a_stranger_reaches_neither_tunnel_nor_metrics_nor_api(first: FirstFligh
 
 
 def test_all_metrics_are_well_formed_and_of_one_configuration(first: FirstFlight) -> None:
-    texts = fetch_metrics(place(), "world") | fetch_metrics(place(), "cloud")
+    texts = scrapes("world") | scrapes("cloud")
     for container, text in texts.items():
         assert promtool("check", "metrics", given=text) == "", container
     found = {name: re.findall(r'build_info{config="(\w*)"', text) for name, text in texts.items()}

@@ -20,7 +20,6 @@ from tests.e2e.conftest import (
     NAME,
     CommandFailedError,
     Usage,
-    cost_between,
     eventually,
     fly,
     helm,
@@ -29,7 +28,6 @@ from tests.e2e.conftest import (
     job_end,
     job_log,
     kubectl,
-    later,
     metrics,
     pace,
     place,
@@ -48,10 +46,8 @@ ASKED_CPU = 0.200
 LIMIT_CPU = 0.300
 """Up to this nothing need be wrong on any machine [cores]: the same release has cost from 89m to
 220m on one and the same machine, by what a wake costs there at the time."""
-LIMIT_MEMORY = 320 * 2**20
-"""Likewise [bytes]."""
-WINDOWS = 3
-"""Over which the cost is measured; the least counts, since what else runs only adds to it."""
+LIMIT_MEMORY = 400 * 2**20
+"""Likewise [bytes]; what processes share counts for each."""
 TOLERANCE = 0.002
 """Of a mean one-way delay [s]."""
 PROFILES = [
@@ -94,7 +90,8 @@ def flight(installed: None) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def readings(flight: None) -> list[Usage]:
-    """Of what the release has used, from the begin of the flight on; each profile adds one."""
+    """Of what the release has used; each test of the flight adds one. The least cost of a window
+    counts, since what else runs only adds to it."""
     return [usage()]
 
 
@@ -188,21 +185,27 @@ def test_the_operator_holds_moves_and_resumes_a_mission(readings: list[Usage]) -
 
 
 def test_a_release_is_cheap(readings: list[Usage], note: Callable[[str], None]) -> None:
-    while len(readings) <= WINDOWS:  # where this test runs alone
-        readings.append(later(readings[-1]))
-    costs = [cost_between(*window) for window in pairwise(readings)]
-    least = min(costs, key=lambda cost: cost.cpu)
-    memory = max(cost.memory for cost in costs)
+    if len(readings) < 2:  # where this test runs alone
+        time.sleep(10.0)
+        readings.append(usage())
+    costs = [
+        {
+            name: (after.cpu[name] - used) / (after.at - before.at)
+            for name, used in before.cpu.items()
+        }
+        for before, after in pairwise(readings)
+    ]
+    least = min(costs, key=lambda cost: sum(cost.values()))
+    memory = max(reading.memory for reading in readings)
     asked = ASKED_CPU * (slower := pace())
     note(
         f"one release in flight: asked {ASKED_CPU * 1000:.0f}m CPU, at this machine's pace of"
-        f" 1 / {slower:.2f} {asked * 1000:.0f}m | least {least.cpu * 1000:.0f}m"
-        f" | windows {', '.join(f'{cost.cpu * 1000:.0f}m' for cost in costs)};"
+        f" 1 / {slower:.2f} {asked * 1000:.0f}m"
+        f" | windows {', '.join(f'{sum(cost.values()) * 1000:.0f}m' for cost in costs)};"
         f" asked {LIMIT_MEMORY / 2**20:.0f} MiB | most {memory / 2**20:.0f} MiB"
     )
-    for name, (cpu, used) in sorted(least.containers.items()):
-        note(f"  {name:<14} {cpu * 1000:4.0f}m CPU  {used / 2**20:4.0f} MiB")
-    assert least.cpu <= max(LIMIT_CPU, asked)
+    note("  " + ", ".join(f"{name} {cpu * 1000:.0f}m" for name, cpu in least.items()))
+    assert sum(least.values()) <= max(LIMIT_CPU, asked)
     assert memory <= LIMIT_MEMORY
 
 
