@@ -30,7 +30,7 @@ LOOK_PERIOD = 1.0
 HELM_LIMIT = 120.0
 """Time limit for one helm command [s]; helm does not wait for pods."""
 FAILURE_TIME = 5.0
-"""A failure is reported if it lasts longer than this [s]; a Secret may appear after its pod."""
+"""A failure is reported if it lasts longer than this [s]; some objects appear after their pod."""
 FLUSH = 1.0
 """Time after which a recorder has certainly flushed its buffer [s]; the buffer holds at most half a
 second of records."""
@@ -124,8 +124,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
             return str(condition.message), True
     found = pods.list_pods(release, component)
     for pod in found:
-        why = pods.pod_failure(pod) or pods.missing_secret(release, pod)
-        if why:
+        if why := pods.pod_failure(pod):
             return why, True
     current = (status.observed_generation or 0) >= deployment.metadata.generation
     if not (current and status.updated_replicas == 1 and status.replicas == 1 and found):

@@ -25,11 +25,8 @@ from cloudrc.cluster.pods import (
     NO_PROXY,
     api_url,
     container_statuses,
-    events,
     find_deployment,
-    has_started,
     list_pods,
-    missing_secret,
     one_line,
     operator_token,
     pod_failure,
@@ -271,7 +268,7 @@ def logs(release: Release, name: str) -> list[str]:
 
 
 def _log(release: Release, pod: Any) -> list[str]:
-    if pod is None or not has_started(pod):
+    if pod is None or pod.status.phase == "Pending":
         return []
     return pod_log(release, pod.metadata.name, COMPONENT).splitlines()
 
@@ -281,10 +278,12 @@ def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
     status, pod = _read(release, name)
     if status.state != "pending":
         return status, _log(release, pod)
-    if pod is None:
-        why = "; ".join(events(release, "Job", name, "FailedCreate")[-1:])
-    else:
-        why = pod_failure(pod) or missing_secret(release, pod)
+    if pod is not None:
+        why = pod_failure(pod)
+    else:  # the cluster may refuse the pod, for example for a quota
+        selector = f"involvedObject.kind=Job,involvedObject.name={name}"
+        found = release.request("list", "events", field_selector=selector)
+        why = next((event.message for event in found if event.reason == "FailedCreate"), "")
     if why:
         raise ClusterError(
             f"Job '{name}' cannot start: {why}; then delete the Job: "

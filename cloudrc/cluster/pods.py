@@ -14,7 +14,7 @@ import tempfile
 import time
 import urllib.request
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -44,12 +44,6 @@ FATAL = {
 """Reason, in Kubernetes' words, why a container will never run -> description."""
 RESTARTS_MAX = 2
 """Largest number of restarts up to which a container may still start [1]."""
-SECRETS = {
-    "secret": ("key", "head -c 32 /dev/urandom"),
-    "tokens": ("operator", "openssl rand -hex 32"),
-}
-"""Volume of the chart's pods -> key that the volume's Secret must have, and a command that makes
-the key's content."""
 TOKENS, OPERATOR = "tokens", "operator"
 """Volume with the API's tokens in the pods of cloud and missions, and key of the operator's."""
 API_PORT = 8080
@@ -139,45 +133,6 @@ def container_statuses(pod: Any) -> list[Any]:
 def one_line(text: str | None) -> str:
     """Write a text of Kubernetes on one line."""
     return " ".join((text or "").split())
-
-
-def has_started(pod: Any) -> bool:
-    """Whether a container of a pod runs or has run."""
-    return any(s.state.running or s.state.terminated for s in container_statuses(pod))
-
-
-def missing_secret(release: Release, pod: Any) -> str:
-    """Name the missing Secret for which a pod waits, and how to make it; "" without one."""
-    if has_started(pod):
-        return ""
-    messages: list[str] = []
-    with suppress(ClusterError):  # the right to read events is not needed to fly
-        messages = events(release, "Pod", pod.metadata.name, "FailedMount")
-    for message in messages:
-        found = re.search(r'volume "(secret|tokens)".* secret "([^"]+)" not found', message)
-        if found and not _has_secret(release, found[2]):
-            file, content = SECRETS[found[1]]
-            return (
-                f"there is no Secret '{found[2]}'; make it: (umask 077; {content} >{file}) && "
-                f"kubectl {' '.join(release.flags)} create secret generic {found[2]} "
-                f"--from-file={file}"
-            )
-    return ""
-
-
-def _has_secret(release: Release, name: str) -> bool:
-    """Whether a Secret exists now; an event about a missing Secret may be two minutes old."""
-    with suppress(ClusterError):
-        release.request("get", "secrets", name=name)
-        return True
-    return False
-
-
-def events(release: Release, kind: str, name: str, reason: str) -> list[str]:
-    """List the messages of those events of an object that have this reason."""
-    selector = f"involvedObject.kind={kind},involvedObject.name={name}"
-    found = release.request("list", "events", field_selector=selector)
-    return [event.message for event in found if event.reason == reason]
 
 
 def tokens_secret(release: Release) -> str:

@@ -90,28 +90,6 @@ def test_the_wait_for_a_release_ends_with_the_cause(
         wait_ready(release, timeout=0.03)
 
 
-def test_a_missing_secret_ends_the_wait_with_a_command(running: FakeApi, release: Release) -> None:
-    def wait_for(name: str) -> None:
-        """Make world's pod wait for a Secret, with the kubelet's event."""
-        state = waiting("ContainerCreating")
-        running.put("pods", pod("world-1", "world", ready=False, state=state))
-        said = f'MountVolume.SetUp failed for volume "secret" : secret "{name}" not found'
-        event = {"metadata": {"name": "world-1.1"}, "involvedObject": {}, "message": said}
-        running.put("events", {**event, "type": "Warning", "reason": "FailedMount"})
-
-    wait_for("mine")
-    command = "kubectl --namespace=demo create secret generic mine --from-file=key"
-    with pytest.raises(ClusterError, match=f"pod cannot run: there is no Secret.*{command}"):
-        wait_ready(release, timeout=5.0)
-    running.refuse["GET", "events"] = 403, "events is forbidden"
-    with pytest.raises(TimedOutError, match="container world is not ready"):
-        wait_ready(release, timeout=0.03)
-    running.refuse.clear()
-    wait_for("cloudrc-tokens")  # exists by now
-    with pytest.raises(TimedOutError, match="container world is not ready"):
-        wait_ready(release, timeout=0.03)
-
-
 @pytest.mark.parametrize(
     ("said", "hint"),
     [
