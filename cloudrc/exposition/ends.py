@@ -25,17 +25,16 @@ from cloudrc.exposition.parts import (
 from cloudrc.exposition.table import (
     AXES,
     BODIES,
-    DELAY_BUCKETS,
+    CLOUD,
     DIRECTIONS,
-    GAP_BUCKETS,
     GUARD_STATES,
-    LATENESS_BUCKETS,
     ONLY_CLOUD,
     ONLY_WORLD,
     OUTCOMES,
-    PERIOD_BUCKETS,
     TERMS,
+    WORLD,
     Labels,
+    of_role,
 )
 from cloudrc.messages import NEVER_NS, GuardState
 from cloudrc.records import (
@@ -109,16 +108,21 @@ class End:
         check: Verdict on the incoming direction of the link.
     """
 
-    def __init__(self, incoming: str, outgoing: str, counts: Mapping[str, int]) -> None:
-        """Set the directions, "uplink" and "downlink", and the counts; there is no session."""
-        self._incoming, self._outgoing, self._counts = incoming, outgoing, counts
-        others = ONLY_CLOUD if incoming == DIRECTIONS[1] else ONLY_WORLD
+    def __init__(self, role: str, counts: Mapping[str, int]) -> None:
+        """Set the role, "world" or "cloud", and the counts; there is no session."""
+        self._counts, self._stream = counts, DatagramTally()
+        self._outgoing, self._incoming = DIRECTIONS if role == WORLD else DIRECTIONS[::-1]
+        others = ONLY_CLOUD if role == WORLD else ONLY_WORLD
         self._outcomes = tuple(name for name in OUTCOMES[1:] if name not in others)
-        self._stream = DatagramTally()
-        self.check = LinkVerdict(incoming)
-        self._one_way, self._age = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
-        self._gap = Histogram(GAP_BUCKETS)
-        self._period, self._lateness = Histogram(PERIOD_BUCKETS), Histogram(LATENESS_BUCKETS)
+        self.check = LinkVerdict(self._incoming)
+        self._histograms = {
+            metric.name: Histogram(metric.buckets) for metric in of_role(role) if metric.buckets
+        }
+        self._one_way = self._histograms[f"cloudrc_{self._incoming}_delay_seconds"]
+        self._age = self._histograms["cloudrc_age_of_information_seconds"]
+        self._gap = self._histograms["cloudrc_link_gap_seconds"]
+        self._period = self._histograms["cloudrc_loop_period_seconds"]
+        self._lateness = self._histograms["cloudrc_loop_lateness_seconds"]
         self._busy = 0.0
         self._clock_steps = 0
         self._sessions, self._epoch, self._opened_ns = 0, 0, NEVER_NS
@@ -185,22 +189,21 @@ class End:
             (incoming, name): counts.get(name, 0) for name in self._outcomes
         }
         datagrams[self._outgoing, "sent"] = counts.get("sent", 0)
-        readings: Readings = self.check.read() | {
+        readings: Readings = {
+            **self._histograms,
+            **self.check.read(),
             "cloudrc_session_epoch": unlabelled(self._epoch),
             "cloudrc_sessions_opened_total": unlabelled(self._sessions),
             "cloudrc_datagrams_total": datagrams,
             "cloudrc_datagrams_expected_total": {(incoming,): stream.expected},
             "cloudrc_datagrams_lost_total": {(incoming,): stream.lost},
             "cloudrc_datagrams_reordered_total": {(incoming,): stream.reordered},
-            "cloudrc_link_gap_seconds": self._gap,
-            "cloudrc_loop_period_seconds": self._period,
-            "cloudrc_loop_lateness_seconds": self._lateness,
             "cloudrc_loop_busy_seconds_total": unlabelled(self._busy),
             "cloudrc_clock_steps_total": unlabelled(self._clock_steps),
         }
-        if self._one_way.cumulative()[-1]:  # unknown without a shared clock: absent, never zero
-            readings[f"cloudrc_{incoming}_delay_seconds"] = self._one_way
-            readings["cloudrc_age_of_information_seconds"] = self._age
+        if not self._one_way.cumulative()[-1]:  # unknown without a shared clock: absent, never zero
+            del readings[f"cloudrc_{incoming}_delay_seconds"]
+            del readings["cloudrc_age_of_information_seconds"]
         return readings
 
 
@@ -217,14 +220,16 @@ class WorldEnd(End):
 
     def __init__(self, counts: Mapping[str, int]) -> None:
         """Set the counts and the guard's state GROUND."""
-        uplink, downlink = DIRECTIONS
-        super().__init__(downlink, uplink, counts)
+        super().__init__(WORLD, counts)
         self._truth: GroundTruth | None = None
         self._guard = GuardState.GROUND
         self._changes = dict.fromkeys(GUARD_STATES, 0)
         self._contacts = dict.fromkeys(BODIES, 0)
         self._slip_ns = self._admitted = 0
-        self._basis_ns, self._command_age = NEVER_NS, Histogram(DELAY_BUCKETS)
+        self._basis_ns, self._command_age = (
+            NEVER_NS,
+            self._histograms["cloudrc_command_age_seconds"],
+        )
         # Samples of world's clock and of the machine's clock [ns].
         self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
         self._instant_ns = NEVER_NS
@@ -285,7 +290,6 @@ class WorldEnd(End):
         """Return the current values; unknown values are absent."""
         readings = super().read() | {
             "cloudrc_clouds_admitted_total": unlabelled(self._admitted),
-            "cloudrc_command_age_seconds": self._command_age,
             "cloudrc_guard_state": unlabelled(self._guard),
             "cloudrc_guard_transitions_total": by_label(self._changes),
             "cloudrc_contacts_total": by_label(self._contacts),
@@ -307,8 +311,9 @@ class CloudEnd(End):
 
     def __init__(self, counts: Mapping[str, int]) -> None:
         """Set the counts; there is no control period yet."""
-        super().__init__(*DIRECTIONS, counts)
-        self._rtt, self._loop = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
+        super().__init__(CLOUD, counts)
+        self._rtt = self._histograms["cloudrc_rtt_seconds"]
+        self._loop = self._histograms["cloudrc_loop_delay_seconds"]
         self._prediction, self._delay = PredictionJudge(), DelayJudge()
         self._control: Control | None = None
         self._loop_delay = nan
@@ -346,8 +351,6 @@ class CloudEnd(End):
         """Return the current values; unknown values are absent."""
         prediction = self._prediction
         readings = super().read() | {
-            "cloudrc_rtt_seconds": self._rtt,
-            "cloudrc_loop_delay_seconds": self._loop,
             "cloudrc_delay_estimate_error_seconds": unlabelled(self._delay.error),
             "cloudrc_prediction_error_meters": per_axis(prediction.error),
             "cloudrc_prediction_error_square_meters_total": unlabelled(prediction.square),
