@@ -11,9 +11,9 @@ from cloudrc.config.problems import leaves
 from cloudrc.config.schema import Experiment
 from tests.chart.conftest import (
     CHART,
+    SCHEMA,
     Object,
     render,
-    schema,
     values_of,
 )
 
@@ -36,7 +36,7 @@ def parts(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ..
 
 
 def test_the_schema_is_closed_at_every_level() -> None:
-    for path, part in parts(schema()):
+    for path, part in parts(SCHEMA):
         if part.get("type") != "object" or OPEN & set(path):
             continue
         extra = part.get("additionalProperties", True)
@@ -45,10 +45,10 @@ def test_the_schema_is_closed_at_every_level() -> None:
 
 
 def test_every_value_has_a_description_and_a_number_its_unit() -> None:
-    definitions = schema()["$defs"]
+    definitions = SCHEMA["$defs"]
     units = {"_m": "[m]", "_ms": "[ms]", "_s": "[s]", "_deg": "[deg]", "_kbit": "[kbit/s]"}
     keys = {path[-1] for path, _ in leaves(Experiment)}
-    for path, part in parts(schema()):
+    for path, part in parts(SCHEMA):
         for name, value in part.get("properties", {}).items():
             reference = value.get("$ref", "").rpartition("/")[2]
             text = value.get("description") or definitions.get(reference, {}).get("description")
@@ -62,7 +62,7 @@ def test_every_value_has_a_description_and_a_number_its_unit() -> None:
 
 def test_the_defaults_are_valid_and_written_out() -> None:
     assert render({"global": {"anything": {"goes": True}}}), "values of a parent chart"
-    assert DEFAULTS.keys() == schema()["properties"].keys() - {"global"}
+    assert DEFAULTS.keys() == SCHEMA["properties"].keys() - {"global"}
 
 
 @pytest.mark.parametrize(

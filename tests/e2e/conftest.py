@@ -231,31 +231,11 @@ def fly(name: str, waypoints: Sequence[Mapping[str, Any]], limit: float = 60.0) 
 
 
 def save(folder: Path) -> None:
-    """Keep what helps to understand a failure: of each namespace in a folder of its own."""
-    for namespace in NAMESPACES:
-        _save_texts(folder / namespace, f"--namespace={namespace}")
+    """Keep what helps to understand a failure: objects, events, logs, recordings."""
+    names = f"--namespaces={','.join(NAMESPACES)}"
+    command("kubectl", "cluster-info", "dump", names, f"--output-directory={folder}")
     for component in ENDS:
         fetch_recording(place(), component, folder / f"{component}.mcap")
-
-
-def _save_texts(folder: Path, where: str) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-
-    def keep(name: str, *words: str) -> None:
-        try:
-            text = kubectl(where, *words, timeout=30.0)
-        except (CommandFailedError, subprocess.TimeoutExpired) as error:
-            text = str(error)
-        (folder / name).write_text(text)
-
-    keep("objects.txt", "get", "all,configmap,networkpolicy,pvc,secret", "--output=wide")
-    keep("events.txt", "get", "events", "--sort-by=.lastTimestamp")
-    keep("describe.txt", "describe", "pods,jobs")
-    for one in read("pods", where)["items"]:
-        name = one["metadata"]["name"]
-        keep(f"{name}.log", "logs", name, "--all-containers", "--prefix", "--timestamps")
-        if any(c["restartCount"] for c in one["status"].get("containerStatuses", [])):
-            keep(f"{name}.previous.log", "logs", name, "--all-containers", "--prefix", "--previous")
 
 
 CLUSTER = "cloudrc-e2e"
