@@ -78,21 +78,6 @@ def test_the_notes_show_mode_and_label_command() -> None:
         assert label in text
 
 
-def test_the_link_is_a_native_sidecar_for_its_pods_egress() -> None:
-    pods = pod_specs(render())
-    for end, direction, peer in (("world", "uplink", "cloud"), ("cloud", "downlink", "world")):
-        (link,) = pods[end]["initContainers"]
-        assert (link["name"], link["restartPolicy"]) == ("link", "Always")
-        wanted = {f"--direction={direction}", f"--peer=demo-cloudrc-{peer}:7400"}
-        wanted |= {"--end=127.0.0.1:7400", "--profile=/etc/cloudrc-link/profile.yaml"}
-        assert wanted <= set(link["args"])
-        # The kubelet updates only directories in a running container.
-        mounts = {mount["mountPath"]: mount["name"] for mount in link["volumeMounts"]}
-        assert mounts["/etc/cloudrc-link"] == "link"
-        own = containers(pods[end])[end]["args"]
-        assert "--route=/run/cloudrc/route" in set(link["args"]) & set(own)
-
-
 def test_helm_test_verifies_the_link_of_this_release() -> None:
     objects = render()
     pods = [thing for thing in objects if thing["kind"] == "Pod"]

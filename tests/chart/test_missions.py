@@ -126,23 +126,6 @@ def test_the_chart_makes_the_same_job_as_the_example() -> None:
         assert theirs[key] == ours[key]
 
 
-def test_helm_test_flies_in_seconds_and_leaves_nothing(tmp_path: Path) -> None:
-    objects = render()
-    pod = of_kind(objects, "Pod")["test"]
-    annotations = pod["metadata"]["annotations"]
-    assert annotations["helm.sh/hook"] == "test"
-    policy = annotations["helm.sh/hook-delete-policy"].split(",")
-    assert {"before-hook-creation", "hook-succeeded"} == set(policy)
-    (container,) = pod["spec"]["containers"]
-    assert container["args"][:2] == ["mission", "fly"]
-    assert pod["spec"]["activeDeadlineSeconds"] <= 180
-    text = of_kind(objects, "ConfigMap")["test"]["data"]["mission.yaml"]
-    (tmp_path / "mission.yaml").write_text(text)
-    mission = load_mission(tmp_path / "mission.yaml")
-    assert check_mission(mission, load_scene("pipes")) == []
-    assert [waypoint.dwell_s <= 2 for waypoint in mission.waypoints] == [True]
-
-
 def test_the_services_do_not_select_mission_pods() -> None:
     objects = render(ENABLED)
     templates = [job["spec"]["template"] for job in jobs(ENABLED)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 
 import pytest
@@ -120,20 +119,6 @@ def test_the_tunnels_services_are_headless_and_early() -> None:
         assert spec["clusterIP"] == "None"
         assert spec["publishNotReadyAddresses"] is True
         assert [(port["port"], port["protocol"]) for port in spec["ports"]] == [(7400, "UDP")]
-
-
-def test_containers_use_valid_arguments() -> None:
-    """The parser of the command line accepts every container's arguments."""
-    load = {"backgroundLoad": {"enabled": True, "workers": 3}}
-    pods = pod_specs(render({"mission": {"enabled": True, "queue": True}, "cloud": load}))
-    found = containers(pods["cloud"])
-    assert list(found) == ["link", "cloud", "teleop", "load"]
-    assert "seq 3" in found["load"]["command"][-1]
-    parts = [c for pod in pods.values() for name, c in containers(pod).items() if name != "load"]
-    assert len(parts) == 8
-    for container in parts:
-        arguments = [re.sub(r"\$\((\w+)\)", r"\1", text) for text in container["args"]]
-        assert callable(build_parser([arguments[0]]).parse_args(arguments).execute)
 
 
 def test_the_link_set_role_may_change_one_configmap() -> None:

@@ -97,14 +97,6 @@ def test_security_contexts_can_be_left_out_or_changed() -> None:
         assert pod["securityContext"]["runAsNonRoot"] is True
 
 
-def test_a_pod_can_be_guaranteed() -> None:
-    same = {"cpu": "500m", "memory": "256Mi"}
-    resources = {"resources": {"requests": same, "limits": same}}
-    pods = pod_specs(render({"world": resources, "link": resources}))
-    for container in containers(pods["world"]).values():
-        assert container["resources"]["requests"] == container["resources"]["limits"]
-
-
 def test_service_accounts_are_made_or_named() -> None:
     made = render()
     names = {thing["metadata"]["name"] for thing in of_kind(made, "ServiceAccount").values()}
