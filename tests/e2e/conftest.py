@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from cloudrc.cli.client import Api
 from cloudrc.cluster.client import Release, connect
 from cloudrc.cluster.flight import wait_ready
-from cloudrc.cluster.jobs import run_job
+from cloudrc.cluster.jobs import JobStatus, follow, logs, run_job
 from cloudrc.cluster.pods import api_url, fetch_metrics, fetch_recording, operator_token
 from cloudrc.errors import CloudrcError
 from tests.drivers.conftest import WORK, slower
@@ -190,38 +190,15 @@ def missions() -> list[dict[str, Any]]:
         return list(Api(url, lambda: token).get("/v1/missions")["missions"])
 
 
-@dataclass
-class JobEnd:
-    """How a Job ended."""
-
-    name: str
-    condition: str
-    exit_code: int
-    message: str
-    log: str = field(repr=False, default="")
-
-
-def job_end(name: str, timeout: float = 150.0) -> JobEnd:
-    """Wait for a Job and read its verdict as `kubectl describe` would show it."""
-
-    def ended() -> str:
-        conditions = read("job", name)["status"].get("conditions", [])
-        true = [c["type"] for c in conditions if c["status"] == "True"]
-        return next((c for c in true if c in ("Complete", "Failed")), "")
-
-    condition = eventually(ended, f"Job {name} has ended", timeout)
-    (one,) = read("pods", f"--selector=batch.kubernetes.io/job-name={name}")["items"]
-    terminated = one["status"]["containerStatuses"][0]["state"]["terminated"]
-    log = kubectl("logs", one["metadata"]["name"])
-    return JobEnd(name, condition, terminated["exitCode"], terminated.get("message", ""), log)
+def job_end(name: str, timeout: float = 150.0) -> tuple[JobStatus, str]:
+    """Wait for the end of a Job; its final state and its log."""
+    lines: list[str] = []
+    return follow(place(), name, lines.append, timeout=timeout), "\n".join(lines)
 
 
 def job_log(name: str) -> str:
     """What a Job has said so far; "" while its pod does not run."""
-    try:
-        return kubectl("logs", f"job/{name}")
-    except CommandFailedError:
-        return ""
+    return "\n".join(logs(place(), name))
 
 
 def fly(name: str, waypoints: Sequence[Mapping[str, Any]], limit: float = 60.0) -> None:

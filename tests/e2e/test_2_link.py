@@ -84,8 +84,8 @@ def flight(installed: None) -> Iterator[None]:
     assert read("job", "long")["status"].get("active") == 1, "it flies still"
     assert identity() == before, "a profile's change must not restart anything"
     in_release("mission", "cancel", "long")
-    end = job_end("long", 30.0)
-    assert (end.condition, end.exit_code) == ("Failed", INTERRUPTED), end
+    end, _ = job_end("long", 30.0)
+    assert (end.state, end.exit_code) == ("failed", INTERRUPTED), end
 
 
 @pytest.fixture(scope="module")

@@ -16,13 +16,13 @@ import pytest
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.pods import fetch_recording
 from cloudrc.config.load import load_mission
+from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from tests.drivers.conftest import ages_at_hold
 from tests.e2e.conftest import (
     NAME,
     NAMESPACE,
     CommandFailedError,
-    JobEnd,
     eventually,
     fly,
     job_end,
@@ -65,6 +65,11 @@ child and os.waitpid(child, 0)
 """
 
 
+def guard() -> str:
+    """State of the guard, by the world's own metrics."""
+    return GuardState(int(value(metrics("world"), "cloudrc_guard_state"))).name
+
+
 def fly_until(name: str, line: str, limit: float = 120.0) -> None:
     fly(name, PIPES, limit)
     eventually(lambda: line in job_log(name), f"{name}: {line}", 90.0)
@@ -77,11 +82,12 @@ def replace(component: str) -> None:
     eventually(lambda: any(p["metadata"]["name"] != old for p in pods(component)), "a new pod")
 
 
-def check_resumed(end: JobEnd) -> None:
-    """Complete, and no waypoint was reached twice or left out, across both pods."""
-    assert (end.condition, end.exit_code) == ("Complete", 0), end
+def check_completed(name: str) -> None:
+    """The Job completes, and no waypoint was reached twice or left out, across both pods."""
+    end, log = job_end(name)
+    assert (end.state, end.exit_code) == ("complete", 0), end
     for number in range(1, 8):
-        assert end.log.count(f"waypoint {number} of 7 reached") == 1, end.log
+        assert log.count(f"waypoint {number} of 7 reached") == 1, log
     touched = {
         dict(labels)["body"]: number
         for (name, labels), number in metrics("world").items()
@@ -100,13 +106,7 @@ def test_a_deleted_cloud_is_replaced_and_the_mission_goes_on(
     eventually(lambda: guard() == "HOLD", "the robot holds", ENDS_IN, every=0.1)
     eventually(lambda: guard() == "TRACK", "the new cloud flies it", COMMANDS_IN + POD_START)
     note(f"cloud pod deleted in flight: flown again after {time.monotonic() - began:.1f} s")
-    check_resumed(job_end("bereft"))
-
-
-def guard() -> str:
-    """State of the guard, by the world's own metrics."""
-    states = {0: "GROUND", 1: "TRACK", 2: "HOLD", 3: "LAND", 4: "ESTOP"}
-    return states[int(value(metrics("world"), "cloudrc_guard_state"))]
+    check_completed("bereft")
 
 
 @pytest.fixture
@@ -129,15 +129,15 @@ def test_an_old_cloud_beside_the_new_one_does_no_harm(installed: None, lingering
     fly_until("haunted", "waypoint 1 of 7 reached")
     replace("cloud")
     eventually(lambda: len(pods("cloud")) == 2, "both are there", 10.0)
-    check_resumed(job_end("haunted"))
+    check_completed("haunted")
 
 
 @pytest.mark.full
 def test_a_deleted_world_ends_the_mission_as_failed(installed: None) -> None:
     fly_until("orphaned", "waypoint 1 of 7 reached")
     replace("world")
-    end = job_end("orphaned", 90.0)
-    assert (end.condition, end.exit_code) == ("Failed", 1), end
+    end, _ = job_end("orphaned", 90.0)
+    assert (end.state, end.exit_code) == ("failed", 1), end
     assert "world_restarted" in end.message
     wait_ready(place(), timeout=60.0)
 
@@ -159,7 +159,7 @@ def test_a_partition_makes_the_robot_hold_and_go_on(installed: None, tmp_path: P
         time.sleep(PARTITION)
     finally:
         set_link("--profile", "paper-p2")
-    check_resumed(job_end("parted"))
+    check_completed("parted")
     ages = ages_at_hold(recording("world", tmp_path))
     assert len(ages) > before
     assert max(ages) <= AGE_MAX
@@ -173,7 +173,7 @@ def test_a_mission_survives_a_throttled_cloud(installed: None) -> None:
     cloud = pod("cloud")["metadata"]["name"]
     kubectl("exec", cloud, "--container=cloud", "--", "python", "-c", BURN)
     assert metrics("cloud")[throttled] - before >= 50
-    check_resumed(job_end("throttled"))
+    check_completed("throttled")
 
 
 @pytest.mark.full
@@ -191,7 +191,7 @@ def test_a_killed_cloud_container_is_replaced(installed: None) -> None:
     )
     assert time.monotonic() - began < COMMANDS_IN + CONTAINER_START
     assert pod("cloud")["metadata"]["uid"] == cloud["metadata"]["uid"]
-    check_resumed(job_end("struck"))
+    check_completed("struck")
 
 
 @pytest.mark.full
@@ -205,7 +205,7 @@ def test_a_mission_whose_job_is_deleted_is_cancelled(installed: None) -> None:
         assert reader.stdout.read().splitlines()[-1].startswith("INTERRUPTED")
     eventually(lambda: guard() == "HOLD", "the robot holds")
     fly("successor", PIPES, 120.0)
-    check_resumed(job_end("successor"))
+    check_completed("successor")
 
 
 @pytest.mark.full
@@ -220,7 +220,7 @@ def test_a_rotated_key_costs_one_hold_at_most(installed: None, tmp_path: Path) -
     kubectl("patch", "secret", secret, f"--patch={json.dumps(data)}")
     for number in range(4):  # a Secret reaches a pod within two minutes
         fly_until(f"rekeyed-{number}", "waypoint 1 of 7 reached")
-        check_resumed(job_end(f"rekeyed-{number}"))
+        check_completed(f"rekeyed-{number}")
     assert len(ages_at_hold(recording("world", tmp_path))) - before <= 1
     for component in ("world", "cloud"):
         texts = recording(component, tmp_path)["/fault"]["text"].tolist()
