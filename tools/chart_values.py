@@ -1,6 +1,6 @@
 """Define every value of the chart, with its unit and default.
 
-`chart_docs.py` writes values.yaml, values.schema.json and the README's tables from these models.
+`docs.py` writes values.yaml, values.schema.json and the README's tables from these models.
 Keys are camelCase in the chart; below `experiment` they are those of an experiment file.
 """
 
