@@ -43,17 +43,26 @@ def test_an_image_is_small_and_holds_no_more_than_its_role_needs(
 
 
 @pytest.mark.parametrize(
-    ("name", "instant"),
-    [("hover", "duration"), pytest.param("paper", "contact_time", marks=pytest.mark.full)],
+    ("name", "setting", "instant"),
+    [
+        ("hover", "mission.waypoints.0.dwell_s=6", "duration"),
+        pytest.param("paper", "seed=1", "contact_time", marks=pytest.mark.full),
+    ],
 )
 def test_a_run_in_a_cluster_is_that_of_virtual_time(
-    installed: None, tmp_path: Path, note: Callable[[str], None], name: str, instant: str
+    installed: None,
+    tmp_path: Path,
+    note: Callable[[str], None],
+    name: str,
+    setting: str,
+    instant: str,
 ) -> None:
     done = cloudrc("doctor", "--mode", "cluster", "-o", "json")
     found = {check["name"]: check["state"] for check in json.loads(done.stdout)["checks"]}
     assert (done.returncode, found["kubeconfig"], found["cluster"]) == (0, "ok", "ok")
     report = tmp_path / name
-    said = in_release("run", name, "--mode", "cluster", "--out", str(report))
+    line = ["run", name, "--set", setting, "--mode", "cluster"]
+    said = in_release(*line, "--out", str(report))
     assert said.splitlines()[-1] == str(report / "report.html")
     wanted = ["report.html", "report.json", "mission.mcap", "config.yaml", "environment.json"]
     wanted += [f"figures/{name}.png" for name in ("delay", "odom", "error")]
@@ -62,7 +71,7 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
     assert (document["verdict"], document["mode"]) == ("success", "cluster")
     assert (document["shaper"], document["complete"]) == ("relay", True)
     real = {name: entry["value"] for name, entry in document["numbers"].items()}
-    virtual = numbers(fly(name))
+    virtual = numbers(fly(name, setting))
     note(f"{name}: {instant} {real[instant]:.2f} s, in virtual time {virtual[instant]:.2f} s")
     assert real[instant] == pytest.approx(virtual[instant], rel=TIME_TOLERANCE)
     for mean in ("uplink_delay_mean", "downlink_delay_mean"):
