@@ -55,7 +55,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
     "struct": ("tunnel/codec", "record/", "world/simulator"),
-    "yaml": ("config/", "link/", "record/", "report/", "cli/", "faults/schedule"),
+    "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/", "faults/schedule"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "report/folder"),
         "faults/schedule",

@@ -1,16 +1,19 @@
 """Write every generated file: `make docs` runs it, a test compares each file with it.
 
 The tables of docs/experiment.md come from the models of `cloudrc/config/schema.py` and the
-signatures of the shipped plug-ins, those of docs/topics.md from `cloudrc/record/topics.py`; the
-text above the tables is written by hand. docs/metrics.md comes from `cloudrc/exposition/table.py`,
-the chart's values, schema and table from `tools/chart_values.py`.
+signatures of the shipped plug-ins, those of docs/topics.md from `cloudrc/record/topics.py`, those
+of docs/metrics.md from `cloudrc/exposition/table.py`; the text around the tables is written by
+hand. The chart's values, schema and table come from `tools/chart_values.py`; shipped profiles and
+missions are copied, because a chart can read only its own files.
 """
 
 from __future__ import annotations
 
 import inspect
+import json
 import re
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +24,13 @@ from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.overrides import KINDS
 from cloudrc.config.schema import Direction, Experiment, Mission, Profile
-from cloudrc.exposition import document as metrics
-from cloudrc.record.topics import SAMPLING, TOPICS, Topic
-from tools import chart_docs
-from tools.chart_docs import ROOT, flow, insert, plain, table
+from cloudrc.exposition.table import METRICS, ROLES, Metric
+from cloudrc.record.topics import SAMPLING, TOPICS
+from tools import chart_values
+from tools.chart_values import ChartValues, Peer, Quantities, Resources, Selector, Values
 
+ROOT = Path(__file__).resolve().parents[1]
+CHART = ROOT / "charts" / "cloudrc"
 PARTS = {
     "mission": "#a-mission",
     **dict.fromkeys(("uplink", "downlink"), "#one-direction-of-a-link"),
@@ -41,19 +46,73 @@ CLOCKS = {
 }
 
 
+OPEN = {
+    "version": "the version",
+    "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
+    "defaults (on one machine with those of plug-ins, as `config_sha256` in report.json; in a "
+    "cluster without those of plug-ins); empty for a process without configuration",
+}
+"""Label of a metric with an open set of values -> description of the values."""
+
+
 def outputs() -> dict[Path, str]:
     """Make everything that `make docs` writes: file -> text."""
-    pages = {
-        **insert(ROOT / "docs" / "experiment.md", _experiment()),
-        **insert(ROOT / "docs" / "topics.md", _topics()),
-        ROOT / "docs" / "metrics.md": metrics.page(),
+    return {
+        **_insert(ROOT / "docs" / "experiment.md", _experiment()),
+        **_insert(ROOT / "docs" / "topics.md", _topics()),
+        **_insert(ROOT / "docs" / "metrics.md", _metrics()),
+        **_insert(CHART / "README.md", table("key | default | meaning", _values(ChartValues()))),
+        CHART / "values.yaml": VALUES_HEAD + _values_text(ChartValues()),
+        CHART / "values.schema.json": json.dumps(_chart_schema(), indent=2) + "\n",
+        **{
+            CHART / "files" / f"{kind}s" / path.name: path.read_text()
+            for kind in ("profile", "mission")
+            for path in sorted(shipped.FOLDERS[kind].glob("*.yaml"))
+        },
     }
-    return pages | chart_docs.outputs()
 
 
 def leftovers() -> list[Path]:
     """List the copies in the chart whose originals are gone."""
-    return [path for path in (chart_docs.CHART / "files").glob("*/*.yaml") if path not in outputs()]
+    return [path for path in (CHART / "files").glob("*/*.yaml") if path not in outputs()]
+
+
+def _insert(page: Path, text: str) -> dict[Path, str]:
+    """Put generated text between the marks of a page; the rest is written by hand."""
+    parts = re.split("(<!-- made by `make docs`.*-->\n|<!-- end -->\n)", page.read_text())
+    if len(parts) != 5:
+        raise ValueError(f"{page.name}: no place for generated text")
+    parts[2] = text
+    return {page: "".join(parts)}
+
+
+def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
+    """Write a table in Markdown; `columns` are their heads, with bars between them."""
+    lines = [f"| {columns} |", f"|{'---|' * len(columns.split('|'))}"]
+    for row in rows:
+        lines.append(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |")
+    return "\n".join(lines) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """Convert a default to plain YAML values."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", by_alias=True, exclude_none=True)
+    if isinstance(value, tuple | list):
+        return [plain(item) for item in value]
+    return value
+
+
+def flow(value: Any) -> str:
+    """Format a value as YAML on one line."""
+    if isinstance(value, dict):
+        inner = ", ".join(f"{key}: {flow(item)}" for key, item in value.items())
+        return f"{{{inner}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(flow, value))}]"
+    if isinstance(value, str) and re.fullmatch(r"[A-Za-z][\w./-]*|[0-9]+[A-Za-z]+", value):
+        return value
+    return json.dumps(value)
 
 
 def _experiment() -> str:
@@ -166,33 +225,136 @@ def _shipped() -> str:
 
 def _topics() -> str:
     """Write the tables of all topics."""
-    blocks = ["\n## All topics\n", table(*_overview())]
-    for topic in TOPICS.values():
-        text = re.sub(r", (world's clock|cloud's clock|clock of its end)", "", topic.text)
-        blocks += [f"## `{topic.name}`\n", f"{text}.\n", _facts(topic)]
-        blocks.append(table("field | type | unit | meaning", _columns(topic)))
-    return "\n".join(blocks)
-
-
-def _overview() -> tuple[str, Iterator[tuple[str, ...]]]:
-    rows = (
+    overview = (
         (f"[`{name}`](#{name[1:]})", f"`{topic.ros_type}`", ENDS[topic.end], SAMPLING[name][1])
         for name, topic in TOPICS.items()
     )
-    return "topic | message | written by | how often", rows
+    blocks = ["\n## All topics\n", table("topic | message | written by | how often", overview)]
+    for name, topic in TOPICS.items():
+        text = re.sub(r", (world's clock|cloud's clock|clock of its end)", "", topic.text)
+        stamp, often = SAMPLING[name]
+        blocks += [
+            f"## `{name}`\n",
+            f"{text}.\n",
+            f"- Message: `{topic.ros_type}`, written by {ENDS[topic.end]}, {often}.\n"
+            f"- Stamp: {stamp}, {CLOCKS[topic.end]}.\n",
+            table(
+                "field | type | unit | meaning",
+                ((f"`{field.name}`", field.kind, field.unit, field.text) for field in topic.fields),
+            ),
+        ]
+    return "\n".join(blocks)
 
 
-def _facts(topic: Topic) -> str:
-    stamp, often = SAMPLING[topic.name]
-    return (
-        f"- Message: `{topic.ros_type}`, written by {ENDS[topic.end]}, {often}.\n"
-        f"- Stamp: {stamp}, {CLOCKS[topic.end]}.\n"
+def _metrics() -> str:
+    """Write the tables of all metrics and of the histograms' buckets."""
+    rows = (
+        (
+            f"`{metric.name}`",
+            metric.kind.value,
+            "all" if metric.roles == ROLES else ", ".join(metric.roles),
+            metric.meaning + _labels(metric),
+        )
+        for metric in METRICS.values()
     )
+    buckets = [
+        f"- `{metric.name}`: {', '.join(f'{bound:g}' for bound in metric.buckets)}\n"
+        for metric in METRICS.values()
+        if metric.buckets
+    ]
+    return f"\n{table('metric | type | from | meaning', rows)}\n## Buckets\n\n{''.join(buckets)}"
 
 
-def _columns(topic: Topic) -> Iterator[tuple[str, ...]]:
-    for field in topic.fields:
-        yield f"`{field.name}`", field.kind, field.unit, field.text
+def _labels(metric: Metric) -> str:
+    """Describe the labels of a metric and their values."""
+    sets = [
+        f"`{name}`: {', '.join(values) or OPEN[name]}" for name, values in metric.labels.items()
+    ]
+    return f" Labels: {'; '.join(sets)}." if sets else ""
+
+
+VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"
+WIDTH = 96
+COMPACT = (Resources, Quantities)
+FOREIGN = (*COMPACT, Peer, Selector, chart_values.Expression, chart_values.IpBlock)
+"""Parts of the values that Kubernetes defines."""
+
+
+def _values_text(part: BaseModel, depth: int = 0) -> str:
+    """Format a part of the values as YAML, each key below its description."""
+    lines = []
+    for key, value, text in _keys_of(part):
+        if key == "global":
+            continue
+        lines += [f"# {line}" for line in textwrap.wrap(text, WIDTH - 2 * depth)]
+        if isinstance(value, Experiment):
+            lines.append(f"{key}: {{}}")
+        elif isinstance(value, BaseModel) and not isinstance(value, COMPACT):
+            lines += [f"{key}:", _values_text(value, depth + 1).rstrip("\n")]
+        elif isinstance(value, Resources):
+            lines += [f"{key}:", *(f"  {k}: {flow(v)}" for k, v in plain(value).items())]
+        else:
+            lines.append(f"{key}: {flow(plain(value))}")
+        if depth == 0:
+            lines.append("")
+    return textwrap.indent("\n".join(lines).rstrip("\n"), "  " if depth else "") + "\n"
+
+
+def _keys_of(part: BaseModel) -> Iterator[tuple[str, Any, str]]:
+    """Yield key, default and description of each value."""
+    for name, info in type(part).model_fields.items():
+        yield info.alias or name, getattr(part, name), " ".join((info.description or "").split())
+
+
+def _chart_schema() -> dict[str, Any]:
+    """Generate the JSON schema of the values, in draft 7, without unknown keys at any level."""
+    made = ChartValues.model_json_schema(by_alias=True)
+    made = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc", **made}
+    made["$defs"] = {name: _adapt(part) for name, part in made.pop("$defs").items()}
+    kinds = {name: getattr(chart_values, name, None) for name in made["$defs"]}
+    own = [name for name, kind in kinds.items() if _is_own(kind)]
+    for part in (made, *(made["$defs"][name] for name in own)):
+        # Templates need the parts as mappings: the schema refuses null for them.
+        needed = [key for key, value in part["properties"].items() if "$ref" in value]
+        part["required"] = sorted({*part.get("required", ()), *needed})
+    made["$defs"]["PlugIn"]["additionalProperties"] = {
+        "description": "A parameter of the plug-in, in the unit that its `build` documents",
+        "type": ["number", "string", "boolean", "array", "null"],
+    }
+    return dict(_adapt(made))
+
+
+def _is_own(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Values) and kind not in FOREIGN
+
+
+def _adapt(part: Any) -> Any:
+    """Remove pydantic's titles and defaults; convert fixed tuples to draft 7."""
+    if isinstance(part, list):
+        return [_adapt(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    kept: dict[str, Any] = {}
+    for key, value in part.items():
+        if key == "properties":
+            kept[key] = {name: _adapt(inner) for name, inner in value.items()}
+        elif key == "description":
+            kept[key] = " ".join(value.split())
+        elif key != "default" and not (key == "title" and value != "cloudrc"):
+            kept[key] = _adapt(value)
+    if "prefixItems" in kept:  # a vector: all items have one type
+        kept["items"] = kept.pop("prefixItems")[0]
+    return kept
+
+
+def _values(part: BaseModel, above: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield a row for each value of the chart."""
+    for key, value, text in _keys_of(part):
+        if isinstance(value, BaseModel) and not isinstance(value, (*COMPACT, Experiment)):
+            yield from _values(value, f"{above}{key}.")
+        else:
+            shown = {} if isinstance(value, Experiment) else plain(value)
+            yield f"`{above}{key}`", f"`{json.dumps(shown)}`", text
 
 
 if __name__ == "__main__":

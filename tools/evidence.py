@@ -17,7 +17,7 @@ from typing import Any
 
 from cloudrc.faults.search import search_rows, search_summary
 from cloudrc.report.document import environment_document, write_json
-from tools.chart_docs import table
+from tools.docs import table
 
 Rows = Iterable[Iterable[object]]
 

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.find_run import find_local_run, link_folder_of, no_run_error, run_argument
 from cloudrc.cli.output import format_document, output_argument, print_line, table
-from cloudrc.cluster.tools import ClusterError
+from cloudrc.cluster.client import DEFAULT_RELEASE, ClusterError, Release
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.link import LinkParts, ReleasePlace
+    from cloudrc.cluster.link import LinkParts
     from cloudrc.config.load import Edit
     from cloudrc.link.state import LinkState
 
@@ -61,11 +61,9 @@ def execute(options: argparse.Namespace) -> int:
         edit, states = _set_here(options, folder, number)
         took = monotonic() - began
     else:
-        from cloudrc.cluster.client import DEFAULT_RELEASE
-        from cloudrc.cluster.link import ReleasePlace, keep, send
+        from cloudrc.cluster.link import keep, send
 
-        release = options.release or DEFAULT_RELEASE
-        place = ReleasePlace(options.context, options.namespace, release)
+        place = Release(options.context, options.namespace, options.release or DEFAULT_RELEASE)
         link, note = _link_of(options, place), partial(_note, number=number)
         sent = send(place, link, options.profile, options.settings, note)
         took = monotonic() - began
@@ -116,7 +114,7 @@ def _set_here(
     return edit, states
 
 
-def _link_of(options: argparse.Namespace, where: ReleasePlace) -> LinkParts:
+def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
     """Read the link of the release; if the release has none, raise an error with the reason."""
     from cloudrc.cluster.link import read_link
 

@@ -91,8 +91,7 @@ def _experiment(release: Release) -> Experiment | None:
     """Read the experiment of a release; None if this user's rights or this version prevent it."""
     from pydantic import ValidationError
 
-    from cloudrc.cluster.client import FILE, experiment_text
-    from cloudrc.cluster.tools import ClusterError
+    from cloudrc.cluster.client import FILE, ClusterError, experiment_text
     from cloudrc.config.document import parse_yaml
     from cloudrc.config.schema import Experiment
     from cloudrc.config.shipped import check_name
@@ -123,7 +122,7 @@ def api(options: argparse.Namespace) -> Iterator[Api]:
     from cloudrc.cluster.pods import api_url, operator_token
 
     token = operator_token(release) if path is None else ""
-    with api_url(release.context, release.namespace, release.name) as url:
+    with api_url(release) as url:
         yield Api(url, token_reader(path) if path else lambda: token)
 
 
@@ -133,11 +132,11 @@ def _run(options: argparse.Namespace) -> int:
         mission["name"] = options.name
     request = parse(options.mission, mission)
     release = _place(options)
+    from cloudrc.cluster.flight import wait_ready
     from cloudrc.cluster.jobs import follow, follow_limit, run_job
-    from cloudrc.cluster.pods import require_release
-    from cloudrc.cluster.release import wait_ready
+    from cloudrc.cluster.pods import find_deployment
 
-    require_release(release)
+    find_deployment(release, "cloud")
     limit = check_on(release, options.mission, request)
     # After 'helm install' without --wait this takes some seconds: the link starts last.
     wait_ready(release, timeout=options.timeout, tell=print_line)

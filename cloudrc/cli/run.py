@@ -162,8 +162,8 @@ def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
     """Return the function that flies in the cluster that the flags name."""
+    from cloudrc.cluster.client import program
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files
-    from cloudrc.cluster.tools import program
 
     refuse_local_files(experiment)
     release = release_from_flags(options)

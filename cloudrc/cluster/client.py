@@ -1,29 +1,68 @@
-"""Select a release by context, namespace and name, and provide Kubernetes clients for it."""
+"""Select a release by context, namespace and name; send requests to its cluster; run kubectl, helm.
+
+Errors of the cluster and of the programs become one sentence.
+"""
 
 from __future__ import annotations
 
+import json
 import logging
 import re
-from collections.abc import Iterator, Sequence
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import IO, Any, TypeVar
 
-from cloudrc.cluster.tools import ClusterError, explain_errors
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
 
 DEFAULT_RELEASE = "cloudrc"
+COMPONENTS = ("world", "cloud")
+"""Components with a pod of their own."""
 REQUEST_TIMEOUT = 15.0
 """Time limit for one request to the API server [s]."""
+VERSION_TIMEOUT = 5.0
+"""Time limit for the API server to return its version [s]."""
+OUTAGE_MAX = 30.0
+"""Longest time for which a request is repeated while the API server does not answer [s]."""
+OUTAGE_PERIOD = 1.0
+"""Time between two tries [s]."""
+STOP_LIMIT = 2.0
+"""Time from SIGTERM to SIGKILL in which a program can end [s]."""
 OLDEST = (1, 29)
 """Oldest Kubernetes version that the chart supports, as kubeVersion in Chart.yaml."""
-ANSWER_LIMIT = 5.0
-"""Time limit for the API server to return its version [s]."""
-COMPONENT = "experiment"
-"""Label `component` of the experiment's ConfigMap."""
 FILE = "experiment.yaml"
 """Key of the experiment in the ConfigMap of a release."""
+WHERE_TO_GET = {
+    "kubectl": "https://kubernetes.io/docs/tasks/tools/",
+    "helm": "https://helm.sh/docs/intro/install/",
+}
+"""Program -> page that explains the installation."""
+PACKAGE = Path(__file__).resolve().parents[1]
+_KINDS = {
+    **{name: ("CoreV1Api", name[:-1]) for name in ("pods", "services", "secrets", "events")},
+    "configmaps": ("CoreV1Api", "config_map"),
+    "pods/log": ("CoreV1Api", "pod_log"),
+    "jobs": ("BatchV1Api", "job"),
+    "deployments": ("AppsV1Api", "deployment"),
+}
+"""Kind of objects -> class of the Kubernetes client, and the kind's name in its methods."""
+
+_Answer = TypeVar("_Answer")
+
+
+class ClusterError(CloudrcError):
+    """The cluster, or an object in it, refused or failed."""
+
+    exit_code = 5
+
+
+class UnavailableError(ClusterError):
+    """The API server does not answer or is overloaded; a later try may succeed."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +71,12 @@ class Release:
 
     Attributes:
         context: Context of the kubeconfig; None for the current context.
-        namespace: Namespace of the release.
+        namespace: Namespace of the release; None for that of the context, for kubectl alone.
         name: Name of the Helm release.
     """
 
     context: str | None
-    namespace: str
+    namespace: str | None
     name: str
 
     @property
@@ -49,29 +88,30 @@ class Release:
     @property
     def flags(self) -> list[str]:
         """Flags of kubectl that select context and namespace."""
-        context = [f"--context={self.context}"] if self.context else []
-        return [*context, f"--namespace={self.namespace}"]
+        given = {"context": self.context, "namespace": self.namespace}
+        return [f"--{name}={value}" for name, value in given.items() if value]
 
     @property
     def helm_flags(self) -> list[str]:
         """Flags of helm that select context and namespace."""
-        context = [f"--kube-context={self.context}"] if self.context else []
-        return [*context, f"--namespace={self.namespace}"]
+        return [flag.replace("--context", "--kube-context") for flag in self.flags]
 
     @property
     def cloudrc_flags(self) -> list[str]:
         """Flags of cloudrc that select context, namespace and release."""
         return [*self.flags, f"--release={self.name}"]
 
-    def selector(self, component: str) -> str:
-        """Return the label selector of a component of this release: "world", "cloud", "mission"."""
-        return (
-            f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={self.name},"
-            f"app.kubernetes.io/component={component}"
-        )
+    def labels(self, component: str) -> dict[str, str]:
+        """Return the labels of a component of this release: "world", "cloud", "mission"."""
+        return {
+            "app.kubernetes.io/name": "cloudrc",
+            "app.kubernetes.io/instance": self.name,
+            "app.kubernetes.io/component": component,
+        }
 
     @cached_property
-    def _client(self) -> Any:
+    def client(self) -> Any:
+        """The Kubernetes client."""
         from kubernetes import client, config
 
         configuration = client.Configuration()
@@ -81,42 +121,39 @@ class Release:
         configuration.retries = False  # callers repeat a request themselves, with a message
         return client.ApiClient(configuration)
 
-    @cached_property
-    def core(self) -> Any:
-        """Client of pods, Services, ConfigMaps."""
+    def request(
+        self, verb: str, kind: str, *, timeout: float = REQUEST_TIMEOUT, **arguments: Any
+    ) -> Any:
+        """Send a request about objects in the release's namespace, with a `timeout` [s].
+
+        Args:
+            verb: "list", which returns a list; or "get", "create" or "delete".
+            kind: Kind of the objects, such as "pods".
+            timeout: Time limit [s].
+            arguments: Arguments of the Kubernetes client, such as `name`.
+
+        Raises:
+            ClusterError: If the API server refuses or does not answer.
+        """
         from kubernetes import client
 
-        return client.CoreV1Api(self._client)
+        name, noun = _KINDS[kind]
+        method = f"{'read' if verb == 'get' else verb}_namespaced_{noun}"
+        call = getattr(getattr(client, name)(self.client), method)
+        with explain_errors(f"{verb} {kind}", self.where):
+            answer = call(namespace=self.namespace, _request_timeout=timeout, **arguments)
+        return answer.items if verb == "list" else answer
 
-    @cached_property
-    def batch(self) -> Any:
-        """Client of Jobs."""
-        from kubernetes import client
-
-        return client.BatchV1Api(self._client)
-
-    @cached_property
-    def version(self) -> Any:
-        """Client of the API server's own version."""
-        from kubernetes import client
-
-        return client.VersionApi(self._client)
-
-    @cached_property
-    def apps(self) -> Any:
-        """Client of Deployments."""
-        from kubernetes import client
-
-        return client.AppsV1Api(self._client)
+    def find(self, kind: str, component: str) -> list[Any]:
+        """List the objects of a kind that belong to a component."""
+        selector = ",".join(f"{name}={value}" for name, value in self.labels(component).items())
+        found: list[Any] = self.request("list", kind, label_selector=selector)
+        return found
 
 
 @contextmanager
 def _login_errors(where: str) -> Iterator[None]:
-    """Raise an error if the kubeconfig's login program fails, which the client only logs.
-
-    Raises:
-        MissingPrerequisiteError: With the client's message, which names the program.
-    """
+    """Raise an error if the kubeconfig's login program fails, which the client only logs."""
     messages: list[str] = []
 
     class Listener(logging.Handler):
@@ -145,10 +182,7 @@ def connect(
 ) -> Release:
     """Select a release by the kubeconfig, without a request to the cluster.
 
-    Args:
-        context: Value of `--context`; None for the current context.
-        namespace: Value of `-n`; None for the namespace of the context, or "default".
-        release: Name of the Helm release.
+    The default of `context` is the current one, that of `namespace` the context's, or "default".
 
     Raises:
         MissingPrerequisiteError: If there is no valid kubeconfig or no such context.
@@ -164,49 +198,170 @@ def connect(
             "a cluster: kind create cluster --config kind-config.yaml"
         ) from error
     if context is not None:
-        current = next((c for c in known if c["name"] == context), None)
-        if current is None:
-            raise MissingPrerequisiteError(_unknown_context(context, [c["name"] for c in known]))
+        contexts_by_name = {each["name"]: each for each in known}
+        if context not in contexts_by_name:
+            raise MissingPrerequisiteError(
+                f"no context '{context}' in the kubeconfig; known: "
+                f"{', '.join(sorted(contexts_by_name)) or 'none'}; choose with --context"
+            )
+        current = contexts_by_name[context]
     inherited = (current or {}).get("context", {}).get("namespace")
     return Release(context, namespace or inherited or "default", release)
 
 
-def _unknown_context(context: str, known: Sequence[str]) -> str:
-    names = ", ".join(sorted(known)) or "none"
-    return f"no context '{context}' in the kubeconfig; known: {names}; choose with --context"
-
-
 def server_version(release: Release) -> tuple[int, int]:
-    """Ask the API server for its version.
+    """Ask the API server for its major and minor version."""
+    from kubernetes import client
 
-    Returns:
-        Major and minor version.
-
-    Raises:
-        ClusterError: If the API server does not answer, or refuses the request.
-    """
     with explain_errors("get the version", release.where):
-        code = release.version.get_code(_request_timeout=ANSWER_LIMIT)
+        code = client.VersionApi(release.client).get_code(_request_timeout=VERSION_TIMEOUT)
     # The minor version of some vendors has a suffix: "29+".
-    found = [re.match(r"\d+", str(text)) for text in (code.major, code.minor)]
-    if not all(found):
-        raise ClusterError(
-            f"the API server {release.where} has the unknown version {code.git_version}"
-        )
-    major, minor = (int(match.group()) for match in found if match)
+    major, minor = (int(re.sub(r"\D.*", "", text) or 0) for text in (code.major, code.minor))
     return major, minor
 
 
 def experiment_text(release: Release) -> str:
-    """Read the experiment of a release as YAML; "" if its ConfigMap is missing.
+    """Read the experiment of a release as YAML; "" if its ConfigMap is missing."""
+    found = release.find("configmaps", "experiment")
+    return next((str((each.data or {}).get(FILE, "")) for each in found), "")
+
+
+@contextmanager
+def explain_errors(doing: str, where: str) -> Iterator[None]:
+    """Convert exceptions of the Kubernetes client to a ClusterError with one sentence.
+
+    Args:
+        doing: Action as verb and kind of object: "list jobs".
+        where: Cluster and namespace, from `Release.where`.
+    """
+    from kubernetes.client.exceptions import ApiException
+    from kubernetes.config.config_exception import ConfigException
+    from urllib3.exceptions import HTTPError
+
+    try:
+        yield
+    except ApiException as error:
+        status = int(error.status or 0)
+        kind = UnavailableError if status == 429 or status >= 500 else ClusterError
+        raise kind(f"cannot {doing} {where}: {_refusal(error, status, doing)}") from error
+    except (HTTPError, OSError) as error:
+        raise UnavailableError(
+            f"cannot {doing} {where}: the API server does not answer ({_root(error)}); "
+            "is the cluster up? ask it: kubectl cluster-info"
+        ) from error
+    except ConfigException as error:  # such as a login program that fails
+        raise ClusterError(f"cannot {doing} {where}: {str(error).partition(chr(10))[0]}") from error
+
+
+def _refusal(error: Any, status: int, doing: str) -> str:
+    """Describe a refusal of the API server, with the next step."""
+    try:
+        message = json.loads(error.body)["message"]
+    except (ValueError, KeyError, TypeError):
+        message = error.reason or f"the API server answered {status}"
+    message = " ".join(str(message).split())
+    if status == 401:
+        return "the API server does not know you; log in to the cluster again"
+    if status == 403 and "exceeded quota" in message:
+        return f"{message}; free some of the namespace's quota"
+    if status == 403:
+        return f"{message}; ask for the permission, and check it: kubectl auth can-i {doing}"
+    return message
+
+
+def _root(error: BaseException) -> str:
+    """Return the innermost cause; the outer exceptions only report repeated tries."""
+    reason = getattr(error, "reason", None)
+    if isinstance(reason, BaseException):
+        return _root(reason)
+    return str(error).strip().partition("\n")[0].rpartition(": ")[2] or type(error).__name__
+
+
+def retry(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
+    """Repeat a request while the API server does not answer, for `OUTAGE_MAX` at most.
+
+    The first error goes to `tell`; the last one is raised.
+    """
+    until = None
+    while True:
+        try:
+            return ask()
+        except UnavailableError as error:
+            if until is None:
+                until = time.monotonic() + OUTAGE_MAX
+                tell(f"{error}; trying again for {OUTAGE_MAX:g} s")
+            elif time.monotonic() > until:
+                raise
+        time.sleep(OUTAGE_PERIOD)
+
+
+def program(name: str) -> str:
+    """Find a program on the PATH; raise MissingPrerequisiteError if it is missing."""
+    path = shutil.which(name)
+    if path is None:
+        raise MissingPrerequisiteError(f"{name} is not installed; install it: {WHERE_TO_GET[name]}")
+    return path
+
+
+def run(
+    name: str,
+    arguments: Sequence[str],
+    *,
+    timeout: float,
+    given: str = "",
+    stdout: IO[bytes] | None = None,
+) -> str:
+    """Run kubectl or helm, and return its output; "" if the output goes to a file `stdout`.
 
     Raises:
-        ClusterError: If the ConfigMap cannot be read.
+        ClusterError: If the program fails; the message is that of the program.
+        TimedOutError: If the program takes longer than `timeout` [s].
+        MissingPrerequisiteError: If the program is not installed.
     """
-    with explain_errors("list configmaps", release.where):
-        found = release.core.list_namespaced_config_map(
-            release.namespace,
-            label_selector=release.selector(COMPONENT),
-            _request_timeout=REQUEST_TIMEOUT,
-        ).items
-    return next((str((each.data or {}).get(FILE, "")) for each in found), "")
+    command = [program(name), *arguments]
+    short = " ".join([name, *[word for word in arguments if not word.startswith("-")][:2]])
+    target = subprocess.PIPE if stdout is None else stdout
+    try:
+        done = subprocess.run(
+            command, input=given.encode(), stdout=target, stderr=subprocess.PIPE, timeout=timeout
+        )
+    except subprocess.TimeoutExpired as error:
+        raise TimedOutError(f"'{short}' took more than {timeout:g} s") from error
+    if done.returncode != 0:
+        raise ClusterError(f"'{short}' failed: {last_words(done.stderr)}")
+    return (done.stdout or b"").decode(errors="replace")
+
+
+def last_words(stderr: bytes) -> str:
+    """Extract a program's error message as one line, without warnings and log lines."""
+    text = stderr.decode(errors="replace")
+    lines = [" ".join(line.split()) for line in text.splitlines() if line.strip()]
+    first = next((i for i, line in enumerate(lines) if line.lower().startswith("error")), -1)
+    message = " ".join(lines[first:])
+    return message.removeprefix("Error: ").removeprefix("error: ") or "no error message"
+
+
+def end_process(process: subprocess.Popen[bytes]) -> None:
+    """End a program; kill it if it does not end within `STOP_LIMIT`."""
+    process.terminate()
+    try:
+        process.wait(STOP_LIMIT)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def chart_folder(package: Path = PACKAGE) -> Path:
+    """Find the Helm chart: inside the package in a wheel, beside the package in a repository.
+
+    Raises:
+        MissingPrerequisiteError: If the chart is missing.
+    """
+    places = (package / "_chart", package.parent / "charts" / "cloudrc")
+    for place in places:
+        if (place / "Chart.yaml").is_file():
+            return place
+    raise MissingPrerequisiteError(
+        f"the Helm chart is in neither of {places[0]} and {places[1]}; install cloudrc again: "
+        "pip install --force-reinstall cloudrc"
+    )

@@ -1,28 +1,36 @@
-"""Fly one experiment in a cluster.
+"""Install a release, wait until it is ready, and fly one experiment on it.
 
-Install or upgrade the release, wait until it is ready, fly the mission by a Job, fetch and merge
-the recordings of both pods, and write the report.
+A flight installs or upgrades the release, flies the mission by a Job, fetches and merges the
+recordings of both pods, and writes the report.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.cluster import pods
+from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, retry, run
+from cloudrc.cluster.jobs import cancel, current_mission, follow, follow_limit, run_job
+from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.client import Release
-    from cloudrc.cluster.jobs import JobStatus
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.record.merge import Mission
 
 Tell = Callable[[str], None]
 
+LOOK_PERIOD = 1.0
+"""Time between two looks at the pods [s]."""
+HELM_LIMIT = 120.0
+"""Time limit for one helm command [s]; helm does not wait for pods."""
+FAILURE_TIME = 5.0
+"""A failure is reported if it lasts longer than this [s]; some objects appear after their pod."""
 FLUSH = 1.0
 """Time after which a recorder has certainly flushed its buffer [s]; the buffer holds at most half a
 second of records."""
@@ -30,14 +38,107 @@ FETCHES = 4
 """Largest number of attempts to fetch recordings that contain the mission's end."""
 FLOWN = (0, 1, 6, 130)
 """Exit codes of a Job whose mission has flown: success, failure, invalid, interrupted."""
-COMPONENTS = ("world", "cloud")
-_SHAPER_LABEL = re.compile(r'cloudrc_link_info\{[^}]*shaper="(\w+)"')
+HINTS = {
+    "cluster unreachable": "is the cluster up? ask it: kubectl cluster-info",
+    "incompatible with Kubernetes": "make a newer one: kind create cluster",
+    "forbidden": "ask for the permission, and check it: kubectl auth can-i --list",
+    "another operation": "end that one first: helm history, then helm rollback",
+    "the specifications of the schema": "see what there is: helm show values charts/cloudrc",
+    "already exists": "is it another release's? see: helm list --all-namespaces",
+}
+"""Words in an error message of helm -> what to do next."""
+
+
+def install(release: Release, values: Mapping[str, Any], timeout: float, tell: Tell) -> None:
+    """Install or upgrade a release and wait until it is ready to fly, as `wait_ready`.
+
+    Args:
+        release: Name and place; a missing namespace is created.
+        values: Values that override the chart's defaults.
+        timeout: Time limit for the pods to become ready [s].
+        tell: Gets a line about each change of the pods' state.
+    """
+    arguments = ["upgrade", "--install", release.name, str(chart_folder()), *release.helm_flags]
+    arguments += ["--create-namespace", "--values=-"]
+    _helm(arguments, given=json.dumps(values))
+    wait_ready(release, timeout=timeout, tell=tell)
+
+
+def current_values(release: Release) -> dict[str, Any]:
+    """Read the values with which a release was installed; empty if the release does not exist."""
+    arguments = ["list", "--output=json", f"--filter=^{release.name}$", *release.helm_flags]
+    if not json.loads(_helm(arguments) or "[]"):
+        return {}
+    arguments = ["get", "values", release.name, "--output=json", *release.helm_flags]
+    return json.loads(_helm(arguments)) or {}
+
+
+def _helm(arguments: Sequence[str], given: str = "") -> str:
+    """Run helm, and add a hint to helm's error message."""
+    try:
+        return run("helm", arguments, timeout=HELM_LIMIT, given=given)
+    except ClusterError as error:
+        hints = [f"; {hint}" for words, hint in HINTS.items() if words in str(error)]
+        raise ClusterError(f"{error}{''.join(hints[:1])}") from error
+
+
+def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: None) -> None:
+    """Wait until both pods of a release have its newest version and are ready.
+
+    Each change of the pods' state goes to `tell`.
+
+    Raises:
+        ClusterError: If a pod will never run; the message has the cause.
+        TimedOutError: If the pods are not ready within `timeout` [s].
+    """
+    selector = f"app.kubernetes.io/instance={release.name}"
+    see = f"see: kubectl {' '.join(release.flags)} describe pods -l {selector}"
+    until, failing_since, last = time.monotonic() + timeout, None, ""
+    while True:
+        states = retry(lambda: {each: _state(release, each) for each in COMPONENTS}, tell)
+        words = "; ".join(f"{component}: {why}" for component, (why, _) in states.items() if why)
+        if not words:
+            return
+        now = time.monotonic()
+        fatal = [f"the {c} pod cannot run: {why}" for c, (why, bad) in states.items() if bad]
+        failing_since = (failing_since or now) if fatal else None
+        if failing_since is not None and now - failing_since >= FAILURE_TIME:
+            raise ClusterError(f"{'; '.join(fatal)}; {see}")
+        if now > until:
+            raise TimedOutError(
+                f"release '{release.name}' is not ready after {timeout:g} s: {words}; "
+                f"{see}, or wait longer: --timeout"
+            )
+        if words != last:
+            tell(words)
+            last = words
+        time.sleep(LOOK_PERIOD)
+
+
+def _state(release: Release, component: str) -> tuple[str, bool]:
+    """Describe why a component is not ready, "" if it is ready; and whether waiting is useless."""
+    deployment = pods.find_deployment(release, component)
+    status = deployment.status
+    for condition in status.conditions or []:  # for example Pod Security or a quota
+        if condition.type == "ReplicaFailure" and condition.status == "True":
+            return str(condition.message), True
+    found = pods.list_pods(release, component)
+    for pod in found:
+        if why := pods.pod_failure(pod):
+            return why, True
+    current = (status.observed_generation or 0) >= deployment.metadata.generation
+    if not (current and status.updated_replicas == 1 and status.replicas == 1 and found):
+        return "its pod is being created", False
+    if any(c.type == "Ready" and c.status == "True" for c in found[0].status.conditions or []):
+        return "", False
+    waiting = [each.name for each in pods.container_statuses(found[0]) if not each.ready]
+    return f"container {' and '.join(waiting)} is not ready yet", False
 
 
 def fly_in_cluster(
     experiment: ResolvedExperiment, folder: Path, release: Release, timeout: float, tell: Tell
 ) -> dict[str, Any]:
-    """Fly one experiment on a release and fill its run folder.
+    """Fly one experiment on a release, fill its run folder, and return the report.
 
     Args:
         experiment: A complete and checked experiment.
@@ -46,24 +147,20 @@ def fly_in_cluster(
         release: The release that flies; installed if missing, and kept afterwards.
         timeout: Time for the release to become ready [s].
         tell: Called with progress, a line at a time.
-
-    Returns:
-        The content of report.json.
-
-    Raises:
-        CloudrcError: If the mission could not be flown, or if the release flies another mission.
     """
-    from cloudrc.cluster.release import current_values, install
-    from cloudrc.cluster.tools import chart_folder
     from cloudrc.config.load import dump
 
-    _refuse_busy(release)
+    found, job = current_mission(release)
+    if found:  # an install would replace both pods
+        end = " ".join(["cloudrc mission cancel", *filter(None, [job]), *release.cloudrc_flags])
+        raise ClusterError(
+            f"{found} is under way on release '{release.name}' {release.where}; wait for it, "
+            f"end it: {end}, or fly on a release of your own: --release NAME"
+        )
     began = time.monotonic()
-    given = chart_values(experiment, current_values(release))
-    install(release, chart_folder(), given, timeout=timeout, tell=tell)
-    tell(
-        f"release '{release.name}' {release.where} is ready after {time.monotonic() - began:.0f} s"
-    )
+    install(release, chart_values(experiment, current_values(release)), timeout, tell)
+    took = time.monotonic() - began
+    tell(f"release '{release.name}' {release.where} is ready after {took:.0f} s")
     interrupted = False
     try:
         _fly(experiment, release, tell)
@@ -75,12 +172,7 @@ def fly_in_cluster(
 
 
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the chart's values for an experiment; all other values of the release stay the same.
-
-    Args:
-        experiment: A complete experiment; it becomes the chart's `experiment`, with its link.
-        before: Values with which the release was installed.
-    """
+    """Put an experiment with its link into a release's values; the others stay as `before`."""
     link = {**before.get("link", {}), "profile": ""}
     # The chart's own Job would fly its mission at the same time.
     mission = {**before.get("mission", {}), "enabled": False}
@@ -88,50 +180,21 @@ def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> d
     return {**before, "link": link, "mission": mission, "experiment": flown}
 
 
-def _refuse_busy(release: Release) -> None:
-    """Refuse to install an experiment, which replaces both pods, while a mission flies."""
-    from cloudrc.cluster.jobs import current_mission
-    from cloudrc.cluster.tools import ClusterError
-
-    found, job = current_mission(release)
-    if found:
-        end = " ".join(["cloudrc mission cancel", *filter(None, [job]), *release.cloudrc_flags])
-        raise ClusterError(
-            f"{found} is under way on release '{release.name}' {release.where}; wait for it, "
-            f"end it: {end}, or fly on a release of your own: --release NAME"
-        )
-
-
-def mission_document(experiment: ResolvedExperiment) -> dict[str, Any]:
-    """Return the mission of an experiment in the API's format."""
-    mission = experiment.mission.model_dump(mode="json")
-    return {
-        "name": experiment.name,
-        "start": mission["start"],
-        "time_limit_s": experiment.criteria.time_limit_s,
-        "waypoints": mission["waypoints"],
-    }
-
-
 def refuse_local_files(experiment: ResolvedExperiment) -> None:
-    """Refuse an experiment that names local files, which the images do not contain.
-
-    Raises:
-        BadInputError: If the experiment names a local file; the message names the key.
-    """
+    """Refuse an experiment that names local files, which the images do not contain."""
     from cloudrc.config.load import FILE_READERS
 
-    paths = {
-        f"cloud.{key}": getattr(experiment.cloud, key).name
-        for key in ("estimator", "predictor", "controller")
+    cloud, link, world = experiment.cloud, experiment.link, experiment.world
+    names = {
+        **{f"cloud.{k}": getattr(cloud, k).name for k in ("estimator", "predictor", "controller")},
+        **{
+            f"link.{way}.{key}": getattr(getattr(link, way), key)
+            for way in ("uplink", "downlink")
+            for key in FILE_READERS
+        },
+        **{"world.robot": world.robot, "world.scene": world.scene},
     }
-    paths |= {
-        f"link.{key}.{name}": getattr(getattr(experiment.link, key), name)
-        for key in ("uplink", "downlink")
-        for name in FILE_READERS
-    }
-    paths |= {"world.robot": experiment.world.robot, "world.scene": experiment.world.scene}
-    for key, name in paths.items():
+    for key, name in names.items():
         if name is not None and ("/" in name or name.endswith(".py")):
             raise BadInputError(
                 f"{key}: {name}: the pods do not have this file; build it into an image, "
@@ -146,55 +209,51 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
     """Fly the mission by a Job; cancel the mission if the user interrupts."""
-    from cloudrc.cluster.jobs import follow, follow_limit, run_job
-    from cloudrc.cluster.tools import ClusterError
-
-    limit = experiment.criteria.time_limit_s
-    job = run_job(release, mission_document(experiment), limit=limit)
+    mission, limit = experiment.mission.model_dump(mode="json"), experiment.criteria.time_limit_s
+    document = {
+        "name": experiment.name,
+        "start": mission["start"],
+        "time_limit_s": limit,
+        "waypoints": mission["waypoints"],
+    }
+    job = run_job(release, document, limit=limit)
     tell(f"Job {job.name} flies {experiment.name}")
     try:
         ended = follow(release, job.name, tell, timeout=follow_limit(limit, False))
     except KeyboardInterrupt:
-        _cancel(release, job, tell)
+        try:
+            tell(cancel(release, job.name))
+        except CloudrcError as error:
+            tell(f"cannot cancel: {error}")
         raise
     if ended.exit_code not in FLOWN:
         raise ClusterError(f"Job {job.name} did not fly its mission: {ended.message}")
 
 
-def _cancel(release: Release, job: JobStatus, tell: Tell) -> None:
-    from cloudrc.cluster.jobs import cancel
-
-    try:
-        tell(cancel(release, job.name))
-    except CloudrcError as error:
-        tell(f"cannot cancel: {error}")
-
-
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Mission:
-    """Fetch recordings, metrics and logs, and merge the recordings.
+    """Fetch recordings, metrics and logs into a folder, and merge the recordings.
 
-    Args:
-        release: The release that flew the mission.
-        folder: The folder of the run.
-        tell: Called with a line for each file that cannot be fetched.
-        want_end: Whether to fetch again until the recordings contain the mission's end.
-
-    Raises:
-        CloudrcError: If the recordings cannot be fetched. The other files are not needed for the
-            report, so they cause no exception.
+    The report needs only the recordings; the errors of other files go to `tell`. If `want_end`,
+    the recordings are fetched again until they contain the mission's end.
     """
-    from cloudrc.cluster.pods import fetch_logs, fetch_metrics
     from cloudrc.record.merge import cut_to_last_mission, merge
 
-    for _ in range(FETCHES):
+    for left in reversed(range(FETCHES)):
         time.sleep(FLUSH)
-        _fetch_recordings(release, folder, tell)
+        try:
+            for component in COMPONENTS:
+                pods.fetch_recording(release, component, folder / f"{component}.mcap")
+        except CloudrcError as error:
+            if not left:
+                raise
+            tell(f"{error}; trying again")
+            continue
         mission, ended = cut_to_last_mission(merge(folder / "world.mcap", folder / "cloud.mcap"))
         if ended or not want_end:
             break
-    _fetch_before(release, folder, tell)
     for component in COMPONENTS:
-        for fetch, suffix in ((fetch_metrics, "metrics"), (fetch_logs, "log")):
+        _fetch_previous(release, component, folder / f"{component}.before.mcap", tell)
+        for fetch, suffix in ((pods.fetch_metrics, "metrics"), (pods.fetch_logs, "log")):
             try:
                 texts = fetch(release, component)
             except CloudrcError as error:
@@ -206,41 +265,16 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
     return mission
 
 
-def _fetch_recordings(release: Release, folder: Path, tell: Tell) -> None:
-    """Copy both recordings; retry if a connection breaks."""
-    from cloudrc.cluster.pods import fetch_recording
-
-    for component in COMPONENTS:
-        for left in reversed(range(FETCHES)):
-            try:
-                fetch_recording(release, component, folder / f"{component}.mcap")
-                break
-            except CloudrcError as error:
-                if not left:
-                    raise
-                tell(f"{error}; trying again")
-                time.sleep(FLUSH)
-
-
-def _fetch_before(release: Release, folder: Path, tell: Tell) -> None:
-    """Copy the earlier recording of a restarted container; the report does not need it."""
-    from cloudrc.cluster.pods import fetch_previous_recording
-
-    for component in COMPONENTS:
-        path = folder / f"{component}.before.mcap"
-        try:
-            if fetch_previous_recording(release, component, path):
-                tell(f"{component} was restarted; its earlier recording is in {path}")
-        except CloudrcError as error:
-            path.unlink(missing_ok=True)
-            tell(f"{component} was restarted; no earlier recording: {error}")
-
-
-def _shaper(folder: Path) -> str:
-    """Read from the link container's metrics what emulates the link, such as netem."""
-    texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
-    found = {name for text in texts for name in _SHAPER_LABEL.findall(text)}
-    return "+".join(sorted(found)) or "unknown"
+def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) -> None:
+    """Copy the recording from before a container's restart; the report does not need it."""
+    try:
+        statuses = pods.container_statuses(pods.find_pod(release, component))
+        if any(each.name == component and each.restart_count for each in statuses):
+            pods.fetch_recording(release, component, path, previous=True)
+            tell(f"{component} was restarted; its earlier recording is in {path}")
+    except CloudrcError as error:
+        path.unlink(missing_ok=True)
+        tell(f"{component} was restarted; no earlier recording: {error}")
 
 
 def _report(
@@ -250,10 +284,14 @@ def _report(
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments, write_report
 
+    # What emulates the link, such as netem, is known to the link containers.
+    texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
+    found = re.findall(r'cloudrc_link_info\{[^}]*shaper="(\w+)"', "\n".join(texts))
+    shaper = "+".join(sorted(set(found))) or "unknown"
     digest = messages_sha256(mission.contents.messages)
-    run = replace(Run("cluster", _shaper(folder), digest), interrupted=interrupted)
+    run_facts = replace(Run("cluster", shaper, digest), interrupted=interrupted)
     try:
         own = experiment.report.metrics  # evaluated here, so the pods do not need the file
-        return write_report(folder, mission.recording(), experiment, run, own=own)
+        return write_report(folder, mission.recording(), experiment, run_facts, own=own)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))

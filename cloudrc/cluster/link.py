@@ -20,17 +20,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from cloudrc.cluster.tools import ClusterError, run
+from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
 from cloudrc.config.document import read_document, write_yaml
 from cloudrc.config.load import DIRECTIONS, FILE_READERS, Edit, edit_profile
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
-from cloudrc.link.follow import HANDED_FILE, Handed, write_handed
+from cloudrc.link.follow import HANDED_FILE, PROFILE, Handed, write_handed
 from cloudrc.link.state import CHANGE_FILE, STATE_FILE, LinkState, from_text, read_change
 
-PROFILE = "profile.yaml"
-"""Key of the profile in the ConfigMap."""
-COMPONENTS = ("world", "cloud")
-"""Components with a link container: world's shapes the uplink, cloud's shapes the downlink."""
 READ_LIMIT = 15.0
 """Time limit for the API server to answer [s]."""
 FOLDER = "/run/cloudrc"
@@ -41,32 +37,8 @@ SEND_LIMIT = 25.0
 """Time limit to send a change to a container and to read the answer [s]."""
 SIZE_MAX = 1_000_000
 """Largest size of a ConfigMap's files [bytes]; a little less than Kubernetes' limit of 1 MiB."""
-_COMPONENT = "app.kubernetes.io/component"
 _LOOK_PERIOD = 0.02
 """Time between two looks at the sidecar's state [s]."""
-_KEY = re.compile(r"[^-._a-zA-Z0-9]")
-"""Pattern of a character that is not allowed in a key of a ConfigMap."""
-
-
-@dataclass(frozen=True)
-class ReleasePlace:
-    """Context, namespace and name of a release; None stands for kubectl's default.
-
-    Attributes:
-        context: Context of the kubeconfig.
-        namespace: Namespace of the release.
-        name: Name of the Helm release.
-    """
-
-    context: str | None
-    namespace: str | None
-    name: str
-
-    @property
-    def flags(self) -> list[str]:
-        """Flags of kubectl that select context and namespace."""
-        context = [f"--context={self.context}"] if self.context else []
-        return context + ([f"--namespace={self.namespace}"] if self.namespace else [])
 
 
 @dataclass(frozen=True)
@@ -84,47 +56,24 @@ class LinkParts:
     pods: dict[str, str]
 
 
-def read_link(place: ReleasePlace) -> LinkParts | None:
-    """Read a release's link with one kubectl command; None if the ConfigMap or a pod is missing.
-
-    Raises:
-        ClusterError: If kubectl fails; the message is kubectl's.
-    """
-    selector = f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={place.name}"
-    words = [*place.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
+def read_link(release: Release) -> LinkParts | None:
+    """Read a release's link with one kubectl command; None if the ConfigMap or a pod is missing."""
+    selector = f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={release.name}"
+    words = [*release.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
     found = json.loads(run("kubectl", words, timeout=READ_LIMIT))["items"]
-    maps = [
-        item for item in found if item["kind"] == "ConfigMap" and PROFILE in item.get("data", {})
-    ]
-    pods = {component: _newest(found, component) for component in COMPONENTS}
-    if not maps or None in pods.values():
+    # The newest pod comes last and wins.
+    found.sort(key=lambda item: str(item["metadata"]["creationTimestamp"]))
+    maps = [each for each in found if PROFILE in each.get("data", {})]
+    pods = {
+        each["metadata"]["labels"].get("app.kubernetes.io/component"): each["metadata"]["name"]
+        for each in found
+        if each["kind"] == "Pod"
+        and each["status"].get("phase") == "Running"
+        and "deletionTimestamp" not in each["metadata"]
+    }
+    if not maps or not pods.keys() >= set(COMPONENTS):
         return None
-    names = {component: str(name) for component, name in pods.items()}
-    return LinkParts(str(maps[0]["metadata"]["name"]), dict(maps[0]["data"]), names)
-
-
-def write_files(place: ReleasePlace, name: str, files: Mapping[str, str]) -> None:
-    """Write files into the ConfigMap; the other files stay unchanged.
-
-    Raises:
-        ClusterError: If the cluster refuses.
-    """
-    words = ["patch", "configmap", name, "--type=merge", "--patch-file=/dev/stdin"]
-    run("kubectl", [*place.flags, *words], timeout=READ_LIMIT, given=json.dumps({"data": files}))
-
-
-def _newest(found: list[dict[str, Any]], component: str) -> str | None:
-    """Return the name of the newest running pod of a component."""
-    pods = [
-        item["metadata"]
-        for item in found
-        if item["kind"] == "Pod"
-        and item["metadata"]["labels"].get(_COMPONENT) == component
-        and item["status"].get("phase") == "Running"
-        and "deletionTimestamp" not in item["metadata"]
-    ]
-    newest = max(pods, key=lambda metadata: str(metadata["creationTimestamp"]), default=None)
-    return str(newest["name"]) if newest else None
+    return LinkParts(maps[0]["metadata"]["name"], maps[0]["data"], pods)
 
 
 APPLY_SCRIPT = f"""\
@@ -145,23 +94,11 @@ sidecar reads it. Then it waits until the sidecar has accepted or refused the ch
 sidecar's state."""
 
 
-def send_change(place: ReleasePlace, pod: str, handed: Handed) -> str:
-    """Send a change to a pod's link container; wait until the container accepts or refuses it.
-
-    Args:
-        place: The release.
-        pod: Name of the pod.
-        handed: The change.
-
-    Returns:
-        The state of the link after the change, as JSON.
-
-    Raises:
-        ClusterError: If kubectl or the container refuses.
-    """
+def send_change(release: Release, pod: str, handed: Handed) -> str:
+    """Send a change to a pod's link container; return its state (JSON) after the change."""
     document, number = write_handed(handed), read_change(handed.change).number
     words = ["sh", "-c", APPLY_SCRIPT, "sh", FOLDER, number, str(len(document.encode()))]
-    command = [*place.flags, "exec", "--stdin", pod, "--container=link", "--", *words]
+    command = [*release.flags, "exec", "--stdin", pod, "--container=link", "--", *words]
     return run("kubectl", command, timeout=SEND_LIMIT, given=document)
 
 
@@ -182,7 +119,7 @@ class Sent(NamedTuple):
 
 
 def send(
-    place: ReleasePlace,
+    release: Release,
     link: LinkParts,
     profile: str | None,
     settings: Sequence[str],
@@ -191,7 +128,7 @@ def send(
     """Change the profile in both link containers, and wait until both have applied the change.
 
     Args:
-        place: The release.
+        release: The release.
         link: The present link of the release.
         profile: New profile, as in `cloudrc.config.load.edit_profile`.
         settings: Values to set, also as in `edit_profile`.
@@ -203,11 +140,11 @@ def send(
     edit, files = with_files(link.files, profile, settings)
     files[CHANGE_FILE] = note(edit)
     number = read_change(files[CHANGE_FILE]).number
-    handed = Handed(files[CHANGE_FILE], needed_files(edit.values, {**link.files, **files}))
+    handed = Handed(files[CHANGE_FILE], _needed_files(edit.values, {**link.files, **files}))
 
-    def ask(part: str) -> LinkState | CloudrcError:
+    def ask(component: str) -> LinkState | CloudrcError:
         try:
-            state = from_text(send_change(place, link.pods[part], handed))
+            state = from_text(send_change(release, link.pods[component], handed))
         except CloudrcError as error:
             return error
         except ValueError as error:
@@ -216,7 +153,7 @@ def send(
             return state
         return TimedOutError(
             f"the {state.direction} did not apply the change within {APPLY_LIMIT:g} s; see the log "
-            f"of the container link of pod {link.pods[part]}"
+            f"of the container link of pod {link.pods[component]}"
         )
 
     with ThreadPoolExecutor(len(COMPONENTS)) as pool:
@@ -232,32 +169,24 @@ def send(
     return Sent(edit, files, states, failed)
 
 
-def keep(place: ReleasePlace, link: LinkParts, sent: Sent) -> None:
-    """Write a change into the ConfigMap, and report all failures.
-
-    Raises:
-        CloudrcError: If a container or the ConfigMap does not have the change.
-    """
+def keep(release: Release, link: LinkParts, sent: Sent) -> None:
+    """Write a change into the ConfigMap; raise an error if that or a container has failed."""
     said = list(map(str, sent.failed))
+    words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:
-        write_files(place, link.name, sent.files)
+        data = json.dumps({"data": sent.files})
+        run("kubectl", [*release.flags, *words], timeout=READ_LIMIT, given=data)
     except CloudrcError as error:
         said.append(f"the ConfigMap is unchanged: {error}")
-        for state in sent.states:
-            said.append(f"the {state.direction} has the change until its pod is replaced")
+        said += [f"the {s.direction} has the change until its pod is replaced" for s in sent.states]
         raise ClusterError("; ".join(said)) from None
     if sent.failed:
         said.append("the ConfigMap has the change, and the pods apply it within 2 minutes")
         raise type(sent.failed[0])("; ".join(said))
 
 
-def needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
-    """Select from a ConfigMap's files the profile and the files that the profile names.
-
-    Args:
-        values: Values of the profile.
-        files: All files.
-    """
+def _needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
+    """Select from a ConfigMap's files the profile and the files that the profile names."""
     ways = [value for value in values.values() if isinstance(value, dict)]
     named = {Path(str(way[key])).name for way in ways for key in FILE_READERS if way.get(key)}
     return {name: text for name, text in files.items() if name == PROFILE or name in named}
@@ -266,25 +195,27 @@ def needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[st
 def with_files(
     files: Mapping[str, str], profile: str | None, settings: Sequence[str]
 ) -> tuple[Edit, dict[str, str]]:
-    """Edit the profile that is one of `files`.
-
-    Returns:
-        The edited profile, and the new files: the profile and its new traces.
+    """Edit the profile that is one of `files`; return it, and the files that are new or changed.
 
     Raises:
         BadInputError: If the request is not valid, or the files are too large for a ConfigMap.
     """
+    new: dict[str, str] = {}
     with TemporaryDirectory(prefix="cloudrc-") as name:
         folder = Path(name).resolve()
         for key, text in files.items():
             (folder / key).write_text(text, encoding="utf-8")
         edited = edit_profile(read_document(folder / PROFILE, PROFILE), profile, settings)
-        new: dict[str, str] = {}
         for way in DIRECTIONS:
+            values = edited.values.get(way, {})
             for key in FILE_READERS:
-                path = edited.values.get(way, {}).get(key)
-                if path is not None:
-                    edited.values[way][key] = _add_file(Path(path), folder, way, new)
+                if values.get(key) is None:
+                    continue
+                path = Path(values[key])
+                values[key] = path.name
+                if path.parent != folder:  # a local file, whose name becomes a valid key
+                    values[key] = f"{way}-{re.sub('[^-._a-zA-Z0-9]', '_', path.name)}"
+                    new[values[key]] = path.read_text(encoding="utf-8-sig")
     size = sum(len(text) for text in {**files, **new}.values())
     if size > SIZE_MAX:
         raise BadInputError(
@@ -292,12 +223,3 @@ def with_files(
             "with fewer rows, for example one per 20 ms"
         )
     return edited, {PROFILE: write_yaml(edited.values), **new}
-
-
-def _add_file(path: Path, folder: Path, way: str, new: dict[str, str]) -> str:
-    """Return the name of a trace's file beside the profile; add a file that is new to `new`."""
-    if path.parent == folder:
-        return path.name
-    key = f"{way}-{_KEY.sub('_', path.name)}"
-    new[key] = path.read_text(encoding="utf-8-sig")
-    return key

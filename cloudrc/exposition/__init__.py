@@ -1,5 +1,5 @@
-"""Exposition: Prometheus metrics of a process, computed from its records, without I/O.
+"""Prometheus metrics of a process, computed from its records, without I/O.
 
 `table` defines all metrics; code, documentation, dashboards and tests read this table. `live` keeps
-the current values. `cloudrc.drivers.exporter` serves the values.
+the current values, which `cloudrc.drivers.exporter` serves.
 """

@@ -8,44 +8,40 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from heapq import heappop, heappush
+from collections.abc import Mapping
 from math import isfinite, nan
 
 from cloudrc.exposition.parts import (
     DatagramTally,
+    DelayJudge,
     Handlers,
     Histogram,
+    PredictionJudge,
     Readings,
     by_label,
     per_axis,
-    select,
     unlabelled,
-    unless_nan,
 )
 from cloudrc.exposition.table import (
     AXES,
     BODIES,
-    DELAY_BUCKETS,
+    CLOUD,
     DIRECTIONS,
-    GAP_BUCKETS,
     GUARD_STATES,
-    LATENESS_BUCKETS,
-    LIMITS,
     ONLY_CLOUD,
     ONLY_WORLD,
     OUTCOMES,
-    PERIOD_BUCKETS,
-    PLUGINS,
     TERMS,
+    WORLD,
     Labels,
+    of_role,
 )
-from cloudrc.messages import NEVER_NS, GuardState, Vector
+from cloudrc.messages import NEVER_NS, GuardState
 from cloudrc.records import (
     Arrival,
     CommandApplied,
     Contact,
     Control,
-    Counted,
     Fault,
     GroundTruth,
     GuardChange,
@@ -54,9 +50,6 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
-
-_LEFT_OUT = ("stamp_ns", "uplink")
-"""Fields that the rows of /link.json do not contain: equal in all rows, or of no use."""
 
 
 class LinkVerdict:
@@ -86,7 +79,9 @@ class LinkVerdict:
             {
                 key: value
                 for key, value in record._asdict().items()
-                if key not in _LEFT_OUT and not (isinstance(value, float) and not isfinite(value))
+                # Left out are values that are equal in all rows, and unknown values.
+                if key not in ("stamp_ns", "uplink")
+                and not (isinstance(value, float) and not isfinite(value))
             }
             for record in self._newest
         ]
@@ -113,17 +108,21 @@ class End:
         check: Verdict on the incoming direction of the link.
     """
 
-    def __init__(self, incoming: str, outgoing: str) -> None:
-        """Set the directions, "uplink" and "downlink"; all counts are 0 and there is no session."""
-        self._incoming, self._outgoing = incoming, outgoing
-        others = ONLY_CLOUD if incoming == DIRECTIONS[1] else ONLY_WORLD
+    def __init__(self, role: str, counts: Mapping[str, int]) -> None:
+        """Set the role, "world" or "cloud", and the counts; there is no session."""
+        self._counts, self._stream = counts, DatagramTally()
+        self._outgoing, self._incoming = DIRECTIONS if role == WORLD else DIRECTIONS[::-1]
+        others = ONLY_CLOUD if role == WORLD else ONLY_WORLD
         self._outcomes = tuple(name for name in OUTCOMES[1:] if name not in others)
-        self._counts: dict[str, int] = {}
-        self._stream = DatagramTally()
-        self.check = LinkVerdict(incoming)
-        self._one_way, self._age = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
-        self._gap = Histogram(GAP_BUCKETS)
-        self._period, self._lateness = Histogram(PERIOD_BUCKETS), Histogram(LATENESS_BUCKETS)
+        self.check = LinkVerdict(self._incoming)
+        self._histograms = {
+            metric.name: Histogram(metric.buckets) for metric in of_role(role) if metric.buckets
+        }
+        self._one_way = self._histograms[f"cloudrc_{self._incoming}_delay_seconds"]
+        self._age = self._histograms["cloudrc_age_of_information_seconds"]
+        self._gap = self._histograms["cloudrc_link_gap_seconds"]
+        self._period = self._histograms["cloudrc_loop_period_seconds"]
+        self._lateness = self._histograms["cloudrc_loop_lateness_seconds"]
         self._busy = 0.0
         self._clock_steps = 0
         self._sessions, self._epoch, self._opened_ns = 0, 0, NEVER_NS
@@ -136,7 +135,6 @@ class End:
         """Map each class of records that this part uses to a handler."""
         return {
             Arrival: self._on_arrival,
-            Counted: self._on_count,
             Fault: self._on_fault,
             Lateness: self._on_wake,
             SessionOpened: self._on_session,
@@ -158,9 +156,6 @@ class End:
             self._one_way.observe(delay)
         if used:
             self._newest_ns, self._newest_delay = stamp_ns, delay
-
-    def _on_count(self, record: Counted) -> None:
-        self._counts[record.name] = record.total
 
     def _on_fault(self, record: Fault) -> None:
         self._clock_steps += record.code == CLOCK_SET
@@ -189,27 +184,26 @@ class End:
 
     def read(self) -> Readings:
         """Return the current values; unknown values are absent."""
-        counts, stream, incoming = self._counts, self._stream, (self._incoming,)
-        received = select(self._outcomes, counts)
-        datagrams: dict[Labels, float] = {(*incoming, name): n for name, n in received.items()}
+        counts, stream, incoming = self._counts, self._stream, self._incoming
+        datagrams: dict[Labels, float] = {
+            (incoming, name): counts.get(name, 0) for name in self._outcomes
+        }
         datagrams[self._outgoing, "sent"] = counts.get("sent", 0)
-        readings: Readings = self.check.read() | {
+        readings: Readings = {
+            **self._histograms,
+            **self.check.read(),
             "cloudrc_session_epoch": unlabelled(self._epoch),
             "cloudrc_sessions_opened_total": unlabelled(self._sessions),
             "cloudrc_datagrams_total": datagrams,
-            "cloudrc_datagrams_expected_total": {incoming: stream.expected},
-            "cloudrc_datagrams_lost_total": {incoming: stream.lost},
-            "cloudrc_datagrams_reordered_total": {incoming: stream.reordered},
-            "cloudrc_link_gap_seconds": self._gap,
-            "cloudrc_loop_period_seconds": self._period,
-            "cloudrc_loop_lateness_seconds": self._lateness,
+            "cloudrc_datagrams_expected_total": {(incoming,): stream.expected},
+            "cloudrc_datagrams_lost_total": {(incoming,): stream.lost},
+            "cloudrc_datagrams_reordered_total": {(incoming,): stream.reordered},
             "cloudrc_loop_busy_seconds_total": unlabelled(self._busy),
             "cloudrc_clock_steps_total": unlabelled(self._clock_steps),
-            "cloudrc_recorder_dropped_records_total": unlabelled(counts.get("recorder_dropped", 0)),
         }
-        if self._one_way.cumulative()[-1]:  # unknown without a shared clock: absent, never zero
-            readings[f"cloudrc_{self._incoming}_delay_seconds"] = self._one_way
-            readings["cloudrc_age_of_information_seconds"] = self._age
+        if not self._one_way.cumulative()[-1]:  # unknown without a shared clock: absent, never zero
+            del readings[f"cloudrc_{incoming}_delay_seconds"]
+            del readings["cloudrc_age_of_information_seconds"]
         return readings
 
 
@@ -224,16 +218,18 @@ ADMITTED = "cloud said hello"
 class WorldEnd(End):
     """Metrics of world: metrics of every end, the robot, guard, contacts, real-time factor."""
 
-    def __init__(self) -> None:
-        """Set all counts to 0 and the guard's state to GROUND."""
-        uplink, downlink = DIRECTIONS
-        super().__init__(incoming=downlink, outgoing=uplink)
+    def __init__(self, counts: Mapping[str, int]) -> None:
+        """Set the counts and the guard's state GROUND."""
+        super().__init__(WORLD, counts)
         self._truth: GroundTruth | None = None
         self._guard = GuardState.GROUND
         self._changes = dict.fromkeys(GUARD_STATES, 0)
         self._contacts = dict.fromkeys(BODIES, 0)
         self._slip_ns = self._admitted = 0
-        self._basis_ns, self._command_age = NEVER_NS, Histogram(DELAY_BUCKETS)
+        self._basis_ns, self._command_age = (
+            NEVER_NS,
+            self._histograms["cloudrc_command_age_seconds"],
+        )
         # Samples of world's clock and of the machine's clock [ns].
         self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
         self._instant_ns = NEVER_NS
@@ -292,142 +288,36 @@ class WorldEnd(End):
 
     def read(self) -> Readings:
         """Return the current values; unknown values are absent."""
-        readings = super().read()
-        readings |= {
+        readings = super().read() | {
             "cloudrc_clouds_admitted_total": unlabelled(self._admitted),
-            "cloudrc_sessions_refused_total": unlabelled(self._counts.get("busy", 0)),
-            "cloudrc_command_age_seconds": self._command_age,
             "cloudrc_guard_state": unlabelled(self._guard),
             "cloudrc_guard_transitions_total": by_label(self._changes),
-            "cloudrc_guard_limited_total": by_label(
-                {limit: self._counts.get(f"limited_{limit}", 0) for limit in LIMITS}
-            ),
-            "cloudrc_guard_held_seconds_total": unlabelled(self._counts.get("held_seconds", 0)),
-            "cloudrc_guard_starts_refused_total": unlabelled(self._counts.get("start_refused", 0)),
             "cloudrc_contacts_total": by_label(self._contacts),
             "cloudrc_world_slip_seconds_total": unlabelled(self._slip_ns * 1e-9),
-            "cloudrc_world_stalls_total": unlabelled(self._counts.get("stalls", 0)),
         }
         if self._truth is not None:
             readings["cloudrc_position_meters"] = per_axis(self._truth.odometry.position)
             readings["cloudrc_tip_force_newtons"] = unlabelled(self._truth.tip_force)
-        factor = self._real_time_factor()
-        if factor is not None:
+        instants = list(self._instants)
+        if len(instants) > 1:
+            (world_ns, machine_ns), (world_end_ns, machine_end_ns) = instants[0], instants[-1]
+            factor = (world_end_ns - world_ns) / (machine_end_ns - machine_ns)
             readings["cloudrc_real_time_factor"] = unlabelled(factor)
         return readings
-
-    def _real_time_factor(self) -> float | None:
-        instants = list(self._instants)
-        if len(instants) < 2:
-            return None
-        (world_ns, machine_ns), (world_end_ns, machine_end_ns) = instants[0], instants[-1]
-        return (world_end_ns - world_ns) / (machine_end_ns - machine_ns)
-
-
-GAP_MAX_NS = 50_000_000
-"""Largest gap between two measurements over which positions are interpolated [ns]."""
-WAITING_MAX = 256
-"""Largest number of predictions that wait for a measurement [1]; a horizon of 1 s needs 100."""
-
-
-class PredictionJudge:
-    """Compares each predicted position with the position measured at the same instant.
-
-    Attributes:
-        error: Newest error: predicted minus measured [m], shape (3,); NaN before the first.
-        square: Sum of the squared lengths of all errors [m^2].
-        judged: Number of compared predictions.
-    """
-
-    def __init__(self) -> None:
-        """Create the judge; there is no prediction and no error yet."""
-        self.error: Vector = (nan, nan, nan)
-        self.square = 0.0
-        self.judged = 0
-        self.reset()
-
-    def reset(self) -> None:
-        """Drop predictions and measurements at the start of a new session."""
-        self._waiting: list[tuple[int, Vector]] = []
-        self._measured_ns = NEVER_NS
-        self._measured: Vector = (nan, nan, nan)
-
-    def take(self, control: Control) -> None:
-        """Compare waiting predictions with a measurement; then store this period's prediction."""
-        stamp_ns, waiting = control.basis_stamp_ns, self._waiting
-        if stamp_ns > self._measured_ns:
-            before_ns, before = self._measured_ns, self._measured
-            self._measured_ns, self._measured = stamp_ns, control.measured
-            while waiting and waiting[0][0] <= stamp_ns:
-                at_ns, predicted = heappop(waiting)
-                if before_ns <= at_ns and stamp_ns - before_ns <= GAP_MAX_NS:
-                    share = (at_ns - before_ns) / (stamp_ns - before_ns)
-                    self._judge(predicted, before, control.measured, share)
-        if len(waiting) < WAITING_MAX:
-            heappush(waiting, (stamp_ns + int(control.horizon * 1e9), control.position))
-
-    def _judge(self, predicted: Vector, before: Vector, after: Vector, share: float) -> None:
-        (px, py, pz), (ax, ay, az), (bx, by, bz) = predicted, before, after
-        x = px - ax - share * (bx - ax)
-        y = py - ay - share * (by - ay)
-        z = pz - az - share * (bz - az)
-        self.error = (x, y, z)
-        self.square += x * x + y * y + z * z
-        self.judged += 1
-
-
-class DelayJudge:
-    """Compares each delay estimate with the true time until the command was applied.
-
-    An echo gives the instant at which world applied the command, on world's clock: the stamp of the
-    echoing odometry minus the hold time. The echo's age in cloud identifies the command.
-
-    Attributes:
-        error: Newest error: estimate minus true time [s]; NaN before the first.
-    """
-
-    def __init__(self) -> None:
-        """Create the judge; there is no command and no error yet."""
-        self.error = nan
-        self.reset()
-
-    def reset(self) -> None:
-        """Drop all commands at the start of a new session."""
-        self._sent: dict[int, Control] = {}
-        self._sent_before: dict[int, Control] = {}
-
-    def sent(self, control: Control) -> None:
-        """Store a command that cloud sent."""
-        if len(self._sent) >= WAITING_MAX:
-            self._sent_before, self._sent = self._sent, {}
-        self._sent[control.stamp_ns] = control
-
-    def echoed(self, control: Control, arrival_ns: int) -> None:
-        """Compute the error of the command that this period's odometry echoed.
-
-        Args:
-            control: First control period after the echo.
-            arrival_ns: Arrival of that odometry [ns], cloud's clock.
-        """
-        stamp_ns = arrival_ns - round(control.loop_delay * 1e9)
-        sent = self._sent.get(stamp_ns) or self._sent_before.get(stamp_ns)
-        if sent is not None:
-            applied_ns = control.basis_stamp_ns - round((control.loop_delay - control.rtt) * 1e9)
-            self.error = sent.horizon - (applied_ns - sent.basis_stamp_ns) * 1e-9
 
 
 class CloudEnd(End):
     """Metrics of cloud: metrics of every end, delays in the loop, prediction, control."""
 
-    def __init__(self) -> None:
-        """Set all counts to 0; there is no control period yet."""
-        uplink, downlink = DIRECTIONS
-        super().__init__(incoming=uplink, outgoing=downlink)
-        self._rtt, self._loop = Histogram(DELAY_BUCKETS), Histogram(DELAY_BUCKETS)
+    def __init__(self, counts: Mapping[str, int]) -> None:
+        """Set the counts; there is no control period yet."""
+        super().__init__(CLOUD, counts)
+        self._rtt = self._histograms["cloudrc_rtt_seconds"]
+        self._loop = self._histograms["cloudrc_loop_delay_seconds"]
         self._prediction, self._delay = PredictionJudge(), DelayJudge()
         self._control: Control | None = None
         self._loop_delay = nan
-        self._used_ns, self._used_count = NEVER_NS, 0
+        self._used_count = 0
 
     def handlers(self) -> Handlers:
         """Map each class of records that this part uses to a handler."""
@@ -459,22 +349,12 @@ class CloudEnd(End):
 
     def read(self) -> Readings:
         """Return the current values; unknown values are absent."""
-        counts, prediction = self._counts, self._prediction
-        readings = super().read()
-        readings |= {
-            "cloudrc_rtt_seconds": self._rtt,
-            "cloudrc_loop_delay_seconds": self._loop,
-            "cloudrc_delay_estimate_error_seconds": unless_nan(self._delay.error),
+        prediction = self._prediction
+        readings = super().read() | {
+            "cloudrc_delay_estimate_error_seconds": unlabelled(self._delay.error),
             "cloudrc_prediction_error_meters": per_axis(prediction.error),
             "cloudrc_prediction_error_square_meters_total": unlabelled(prediction.square),
             "cloudrc_predictions_judged_total": unlabelled(prediction.judged),
-            "cloudrc_horizon_clamped_total": unlabelled(counts.get("horizon_clamped", 0)),
-            "cloudrc_commands_frozen_total": unlabelled(counts.get("frozen", 0)),
-            "cloudrc_words_dropped_total": unlabelled(counts.get("words_dropped", 0)),
-            "cloudrc_loop_missed_periods_total": unlabelled(counts.get("missed_periods", 0)),
-            "cloudrc_plugin_failures_total": {
-                (plugin,): counts.get(f"{plugin}_failed", 0) for plugin in PLUGINS
-            },
         }
         return readings if self._control is None else readings | _read_period(self._control)
 
@@ -482,19 +362,16 @@ class CloudEnd(End):
 def _read_period(control: Control) -> Readings:
     """Read the metrics of one control period."""
     terms = (control.proportional, control.integral, control.derivative)
+    (sx, sy, sz), (mx, my, mz) = control.setpoint, control.measured
     return {
-        "cloudrc_delay_estimate_seconds": unless_nan(control.horizon),
-        "cloudrc_tracking_error_meters": per_axis(_difference(control.setpoint, control.measured)),
+        "cloudrc_delay_estimate_seconds": unlabelled(control.horizon),
+        "cloudrc_tracking_error_meters": per_axis((sx - mx, sy - my, sz - mz)),
         "cloudrc_setpoint_meters": per_axis(control.setpoint),
         "cloudrc_command_velocity_meters_per_second": per_axis(control.command),
-        "cloudrc_command_yaw_rate_radians_per_second": unless_nan(control.yaw_rate),
+        "cloudrc_command_yaw_rate_radians_per_second": unlabelled(control.yaw_rate),
         "cloudrc_pid_output": {
             (axis, name): term[index]
             for name, term in zip(TERMS, terms, strict=True)
             for index, axis in enumerate(AXES)
         },
     }
-
-
-def _difference(one: Vector, other: Vector) -> Vector:
-    return (one[0] - other[0], one[1] - other[1], one[2] - other[2])

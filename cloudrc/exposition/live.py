@@ -1,70 +1,71 @@
-"""The current metrics of one process, computed from its records: API, link, mission and both ends.
-
-The module `ends` has the metrics of the tunnel's ends.
-"""
+"""The current metrics of one process, computed from its records."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from cloudrc.exposition.ends import CloudEnd, End, WorldEnd
-from cloudrc.exposition.parts import Handlers, Part, Readings, by_label, select, unlabelled
+from cloudrc.exposition.parts import Handlers, Readings, by_label, unlabelled
 from cloudrc.exposition.table import (
-    API_REFUSALS,
     CLOUD,
-    DIRECTIONS,
     LINK,
-    LINK_MODES,
-    LINK_OUTCOMES,
     MISSION,
     MISSION_OUTCOMES,
     MISSION_STATES,
-    ORDER_REFUSALS,
     RELEASE_PERCENTILES,
-    SHAPERS,
     STEP_PERCENTILES,
     TELEOP,
     WORLD,
     Labels,
+    of_role,
 )
 from cloudrc.records import UNDER_WAY, Counted, MissionEvent, Record
 
-
-class Api:
-    """Counts of teleop's API and journal."""
-
-    def __init__(self) -> None:
-        """Set all counts to 0."""
-        self._counts: dict[str, int] = {}
-
-    def handlers(self) -> Handlers:
-        """Map each class of records that this part uses to a handler."""
-        return {Counted: self._on_count}
-
-    def _on_count(self, record: Counted) -> None:
-        self._counts[record.name] = record.total
-
-    def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
-        counts = {name.removeprefix("api_"): count for name, count in self._counts.items()}
-        return {
-            "cloudrc_api_requests_total": unlabelled(counts.get("served", 0)),
-            "cloudrc_api_rejected_total": by_label(select(API_REFUSALS, counts)),
-            "cloudrc_missions_refused_total": by_label(
-                {reason: counts.get(f"order_{reason}", 0) for reason in ORDER_REFUSALS}
-            ),
-            "cloudrc_stream_dropped_events_total": unlabelled(counts.get("events_dropped", 0)),
-            "cloudrc_audit_dropped_total": unlabelled(counts.get("audit_dropped", 0)),
-            "cloudrc_journal_repaired_total": unlabelled(counts.get("journal_repaired", 0)),
-        }
-
-
-_SINGLE_SHAPER_COUNTS = {
+COUNTS = {
+    "cloudrc_sessions_refused_total": "busy",
+    "cloudrc_guard_limited_total": "limited_{}",
+    "cloudrc_guard_held_seconds_total": "held_seconds",
+    "cloudrc_guard_starts_refused_total": "start_refused",
+    "cloudrc_world_stalls_total": "stalls",
+    "cloudrc_horizon_clamped_total": "horizon_clamped",
+    "cloudrc_commands_frozen_total": "frozen",
+    "cloudrc_words_dropped_total": "words_dropped",
+    "cloudrc_loop_missed_periods_total": "missed_periods",
+    "cloudrc_plugin_failures_total": "{}_failed",
+    "cloudrc_recorder_dropped_records_total": "recorder_dropped",
+    "cloudrc_api_requests_total": "api_served",
+    "cloudrc_api_rejected_total": "api_{}",
+    "cloudrc_missions_refused_total": "api_order_{}",
+    "cloudrc_stream_dropped_events_total": "api_events_dropped",
+    "cloudrc_audit_dropped_total": "api_audit_dropped",
+    "cloudrc_journal_repaired_total": "journal_repaired",
+    "cloudrc_link_datagrams_total": "{}",
     "cloudrc_link_restored_total": "restored",
     "cloudrc_link_released_early_total": "released_early",
+    "cloudrc_dns_errors_total": "unresolved",
 }
-"""Metric that only the relay or only netem has -> name of its count."""
+"""Metric -> name of its count in `Counted`, with the value of its label at {}."""
+ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
+"""Metrics that only the relay or only netem has: absent until counted."""
+PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
+    "cloudrc_link_release_error_seconds": ("release_error", RELEASE_PERCENTILES),
+    "cloudrc_link_step_lateness_seconds": ("step_lateness", STEP_PERCENTILES),
+}
+"""Metric -> first part of its counts [ns], and label value -> name of the percentile."""
+
+
+def read_counts(role: str, counts: Mapping[str, int]) -> Iterator[tuple[str, dict[Labels, float]]]:
+    """Read the metrics of a role that are counts of its process."""
+    for metric in of_role(role):
+        pattern = COUNTS.get(metric.name)
+        if pattern is None or (metric.name in ONE_SHAPER and pattern not in counts):
+            continue
+        values = next(iter(metric.labels.values()), None)
+        if values is None:
+            yield metric.name, {(): counts.get(pattern, 0)}
+        else:
+            yield metric.name, {(each,): counts.get(pattern.format(each), 0) for each in values}
 
 
 class Link:
@@ -74,16 +75,12 @@ class Link:
         tell: Returns the page /link.json: details that are not metrics.
     """
 
-    def __init__(self) -> None:
-        """Create the metrics; nothing is shaped or counted yet."""
+    def __init__(self, counts: Mapping[str, int]) -> None:
+        """Set the counts of the process; nothing is shaped yet."""
         self.tell: Callable[[], str] = lambda: "{}\n"
+        self._counts = counts
         self._shapers: dict[str, Labels] = {}
         self._delays: dict[str, float] = {}
-        self._counts: dict[str, int] = {}
-
-    def handlers(self) -> Handlers:
-        """Map each class of records that this part uses to a handler."""
-        return {Counted: self._on_count}
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
         """Set the shaper of a direction from now on.
@@ -93,50 +90,25 @@ class Link:
             direction: "uplink" or "downlink".
             mode: The configured mode: "auto", "relay" or "netem".
         """
-        assert shaper in SHAPERS
-        assert direction in DIRECTIONS
-        assert mode in LINK_MODES
         self._shapers[direction] = (shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:
         """Set the mean delay [s] that the profile sets for a direction from now on."""
-        assert direction in DIRECTIONS
         self._delays[direction] = delay
-
-    def _on_count(self, record: Counted) -> None:
-        self._counts[record.name] = record.total
 
     def read(self) -> Readings:
         """Return the current values; unknown values are absent."""
-        return {
+        counts = dict(self._counts)  # one atomic copy: the loop's thread may count on
+        readings: Readings = {
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
             "cloudrc_link_delay_seconds": by_label(dict(self._delays)),
-            "cloudrc_link_datagrams_total": by_label(select(LINK_OUTCOMES, self._counts)),
-            "cloudrc_dns_errors_total": unlabelled(self._counts.get("unresolved", 0)),
-            "cloudrc_link_release_error_seconds": self._percentiles(
-                "release_error", RELEASE_PERCENTILES
-            ),
-            "cloudrc_link_step_lateness_seconds": self._percentiles(
-                "step_lateness", STEP_PERCENTILES
-            ),
-        } | self._single_shaper_counts()
-
-    def _single_shaper_counts(self) -> Readings:
-        """Read the counts that only the relay or only netem has; uncounted values are absent."""
-        counts = dict(self._counts)  # one atomic copy: the loop's thread may count on
-        return {
-            name: unlabelled(counts[one])
-            for name, one in _SINGLE_SHAPER_COUNTS.items()
-            if one in counts
         }
-
-    def _percentiles(self, quantity: str, percentiles: Mapping[str, str]) -> dict[Labels, float]:
-        """Read the percentiles of a lateness [s]; empty before the first count."""
-        counts = dict(self._counts)  # one atomic copy: the loop's thread may count on
-        names = {label: f"{quantity}_{name}_ns" for label, name in percentiles.items()}
-        return by_label(
-            {label: counts[name] * 1e-9 for label, name in names.items() if name in counts}
-        )
+        for metric, (quantity, percentiles) in PERCENTILES.items():
+            names = {label: f"{quantity}_{name}_ns" for label, name in percentiles.items()}
+            readings[metric] = {
+                (label,): counts[name] * 1e-9 for label, name in names.items() if name in counts
+            }
+        return readings
 
 
 NO_WAYPOINT = -1
@@ -165,7 +137,9 @@ class Mission:
         self._shown = True
         event = record.event
         if event not in UNDER_WAY:
-            self._end(event)
+            self._ended[event if event in self._ended else "other"] += 1
+            self._state = event if event in ("done", "cancelled") else "failed"
+            self._waypoint = NO_WAYPOINT
         elif event == "reached":
             self._reached += 1
             self._waypoint = record.waypoint + 1
@@ -175,11 +149,6 @@ class Mission:
             self._state, self._waypoint = "flying", record.waypoint
         elif self._state != "held":  # a new mission; in HOLD, goto only moves the hold point
             self._state, self._waypoint = "starting", NO_WAYPOINT
-
-    def _end(self, event: str) -> None:
-        self._ended[event if event in self._ended else "other"] += 1
-        self._state = event if event in ("done", "cancelled") else "failed"
-        self._waypoint = NO_WAYPOINT
 
     def read(self) -> Readings:
         """Return the current values; unknown values are absent."""
@@ -209,15 +178,19 @@ class LiveMetrics:
             missions: Whether to expose metrics of missions; False in a cloud whose teleop exposes
                 them.
         """
-        self.end: End | None = {WORLD: WorldEnd, CLOUD: CloudEnd}.get(role, lambda: None)()
-        self.link = Link() if role == LINK else None
+        self._role = role
+        self._counts: dict[str, int] = {}
+        ends: dict[str, type[WorldEnd | CloudEnd]] = {WORLD: WorldEnd, CLOUD: CloudEnd}
+        self.end: End | None = ends[role](self._counts) if role in ends else None
+        self.link = Link(self._counts) if role == LINK else None
         mission = Mission(always=role == TELEOP) if missions and role in MISSION else None
-        api = Api() if role == TELEOP else None
-        parts: tuple[Part | None, ...] = (self.end, self.link, mission, api)
-        self._parts = [part for part in parts if part is not None]
-        self._handlers: dict[type, Callable[[Any], None]] = {}
-        for part in self._parts:
-            self._handlers.update(part.handlers())
+        self._parts = [part for part in (self.end, self.link, mission) if part is not None]
+        self._handlers: dict[type, Callable[[Any], None]] = {Counted: self._on_count}
+        for source in (self.end, mission):
+            self._handlers |= source.handlers() if source is not None else {}
+
+    def _on_count(self, record: Counted) -> None:
+        self._counts[record.name] = record.total
 
     def see(self, records: Iterable[Record]) -> None:
         """Process records of this process, oldest first, without blocking."""
@@ -229,7 +202,7 @@ class LiveMetrics:
 
     def read(self) -> Readings:
         """Return the current values; unknown values are absent."""
-        readings: Readings = {}
+        readings: Readings = dict(read_counts(self._role, dict(self._counts)))
         for part in self._parts:
             readings |= part.read()
         return readings

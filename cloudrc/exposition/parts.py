@@ -1,4 +1,4 @@
-"""Building blocks of live metrics: `Part`, a fast histogram, and loss counters of one direction.
+"""Building blocks of live metrics: a fast histogram, loss counters, judges of predictions.
 
 A handler of records runs on the loop's thread and has a budget of 1 us. Therefore a handler only
 stores the newest record and counts. `read` does all other work, on the thread that serves the
@@ -8,12 +8,15 @@ scrape.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Mapping
-from math import isnan
-from typing import Any, Protocol, TypeAlias
+from collections.abc import Callable, Mapping
+from heapq import heappop, heappush
+from itertools import accumulate
+from math import isnan, nan
+from typing import Any, TypeAlias
 
 from cloudrc.exposition.table import AXES, Labels
-from cloudrc.messages import Vector
+from cloudrc.messages import NEVER_NS, Vector
+from cloudrc.records import Control
 
 
 class Histogram:
@@ -39,34 +42,16 @@ class Histogram:
 
     def cumulative(self) -> list[int]:
         """Count the values up to each bound; the last entry counts all values."""
-        counts, below = list(self._counts), 0  # one atomic copy: the loop's thread may count on
-        for index, count in enumerate(counts):
-            below += count
-            counts[index] = below
-        return counts
+        return list(accumulate(list(self._counts)))  # one atomic copy: the loop may count on
 
 
 Handlers: TypeAlias = Mapping[type, Callable[[Any], None]]
+"""Class of records -> function that processes a record."""
 Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 """Metric name -> value for each tuple of label values, or a histogram (without labels)."""
 
 
-class Part(Protocol):
-    """A group of metrics of one process."""
-
-    def handlers(self) -> Handlers:
-        """Map each class of records that this part uses to a handler; parts share no class."""
-
-    def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
-
-
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Make a reading without labels from `value` [base unit of the metric]."""
-    return {(): value}
-
-
-def unless_nan(value: float) -> dict[Labels, float]:
     """Make a reading without labels from `value` [base unit of the metric]; absent if NaN."""
     return {} if isnan(value) else {(): value}
 
@@ -80,11 +65,6 @@ def per_axis(vector: Vector) -> dict[Labels, float]:
 def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
     """Make a reading with one label from a mapping of label values to values."""
     return {(name,): count for name, count in counts.items()}
-
-
-def select(names: Iterable[str], counts: Mapping[str, float]) -> dict[str, float]:
-    """Select counts by name; a missing count is 0."""
-    return {name: counts.get(name, 0) for name in names}
 
 
 WINDOW = 128
@@ -131,8 +111,10 @@ class DatagramTally:
                 self.lost += 1
             self._seen = (self._seen << 1 | 1) & _MASK
             self._newest = counter
-        elif ahead > 1:
-            self._skip(ahead)
+        elif ahead > 1:  # the skipped datagrams are lost or late
+            leaving = min(ahead, WINDOW)
+            self.lost += ahead - (self._seen >> (WINDOW - leaving)).bit_count()
+            self._seen = (self._seen << ahead | 1) & _MASK if ahead < WINDOW else 1
             self._newest = counter
         elif ahead > -WINDOW and not self._seen >> -ahead & 1:
             self._seen |= 1 << -ahead
@@ -141,9 +123,94 @@ class DatagramTally:
             return False
         return True
 
-    def _skip(self, ahead: int) -> None:
-        """Move the window by more than one datagram: the skipped datagrams are lost or late."""
-        leaving = min(ahead, WINDOW)
-        self.lost += leaving - (self._seen >> (WINDOW - leaving)).bit_count()
-        self.lost += ahead - leaving
-        self._seen = (self._seen << ahead | 1) & _MASK if ahead < WINDOW else 1
+
+GAP_MAX_NS = 50_000_000
+"""Largest gap between two measurements over which positions are interpolated [ns]."""
+WAITING_MAX = 256
+"""Largest number of predictions that wait for a measurement [1]; a horizon of 1 s needs 100."""
+
+
+class PredictionJudge:
+    """Compares each predicted position with the position measured at the same instant.
+
+    Attributes:
+        error: Newest error: predicted minus measured [m], shape (3,); NaN before the first.
+        square: Sum of the squared lengths of all errors [m^2].
+        judged: Number of compared predictions.
+    """
+
+    def __init__(self) -> None:
+        """Create the judge; there is no prediction and no error yet."""
+        self.error: Vector = (nan, nan, nan)
+        self.square = 0.0
+        self.judged = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop predictions and measurements at the start of a new session."""
+        self._waiting: list[tuple[int, Vector]] = []
+        self._measured_ns = NEVER_NS
+        self._measured: Vector = (nan, nan, nan)
+
+    def take(self, control: Control) -> None:
+        """Compare waiting predictions with a measurement; then store this period's prediction."""
+        stamp_ns, waiting = control.basis_stamp_ns, self._waiting
+        if stamp_ns > self._measured_ns:
+            before_ns, before = self._measured_ns, self._measured
+            self._measured_ns, self._measured = stamp_ns, control.measured
+            while waiting and waiting[0][0] <= stamp_ns:
+                at_ns, predicted = heappop(waiting)
+                if before_ns <= at_ns and stamp_ns - before_ns <= GAP_MAX_NS:
+                    share = (at_ns - before_ns) / (stamp_ns - before_ns)
+                    self._judge(predicted, before, control.measured, share)
+        if len(waiting) < WAITING_MAX:
+            heappush(waiting, (stamp_ns + int(control.horizon * 1e9), control.position))
+
+    def _judge(self, predicted: Vector, before: Vector, after: Vector, share: float) -> None:
+        (px, py, pz), (ax, ay, az), (bx, by, bz) = predicted, before, after
+        x = px - ax - share * (bx - ax)
+        y = py - ay - share * (by - ay)
+        z = pz - az - share * (bz - az)
+        self.error = (x, y, z)
+        self.square += x * x + y * y + z * z
+        self.judged += 1
+
+
+class DelayJudge:
+    """Compares each delay estimate with the true time until the command was applied.
+
+    An echo gives the instant at which world applied the command, on world's clock: the stamp of the
+    echoing odometry minus the hold time. The echo's age in cloud identifies the command.
+
+    Attributes:
+        error: Newest error: estimate minus true time [s]; NaN before the first.
+    """
+
+    def __init__(self) -> None:
+        """Create the judge; there is no command and no error yet."""
+        self.error = nan
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop all commands at the start of a new session."""
+        self._sent: dict[int, Control] = {}
+        self._sent_before: dict[int, Control] = {}
+
+    def sent(self, control: Control) -> None:
+        """Store a command that cloud sent."""
+        if len(self._sent) >= WAITING_MAX:
+            self._sent_before, self._sent = self._sent, {}
+        self._sent[control.stamp_ns] = control
+
+    def echoed(self, control: Control, arrival_ns: int) -> None:
+        """Compute the error of the command that this period's odometry echoed.
+
+        Args:
+            control: First control period after the echo.
+            arrival_ns: Arrival of that odometry [ns], cloud's clock.
+        """
+        stamp_ns = arrival_ns - round(control.loop_delay * 1e9)
+        sent = self._sent.get(stamp_ns) or self._sent_before.get(stamp_ns)
+        if sent is not None:
+            applied_ns = control.basis_stamp_ns - round((control.loop_delay - control.rtt) * 1e9)
+            self.error = sent.horizon - (applied_ns - sent.basis_stamp_ns) * 1e-9

@@ -6,8 +6,10 @@ label has a closed set of values, so that one pod has fewer than 200 series.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from enum import Enum
+from textwrap import dedent
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -20,22 +22,8 @@ AXES = ("x", "y", "z")
 TERMS = ("proportional", "integral", "derivative")
 DIRECTIONS = ("uplink", "downlink")
 OUTCOMES = (
-    "sent",
-    "used",
-    "late",
-    "stale",
-    "repeated",
-    "old_epoch",
-    "range",
-    "future",
-    "malformed",
-    "version",
-    "direction",
-    "accept_ignored",
-    "tag",
-    "hello",
-    "busy",
-    "unanswered",
+    *("sent", "used", "late", "stale", "repeated", "old_epoch", "range", "future", "malformed"),
+    *("version", "direction", "accept_ignored", "tag", "hello", "busy", "unanswered"),
 )
 """What can happen to a datagram. The sender counts "sent", the receiver the other outcomes."""
 ONLY_WORLD = {"stale", "range", "future", "hello", "unanswered"}
@@ -50,16 +38,8 @@ GUARD_STATES = ("ground", "track", "hold", "land", "estop")
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
 """States of a mission, in the order of `cloudrc.teleop.wire.State`."""
 MISSION_OUTCOMES = (
-    "done",
-    "cancelled",
-    "timed_out",
-    "leg_timed_out",
-    "world_restarted",
-    "guard_stopped",
-    "emergency_stopped",
-    "taken_over",
-    "end_lost",
-    "other",
+    *("done", "cancelled", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped"),
+    *("emergency_stopped", "taken_over", "end_lost", "other"),
 )
 API_REFUSALS = ("token", "role", "busy", "slow")
 """Reasons for which the API rejects a request: no valid token; a reader's token for a request of an
@@ -118,404 +98,263 @@ class Metric(NamedTuple):
     buckets: tuple[float, ...] = ()
 
 
-def counter(name: str, meaning: str, roles: tuple[str, ...], **labels: Labels) -> Metric:
-    """Define a counter."""
-    return Metric(name, Kind.COUNTER, meaning, roles, labels)
-
-
-def gauge(name: str, meaning: str, roles: tuple[str, ...], **labels: Labels) -> Metric:
-    """Define a gauge."""
-    return Metric(name, Kind.GAUGE, meaning, roles, labels)
-
-
-def delay_histogram(name: str, meaning: str, roles: tuple[str, ...]) -> Metric:
-    """Define a histogram of delays."""
-    return Metric(name, Kind.HISTOGRAM, meaning, roles, buckets=DELAY_BUCKETS)
-
-
-def numbered(names: Labels) -> str:
-    """List states with their numbers: "0 idle, 1 starting"."""
+def numbered(names: tuple[str, ...]) -> str:
+    """Describe states with their numbers: "0 idle, 1 starting"."""
     return ", ".join(f"{number} {name}" for number, name in enumerate(names))
 
 
-CHECK = (
-    gauge(
-        "cloudrc_link_believed",
-        "1 if the incoming direction of the link behaves as configured, 0 if it does not"
-        " (/link.json on the same port says why); absent while there are too few datagrams to"
-        " decide.",
-        ENDS,
-        direction=DIRECTIONS,
-    ),
-)
-"""Metrics of the check of the link in flight."""
-
-
-LINKS = (
-    Metric(
-        "cloudrc_link_info",
-        Kind.GAUGE,
-        "Always 1; the labels say what shapes a direction of the link, and the configured mode.",
-        (LINK,),
-        {"shaper": SHAPERS, "direction": DIRECTIONS, "mode": LINK_MODES},
-    ),
-    gauge(
-        "cloudrc_link_delay_seconds",
-        "Mean one-way delay that the current link profile sets.",
-        (LINK,),
-        direction=DIRECTIONS,
-    ),
-    gauge(
-        "cloudrc_link_step_lateness_seconds",
-        "Lateness of the last 10,000 changes of netem's qdisc on the profile's time line; absent"
-        " without changes.",
-        (LINK,),
-        percentile=tuple(STEP_PERCENTILES),
-    ),
-    counter(
-        "cloudrc_link_datagrams_total",
-        "Datagrams at the shaper, by outcome.",
-        (LINK,),
-        outcome=LINK_OUTCOMES,
-    ),
-    counter(
-        "cloudrc_link_restored_total",
-        "Times that another program removed or changed netem's qdisc.",
-        (LINK,),
-    ),
-    gauge(
-        "cloudrc_link_release_error_seconds",
-        "Lateness of datagrams that left the relay in the last 10 s; absent with netem.",
-        (LINK,),
-        percentile=tuple(RELEASE_PERCENTILES),
-    ),
-    counter(
-        "cloudrc_link_released_early_total",
-        "Datagrams that left the relay before they were due; above 0 the relay has a bug; absent"
-        " with netem.",
-        (LINK,),
-    ),
-    counter(
-        "cloudrc_dns_errors_total",
-        "Failed look-ups of the peer's name; the last known address stays in use.",
-        (LINK,),
-    ),
-)
-"""Metrics of the emulated link."""
-
-
-MISSIONS = (
-    # Mission: exposed by the process that flies it.
-    gauge("cloudrc_mission_state", f"State of the mission: {numbered(MISSION_STATES)}.", MISSION),
-    gauge("cloudrc_mission_waypoint", "Index of the next waypoint; -1 if none.", MISSION),
-    counter("cloudrc_waypoints_reached_total", "Waypoints reached.", MISSION),
-    counter(
-        "cloudrc_missions_total", "Missions ended, by outcome.", MISSION, outcome=MISSION_OUTCOMES
-    ),
-    # Teleop: its API and its journal.
-    counter("cloudrc_api_requests_total", "Requests that the API has served.", (TELEOP,)),
-    counter(
-        "cloudrc_api_rejected_total",
-        "Requests that the API rejected, by reason.",
-        (TELEOP,),
-        reason=API_REFUSALS,
-    ),
-    counter(
-        "cloudrc_missions_refused_total",
-        "Mission orders that the API refused: invalid, or in conflict with another mission.",
-        (TELEOP,),
-        reason=ORDER_REFUSALS,
-    ),
-    counter(
-        "cloudrc_stream_dropped_events_total",
-        "Events that slow readers of the event stream missed.",
-        (TELEOP,),
-    ),
-    counter(
-        "cloudrc_audit_dropped_total",
-        "Lines of the audit log that the disk refused.",
-        (TELEOP,),
-    ),
-    counter(
-        "cloudrc_journal_repaired_total",
-        "Times that a damaged journal was set aside and a new one begun.",
-        (TELEOP,),
-    ),
-)
-"""Metrics of missions, of the API that accepts them, and of the journal that stores them."""
-
-
-_ENTRIES = (
-    # Every process.
-    Metric(
-        "cloudrc_build_info",
-        Kind.GAUGE,
-        "Always 1; the labels name the process, its version and its configuration. Both ends of a"
-        " run have the same configuration.",
+_MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
+    (
         ROLES,
-        {"version": (), "role": ROLES, "config": ()},
+        """
+        cloudrc_build_info: Always 1; the labels name the process, its version and its
+            configuration. Both ends of a run have the same configuration.
+        cloudrc_ready: 1 while this process hears its peer, else 0.
+        cloudrc_cpu_periods_total: CFS periods in which this container wanted to run.
+        cloudrc_cpu_throttled_periods_total: CFS periods in which the CPU limit stopped this
+            container.
+        cloudrc_cpu_throttled_seconds_total: Time for which the CPU limit stopped this container.
+        """,
     ),
-    gauge("cloudrc_ready", "1 while this process hears its peer, else 0.", ROLES),
-    counter(
-        "cloudrc_cpu_periods_total", "CFS periods in which this container wanted to run.", ROLES
-    ),
-    counter(
-        "cloudrc_cpu_throttled_periods_total",
-        "CFS periods in which the CPU limit stopped this container.",
-        ROLES,
-    ),
-    counter(
-        "cloudrc_cpu_throttled_seconds_total",
-        "Time for which the CPU limit stopped this container.",
-        ROLES,
-    ),
-    # Both ends: session and link.
-    gauge("cloudrc_session_epoch", "Epoch number of the current session.", ENDS),
-    counter("cloudrc_sessions_opened_total", "Sessions opened since this process started.", ENDS),
-    counter(
-        "cloudrc_clouds_admitted_total",
-        "Cloud processes that got a session: the first, one that restarted, or another one.",
-        (WORLD,),
-    ),
-    counter(
-        "cloudrc_sessions_refused_total",
-        "Session requests refused because another cloud controls the robot.",
-        (WORLD,),
-    ),
-    counter(
-        "cloudrc_datagrams_total",
-        "Datagrams by outcome; updated once a second.",
+    (
         ENDS,
-        direction=DIRECTIONS,
-        outcome=OUTCOMES,
+        """
+        cloudrc_session_epoch: Epoch number of the current session.
+        cloudrc_sessions_opened_total: Sessions opened since this process started.
+        """,
     ),
-    counter(
-        "cloudrc_datagrams_expected_total",
-        "Incoming telemetry or command datagrams whose fate is known: arrived or lost.",
-        ENDS,
-        direction=DIRECTIONS,
-    ),
-    counter(
-        "cloudrc_datagrams_lost_total",
-        "Expected datagrams that had not arrived when the peer had sent 128 newer ones.",
-        ENDS,
-        direction=DIRECTIONS,
-    ),
-    counter(
-        "cloudrc_datagrams_reordered_total",
-        "Telemetry or command datagrams that arrived after a newer one.",
-        ENDS,
-        direction=DIRECTIONS,
-    ),
-    Metric(
-        "cloudrc_link_gap_seconds",
-        Kind.HISTOGRAM,
-        "Time between two arrivals: of telemetry at cloud, of commands at world.",
-        ENDS,
-        buckets=GAP_BUCKETS,
-    ),
-    delay_histogram(
-        "cloudrc_uplink_delay_seconds",
-        "One-way delay from world to cloud, late datagrams included; absent unless both ends"
-        " prove that they share a clock.",
-        (CLOUD,),
-    ),
-    delay_histogram(
-        "cloudrc_downlink_delay_seconds",
-        "One-way delay from cloud to world, late datagrams included; absent unless both ends"
-        " prove that they share a clock.",
+    (
         (WORLD,),
+        """
+        cloudrc_clouds_admitted_total: Cloud processes that got a session: the first, one that
+            restarted, or another one.
+        cloudrc_sessions_refused_total: Session requests refused because another cloud controls
+            the robot.
+        """,
     ),
-    *CHECK,
-    delay_histogram(
-        "cloudrc_age_of_information_seconds",
-        "Age of the newest datagram used, sampled every period: odometry in cloud, commands in"
-        " world; absent unless both ends prove that they share a clock.",
+    (
         ENDS,
+        """
+        cloudrc_datagrams_total: Datagrams by outcome; updated once a second.
+        cloudrc_datagrams_expected_total: Incoming telemetry or command datagrams whose fate is
+            known: arrived or lost.
+        cloudrc_datagrams_lost_total: Expected datagrams that had not arrived when the peer had
+            sent 128 newer ones.
+        cloudrc_datagrams_reordered_total: Telemetry or command datagrams that arrived after a
+            newer one.
+        cloudrc_link_gap_seconds: Time between two arrivals: of telemetry at cloud, of commands at
+            world.
+        """,
     ),
-    # Cloud: delays as the loop sees them.
-    delay_histogram(
-        "cloudrc_rtt_seconds",
-        "Round trip of applied commands, without the hold time in world; one sample per echo.",
+    (
         (CLOUD,),
+        """
+        cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included;
+            absent unless both ends prove that they share a clock.
+        """,
     ),
-    delay_histogram(
-        "cloudrc_loop_delay_seconds",
-        "Time from a command's stamp to its echo, with the hold time in world: the paper's tau.",
-        (CLOUD,),
-    ),
-    gauge(
-        "cloudrc_delay_estimate_seconds",
-        "Delay estimate, clamped: the horizon over which the newest odometry is predicted.",
-        (CLOUD,),
-    ),
-    gauge(
-        "cloudrc_delay_estimate_error_seconds",
-        "Delay estimate minus the true time from the odometry to the application of the command,"
-        " for the newest echoed command.",
-        (CLOUD,),
-    ),
-    # Cloud: prediction and control.
-    gauge(
-        "cloudrc_prediction_error_meters",
-        "Newest prediction error: predicted minus measured position at the same instant.",
-        (CLOUD,),
-        axis=AXES,
-    ),
-    counter(
-        "cloudrc_prediction_error_square_meters_total",
-        "Sum of the squared lengths of all prediction errors.",
-        (CLOUD,),
-    ),
-    counter(
-        "cloudrc_predictions_judged_total",
-        "Predictions compared with a measurement.",
-        (CLOUD,),
-    ),
-    gauge(
-        "cloudrc_tracking_error_meters",
-        "Setpoint minus measured position, in the newest period.",
-        (CLOUD,),
-        axis=AXES,
-    ),
-    gauge("cloudrc_setpoint_meters", "Position setpoint, world frame.", (CLOUD,), axis=AXES),
-    gauge(
-        "cloudrc_pid_output",
-        "Terms of the controller's output [m/s], in the newest period.",
-        (CLOUD,),
-        axis=AXES,
-        term=TERMS,
-    ),
-    gauge(
-        "cloudrc_command_velocity_meters_per_second",
-        "Commanded velocity, world frame.",
-        (CLOUD,),
-        axis=AXES,
-    ),
-    gauge("cloudrc_command_yaw_rate_radians_per_second", "Commanded yaw rate.", (CLOUD,)),
-    counter(
-        "cloudrc_horizon_clamped_total",
-        "Delay estimates above 1 s or below 0, which were clamped.",
-        (CLOUD,),
-    ),
-    counter(
-        "cloudrc_commands_frozen_total",
-        "Zero-velocity commands sent because no echo arrives.",
-        (CLOUD,),
-    ),
-    counter(
-        "cloudrc_plugin_failures_total",
-        "Plug-in calls that raised an exception or returned a value that is not finite.",
-        (CLOUD,),
-        plugin=PLUGINS,
-    ),
-    # World: robot and guard.
-    gauge(
-        "cloudrc_position_meters", "True position of the base, world frame.", (WORLD,), axis=AXES
-    ),
-    gauge("cloudrc_tip_force_newtons", "Force on the touch sensor at the arm's tip.", (WORLD,)),
-    delay_histogram(
-        "cloudrc_command_age_seconds",
-        "Age of the current command, sampled every period in TRACK: time since the odometry that"
-        " it was computed from, on world's clock, as the guard sees it.",
+    (
         (WORLD,),
+        """
+        cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams
+            included; absent unless both ends prove that they share a clock.
+        """,
     ),
-    gauge("cloudrc_guard_state", f"State of the guard: {numbered(GUARD_STATES)}.", (WORLD,)),
-    counter(
-        "cloudrc_guard_transitions_total",
-        "Changes of the guard's state, by new state.",
-        (WORLD,),
-        state=GUARD_STATES,
-    ),
-    counter(
-        "cloudrc_guard_limited_total",
-        "Commands that a limit of the guard changed; for the fence, ticks instead of commands.",
-        (WORLD,),
-        limit=LIMITS,
-    ),
-    counter(
-        "cloudrc_guard_held_seconds_total",
-        "Time in HOLD during missions; updated once a second.",
-        (WORLD,),
-    ),
-    counter(
-        "cloudrc_guard_starts_refused_total",
-        "Mission starts refused: in LAND or ESTOP.",
-        (WORLD,),
-    ),
-    counter(
-        "cloudrc_contacts_total",
-        "Times that the robot came into contact with a body of the scene, by kind of body.",
-        (WORLD,),
-        body=BODIES,
-    ),
-    gauge(
-        "cloudrc_real_time_factor",
-        "Simulated time divided by machine time over the last 10 s; below 0.95 a run is invalid.",
-        (WORLD,),
-    ),
-    counter(
-        "cloudrc_world_slip_seconds_total",
-        "Time by which world's clock has fallen behind the machine's clock.",
-        (WORLD,),
-    ),
-    counter(
-        "cloudrc_world_stalls_total",
-        "Wakes so late that the datagrams waiting in the socket were stale.",
-        (WORLD,),
-    ),
-    # Both ends: the process.
-    Metric(
-        "cloudrc_loop_period_seconds",
-        Kind.HISTOGRAM,
-        "Time between two handled deadlines.",
+    (
         ENDS,
-        buckets=PERIOD_BUCKETS,
+        """
+        cloudrc_link_believed: 1 if the incoming direction of the link behaves as configured, 0 if
+            it does not (/link.json on the same port says why); absent while there are too few
+            datagrams to decide.
+        cloudrc_age_of_information_seconds: Age of the newest datagram used, sampled every period:
+            odometry in cloud, commands in world; absent unless both ends prove that they share a
+            clock.
+        """,
     ),
-    Metric(
-        "cloudrc_loop_lateness_seconds",
-        Kind.HISTOGRAM,
-        "Delay from a deadline to the wake of the loop.",
-        ENDS,
-        buckets=LATENESS_BUCKETS,
-    ),
-    counter("cloudrc_loop_busy_seconds_total", "Time spent handling deadlines.", ENDS),
-    counter(
-        "cloudrc_words_dropped_total",
-        "Teleop messages dropped because they were for another session or no request number was"
-        " left.",
+    (
         (CLOUD,),
+        """
+        cloudrc_rtt_seconds: Round trip of applied commands, without the hold time in world; one
+            sample per echo.
+        cloudrc_loop_delay_seconds: Time from a command's stamp to its echo, with the hold time in
+            world: the paper's tau.
+        cloudrc_delay_estimate_seconds: Delay estimate, clamped: the horizon over which the newest
+            odometry is predicted.
+        cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry
+            to the application of the command, for the newest echoed command.
+        cloudrc_prediction_error_meters: Newest prediction error: predicted minus measured
+            position at the same instant.
+        cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction
+            errors.
+        cloudrc_predictions_judged_total: Predictions compared with a measurement.
+        cloudrc_tracking_error_meters: Setpoint minus measured position, in the newest period.
+        cloudrc_setpoint_meters: Position setpoint, world frame.
+        cloudrc_pid_output: Terms of the controller's output [m/s], in the newest period.
+        cloudrc_command_velocity_meters_per_second: Commanded velocity, world frame.
+        cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
+        cloudrc_horizon_clamped_total: Delay estimates above 1 s or below 0, which were clamped.
+        cloudrc_commands_frozen_total: Zero-velocity commands sent because no echo arrives.
+        cloudrc_plugin_failures_total: Plug-in calls that raised an exception or returned a value
+            that is not finite.
+        """,
     ),
-    counter(
-        "cloudrc_loop_missed_periods_total",
-        "Commands that a late loop skipped.",
+    (
+        (WORLD,),
+        f"""
+        cloudrc_position_meters: True position of the base, world frame.
+        cloudrc_tip_force_newtons: Force on the touch sensor at the arm's tip.
+        cloudrc_command_age_seconds: Age of the current command, sampled every period in TRACK:
+            time since the odometry that it was computed from, on world's clock, as the guard sees
+            it.
+        cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
+        cloudrc_guard_transitions_total: Changes of the guard's state, by new state.
+        cloudrc_guard_limited_total: Commands that a limit of the guard changed; for the fence,
+            ticks instead of commands.
+        cloudrc_guard_held_seconds_total: Time in HOLD during missions; updated once a second.
+        cloudrc_guard_starts_refused_total: Mission starts refused: in LAND or ESTOP.
+        cloudrc_contacts_total: Times that the robot came into contact with a body of the scene,
+            by kind of body.
+        cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below
+            0.95 a run is invalid.
+        cloudrc_world_slip_seconds_total: Time by which world's clock has fallen behind the
+            machine's clock.
+        cloudrc_world_stalls_total: Wakes so late that the datagrams waiting in the socket were
+            stale.
+        """,
+    ),
+    (
+        ENDS,
+        """
+        cloudrc_loop_period_seconds: Time between two handled deadlines.
+        cloudrc_loop_lateness_seconds: Delay from a deadline to the wake of the loop.
+        cloudrc_loop_busy_seconds_total: Time spent handling deadlines.
+        """,
+    ),
+    (
         (CLOUD,),
+        """
+        cloudrc_words_dropped_total: Teleop messages dropped because they were for another session
+            or no request number was left.
+        cloudrc_loop_missed_periods_total: Commands that a late loop skipped.
+        """,
     ),
-    counter(
-        "cloudrc_recorder_dropped_records_total",
-        "Records that did not reach the recording.",
+    (
         ENDS,
+        """
+        cloudrc_recorder_dropped_records_total: Records that did not reach the recording.
+        cloudrc_recorder_sync_age_seconds: Time since the start of the newest completed sync of
+            the recording: the part that a power cut would lose; absent without a recording,
+            rising forever after recording failed.
+        cloudrc_clock_steps_total: Times that the wall clock was set, each recorded as a fault
+            with its size; flight does not depend on the wall clock.
+        """,
     ),
-    gauge(
-        "cloudrc_recorder_sync_age_seconds",
-        "Time since the start of the newest completed sync of the recording: the part that a power"
-        " cut would lose; absent without a recording, rising forever after recording failed.",
-        ENDS,
+    (
+        MISSION,
+        f"""
+        cloudrc_mission_state: State of the mission: {numbered(MISSION_STATES)}.
+        cloudrc_mission_waypoint: Index of the next waypoint; -1 if none.
+        cloudrc_waypoints_reached_total: Waypoints reached.
+        cloudrc_missions_total: Missions ended, by outcome.
+        """,
     ),
-    counter(
-        "cloudrc_clock_steps_total",
-        "Times that the wall clock was set, each recorded as a fault with its size; flight does not"
-        " depend on the wall clock.",
-        ENDS,
+    (
+        (TELEOP,),
+        """
+        cloudrc_api_requests_total: Requests that the API has served.
+        cloudrc_api_rejected_total: Requests that the API rejected, by reason.
+        cloudrc_missions_refused_total: Mission orders that the API refused: invalid, or in
+            conflict with another mission.
+        cloudrc_stream_dropped_events_total: Events that slow readers of the event stream missed.
+        cloudrc_audit_dropped_total: Lines of the audit log that the disk refused.
+        cloudrc_journal_repaired_total: Times that a damaged journal was set aside and a new one
+            begun.
+        """,
     ),
-    *MISSIONS,
-    *LINKS,
+    (
+        (LINK,),
+        """
+        cloudrc_link_info: Always 1; the labels say what shapes a direction of the link, and the
+            configured mode.
+        cloudrc_link_delay_seconds: Mean one-way delay that the current link profile sets.
+        cloudrc_link_step_lateness_seconds: Lateness of the last 10,000 changes of netem's qdisc
+            on the profile's time line; absent without changes.
+        cloudrc_link_datagrams_total: Datagrams at the shaper, by outcome.
+        cloudrc_link_restored_total: Times that another program removed or changed netem's qdisc.
+        cloudrc_link_release_error_seconds: Lateness of datagrams that left the relay in the last
+            10 s; absent with netem.
+        cloudrc_link_released_early_total: Datagrams that left the relay before they were due;
+            above 0 the relay has a bug; absent with netem.
+        cloudrc_dns_errors_total: Failed look-ups of the peer's name; the last known address stays
+            in use.
+        """,
+    ),
 )
+"""Exposing processes, and the names and meanings of the metrics that they expose."""
 
-METRICS: Mapping[str, Metric] = MappingProxyType({metric.name: metric for metric in _ENTRIES})
+_BY_DIRECTION: Mapping[str, Labels] = {"direction": DIRECTIONS}
+_BY_AXIS: Mapping[str, Labels] = {"axis": AXES}
+_LABELS: Mapping[str, Mapping[str, Labels]] = {
+    "cloudrc_build_info": {"version": (), "role": ROLES, "config": ()},
+    "cloudrc_datagrams_total": {"direction": DIRECTIONS, "outcome": OUTCOMES},
+    "cloudrc_datagrams_expected_total": _BY_DIRECTION,
+    "cloudrc_datagrams_lost_total": _BY_DIRECTION,
+    "cloudrc_datagrams_reordered_total": _BY_DIRECTION,
+    "cloudrc_link_believed": _BY_DIRECTION,
+    "cloudrc_prediction_error_meters": _BY_AXIS,
+    "cloudrc_tracking_error_meters": _BY_AXIS,
+    "cloudrc_setpoint_meters": _BY_AXIS,
+    "cloudrc_pid_output": {"axis": AXES, "term": TERMS},
+    "cloudrc_command_velocity_meters_per_second": _BY_AXIS,
+    "cloudrc_plugin_failures_total": {"plugin": PLUGINS},
+    "cloudrc_position_meters": _BY_AXIS,
+    "cloudrc_guard_transitions_total": {"state": GUARD_STATES},
+    "cloudrc_guard_limited_total": {"limit": LIMITS},
+    "cloudrc_contacts_total": {"body": BODIES},
+    "cloudrc_missions_total": {"outcome": MISSION_OUTCOMES},
+    "cloudrc_api_rejected_total": {"reason": API_REFUSALS},
+    "cloudrc_missions_refused_total": {"reason": ORDER_REFUSALS},
+    "cloudrc_link_info": {"shaper": SHAPERS, "direction": DIRECTIONS, "mode": LINK_MODES},
+    "cloudrc_link_delay_seconds": _BY_DIRECTION,
+    "cloudrc_link_step_lateness_seconds": {"percentile": tuple(STEP_PERCENTILES)},
+    "cloudrc_link_datagrams_total": {"outcome": LINK_OUTCOMES},
+    "cloudrc_link_release_error_seconds": {"percentile": tuple(RELEASE_PERCENTILES)},
+}
+"""Name of a metric -> label -> all values of the label; () if the set is open."""
+_BUCKETS: Mapping[str, tuple[float, ...]] = {
+    "cloudrc_link_gap_seconds": GAP_BUCKETS,
+    "cloudrc_uplink_delay_seconds": DELAY_BUCKETS,
+    "cloudrc_downlink_delay_seconds": DELAY_BUCKETS,
+    "cloudrc_age_of_information_seconds": DELAY_BUCKETS,
+    "cloudrc_rtt_seconds": DELAY_BUCKETS,
+    "cloudrc_loop_delay_seconds": DELAY_BUCKETS,
+    "cloudrc_command_age_seconds": DELAY_BUCKETS,
+    "cloudrc_loop_period_seconds": PERIOD_BUCKETS,
+    "cloudrc_loop_lateness_seconds": LATENESS_BUCKETS,
+}
+"""Name of a histogram -> upper bounds of its buckets."""
+
+
+def _metrics() -> Iterator[Metric]:
+    for roles, text in _MEANINGS:
+        for block in re.split(r"\n(?=cloudrc_)", dedent(text).strip()):
+            name, _, meaning = block.partition(": ")
+            kind = Kind.COUNTER if name.endswith("_total") else Kind.GAUGE
+            buckets = _BUCKETS.get(name, ())
+            yield Metric(
+                name,
+                Kind.HISTOGRAM if buckets else kind,
+                " ".join(meaning.split()),
+                roles,
+                _LABELS.get(name, {}),
+                buckets,
+            )
+
+
+METRICS: Mapping[str, Metric] = MappingProxyType({metric.name: metric for metric in _metrics()})
 """All metrics by name."""
 
 
 def of_role(role: str) -> list[Metric]:
     """List the metrics that processes of a role expose."""
-    return [metric for metric in _ENTRIES if role in metric.roles]
+    return [metric for metric in METRICS.values() if role in metric.roles]

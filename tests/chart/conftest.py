@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ CI_VALUES = sorted((CHART / "ci").glob("*-values.yaml"))
 EXAMPLES = sorted((CHART / "examples").glob("values-*.yaml"))
 
 Object = dict[str, Any]
+SCHEMA = json.loads((CHART / "values.schema.json").read_text())
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 Lookup = Callable[[str, str, str, str], Any]
 
@@ -31,25 +32,21 @@ class Files:
     """Helm's `.Files`."""
 
     def Get(self, name: str) -> str:  # noqa: N802
-        path = CHART / name
-        return path.read_text() if path.is_file() else ""
+        return self.Glob(name).get(name, "")
 
     def Glob(self, pattern: str) -> dict[str, str]:  # noqa: N802
-        found = sorted(CHART.glob(pattern))
+        found = (path for path in sorted(CHART.glob(pattern)) if path.is_file())
         return {path.relative_to(CHART).as_posix(): path.read_text() for path in found}
 
 
-class Versions:
+class Versions(set[str]):
     """Helm's `.Capabilities.APIVersions`."""
 
-    def __init__(self, known: Iterable[str]) -> None:
-        self.known = set(known)
-
     def Has(self, version: str) -> bool:  # noqa: N802
-        return version in self.known
+        return version in self
 
 
-def nothing(version: str, kind: str, namespace: str, name: str) -> Object:
+def nothing(*words: str) -> Object:
     """Answer `lookup` as without a cluster (`helm template`)."""
     return {}
 
@@ -84,12 +81,7 @@ def laid_over(base: Any, values: Any) -> Any:
     return {k: v for k, v in {**base, **merged}.items() if v is not None}
 
 
-@cache
-def sources() -> Mapping[str, str]:
-    paths = (path for path in (CHART / "templates").rglob("*") if path.is_file())
-    return {path.relative_to(CHART).as_posix(): path.read_text() for path in sorted(paths)}
-
-
+SOURCES = Files().Glob("templates/**/*")
 cluster: list[Lookup] = []
 """The function that answers `lookup`, last in the list; templates are compiled only once."""
 
@@ -99,12 +91,7 @@ def engine() -> Any:
     def lookup(version: str, kind: str, namespace: str, name: str) -> Any:
         return cluster[-1](version, kind, namespace, name)
 
-    return gotpl_helm.HelmTemplateEngine(sources(), lookup=lookup)
-
-
-@cache
-def schema() -> Any:
-    return json.loads((CHART / "values.schema.json").read_text())
+    return gotpl_helm.HelmTemplateEngine(SOURCES, lookup=lookup)
 
 
 def render_texts(
@@ -119,7 +106,7 @@ def render_texts(
     import jsonschema
 
     merged = laid_over(values_of(CHART / "values.yaml"), values or {})
-    jsonschema.Draft7Validator(schema()).validate(merged)
+    jsonschema.Draft7Validator(SCHEMA).validate(merged)
     context = {
         "Values": copy.deepcopy(merged),
         "Release": {"Name": release, "Namespace": namespace, "Service": "Helm", "IsInstall": True},
@@ -127,7 +114,7 @@ def render_texts(
         "Capabilities": {"APIVersions": Versions(apis)},
         "Files": Files(),
     }
-    wanted = [name for name in sources() if not name.endswith(".tpl")]
+    wanted = [name for name in SOURCES if not name.endswith(".tpl")]
     cluster.append(lookup)
     try:
         return dict(engine().render(dict.fromkeys(wanted, context)))

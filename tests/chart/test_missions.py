@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -24,7 +25,7 @@ def jobs(values: Object | None = None) -> list[Object]:
     return list(of_kind(render(values), "Job").values())
 
 
-def plan(values: Object, folder: Path) -> object:
+def plan(values: Object, folder: Path) -> Any:
     """Load the mission from the ConfigMap that the Job mounts."""
     objects = render(values)
     (job,) = of_kind(objects, "Job").values()
@@ -36,16 +37,9 @@ def plan(values: Object, folder: Path) -> object:
     return load_mission(folder / "mission.yaml")
 
 
-each_job = pytest.mark.parametrize(
+@pytest.mark.parametrize(
     "job", [*jobs(ENABLED), *(job for _, job in EXAMPLES.values())], ids=["chart", *EXAMPLES]
 )
-
-
-def test_no_mission_flies_by_default() -> None:
-    assert jobs() == []
-
-
-@each_job
 def test_a_job_flies_once_and_has_time_limits(job: Object) -> None:
     spec = job["spec"]
     assert spec["backoffLimit"] == 0
@@ -56,11 +50,6 @@ def test_a_job_flies_once_and_has_time_limits(job: Object) -> None:
     (container,) = pod["containers"]
     assert container["terminationMessagePolicy"] == "FallbackToLogsOnError"
     assert container["args"][:2] == ["mission", "fly"]
-
-
-@each_job
-def test_the_jobs_uid_is_the_key(job: Object) -> None:
-    (container,) = job["spec"]["template"]["spec"]["containers"]
     (variable,) = container["env"]
     field = variable["valueFrom"]["fieldRef"]["fieldPath"]
     assert field == "metadata.labels['batch.kubernetes.io/controller-uid']"
@@ -68,11 +57,14 @@ def test_the_jobs_uid_is_the_key(job: Object) -> None:
 
 
 def test_a_job_calls_the_releases_api() -> None:
-    objects = render({**ENABLED, "teleop": {"service": {"port": 80}}})
+    assert jobs() == [], "no mission flies by default"
+    values = {"mission": {"enabled": True, "queue": True}, "teleop": {"service": {"port": 80}}}
+    objects = render(values)
     (container,) = pod_specs(objects)["mission"]["containers"]
     service = of_kind(objects, "Service")["api"]
     assert service["spec"]["publishNotReadyAddresses"] is True
     assert f"--api=http://{service['metadata']['name']}:80" in container["args"]
+    assert "--queue" in container["args"]
 
 
 @pytest.mark.parametrize(
@@ -88,34 +80,18 @@ def test_the_plan_defaults_to_the_experiments_mission(
 ) -> None:
     values = {**values, "mission": {**values.get("mission", {}), "enabled": True}}
     assert plan(values, tmp_path) == load_mission(name)
-
-
-def test_a_plan_may_be_a_mission(tmp_path: Path) -> None:
     point = {"position_m": [0.0, 0.0, 1.0], "dwell_s": 2.0}
-    values = {"mission": {"enabled": True, "plan": {"start": "here", "waypoints": [point]}}}
-    mission = plan(values, tmp_path)
-    assert mission.start == "here"  # type: ignore[attr-defined]
+    own = {"mission": {"enabled": True, "plan": {"start": "here", "waypoints": [point]}}}
+    assert plan(own, tmp_path).start == "here"
 
 
 def test_only_another_mission_makes_another_job() -> None:
     """A Job is immutable: with the same name, an upgrade with a new plan would fail."""
-    names = [
-        job["metadata"]["name"]
-        for values in (
-            ENABLED,
-            ENABLED,
-            {"mission": {"enabled": True, "plan": "hover"}},
-            {**ENABLED, "image": {"tag": "9"}},
-        )
-        for job in jobs(values)
-    ]
+    other = {"mission": {"enabled": True, "plan": "hover"}}
+    given = (ENABLED, ENABLED, other, {**ENABLED, "image": {"tag": "9"}})
+    names = [job["metadata"]["name"] for values in given for job in jobs(values)]
     assert names[0] == names[1]
     assert len(set(names)) == 3
-
-
-def test_queueing_is_a_flag() -> None:
-    (job,) = jobs({"mission": {"enabled": True, "queue": True}})
-    assert "--queue" in job["spec"]["template"]["spec"]["containers"][0]["args"]
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -134,66 +110,26 @@ def test_an_example_fits_the_release_of_the_readme(name: str, tmp_path: Path) ->
     (tmp_path / "mission.yaml").write_text(config["data"]["mission.yaml"])
     mission = load_mission(tmp_path / "mission.yaml")
     assert check_mission(mission, load_scene("pipes")) == []
-    assert len(mission.waypoints) == {"mission-job": 3, "mission-paper": 7}[name]
+    if name == "mission-paper":
+        assert mission.waypoints == load_mission("pipes").waypoints
 
 
-def test_the_papers_mission_equals_the_shipped_one(tmp_path: Path) -> None:
-    (tmp_path / "mission.yaml").write_text(EXAMPLES["mission-paper"][0]["data"]["mission.yaml"])
-    assert load_mission(tmp_path / "mission.yaml").waypoints == load_mission("pipes").waypoints
-
-
-def test_the_chart_makes_the_same_job_as_mission_run() -> None:
-    """The Job of `cloudrc mission run` differs only in names and times."""
-    from cloudrc.cluster import jobs as manifest
-    from cloudrc.cluster.client import Release
-
-    follower = manifest.JobSettings(
-        "cloudrc/cloud:0.1.0",
-        "IfNotPresent",
-        (),
-        "http://demo-cloudrc-api:8080",
-        "demo-cloudrc-tokens",
-    )
-    made = manifest.job(Release(None, "lab", "demo"), "m", follower, limit=60.0, queue=False)
+def test_the_chart_makes_the_same_job_as_the_example() -> None:
+    """`cloudrc mission run` fills in the example."""
     (job,) = jobs(ENABLED)
-    theirs, ours = (j["spec"]["template"] for j in (made, job))
-    same = ("app.kubernetes.io/name", "app.kubernetes.io/instance", "app.kubernetes.io/component")
-    assert [theirs["metadata"]["labels"][k] for k in same] == [
-        ours["metadata"]["labels"][k] for k in same
-    ]
+    theirs, ours = (each["spec"]["template"] for each in (EXAMPLES["mission-job"][1], job))
+    same = {"app.kubernetes.io/name", "app.kubernetes.io/component"}
+    assert all(theirs["metadata"]["labels"][k] == ours["metadata"]["labels"][k] for k in same)
+    assert theirs["spec"]["securityContext"] == ours["spec"]["securityContext"]
     (theirs,), (ours,) = (template["spec"]["containers"] for template in (theirs, ours))
-    assert theirs["env"] == ours["env"]
-    assert theirs["securityContext"] == ours["securityContext"]
-    assert theirs["volumeMounts"] == ours["volumeMounts"]
-    assert theirs["resources"] == ours["resources"]
-
-
-def test_helm_test_flies_and_leaves_nothing() -> None:
-    pod = of_kind(render(), "Pod")["test"]
-    annotations = pod["metadata"]["annotations"]
-    assert annotations["helm.sh/hook"] == "test"
-    policy = annotations["helm.sh/hook-delete-policy"].split(",")
-    assert {"before-hook-creation", "hook-succeeded"} == set(policy)
-    (container,) = pod["spec"]["containers"]
-    assert container["args"][:2] == ["mission", "fly"]
-    assert pod["spec"]["activeDeadlineSeconds"] <= 180
-
-
-def test_the_test_mission_can_be_flown_in_seconds(tmp_path: Path) -> None:
-    text = of_kind(render(), "ConfigMap")["test"]["data"]["mission.yaml"]
-    (tmp_path / "mission.yaml").write_text(text)
-    mission = load_mission(tmp_path / "mission.yaml")
-    assert check_mission(mission, load_scene("pipes")) == []
-    assert len(mission.waypoints) == 1
-    assert mission.waypoints[0].dwell_s <= 2
+    for key in ("securityContext", "volumeMounts", "resources"):
+        assert theirs[key] == ours[key]
 
 
 def test_the_services_do_not_select_mission_pods() -> None:
     objects = render(ENABLED)
+    templates = [job["spec"]["template"] for job in jobs(ENABLED)]
     for service in of_kind(objects, "Service").values():
-        for template in [
-            *(j["spec"]["template"] for j in jobs(ENABLED)),
-            of_kind(objects, "Pod")["test"],
-        ]:
+        for template in [*templates, of_kind(objects, "Pod")["test"]]:
             assert not service["spec"]["selector"].items() <= template["metadata"]["labels"].items()
     assert containers(pod_specs(objects)["mission"]).keys() == {"mission"}

@@ -9,6 +9,7 @@ from tests.chart.conftest import Object, containers, of_kind, pod_specs, render
 TUNNEL, DNS, API = {("UDP", 7400)}, {("UDP", 53), ("TCP", 53)}, {("TCP", 8080)}
 LINK_TEST = {("TCP", 9100), ("TCP", 9102)}
 PROMETHEUS = {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "monitoring"}}}
+KUBE_SYSTEM = {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "kube-system"}}}
 
 
 def policies(values: Object | None = None) -> dict[str, Object]:
@@ -19,63 +20,46 @@ def ports(rule: Object) -> set[tuple[str, int]]:
     return {(port["protocol"], port["port"]) for port in rule["ports"]}
 
 
-def peers(rule: Object) -> list[str]:
-    """Return the peers of a rule: components of this release by name, others unchanged."""
-    found = rule.get("from") or rule.get("to")
-    assert found, "a rule without peers admits everybody"
-    return sorted(map(_peer, found))
-
-
-def _peer(peer: Any) -> str:
+def peer_name(peer: Any) -> str:
+    """Return a component of this release by name, any other peer unchanged."""
     labels = peer.get("podSelector", {}).get("matchLabels", {})
     if labels.get("app.kubernetes.io/instance") == "demo" and len(peer) == 1:
         return str(labels["app.kubernetes.io/component"])
     return str(peer)
 
 
-def said(spec: Object, way: str) -> list[tuple[list[str], set[tuple[str, int]]]]:
-    return [(peers(rule), ports(rule)) for rule in spec.get(way, [])]
+def allowed(spec: Object, way: str) -> list[tuple[list[str], set[tuple[str, int]]]]:
+    rules = spec.get(way, [])
+    peers = [rule.get("from") or rule.get("to") for rule in rules]
+    assert all(peers), "a rule without peers admits everybody"
+    return [
+        (sorted(map(peer_name, found)), ports(rule))
+        for found, rule in zip(peers, rules, strict=True)
+    ]
 
 
-def test_every_pod_has_ingress_and_egress_policies() -> None:
+def test_traffic_is_tunnel_dns_and_api_only() -> None:
+    test, names = (["test"], LINK_TEST), ([str(KUBE_SYSTEM)], DNS)
+    wanted = {
+        "world": ([(["cloud"], TUNNEL), test], [(["cloud"], TUNNEL), names]),
+        "cloud": (
+            [(["world"], TUNNEL), (["mission", "test"], API), test],
+            [(["world"], TUNNEL), names],
+        ),
+        "mission": ([], [(["cloud"], API), names]),
+        "test": ([], [(["cloud"], API), (["cloud", "world"], LINK_TEST), names]),
+    }
     found = policies()
-    assert found.keys() == {"world", "cloud", "mission", "test"}
+    assert {n: (allowed(s, "ingress"), allowed(s, "egress")) for n, s in found.items()} == wanted
     for name, spec in found.items():
         assert spec["policyTypes"] == ["Ingress", "Egress"]
         labels = spec["podSelector"]["matchLabels"]
         assert labels["app.kubernetes.io/component"] == name
         assert labels["app.kubernetes.io/instance"] == "demo"
+    assert policies({"networkPolicy": {"enabled": False}}) == {}
 
 
-def test_ingress_is_tunnel_and_api_only() -> None:
-    found = policies()
-    test = (["test"], LINK_TEST)
-    assert said(found["world"], "ingress") == [(["cloud"], TUNNEL), test]
-    assert said(found["cloud"], "ingress") == [
-        (["world"], TUNNEL),
-        (["mission", "test"], API),
-        test,
-    ]
-    assert said(found["mission"], "ingress") == said(found["test"], "ingress") == []
-
-
-def test_egress_is_tunnel_dns_and_api_only() -> None:
-    found = policies()
-    kube_system = str(
-        {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "kube-system"}}}
-    )
-    names = ([kube_system], DNS)
-    assert said(found["world"], "egress") == [(["cloud"], TUNNEL), names]
-    assert said(found["cloud"], "egress") == [(["world"], TUNNEL), names]
-    assert said(found["mission"], "egress") == [(["cloud"], API), names]
-    assert said(found["test"], "egress") == [
-        (["cloud"], API),
-        (["cloud", "world"], LINK_TEST),
-        names,
-    ]
-
-
-def test_allowed_peers_may_scrape_all_metrics_ports() -> None:
+def test_allowed_peers_may_scrape_and_call_the_api() -> None:
     found = policies({"metrics": {"allowFrom": [PROMETHEUS]}})
     for end in ("world", "cloud"):
         rule = found[end]["ingress"][-1]
@@ -87,16 +71,9 @@ def test_allowed_peers_may_scrape_all_metrics_ports() -> None:
             if port["name"].endswith("metrics")
         }
         assert ports(rule) == {("TCP", port) for port in served}
-
-
-def test_allowed_peers_may_call_the_api() -> None:
     found = policies({"teleop": {"allowFrom": [PROMETHEUS]}})
     assert PROMETHEUS in found["cloud"]["ingress"][1]["from"]
     assert all(PROMETHEUS not in rule["from"] for rule in found["world"]["ingress"])
-
-
-def test_policies_can_be_disabled() -> None:
-    assert policies({"networkPolicy": {"enabled": False}}) == {}
 
 
 def test_everything_listens_at_both_address_families() -> None:
@@ -107,9 +84,7 @@ def test_everything_listens_at_both_address_families() -> None:
             listens = [word for word in part["args"] if word.startswith(flags)]
             assert listens
             assert all("=[::]:" in word or "=127.0.0.1:" in word for word in listens)
-    policies = [
-        thing["spec"].get("ipFamilyPolicy") for thing in of_kind(objects, "Service").values()
-    ]
-    assert policies == ["PreferDualStack"] * 3
+    services = of_kind(objects, "Service").values()
+    assert [thing["spec"]["ipFamilyPolicy"] for thing in services] == ["PreferDualStack"] * 3
     for thing in of_kind(render({"ipFamilyPolicy": None}), "Service").values():
         assert "ipFamilyPolicy" not in thing["spec"]

@@ -1,37 +1,34 @@
-"""Names, labels, selectors, images and arguments fit together."""
+"""Names, labels, selectors, images, arguments and notes fit together."""
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
+import shlex
 
 import pytest
 
 import cloudrc
+from cloudrc.cli.parser import build_parser
 from tests.chart.conftest import (
     CHART,
-    CI_VALUES,
     METADATA,
+    Object,
+    component,
     containers,
+    notes,
     of_kind,
     pod_specs,
     render,
     values_of,
 )
 
-LABELS = {f"app.kubernetes.io/{key}" for key in (
-    "name", "instance", "version", "component", "part-of", "managed-by",
-)} | {"helm.sh/chart"}  # fmt: skip
-SELECTORS = {f"app.kubernetes.io/{key}" for key in ("name", "instance", "component")}
+KEYS = ("name", "instance", "component", "version", "part-of", "managed-by")
+LABELS = {f"app.kubernetes.io/{key}" for key in KEYS} | {"helm.sh/chart"}
+SELECTORS = {f"app.kubernetes.io/{key}" for key in KEYS[:3]}
 
 
-def test_the_chart_has_the_version_of_the_package() -> None:
+def test_objects_have_the_labels_that_selectors_need() -> None:
     assert METADATA["version"] == METADATA["appVersion"] == cloudrc.__version__
-
-
-@pytest.mark.parametrize("path", CI_VALUES, ids=lambda path: path.stem)
-def test_objects_have_the_labels_that_selectors_need(path: Path) -> None:
-    objects = render(values_of(path))
+    objects = render(values_of(CHART / "ci" / "everything-values.yaml"))
     for thing in objects:
         assert thing["metadata"]["labels"].keys() >= LABELS, thing["metadata"]["name"]
     pods = [
@@ -39,18 +36,14 @@ def test_objects_have_the_labels_that_selectors_need(path: Path) -> None:
         for thing in objects
         if thing["kind"] == "Deployment"
     ]
+    for labels in pods:  # a new version of the chart alone restarts no pod
+        assert not labels.keys() & {"helm.sh/chart", "app.kubernetes.io/version"}
     for thing in objects:
-        spec = thing.get("spec", {})
         if thing["kind"] in ("Service", "Deployment"):
-            selector = spec["selector"].get("matchLabels", spec["selector"])
+            selector = thing["spec"]["selector"]
+            selector = selector.get("matchLabels", selector)
             assert selector.keys() == SELECTORS
             assert sum(selector.items() <= labels.items() for labels in pods) == 1
-
-
-def test_a_new_chart_version_alone_restarts_no_pod() -> None:
-    for thing in of_kind(render(), "Deployment").values():
-        labels = thing["spec"]["template"]["metadata"]["labels"]
-        assert not labels.keys() & {"helm.sh/chart", "app.kubernetes.io/version"}
 
 
 @pytest.mark.parametrize(
@@ -60,6 +53,7 @@ def test_a_new_chart_version_alone_restarts_no_pod() -> None:
         ("cloudrc", {}, "cloudrc-world"),
         ("my-cloudrc", {}, "my-cloudrc-world"),
         ("demo", {"fullnameOverride": "robot"}, "robot-world"),
+        ("1rel", {"fullnameOverride": "robot"}, "robot-world"),
         ("d" * 53, {}, "d" * 46 + "-world"),
     ],
 )
@@ -73,58 +67,49 @@ def test_names_follow_release_and_override(release: str, values: dict[str, str],
 def test_an_invalid_name_is_refused(release: str) -> None:
     with pytest.raises(Exception, match=f"the name '{release}-cloudrc' .* set fullnameOverride"):
         render(release=release)
-    assert render({"fullnameOverride": "robot"}, release=release)
 
 
-def test_annotations_of_the_user_override_the_charts() -> None:
-    mine = {"prometheus.io/scrape": "false", "example.org/owner": "me"}
-    pods = of_kind(render({"cloud": {"podAnnotations": mine}}), "Deployment")
-    found = pods["cloud"]["spec"]["template"]["metadata"]["annotations"]
-    assert mine.items() <= found.items()
-    assert found["prometheus.io/port"] == "9100"
-
-
-def test_missions_have_the_placement_of_cloud() -> None:
+def test_annotations_and_placement_of_the_user_are_used() -> None:
     where = {
         "nodeSelector": {"disk": "fast"},
         "tolerations": [{"key": "lab", "operator": "Exists"}],
         "affinity": {"nodeAffinity": {}},
     }
-    pods = pod_specs(render({"cloud": where, "mission": {"enabled": True}}))
+    mine = {"prometheus.io/scrape": "false", "example.org/owner": "me"}
+    inject = {"sidecar.istio.io/inject": "false"}
+    mission = {"enabled": True, "podAnnotations": inject}
+    objects = render({"cloud": {**where, "podAnnotations": mine}, "mission": mission})
+    pods = pod_specs(objects)
     for name in ("cloud", "mission", "test", "test-link"):
         assert where.items() <= pods[name].items()
     assert not where.keys() & pods["world"].keys()
-
-
-def images(values: dict[str, object]) -> dict[str, str]:
-    pods = pod_specs(render({"image": values}))
-    return {
-        name: container["image"]
-        for pod in pods.values()
-        for name, container in containers(pod).items()
-    }
-
-
-def test_the_image_is_the_one_from_make_images() -> None:
-    assert images({})["world"] == f"cloudrc/world:{cloudrc.__version__}"
-    for name in ("teleop", "test", "test-link"):
-        assert images({})[name] == f"cloudrc/cloud:{cloudrc.__version__}"
-    assert {
-        c["imagePullPolicy"] for p in pod_specs(render()).values() for c in containers(p).values()
-    } == {"IfNotPresent"}
-
-
-def test_a_digest_overrides_the_tag_and_a_tag_the_version() -> None:
-    digest = "sha256:" + "0" * 64
-    found = images({"registry": "ghcr.io/me", "tag": "9.9.9", "world": {"digest": digest}})
-    assert found["world"] == f"ghcr.io/me/cloudrc/world@{digest}"
-    assert found["cloud"] == "ghcr.io/me/cloudrc/cloud:9.9.9"
+    cloud = of_kind(objects, "Deployment")["cloud"]["spec"]["template"]["metadata"]["annotations"]
+    assert mine.items() <= cloud.items()
+    assert cloud["prometheus.io/port"] == "9100"
+    (job,) = of_kind(objects, "Job").values()
+    assert job["spec"]["template"]["metadata"]["annotations"] == inject
+    for pod in of_kind(objects, "Pod").values():
+        assert pod["metadata"]["annotations"].items() > inject.items()
 
 
 def test_each_pod_has_one_image() -> None:
     """A node pulls one image per pod, because the link uses that of its pod."""
-    for pod in pod_specs(render()).values():
-        assert len({container["image"] for container in containers(pod).values()}) == 1
+
+    def images(values: dict[str, object]) -> dict[str, str]:
+        found = {}
+        for name, pod in pod_specs(render({"image": values})).items():
+            (found[name],) = {container["image"] for container in containers(pod).values()}
+            policies = {container["imagePullPolicy"] for container in containers(pod).values()}
+            assert policies == {"IfNotPresent"}
+        return found
+
+    cloud = f"cloudrc/cloud:{cloudrc.__version__}"
+    world = f"cloudrc/world:{cloudrc.__version__}"
+    assert images({}) == {"world": world, "cloud": cloud, "test": cloud, "test-link": cloud}
+    digest = "sha256:" + "0" * 64
+    found = images({"registry": "ghcr.io/me", "tag": "9.9.9", "world": {"digest": digest}})
+    assert found["world"] == f"ghcr.io/me/cloudrc/world@{digest}"
+    assert found["cloud"] == "ghcr.io/me/cloudrc/cloud:9.9.9"
 
 
 def test_the_tunnels_services_are_headless_and_early() -> None:
@@ -136,74 +121,57 @@ def test_the_tunnels_services_are_headless_and_early() -> None:
         assert [(port["port"], port["protocol"]) for port in spec["ports"]] == [(7400, "UDP")]
 
 
-def test_the_link_is_a_native_sidecar_for_its_pods_egress() -> None:
-    pods = pod_specs(render())
-    for end, direction, peer in (("world", "uplink", "cloud"), ("cloud", "downlink", "world")):
-        (link,) = pods[end]["initContainers"]
-        assert link["name"] == "link"
-        assert link["restartPolicy"] == "Always"
-        assert f"--direction={direction}" in link["args"]
-        assert f"--peer=demo-cloudrc-{peer}:7400" in link["args"]
-        assert "--end=127.0.0.1:7400" in link["args"]
-        (own,) = (c for c in pods[end]["containers"] if c["name"] == end)
-        assert "--route=/run/cloudrc/route" in set(link["args"]) & set(own["args"])
-
-
-def test_cloud_and_teleop_are_two_containers() -> None:
-    found = containers(pod_specs(render())["cloud"])
-    assert list(found) == ["link", "cloud", "teleop"]
-    loaded = {"cloud": {"backgroundLoad": {"enabled": True, "workers": 3}}}
-    load = containers(pod_specs(render(loaded))["cloud"])["load"]
-    assert "seq 3" in load["command"][-1]
-
-
 def test_the_link_set_role_may_change_one_configmap() -> None:
     """The experiment's ConfigMap has the guard's limits."""
     role = values_of(CHART / "examples" / "link-set-role.yaml")
-    changing = [rule for rule in role["rules"] if set(rule["verbs"]) - {"get", "list", "create"}]
-    assert changing == [
-        {
-            "apiGroups": [""],
-            "resources": ["configmaps"],
-            "resourceNames": ["cloudrc-link"],
-            "verbs": ["get", "patch"],
-        }
-    ]
+    (changing,) = (rule for rule in role["rules"] if set(rule["verbs"]) - {"get", "list", "create"})
+    assert changing["verbs"] == ["get", "patch"]
+    assert (changing["resources"], changing["resourceNames"]) == (["configmaps"], ["cloudrc-link"])
     assert "cloudrc-link" in of_kind(render(release="cloudrc"), "ConfigMap")
 
 
-def test_mounts_have_volumes_and_volumes_have_objects() -> None:
-    objects = render()
-    names = {(thing["kind"], thing["metadata"]["name"]) for thing in objects}
-    kinds = {"configMap": ("ConfigMap", "name"), "secret": ("Secret", "secretName"),
-             "persistentVolumeClaim": ("PersistentVolumeClaim", "claimName")}  # fmt: skip
-    for pod in pod_specs(objects).values():
-        volumes = {volume["name"]: volume for volume in pod.get("volumes", ())}
-        mounted = {m["name"] for c in containers(pod).values() for m in c.get("volumeMounts", ())}
-        assert mounted == volumes.keys()
-        for volume in volumes.values():
-            for key, (kind, field) in kinds.items():
-                if key in volume:
-                    assert (kind, volume[key][field]) in names
+def test_the_notes_are_three_commands_for_this_release() -> None:
+    text = notes(release="flight", namespace="lab-7")
+    wait, fly, logs = (shlex.split(line) for line in text.splitlines() if line.startswith("  "))
+    for words in (wait, fly, logs):
+        assert words[words.index("--namespace") + 1] == "lab-7"
+    deployments = of_kind(render(release="flight"), "Deployment")
+    key, value = wait[wait.index("--selector") + 1].split("=")
+    selected = [component(t) for t in deployments.values() if t["metadata"]["labels"][key] == value]
+    assert sorted(selected) == ["cloud", "world"]
+    options = build_parser([fly[1]]).parse_args(fly[1:])
+    assert (fly[0], options.namespace, options.release) == ("cloudrc", "lab-7", "flight")
+    name = next(w.partition("/")[2] for w in logs if w.startswith("deployment/"))
+    (thing,) = (t for t in deployments.values() if t["metadata"]["name"] == name)
+    links = [c["name"] for c in thing["spec"]["template"]["spec"]["initContainers"]]
+    assert logs[logs.index("--container") + 1] in links
 
 
-def test_no_mount_has_a_sub_path() -> None:
-    """A mount with a subPath never gets a changed ConfigMap."""
-    for pod in pod_specs(render()).values():
-        for container in containers(pod).values():
-            assert not any("subPath" in mount for mount in container.get("volumeMounts", ()))
+SATELLITE = {"profile": "satellite"}
+SLOW = "experiment.guard.command_age_max_ms=800"
+CLOSED = "No Prometheus may scrape"
 
 
-def test_containers_use_valid_arguments() -> None:
-    """The parser of the command line accepts every container's arguments."""
-    from cloudrc.cli.parser import build_parser
-
-    pods = pod_specs(render({"mission": {"enabled": True, "queue": True}}))
-    parsed = 0
-    for pod in pods.values():
-        for container in containers(pod).values():
-            arguments = [re.sub(r"\$\((\w+)\)", r"\1", text) for text in container["args"]]
-            options = build_parser([arguments[0]]).parse_args(arguments)
-            assert callable(options.execute)
-            parsed += 1
-    assert parsed == 8
+@pytest.mark.parametrize(
+    ("values", "words", "warns"),
+    [
+        ({}, SLOW, False),
+        ({"link": SATELLITE}, SLOW, True),
+        (
+            {"link": SATELLITE, "experiment": {"guard": {"command_age_max_ms": 800}}},
+            SLOW,
+            False,
+        ),
+        ({"experiment": {"link": SATELLITE}}, SLOW, False),
+        ({}, CLOSED, True),
+        ({"metrics": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]}}, CLOSED, False),
+        (
+            {"networkPolicy": {"enabled": False}},
+            "WARNING: networkPolicy.enabled is false",
+            True,
+        ),
+    ],
+)
+def test_the_notes_warn_of_what_will_not_work(values: Object, words: str, warns: bool) -> None:
+    """The guard's limit is in the experiment, because a change of the link restarts nothing."""
+    assert (words in notes(values)) is warns

@@ -1,8 +1,4 @@
-"""A fake Kubernetes API server with objects in memory, a kubeconfig for it, and fake programs.
-
-kmock does not fit: it does not select by label, and its pytest plug-in needs another one that
-warns in every run.
-"""
+"""A fake Kubernetes API server with objects in memory, a fake teleop, and fake programs."""
 
 from __future__ import annotations
 
@@ -10,11 +6,9 @@ import base64
 import itertools
 import json
 import os
-import sys
 import threading
 import uuid
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -23,68 +17,50 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 import yaml
 
-from cloudrc.cluster import jobs, tools
-from cloudrc.cluster import release as deploy
+from cloudrc.cluster import client, flight, jobs
 from cloudrc.cluster.client import Release, connect
-from cloudrc.link.state import LinkState, from_text
+from cloudrc.cluster.jobs import UID_LABEL
 
 VERSION_KEYS = (
     "buildDate compiler gitCommit gitTreeState gitVersion goVersion major minor platform".split()
 )
 
 
-def _merge(target: dict[str, Any], patch: dict[str, Any]) -> None:
-    """Merge a patch into an object (RFC 7396)."""
-    for key, value in patch.items():
-        if isinstance(value, dict):
-            _merge(target.setdefault(key, {}), value)
-        elif value is None:
-            target.pop(key, None)
-        else:
-            target[key] = value
-
-
 class FakeApi:
-    """Objects by (plural, namespace, name); `refuse` maps a method and plural to an error."""
+    """Objects of a namespace by (plural, name); `refuse` maps a method and plural to an error."""
 
     def __init__(self) -> None:
-        self.objects: dict[tuple[str, str, str], dict[str, Any]] = {}
+        self.objects: dict[tuple[str, str], dict[str, Any]] = {}
         self.logs: dict[str, str] = {}
         self.refuse: dict[tuple[str, str], tuple[int, str]] = {}
         self.seen: list[str] = []
         self.version = {"major": "1", "minor": "33"}
         self.lock = threading.RLock()
         self._clock = itertools.count()
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
-        self._server.daemon_threads = True
-        threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()
-        self.url = f"http://127.0.0.1:{self._server.server_port}"
+        self.server = serve(lambda request, body: self.answer(request.command, request.path, body))
+        self.url = f"http://127.0.0.1:{self.server.server_port}"
 
     def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+        self.server.shutdown()
+        self.server.server_close()
 
-    def put(self, plural: str, namespace: str, body: dict[str, Any]) -> dict[str, Any]:
-        metadata = body.setdefault("metadata", {})
-        metadata.setdefault("namespace", namespace)
-        metadata.setdefault("uid", str(uuid.uuid4()))
-        metadata.setdefault("generation", 1)
+    def put(self, plural: str, body: dict[str, Any]) -> dict[str, Any]:
         stamp = f"2026-01-01T00:00:{next(self._clock) % 60:02d}Z"
-        metadata.setdefault("creationTimestamp", stamp)
-        body.setdefault("status", {})
+        made = {"uid": str(uuid.uuid4()), "generation": 1, "creationTimestamp": stamp}
+        body = {"status": {}, **body, "metadata": {**made, **body["metadata"]}}
         with self.lock:
-            self.objects[plural, namespace, metadata["name"]] = body
+            self.objects[plural, body["metadata"]["name"]] = body
         return body
 
-    def get(self, plural: str, name: str, namespace: str = "demo") -> dict[str, Any]:
-        return self.objects[plural, namespace, name]
+    def get(self, plural: str, name: str) -> dict[str, Any]:
+        return self.objects[plural, name]
 
     def answer(self, method: str, path: str, body: Any) -> tuple[int, Any]:
         address = urlsplit(path)
         if address.path == "/version/":
             return 200, {**dict.fromkeys(VERSION_KEYS, ""), **self.version}
         parts = address.path.strip("/").split("/")
-        namespace, plural, *rest = parts[parts.index("namespaces") + 1 :]
+        _, plural, *rest = parts[parts.index("namespaces") + 1 :]
         name, subresource = (*rest, "", "")[:2]
         self.seen.append(f"{method} {plural}{'/' + name if name else ''}")
         if (method, plural) in self.refuse:
@@ -92,60 +68,83 @@ class FakeApi:
             return code, {"kind": "Status", "message": message, "code": code}
         with self.lock:
             if method == "POST":
-                return 201, self.put(plural, namespace, body)
+                return 201, self.put(plural, body)
             if not name:
                 selector = parse_qs(address.query).get("labelSelector", [""])[0]
-                return 200, {"items": self._select(plural, namespace, selector)}
-            if (plural, namespace, name) not in self.objects:
+                wanted = dict(term.split("=") for term in selector.split(",") if term)
+                found = [body for (kind, _), body in self.objects.items() if kind == plural]
+                labels = [body["metadata"].get("labels", {}).items() for body in found]
+                pairs = zip(found, labels, strict=True)
+                return 200, {"items": [body for body, own in pairs if wanted.items() <= own]}
+            if (plural, name) not in self.objects:
                 return 404, {"message": f'{plural} "{name}" not found', "code": 404}
             if subresource == "log":
                 return 200, self.logs.get(name, "")
-            if method == "PATCH":
-                _merge(self.objects[plural, namespace, name], body)
             if method == "DELETE":
-                return 200, self.objects.pop((plural, namespace, name))
-            return 200, self.objects[plural, namespace, name]
-
-    def _select(self, plural: str, namespace: str, selector: str) -> list[dict[str, Any]]:
-        wanted = dict(term.split("=") for term in selector.split(",") if term)
-        return [
-            body
-            for (kind, place, _), body in self.objects.items()
-            if (kind, place) == (plural, namespace)
-            and wanted.items() <= body["metadata"].get("labels", {}).items()
-        ]
-
-    def _handler(self) -> type[BaseHTTPRequestHandler]:
-        api = self
-
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-            disable_nagle_algorithm = True
-
-            def reply(self) -> None:
-                length = int(self.headers.get("Content-Length") or 0)
-                body = json.loads(self.rfile.read(length)) if length else None
-                code, answer = api.answer(self.command, self.path, body)
-                data = answer.encode() if isinstance(answer, str) else json.dumps(answer).encode()
-                self.send_response(code)
-                kind = "text/plain" if isinstance(answer, str) else "application/json"
-                self.send_header("Content-Type", kind)
-                self.send_header("Content-Length", str(len(data)))
-                self.end_headers()
-                self.wfile.write(data)
-
-            do_GET = do_POST = do_DELETE = do_PATCH = reply  # noqa: N815
-
-            def log_message(self, *words: Any) -> None:
-                pass
-
-        return Handler
+                return 200, self.objects.pop((plural, name))
+            return 200, self.objects[plural, name]
 
 
-def kubeconfig(url: str, namespace: str = "demo") -> str:
+def serve(answer: Callable[[BaseHTTPRequestHandler, Any], tuple[int, Any]]) -> ThreadingHTTPServer:
+    """Serve HTTP on a free port; `answer` gets the request and its JSON, and returns a reply."""
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+        disable_nagle_algorithm = True
+
+        def reply(self) -> None:
+            length = int(self.headers.get("Content-Length") or 0)
+            code, said = answer(self, json.loads(self.rfile.read(length)) if length else None)
+            is_text = isinstance(said, str)
+            data = said.encode() if is_text else json.dumps(said).encode()
+            self.send_response(code)
+            self.send_header("Content-Type", "text/plain" if is_text else "application/json")
+            self.send_header("Content-Length", str(len(data)))
+            self.end_headers()
+            self.wfile.write(data)
+
+        do_GET = do_POST = do_DELETE = reply  # noqa: N815
+
+        def log_message(self, *words: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+    return server
+
+
+class FakeTeleop:
+    """The API and the metrics of a cloud pod, with a record of its requests."""
+
+    def __init__(self) -> None:
+        self.missions: list[dict[str, str]] = []
+        self.posted: list[str] = []
+        self.tokens: set[str | None] = set()
+        self.refuses = False
+        self.server = serve(self._answer)
+        self.port = self.server.server_port
+
+    def _answer(self, request: BaseHTTPRequestHandler, body: Any) -> tuple[int, Any]:
+        if request.path == "/metrics":
+            return 200, 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
+        self.tokens.add(request.headers["Authorization"])
+        if request.command == "GET":
+            return 200, {"missions": self.missions}
+        self.posted.append(request.path)
+        return (409, {"detail": "it is over"}) if self.refuses else (200, {})
+
+    def forwards(self) -> str:
+        """What kubectl prints when it forwards all ports of a pod to this server."""
+        ports = (8080, 9100, 9101, 9102)
+        lines = (f"echo 'Forwarding from 127.0.0.1:{self.port} -> {port}'" for port in ports)
+        return "\n".join([*lines, "exec sleep 60"])
+
+
+def kubeconfig(url: str) -> str:
     """Build a kubeconfig with two contexts: `here`, the current one, and `elsewhere`."""
     contexts = [
-        {"name": "here", "context": {"cluster": "fake", "user": "me", "namespace": namespace}},
+        {"name": "here", "context": {"cluster": "fake", "user": "me", "namespace": "demo"}},
         {"name": "elsewhere", "context": {"cluster": "fake", "user": "me"}},
     ]
     return yaml.safe_dump(
@@ -168,6 +167,22 @@ def labels(component: str, release: str = "cloudrc") -> dict[str, str]:
     }
 
 
+SECURE = {"runAsUser": 10001}
+TELEOP = {
+    "name": "teleop",
+    "image": "cloudrc/cloud:0.1.0",
+    "securityContext": {"allowPrivilegeEscalation": False},
+}
+POD = {
+    "containers": [{"name": "cloud"}, TELEOP],
+    "volumes": [
+        {"name": "data", "emptyDir": {}},
+        {"name": "tokens", "secret": {"secretName": "cloudrc-tokens"}},
+    ],
+}
+"""Pod of a component, as in its Deployment."""
+
+
 def pod(
     name: str,
     component: str,
@@ -188,16 +203,9 @@ def pod(
         "lastState": more.pop("last", {}),
     }
     conditions = [{"type": "Ready", "status": str(ready)}, *more.pop("conditions", [])]
-    containers = [{"name": "cloud"}, {"name": "teleop", "image": "cloudrc/cloud:0.1.0"}]
     return {
         "metadata": {"name": name, "labels": {**labels(component), **more.pop("labels", {})}},
-        "spec": {
-            "containers": containers,
-            "volumes": [
-                {"name": "data", "emptyDir": {}},
-                {"name": "tokens", "secret": {"secretName": "cloudrc-tokens"}},
-            ],
-        },
+        "spec": POD,
         "status": {"phase": phase, "conditions": conditions, "containerStatuses": [status]},
     }
 
@@ -206,112 +214,14 @@ def deployment(component: str, **status: Any) -> dict[str, Any]:
     settled = {"observedGeneration": 1, "replicas": 1, "updatedReplicas": 1}
     return {
         "metadata": {"name": f"cloudrc-{component}", "labels": labels(component)},
-        "spec": {"selector": {}, "template": {}},
+        "spec": {"selector": {}, "template": {"spec": {**POD, "securityContext": SECURE}}},
         "status": {**settled, **status},
     }
 
 
-PROFILE = "uplink: {delay_ms: 45, jitter_ms: 25}\ndownlink: {delay_ms: 45, jitter_ms: 25}\n"
-TRACE = "time_s,delay_ms\n0,40\n1,60\n"
-LABEL = "app.kubernetes.io/component"
-KUBECTL = """
-import json, pathlib, sys
-folder, words = pathlib.Path(sys.argv[1]), sys.argv[2:]
-verb = next(word for word in words if word in ("get", "patch", "exec"))
-with (folder / "asked").open("a") as asked:
-    print(" ".join(" ".join(words).split()), file=asked)
-refused = folder / f"refuse-{verb}"
-if refused.exists():
-    sys.exit(refused.read_text())
-if verb == "get":
-    print((folder / "items.json").read_text())
-elif verb == "patch":
-    (folder / "patched.json").write_text(sys.stdin.read())
-else:
-    pod = words[words.index("exec") + 2]
-    broken, number = folder / f"broken-{pod}", str(len(list(folder.glob(f"handed-{pod}-*"))))
-    if broken.exists() and broken.read_text() in ("", number):
-        sys.exit("Error from server: the pod is gone")
-    document = json.loads(sys.stdin.read())
-    (folder / f"handed-{pod}-{number}.json").write_text(json.dumps(document))
-    change = json.loads(document["change"])
-    place = folder / f"state-{pod}.json"
-    state, cannot = json.loads(place.read_text()), folder / f"cannot-{pod}"
-    if cannot.exists() and cannot.read_text() in document["files"]["profile.yaml"]:
-        state |= {"refused": change["number"], "refusal": "netem cannot do that"}
-    elif not (folder / f"deaf-{pod}").exists():
-        state |= {"change": change["number"], "cause": change["cause"]}
-    place.write_text(json.dumps(state))
-    print(json.dumps(state))
-"""
-
-
-def item(kind: str, name: str, component: str, **rest: Any) -> dict[str, Any]:
-    stamp = "2026-01-01T00:00:00Z"
-    metadata = {"name": name, "labels": {LABEL: component}, "creationTimestamp": stamp}
-    return {"kind": kind, "metadata": metadata, **rest}
-
-
-class Cluster:
-    """The cluster of the fake kubectl, and a record of its calls."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        running = {"status": {"phase": "Running"}}
-        self.items = [
-            item("ConfigMap", "demo-link", "link", data={"profile.yaml": PROFILE}),
-            item("ConfigMap", "demo-experiment", "shared", data={"experiment.yaml": "{}"}),
-            item("Pod", "world-1", "world", **running),
-            item("Pod", "cloud-1", "cloud", **running),
-            item("Pod", "cloud-0", "cloud", **running),
-        ]
-        self.items[-1]["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:01Z"
-        for pod, way in (("world-1", "uplink"), ("cloud-1", "downlink")):
-            asked = {"delay": 0.12}
-            state = asdict(LinkState("netem", "", "auto", way, {}, "", 1, asked=asked))
-            (folder / f"state-{pod}.json").write_text(json.dumps(state))
-        self.tell()
-
-    def tell(self) -> None:
-        (self.folder / "items.json").write_text(json.dumps({"items": self.items}))
-
-    def refuse(self, verb: str, text: str) -> None:
-        (self.folder / f"refuse-{verb}").write_text(text)
-
-    def patched(self) -> dict[str, str]:
-        data: dict[str, str] = json.loads((self.folder / "patched.json").read_text())["data"]
-        return data
-
-    def make(self, what: str, pod: str, how: str = "") -> None:
-        """Make a pod `deaf`, `broken` (at its Nth call), or one that `cannot` apply a text."""
-        (self.folder / f"{what}-{pod}").write_text(how)
-
-    def handed(self, pod: str) -> list[dict[str, Any]]:
-        """Return the changes that a pod received, the newest last."""
-        paths = sorted(self.folder.glob(f"handed-{pod}-*.json"))
-        return [json.loads(path.read_text()) for path in paths]
-
-    def state(self, pod: str) -> LinkState:
-        return from_text((self.folder / f"state-{pod}.json").read_text())
-
-    def kept(self) -> bool:
-        """Whether the ConfigMap was written."""
-        return (self.folder / "patched.json").exists()
-
-    def asked(self) -> list[str]:
-        """Return all command lines of kubectl."""
-        return (self.folder / "asked").read_text().splitlines()
-
-
-def pretended(folder: Path, pretend: Callable[[str, str], Path]) -> Cluster:
-    """Write a release and its fake kubectl into a folder."""
-    script = folder / "kubectl.py"
-    script.write_text(KUBECTL)
-    pretend("kubectl", f'exec {sys.executable} -S {script} {folder} "$@"')
-    return Cluster(folder)
-
-
 TOKEN = "operator-token-of-the-release"
+CONFIG_PLACE = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
+"""Where the client keeps the path of the kubeconfig."""
 
 
 @pytest.fixture
@@ -319,11 +229,11 @@ def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeApi]:
     server = FakeApi()
     path = tmp_path / "kubeconfig"
     path.write_text(kubeconfig(server.url))
-    monkeypatch.setattr("kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION", str(path))
+    monkeypatch.setattr(CONFIG_PLACE, str(path))
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
-    monkeypatch.setattr(tools, "OUTAGE_PERIOD", 0.01)
-    monkeypatch.setattr(deploy, "LOOK_PERIOD", 0.01)
-    monkeypatch.setattr(deploy, "FAILURE_TIME", 0.0)
+    monkeypatch.setattr(client, "OUTAGE_PERIOD", 0.01)
+    monkeypatch.setattr(flight, "LOOK_PERIOD", 0.01)
+    monkeypatch.setattr(flight, "FAILURE_TIME", 0.0)
     yield server
     server.close()
 
@@ -337,16 +247,16 @@ def release(api: FakeApi) -> Release:
 def running(api: FakeApi, release: Release) -> FakeApi:
     """The fake API server with a release that is ready to fly."""
     for component in ("world", "cloud"):
-        api.put("deployments", "demo", deployment(component))
-        api.put("pods", "demo", pod(f"{component}-1", component))
+        api.put("deployments", deployment(component))
+        api.put("pods", pod(f"{component}-1", component))
     service = {
-        "metadata": {"name": "cloudrc-api", "labels": {"app.kubernetes.io/instance": "cloudrc"}},
+        "metadata": {"name": "cloudrc-api", "labels": labels("cloud")},
         "spec": {"ports": [{"name": "api", "port": 8080, "targetPort": "api"}]},
     }
-    api.put("services", "demo", service)
+    api.put("services", service)
     token = base64.b64encode(TOKEN.encode()).decode()
     tokens = {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}}
-    api.put("secrets", "demo", tokens)
+    api.put("secrets", tokens)
     return api
 
 
@@ -367,6 +277,48 @@ def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.fixture
-def cluster(tmp_path: Path, pretend: Callable[[str, str], Path]) -> Cluster:
-    """A release with a running link, and a fake kubectl for it."""
-    return pretended(tmp_path, pretend)
+def teleop(running: FakeApi, pretend: Callable[[str, str], Path]) -> Iterator[FakeTeleop]:
+    """A fake API of the release, to which the fake kubectl forwards ports."""
+    fake = FakeTeleop()
+    pretend("kubectl", fake.forwards())
+    yield fake
+    fake.server.shutdown()
+    fake.server.server_close()
+
+
+MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
+
+
+def end(api: FakeApi, name: str, kind: str, **condition: str) -> None:
+    """End a Job: `kind` is "Complete" or "Failed"."""
+    ended = {"type": kind, "status": "True", **condition}
+    api.get("jobs", name)["status"] = {"conditions": [ended]}
+
+
+def start_pod(api: FakeApi, name: str, **given: Any) -> None:
+    """Create the pod of a Job as Kubernetes does."""
+    uid = api.get("jobs", name)["metadata"]["uid"]
+    api.put("pods", pod(f"{name}-x", "mission", labels={UID_LABEL: uid}, **given))
+
+
+def terminated(exit_code: int, message: str) -> dict[str, Any]:
+    return {"terminated": {"exitCode": exit_code, "message": message}}
+
+
+def at_look(api: FakeApi, number: int, action: Callable[[], None]) -> None:
+    """Call `action` at the n-th request for the Job."""
+    original, looks = api.answer, iter(range(1, 1000))
+    lock = threading.Lock()
+
+    def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
+        with lock:
+            if method == "GET" and "/jobs/" in path and next(looks) == number:
+                action()
+        return original(method, path, body)
+
+    api.answer = answer  # type: ignore[method-assign]
+
+
+def made(api: FakeApi) -> list[dict[str, Any]]:
+    """Return the Jobs."""
+    return [body for (kind, _), body in api.objects.items() if kind == "jobs"]

@@ -3,95 +3,128 @@
 from __future__ import annotations
 
 import json
-import sys
-import threading
-from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.cluster import flight
-from cloudrc.cluster import pods as fetch
-from cloudrc.cluster.client import Release, connect
+from cloudrc.cluster import flight, pods
+from cloudrc.cluster.client import ClusterError, Release, connect
 from cloudrc.cluster.jobs import run_job
-from cloudrc.cluster.tools import ClusterError
 from cloudrc.config.load import load_experiment
-from tests.cluster.conftest import FakeApi
-from tests.cluster.test_cut import HOVER, SECOND, flown, later, merged
-from tests.cluster.test_jobs import at_look, end, start_pod, terminated
+from cloudrc.record.merge import Mission, cut_to_last_mission, merge
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import Record
+from cloudrc.report.document import Run
+from cloudrc.report.write import assess
+from tests.cluster.conftest import FakeApi, FakeTeleop, at_look, end, start_pod, terminated
+from tests.flights.conftest import records
 
-Patch = pytest.MonkeyPatch
-NAME, (SETTING,) = HOVER
-MISSIONS: list[dict[str, str]] = []
-"""Missions that the fake API of teleop returns."""
+Printed = pytest.CaptureFixture[str]
+SECOND = 1_000_000_000
+NAME, SETTING = "hover", "mission.waypoints.0.dwell_s=1.0"
 LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@cache
+def flown() -> tuple[list[Record], list[Record]]:
+    return records(load_experiment(NAME, [SETTING]))
+
+
+def later(given: list[Record], by_ns: int) -> list[Record]:
+    return [record._replace(stamp_ns=record.stamp_ns + by_ns) for record in given]
+
+
+def merged(folder: Path, *flights: tuple[list[Record], list[Record]], torn: bool) -> Mission:
+    """Record flights as two pods do; torn: the files have no end, as when copied in flight."""
+    for number, name in enumerate(("world", "cloud")):
+        path = folder / f"{name}.mcap"
+        with McapWriter(path, clock=name, clock_id="same") as writer:
+            for each in flights:
+                writer.write(each[number])
+            writer.flush()
+            size = path.stat().st_size
+        if torn:
+            with path.open("r+b") as file:
+                file.truncate(size)
+    return merge(folder / "world.mcap", folder / "cloud.mcap")
+
+
+@pytest.mark.parametrize("torn", [True, False])
+def test_a_recording_with_the_missions_end_is_complete(tmp_path: Path, torn: bool) -> None:
+    world, cloud = flown()
+    after = later(world[-300:], SECOND), list[Record]()
+    # The mission's start may be in the recording of a pod that is gone.
+    for flight_of_cloud in (cloud, cloud[len(cloud) // 3 :]):
+        mission = merged(tmp_path, (world, flight_of_cloud), after, torn=torn)
+        assert bool(mission.contents.note) == torn
+        cut, ended = cut_to_last_mission(mission)
+        assert ended
+        assert cut.contents.messages[0][1] <= world[0].stamp_ns + SECOND
+    half = (world[: len(world) // 2], cloud[: len(cloud) // 2])
+    cut, ended = cut_to_last_mission(merged(tmp_path, half, torn=True))
+    assert not ended
+    assert not cut.recording().complete
+
+
+def test_only_the_last_of_two_missions_is_kept(tmp_path: Path) -> None:
+    world, cloud = flown()
+    gap = world[-1].stamp_ns + 5 * SECOND
+    second = later(world, gap), later(cloud, gap)
+    after = later(world[-300:], gap + SECOND), list[Record]()
+    cut, ended = cut_to_last_mission(merged(tmp_path, flown(), second, after, torn=True))
+    assert ended
+    alone, _ = cut_to_last_mission(merged(tmp_path, second, after, torn=True))
+    experiment = load_experiment(NAME, [SETTING])
+    both = [assess(m.recording(), experiment, Run("virtual", "virtual")) for m in (cut, alone)]
+    assert both[0].verdict.outcome == "success"
+    assert both[0].numbers["duration"] == both[1].numbers["duration"]
+    assert int(cut.recording()["/mission"]["stamp_ns"][0]) > gap
+
+
+@pytest.fixture
+def ready(
+    running: FakeApi,
+    teleop: FakeTeleop,
+    pretend: Callable[[str, str], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> FakeApi:
+    """A release whose pods have recorded a flight."""
     monkeypatch.setattr(flight, "FLUSH", 0.0)
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def metrics_port() -> Iterator[int]:
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.end_headers()
-            if self.path == "/v1/missions":
-                self.wfile.write(json.dumps({"missions": MISSIONS}).encode())
-            else:
-                self.wfile.write(b'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n')
-
-        def log_message(self, *words: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
-    yield server.server_port
-    server.shutdown()
-    server.server_close()
-
-
-@pytest.fixture
-def pods(
-    running: FakeApi, pretend: Callable[[str, str], Path], tmp_path: Path, metrics_port: int
-) -> FakeApi:
-    """A release whose pods have recorded a flight, and whose Jobs end at once."""
     world, _ = flown()
     merged(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)
     pretend("helm", f"echo $@ >> {tmp_path}/helm; test $1 = list && echo '[]' || cat > /dev/null")
-    opened = "\n".join(
-        f"echo 'Forwarding from 127.0.0.1:{metrics_port} -> {port}'"
-        for port in (8080, 9100, 9101, 9102)
-    )
     pretend(
         "kubectl",
-        f'case "$*" in *exec*world*) cat {tmp_path}/world.mcap ;;'
-        f" *exec*cloud*) cat {tmp_path}/cloud.mcap ;; *) {opened}\nexec sleep 60 ;; esac",
+        f'case "$*" in *exec*before*) cat {tmp_path}/left ;;'
+        f" *exec*world*) cat {tmp_path}/world.mcap ;;"
+        f" *exec*cloud*) cat {tmp_path}/cloud.mcap ;; *) {teleop.forwards()} ;; esac",
     )
     return running
 
 
-def ending(api: FakeApi, kind: str, exit_code: int, message: str) -> Callable[[], None]:
+def ends(api: FakeApi, kind: str = "Complete", exit_code: int = 0, message: str = "done") -> None:
+    """Let the Job end at the second look."""
+
     def action() -> None:
-        (name,) = [key[2] for key in api.objects if key[0] == "jobs"]
+        (name,) = [key[1] for key in api.objects if key[0] == "jobs"]
         start_pod(api, name, state=terminated(exit_code, message))
         api.logs[f"{name}-x"] = "waypoint 1 of 1 reached at 3.00 s\n"
         end(api, name, kind)
 
-    return action
+    at_look(api, 2, action)
 
 
 def test_a_flight_on_a_cluster_writes_a_whole_run(
-    pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ready: FakeApi, tmp_path: Path, capsys: Printed
 ) -> None:
     (tmp_path / "two.py").write_text("UNIT = '1'\ndef measure(flight):\n    return 2.0\n")
-    at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
+    ends(ready)
     code = main([*LINE, "--out", "out", "--set", "report.metrics=./two.py"])
     captured = capsys.readouterr()
     assert "waypoint 1 of 1 reached" in captured.err
@@ -111,9 +144,9 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(
 
 @pytest.mark.parametrize("out", [[], ["--out", "out"]], ids=["runs", "out"])
 def test_a_refused_mission_leaves_no_run(
-    pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: list[str]
+    ready: FakeApi, tmp_path: Path, capsys: Printed, out: list[str]
 ) -> None:
-    at_look(pods, 2, ending(pods, "Failed", 5, "mission m-1 is under way"))
+    ends(ready, "Failed", 5, "mission m-1 is under way")
     assert main([*LINE, *out]) == 5
     said = capsys.readouterr().err
     assert "did not fly its mission: mission m-1 is under way" in said
@@ -122,28 +155,18 @@ def test_a_refused_mission_leaves_no_run(
     assert list((tmp_path / "runs").glob("*")) == []
 
 
-def test_a_run_on_a_cluster_becomes_the_latest_one(pods: FakeApi, tmp_path: Path) -> None:
-    at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
-    assert main(LINE) == 6
-    assert (tmp_path / "runs" / "latest" / "report.json").is_file()
-
-
 @pytest.mark.parametrize("left", [True, False], ids=["left", "nothing"])
 def test_the_recording_from_before_a_restart_is_copied(
-    pods: FakeApi,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    pretend: Callable[[str, str], Path],
-    left: bool,
+    ready: FakeApi, tmp_path: Path, capsys: Printed, left: bool
 ) -> None:
-    (key,) = [key for key in pods.objects if key[0] == "pods" and "world" in key[2]]
-    pods.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
-    other = (tmp_path / "bin" / "kubectl").read_text().removeprefix("#!/bin/sh\n")
-    before = "echo before; exit 0" if left else "echo 'cat: no such file' >&2; exit 1"
-    pretend("kubectl", f'case "$*" in *before*) {before} ;; esac\n{other}')
-    at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
-    assert main([*LINE, "--out", "out"]) == 6
-    out, said = tmp_path / "out", capsys.readouterr().err
+    (key,) = [key for key in ready.objects if key[0] == "pods" and "world" in key[1]]
+    ready.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
+    if left:
+        (tmp_path / "left").write_text("before\n")
+    ends(ready)
+    assert main(LINE) == 6
+    out, said = tmp_path / "runs" / "latest", capsys.readouterr().err
+    assert (out / "report.json").is_file()
     assert not (out / "cloud.before.mcap").exists()
     assert (out / "world.before.mcap").exists() is left
     assert "world was restarted" in said
@@ -152,7 +175,7 @@ def test_the_recording_from_before_a_restart_is_copied(
 
 
 def test_a_broken_port_forward_loses_metrics_but_no_report(
-    pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Patch
+    ready: FakeApi, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[str] = []
 
@@ -165,10 +188,10 @@ def test_a_broken_port_forward_loses_metrics_but_no_report(
             raise ClusterError("kubectl exec failed")
         fetch_recording(release, component, target)
 
-    fetch_recording = fetch.fetch_recording
-    monkeypatch.setattr(fetch, "fetch_metrics", broken)
-    monkeypatch.setattr(fetch, "fetch_recording", hiccup)
-    at_look(pods, 2, ending(pods, "Complete", 0, "mission done"))
+    fetch_recording = pods.fetch_recording
+    monkeypatch.setattr(pods, "fetch_metrics", broken)
+    monkeypatch.setattr(pods, "fetch_recording", hiccup)
+    ends(ready)
     assert main([*LINE, "--out", "out"]) == 6
     captured = capsys.readouterr()
     assert json.loads(captured.out)["shaper"] == "unknown"
@@ -178,14 +201,14 @@ def test_a_broken_port_forward_loses_metrics_but_no_report(
 
 
 def test_a_run_does_not_end_a_flight_in_progress(
-    pods: FakeApi, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Patch
+    ready: FakeApi, teleop: FakeTeleop, tmp_path: Path, capsys: Printed
 ) -> None:
-    monkeypatch.setattr(sys.modules[__name__], "MISSIONS", [{"id": "m7", "state": "held"}])
+    teleop.missions = [{"id": "m7", "state": "held"}]
     assert main([*LINE, "--out", "out"]) == 5
     said = capsys.readouterr().err
     assert "mission m7 is under way on release 'cloudrc'" in said
     assert "end it: cloudrc mission cancel --namespace=demo --release=cloudrc, or" in said
-    monkeypatch.setattr(sys.modules[__name__], "MISSIONS", [{"id": "m7", "state": "done"}])
+    teleop.missions = [{"id": "m7", "state": "done"}]
     run_job(connect(), {}, name="first")
     assert main([*LINE, "--out", "out"]) == 5
     said = capsys.readouterr().err
@@ -204,8 +227,13 @@ def test_a_run_does_not_end_a_flight_in_progress(
     ],
 )
 def test_what_pods_cannot_have_is_refused_before_the_install(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: list[str], words: str
+    tmp_path: Path,
+    capsys: Printed,
+    monkeypatch: pytest.MonkeyPatch,
+    settings: list[str],
+    words: str,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
     (tmp_path / "mine.py").write_text(plugin)
     (tmp_path / "mine.xml").write_text("<mujoco/>")
@@ -215,14 +243,13 @@ def test_what_pods_cannot_have_is_refused_before_the_install(
 
 
 def test_an_upgrade_keeps_the_values_of_a_release() -> None:
-    before = {"metrics": {"allowFrom": ["x"]}, "link": {"mode": "relay", "profile": "paper-p1"}}
+    before = {
+        "metrics": {"allowFrom": ["x"]},
+        "link": {"mode": "relay", "profile": "paper-p1"},
+        "mission": {"enabled": True, "queue": True},
+    }
     given = flight.chart_values(load_experiment("hover"), before)
     assert given["metrics"] == before["metrics"]
     assert given["link"] == {"mode": "relay", "profile": ""}
+    assert given["mission"] == {"enabled": False, "queue": True}, "only the run's own mission flies"
     assert given["experiment"]["name"] == "hover"
-
-
-def test_a_run_disables_the_charts_own_mission() -> None:
-    before = {"mission": {"enabled": True, "queue": True}}
-    given = flight.chart_values(load_experiment("hover"), before)
-    assert given["mission"] == {"enabled": False, "queue": True}

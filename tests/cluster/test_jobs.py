@@ -1,129 +1,91 @@
-"""Jobs of missions on the fake API server: created, followed, listed, deleted."""
+"""Jobs of missions on the fake API server: created, followed, listed, cancelled, deleted."""
 
 from __future__ import annotations
 
 import json
-import threading
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from cloudrc.cluster import jobs
-from cloudrc.cluster.client import Release
-from cloudrc.cluster.jobs import delete_job, follow, list_jobs, logs, read_job, run_job
-from cloudrc.cluster.tools import ClusterError, ExpiredError
-from tests.cluster.conftest import FakeApi, pod
-
-MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
-
-
-def end(api: FakeApi, name: str, kind: str, **condition: str) -> None:
-    ended = {"type": kind, "status": "True", **condition}
-    api.get("jobs", name)["status"] = {"conditions": [ended]}
-
-
-def start_pod(api: FakeApi, name: str, **given: Any) -> None:
-    """Create the pod of a Job as Kubernetes does."""
-    uid = api.get("jobs", name)["metadata"]["uid"]
-    api.put("pods", "demo", pod(f"{name}-x", "mission", labels={jobs.UID_LABEL: uid}, **given))
-
-
-def terminated(exit_code: int, message: str) -> dict[str, Any]:
-    return {"terminated": {"exitCode": exit_code, "message": message}}
-
-
-def at_look(api: FakeApi, number: int, action: Callable[[], None]) -> None:
-    """Call `action` at the n-th request for the Job."""
-    original, looks = api.answer, iter(range(1, 1000))
-    lock = threading.Lock()
-
-    def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
-        with lock:
-            if method == "GET" and "/jobs/" in path and next(looks) == number:
-                action()
-        return original(method, path, body)
-
-    api.answer = answer  # type: ignore[method-assign]
+from cloudrc.cluster.client import ClusterError, Release
+from cloudrc.cluster.jobs import (
+    cancel,
+    delete_job,
+    follow,
+    follow_limit,
+    list_jobs,
+    logs,
+    read_job,
+    run_job,
+)
+from cloudrc.errors import TimedOutError
+from tests.cluster.conftest import (
+    MISSION,
+    SECURE,
+    TELEOP,
+    TOKEN,
+    FakeApi,
+    FakeTeleop,
+    at_look,
+    end,
+    made,
+    start_pod,
+    terminated,
+)
 
 
-def test_a_job_uses_image_and_api_of_the_release(running: FakeApi, release: Release) -> None:
+def pod_of(api: FakeApi, name: str) -> Any:
+    return api.get("jobs", name)["spec"]["template"]["spec"]
+
+
+def test_a_job_posts_the_mission_to_its_release(running: FakeApi, release: Release) -> None:
     status = run_job(release, MISSION, name="first", limit=60.0)
     assert status.state == "pending"
-    job, plan = running.get("jobs", "first"), running.get("configmaps", "first")
-    (container,) = job["spec"]["template"]["spec"]["containers"]
-    assert container["image"] == "cloudrc/cloud:0.1.0"
-    assert "--api=http://cloudrc-api:8080" in container["args"]
+    plan = running.get("configmaps", "first")
     assert json.loads(plan["data"]["mission.yaml"]) == MISSION
     assert plan["metadata"]["ownerReferences"][0]["uid"] == status.uid
+    pod = pod_of(running, "first")
+    (container,) = pod["containers"]
+    assert container["image"] == "cloudrc/cloud:0.1.0"
+    assert "--api=http://cloudrc-api:8080" in container["args"]
+    assert "--queue" not in container["args"]
+    volume = next(v["secret"] for v in pod["volumes"] if v["name"] == "tokens")
+    assert volume["secretName"] == "cloudrc-tokens"
+    assert TOKEN not in str(running.get("jobs", "first"))
+    run_job(release, MISSION, name="patient", queue=True)
+    assert "--queue" in pod_of(running, "patient")["containers"][0]["args"]
 
 
-def test_a_job_has_owner_and_placement_of_its_release(running: FakeApi, release: Release) -> None:
-    cloud = running.get("deployments", "cloudrc-cloud")
-    where = {"nodeSelector": {"disk": "fast"}, "tolerations": [{"key": "lab"}]}
-    cloud["spec"]["template"] = {"spec": {**where, "containers": []}}
-    run_job(release, MISSION, name="first")
-    job = running.get("jobs", "first")
-    (owner,) = job["metadata"]["ownerReferences"]
-    assert (owner["kind"], owner["uid"]) == ("Deployment", cloud["metadata"]["uid"])
-    assert where.items() <= job["spec"]["template"]["spec"].items()
-
-
-def test_a_job_of_a_release_with_a_long_name_is_short_enough(
+def test_a_job_has_owner_nodes_and_rights_of_its_release(
     running: FakeApi, release: Release
 ) -> None:
+    cloud = running.get("deployments", "cloudrc-cloud")
+    where = {"nodeSelector": {"disk": "fast"}, "tolerations": [{"key": "lab"}]}
+    run_job(release, MISSION, name="first")
+    cloud["spec"]["template"]["spec"] |= where
+    run_job(release, MISSION, name="second")
+    (owner,) = running.get("jobs", "second")["metadata"]["ownerReferences"]
+    assert (owner["kind"], owner["uid"]) == ("Deployment", cloud["metadata"]["uid"])
+    assert where.items() <= pod_of(running, "second").items()
+    pod = pod_of(running, "first")
+    assert pod["securityContext"] == SECURE
+    assert pod["containers"][0]["securityContext"] == TELEOP["securityContext"]
+    assert not pod.keys() & where.keys()
+    assert pod["automountServiceAccountToken"] is False
+    # On OpenShift a release has no security contexts of its own.
+    spec = cloud["spec"]["template"]["spec"]
+    del spec["securityContext"]
+    run_job(release, MISSION, name="third")
+    assert "securityContext" not in pod_of(running, "third")
+
+
+def test_a_job_has_an_unused_and_short_name(running: FakeApi, release: Release) -> None:
+    assert len({run_job(release, MISSION).name for _ in range(5)}) == 5
     for body in list(running.objects.values()):
         body["metadata"].setdefault("labels", {})["app.kubernetes.io/instance"] = "r" * 53
     status = run_job(replace(release, name="r" * 53), MISSION)
     assert len(status.name) <= 63 - len("-xxxxx")
-
-
-def test_a_job_without_a_name_gets_an_unused_one(running: FakeApi, release: Release) -> None:
-    names = {run_job(release, MISSION).name for _ in range(5)}
-    assert len(names) == 5
-
-
-def test_a_job_passes_pod_security_restricted(running: FakeApi, release: Release) -> None:
-    run_job(release, MISSION, name="first")
-    spec = running.get("jobs", "first")["spec"]["template"]["spec"]
-    (container,) = spec["containers"]
-    assert spec["automountServiceAccountToken"] is False
-    assert spec["securityContext"]["runAsNonRoot"] is True
-    assert spec["securityContext"]["runAsUser"] >= 10000
-    assert spec["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
-    assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}
-    assert container["securityContext"]["readOnlyRootFilesystem"] is True
-    assert container["securityContext"]["allowPrivilegeEscalation"] is False
-
-
-def test_a_job_is_tried_once_and_has_time_limits(running: FakeApi, release: Release) -> None:
-    run_job(release, MISSION, name="first", limit=60.0)
-    spec = running.get("jobs", "first")["spec"]
-    assert spec["backoffLimit"] == 0
-    assert 60 < spec["activeDeadlineSeconds"] <= 300
-    assert spec["ttlSecondsAfterFinished"] > 0
-    assert spec["template"]["spec"]["restartPolicy"] == "Never"
-
-
-def test_the_jobs_uid_is_the_missions_key(running: FakeApi, release: Release) -> None:
-    run_job(release, MISSION, name="first")
-    (container,) = running.get("jobs", "first")["spec"]["template"]["spec"]["containers"]
-    (variable,) = container["env"]
-    assert f"--key=$({variable['name']})" in container["args"]
-    path = variable["valueFrom"]["fieldRef"]["fieldPath"]
-    assert path == "metadata.labels['batch.kubernetes.io/controller-uid']"
-
-
-def test_only_a_queued_job_waits(running: FakeApi, release: Release) -> None:
-    run_job(release, MISSION, name="impatient")
-    run_job(release, MISSION, name="patient", queue=True)
-
-    def arguments(name: str) -> list[str]:
-        return running.get("jobs", name)["spec"]["template"]["spec"]["containers"][0]["args"]
-
-    assert "--queue" not in arguments("impatient")
-    assert "--queue" in arguments("patient")
 
 
 @pytest.mark.parametrize(
@@ -151,21 +113,10 @@ def test_follow_writes_each_line_once_and_returns_the_verdict(
     assert (ended.state, ended.exit_code, ended.message) == (state, code, "the verdict")
 
 
-def test_follow_has_a_timeout(running: FakeApi, release: Release) -> None:
+def test_follow_ends_when_the_pod_cannot_run(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first")
-    with pytest.raises(ExpiredError, match=r"'first' has not ended within 0\.05 s"):
+    with pytest.raises(TimedOutError, match=r"'first' has not ended within 0\.05 s"):
         follow(release, "first", print, timeout=0.05)
-
-
-def test_follow_ends_at_once_if_the_image_is_missing(running: FakeApi, release: Release) -> None:
-    run_job(release, MISSION, name="first")
-    start_pod(running, "first", state={"waiting": {"reason": "ErrImagePull"}}, ready=False)
-    with pytest.raises(ClusterError, match=r"cannot start: the image.*make kind-load"):
-        follow(release, "first", print, timeout=10.0)
-
-
-def test_follow_ends_if_the_pod_is_refused(running: FakeApi, release: Release) -> None:
-    run_job(release, MISSION, name="first")
     event = {
         "metadata": {"name": "first.1"},
         "involvedObject": {"kind": "Job", "name": "first"},
@@ -173,15 +124,19 @@ def test_follow_ends_if_the_pod_is_refused(running: FakeApi, release: Release) -
         "reason": "FailedCreate",
         "message": "violates PodSecurity",
     }
-    running.put("events", "demo", event)
+    running.put("events", event)
     with pytest.raises(ClusterError, match="violates PodSecurity"):
+        follow(release, "first", print, timeout=10.0)
+    start_pod(running, "first", state={"waiting": {"reason": "ErrImagePull"}}, ready=False)
+    with pytest.raises(ClusterError, match=r"cannot start: the image.*make kind-load"):
         follow(release, "first", print, timeout=10.0)
 
 
-def test_a_job_past_its_deadline_names_the_deadline(running: FakeApi, release: Release) -> None:
+def test_a_deadline_is_named_and_bounded(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first")
     end(running, "first", "Failed", reason="DeadlineExceeded", message="...")
     assert "activeDeadlineSeconds" in read_job(release, "first").message
+    assert follow_limit(1e300, queue=True) < 2**31 + 100
 
 
 def test_jobs_are_listed_with_their_state_oldest_first(running: FakeApi, release: Release) -> None:
@@ -191,22 +146,55 @@ def test_jobs_are_listed_with_their_state_oldest_first(running: FakeApi, release
     start_pod(running, "two")
     found = [(status.name, status.state) for status in list_jobs(release)]
     assert found == [("one", "complete"), ("two", "flying"), ("three", "pending")]
+    delete_job(release, "one")
+    with pytest.raises(ClusterError, match='"one" not found'):
+        logs(release, "one")
 
 
-def test_a_deleted_job_is_gone(running: FakeApi, release: Release) -> None:
-    run_job(release, MISSION, name="first")
-    delete_job(release, "first")
-    with pytest.raises(ClusterError, match='"first" not found'):
-        logs(release, "first")
-
-
-def test_a_missing_permission_is_reported(running: FakeApi, release: Release) -> None:
+def test_a_job_that_cannot_be_made_leaves_nothing(running: FakeApi, release: Release) -> None:
+    running.refuse["POST", "configmaps"] = 403, "configmaps is forbidden"
+    with pytest.raises(ClusterError, match="can-i create configmaps"):
+        run_job(release, MISSION, name="first")
     running.refuse["POST", "jobs"] = 403, "jobs.batch is forbidden"
-    with pytest.raises(ClusterError, match="can-i create jobs") as caught:
+    with pytest.raises(ClusterError, match="can-i create jobs"):
         run_job(release, MISSION)
-    assert caught.value.exit_code == 5
-
-
-def test_a_job_needs_a_release(api: FakeApi, release: Release) -> None:
+    assert made(running) == []
+    running.objects.clear()
     with pytest.raises(ClusterError, match="no release"):
         run_job(release, MISSION)
+
+
+def test_the_mission_of_a_job_is_cancelled_by_its_key(teleop: FakeTeleop, release: Release) -> None:
+    job = run_job(release, MISSION, name="first")
+    teleop.missions = [{"id": "m1", "key": "another"}, {"id": "m2", "key": job.uid, "name": "up"}]
+    assert cancel(release, "first") == "mission m2 (up) of Job 'first' is cancelled"
+    assert teleop.posted == ["/v1/missions/m2/cancel"]
+    assert teleop.tokens == {f"Bearer {TOKEN}"}
+    teleop.tokens.clear()
+    cancel(release, "first", "a-token-of-mine-alone")
+    assert teleop.tokens == {"Bearer a-token-of-mine-alone"}
+    teleop.refuses = True
+    with pytest.raises(ClusterError, match="it is over"):
+        cancel(release, "first")
+
+
+@pytest.mark.parametrize("phase", ["Running", "Pending"])
+def test_a_job_that_has_not_posted_is_deleted(
+    running: FakeApi, teleop: FakeTeleop, release: Release, phase: str
+) -> None:
+    run_job(release, MISSION, name="first")
+    running.get("pods", "cloud-1")["status"]["phase"] = phase
+    said = cancel(release, "first")
+    assert "'first' is deleted" in said
+    later = "cloudrc mission cancel --namespace=demo --release=cloudrc"
+    assert (later in said) == (phase == "Pending")
+    assert (teleop.posted, made(running)) == ([], [])
+
+
+def test_cancelling_an_ended_job_changes_nothing(
+    running: FakeApi, teleop: FakeTeleop, release: Release
+) -> None:
+    run_job(release, MISSION, name="first")
+    end(running, "first", "Complete")
+    assert "has ended already" in cancel(release, "first")
+    assert teleop.posted == []

@@ -1,9 +1,4 @@
-"""A cluster for the end-to-end tests: made or found, given the images, and taken down again.
-
-The cluster as the tests see it: kubectl and helm, one release, what to save on failure.
-
-What a release costs: the kubelet's own counters, read twice; and how fast the machine is.
-"""
+"""A cluster for the end-to-end tests, the release in it, what to save on failure, and its cost."""
 
 from __future__ import annotations
 
@@ -15,8 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from datetime import datetime
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -27,7 +21,10 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc.cli.client import Api
 from cloudrc.cluster.client import Release, connect
-from cloudrc.cluster.pods import api_url, fetch_metrics, operator_token
+from cloudrc.cluster.flight import wait_ready
+from cloudrc.cluster.jobs import JobStatus, follow, logs, run_job
+from cloudrc.cluster.pods import api_url, fetch_metrics, fetch_recording, operator_token
+from cloudrc.errors import CloudrcError
 from tests.drivers.conftest import WORK, slower
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,6 +34,7 @@ NAMESPACE = "cloudrc-e2e"
 NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring", f"{NAMESPACE}-bad")
 """All that these tests make."""
 NAME = "cloudrc"
+ENDS = ("world", "cloud")
 RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
 SUMMARY: list[str] = []
 """Lines that are printed at the end."""
@@ -77,8 +75,12 @@ def read(*words: str) -> Any:
     return json.loads(kubectl("get", *words, "--output=json"))
 
 
-def apply(*documents: Mapping[str, Any]) -> None:
-    kubectl("apply", "--filename=-", given=yaml.safe_dump_all(documents))
+def apply(*documents: dict[str, Any]) -> None:
+    """Apply objects, in the namespace of the tests unless they name another."""
+    for document in documents:
+        if document["kind"] != "Namespace":
+            document["metadata"].setdefault("namespace", NAMESPACE)
+    command("kubectl", "apply", "--filename=-", given=yaml.safe_dump_all(documents))
 
 
 def helm(*words: str, timeout: float = 180.0) -> str:
@@ -94,6 +96,19 @@ def cloudrc(*words: str, timeout: float = 240.0) -> subprocess.CompletedProcess[
         timeout=timeout,
         cwd=ROOT,
     )
+
+
+def in_release(*words: str, timeout: float = 240.0) -> str:
+    """Run our own command line for the tests' release; what it wrote."""
+    done = cloudrc(*words, "-n", NAMESPACE, "--release", NAME, timeout=timeout)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def set_link(*words: str) -> dict[str, Any]:
+    """Set the link of the flight by hand; gives what is in force then."""
+    document: dict[str, Any] = json.loads(in_release("link", "set", *words, "-o", "json"))
+    return document
 
 
 def eventually(
@@ -127,7 +142,7 @@ def pod(component: str) -> dict[str, Any]:
 def identity() -> dict[str, tuple[str, list[int]]]:
     """What changes when a pod is replaced or a container starts again."""
     found = {}
-    for component in ("world", "cloud"):
+    for component in ENDS:
         one = pod(component)
         status = one["status"]
         containers = [*status.get("initContainerStatuses", []), *status["containerStatuses"]]
@@ -143,14 +158,18 @@ def scrapes(component: str) -> dict[str, str]:
     return fetch_metrics(place(), component)
 
 
-def metrics(component: str, container: str = "") -> dict[Sample, float]:
-    """Every sample of a container: by name and sorted labels."""
-    text = scrapes(component)[container or component]
+def samples(text: str) -> dict[Sample, float]:
+    """Every sample of a scrape: by name and sorted labels."""
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(text)
         for sample in family.samples
     }
+
+
+def metrics(component: str) -> dict[Sample, float]:
+    """Every sample of world or cloud."""
+    return samples(scrapes(component)[component])
 
 
 def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
@@ -166,90 +185,34 @@ def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
 
 def missions() -> list[dict[str, Any]]:
     """All missions that the API knows, oldest first."""
-    token = operator_token(connect(None, NAMESPACE, NAME))
-    with api_url(None, NAMESPACE, NAME) as url:
+    token = operator_token(place())
+    with api_url(place()) as url:
         return list(Api(url, lambda: token).get("/v1/missions")["missions"])
 
 
-@dataclass
-class JobEnd:
-    """How a Job ended."""
-
-    name: str
-    condition: str
-    exit_code: int
-    message: str
-    log: str = field(repr=False, default="")
-
-
-def job_end(name: str, timeout: float = 150.0) -> JobEnd:
-    """Wait for a Job and read its verdict as `kubectl describe` would show it."""
-
-    def ended() -> str:
-        conditions = read("job", name)["status"].get("conditions", [])
-        true = [c["type"] for c in conditions if c["status"] == "True"]
-        return next((c for c in true if c in ("Complete", "Failed")), "")
-
-    condition = eventually(ended, f"Job {name} has ended", timeout)
-    (one,) = read("pods", f"--selector=batch.kubernetes.io/job-name={name}")["items"]
-    terminated = one["status"]["containerStatuses"][0]["state"]["terminated"]
-    log = kubectl("logs", one["metadata"]["name"])
-    return JobEnd(name, condition, terminated["exitCode"], terminated.get("message", ""), log)
+def job_end(name: str, timeout: float = 150.0) -> tuple[JobStatus, str]:
+    """Wait for the end of a Job; its final state and its log."""
+    lines: list[str] = []
+    return follow(place(), name, lines.append, timeout=timeout), "\n".join(lines)
 
 
 def job_log(name: str) -> str:
     """What a Job has said so far; "" while its pod does not run."""
-    try:
-        return kubectl("logs", f"job/{name}")
-    except CommandFailedError:
-        return ""
+    return "\n".join(logs(place(), name))
 
 
 def fly(name: str, waypoints: Sequence[Mapping[str, Any]], limit: float = 60.0) -> None:
     """Fly waypoints by a Job of this name, as `cloudrc mission run` does."""
-    from cloudrc.cluster.jobs import run_job
-
     mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints)}
     run_job(place(), mission, name=name, limit=limit)
 
 
 def save(folder: Path) -> None:
-    """Keep what helps to understand a failure: of each namespace in a folder of its own."""
-    for namespace in NAMESPACES:
-        _save_texts(folder / namespace, f"--namespace={namespace}")
-    for component in ("world", "cloud"):
-        for one in pods(component):
-            name = one["metadata"]["name"]
-            path = f"/var/lib/cloudrc/{component}.mcap"
-            words = [
-                "kubectl",
-                f"--namespace={NAMESPACE}",
-                "exec",
-                name,
-                f"--container={component}",
-            ]
-            with (folder / f"{name}.mcap").open("wb") as file:
-                subprocess.run([*words, "--", "cat", path], stdout=file, stderr=-3, timeout=60)
-
-
-def _save_texts(folder: Path, where: str) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-
-    def keep(name: str, *words: str) -> None:
-        try:
-            text = kubectl(where, *words, timeout=30.0)
-        except (CommandFailedError, subprocess.TimeoutExpired) as error:
-            text = str(error)
-        (folder / name).write_text(text)
-
-    keep("objects.txt", "get", "all,configmap,networkpolicy,pvc,secret", "--output=wide")
-    keep("events.txt", "get", "events", "--sort-by=.lastTimestamp")
-    keep("describe.txt", "describe", "pods,jobs")
-    for one in read("pods", where)["items"]:
-        name = one["metadata"]["name"]
-        keep(f"{name}.log", "logs", name, "--all-containers", "--prefix", "--timestamps")
-        if any(c["restartCount"] for c in one["status"].get("containerStatuses", [])):
-            keep(f"{name}.previous.log", "logs", name, "--all-containers", "--prefix", "--previous")
+    """Keep what helps to understand a failure: objects, events, logs, recordings."""
+    names = f"--namespaces={','.join(NAMESPACES)}"
+    command("kubectl", "cluster-info", "dump", names, f"--output-directory={folder}")
+    for component in ENDS:
+        fetch_recording(place(), component, folder / f"{component}.mcap")
 
 
 CLUSTER = "cloudrc-e2e"
@@ -302,22 +265,18 @@ def cluster(request: pytest.FixtureRequest) -> Iterator[None]:
             os.environ["KUBECONFIG"] = str(BUILD / "kubeconfig")
             _create()
         _load()
-        _make_namespace()
-        TIMES["loaded"] = time.monotonic()
+        metadata = {"name": NAMESPACE, "labels": RESTRICTED}
+        apply({"apiVersion": "v1", "kind": "Namespace", "metadata": metadata})
         request.config.stash[UP] = True
         yield
     finally:
         request.config.stash[UP] = False
         if not request.config.getoption("--keep", default=False):
-            _remove(own)
-
-
-def _remove(own: bool) -> None:
-    if own:
-        command("kind", "delete", "cluster", f"--name={CLUSTER}")
-    else:
-        words = ["delete", "namespace", *NAMESPACES, "--ignore-not-found", "--wait=false"]
-        command("kubectl", *words)
+            if own:
+                command("kind", "delete", "cluster", f"--name={CLUSTER}")
+            else:
+                words = ["namespace", *NAMESPACES, "--ignore-not-found", "--wait=false"]
+                command("kubectl", "delete", *words)
 
 
 def _create() -> None:
@@ -336,11 +295,6 @@ def _load() -> None:
         command("make", "kind-load", name, f"IMAGES={IMAGES}", timeout=300)
 
 
-def _make_namespace() -> None:
-    metadata = {"name": NAMESPACE, "labels": RESTRICTED}
-    apply({"apiVersion": "v1", "kind": "Namespace", "metadata": metadata})
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
     report = yield
@@ -348,7 +302,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
         folder = BUILD / re.sub(r"\W+", "-", item.name)
         try:
             save(folder)
-        except (AssertionError, subprocess.SubprocessError, OSError) as error:
+        except (AssertionError, CloudrcError, subprocess.SubprocessError, OSError) as error:
             SUMMARY.append(f"nothing more could be saved of {item.name}: {error}")
         SUMMARY.append(f"{item.name} FAILED: see {folder.relative_to(ROOT)}")
     return report
@@ -377,8 +331,6 @@ def values(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def installed(cluster: None, values: Path) -> None:
     """The release that most tests use."""
-    from cloudrc.cluster.release import wait_ready
-
     kubectl("delete", "jobs", "--all")  # of an earlier session, where the cluster was kept
     began = time.monotonic()
     helm("upgrade", "--install", NAME, str(CHART), f"--values={values}")
@@ -394,61 +346,23 @@ def prometheus_image(cluster: None) -> str:
 
 
 @dataclass
-class Cost:
-    """Processor [cores] and memory [bytes]: in all, and of each container."""
+class Usage:
+    """What the release has used up to an instant [s]."""
 
-    cpu: float
+    at: float
+    cpu: dict[str, float]
+    """Container -> processor time [s]."""
     memory: float
-    containers: dict[str, tuple[float, float]]
-
-
-Usage = dict[str, tuple[float, float, float]]
-"""Container -> instant [s], processor time used so far [s], memory [bytes]."""
+    """Of all containers [bytes]."""
 
 
 def usage() -> Usage:
-    """Read the counters of all containers of the release."""
-    found: Usage = {}
-    for component in ("world", "cloud"):
-        one = pod(component)
-        summary = json.loads(command("kubectl", "get", "--raw", _address(one["spec"]["nodeName"])))
-        (mine,) = [
-            each
-            for each in summary["pods"]
-            if each["podRef"]["uid"] == one["metadata"]["uid"]
-            and each["podRef"]["namespace"] == NAMESPACE
-        ]
-        for container in mine["containers"]:
-            cpu = container["cpu"]
-            found[f"{component}/{container['name']}"] = (
-                datetime.fromisoformat(cpu["time"].replace("Z", "+00:00")).timestamp(),
-                cpu["usageCoreNanoSeconds"] * 1e-9,
-                container["memory"]["workingSetBytes"],
-            )
-    return found
-
-
-def cost_between(before: Usage, after: Usage) -> Cost:
-    """What was used per second from one reading to a later one."""
-    newest = after if _is_later(after, before) else later(before)
-    containers = {
-        name: ((used - before[name][1]) / (at - before[name][0]), memory)
-        for name, (at, used, memory) in newest.items()
-        if name in before
-    }
-    cpu, memory = (sum(each[i] for each in containers.values()) for i in (0, 1))
-    return Cost(cpu, memory, containers)
-
-
-def later(before: Usage) -> Usage:
-    """Read the counters once the kubelet has measured all containers again."""
-
-    def look() -> Usage | None:
-        now = usage()
-        return now if _is_later(now, before) else None
-
-    found: Usage = eventually(look, "the kubelet has measured again", 30.0)
-    return found
+    """Read what each process of the release says of itself."""
+    texts = {f"{end}/{name}": text for end in ENDS for name, text in scrapes(end).items()}
+    found = {name: samples(text) for name, text in texts.items()}
+    cpu = {name: value(each, "process_cpu_seconds_total") for name, each in found.items()}
+    memory = [value(each, "process_resident_memory_bytes") for each in found.values()]
+    return Usage(time.monotonic(), cpu, sum(memory))
 
 
 @cache  # measured where the release flies; later its pods may just be replaced
@@ -456,11 +370,3 @@ def pace() -> float:
     """How much slower than nominal the release's own interpreter is at its own work; at least 1."""
     words = ("exec", pod("world")["metadata"]["name"], "--container=world", "--")
     return slower(kubectl(*words, "python", "-c", WORK))
-
-
-def _is_later(one: Usage, other: Usage) -> bool:
-    return all(one[name][0] > other[name][0] for name in other)
-
-
-def _address(node: str) -> str:
-    return f"/api/v1/nodes/{node}/proxy/stats/summary"

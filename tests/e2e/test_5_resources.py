@@ -5,37 +5,37 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from tests.e2e.conftest import CHART, EXAMPLES, NAME, NAMESPACE, cloudrc, helm, metrics, pace, value
 
-PLACE = ["-n", NAMESPACE, "--release", NAME]
 SHORT = ["--set", "mission.waypoints.0.dwell_s=6"]
 """Over `hover`: long enough to be throttled, short enough for a suite."""
 PATIENCE = 480.0
 """For a world with 15m of a CPU, which takes minutes to start where Python takes 2 s [s]."""
 VISIBLE = 10.0
 """Times as long as unconstrained a part has to be throttled."""
+Constrained = Callable[..., tuple[int, dict[str, Any]]]
 
 
 @pytest.fixture
-def with_values(installed: None, values: Path) -> Iterator[Callable[..., None]]:
-    def upgrade(name: str, *words: str) -> None:
+def constrained(installed: None, values: Path, tmp_path: Path) -> Iterator[Constrained]:
+    """Fly under an example's limits: exit code and report."""
+
+    def fly(name: str, *words: str) -> tuple[int, dict[str, Any]]:
         file = EXAMPLES / f"values-{name}.yaml"
         helm("upgrade", NAME, str(CHART), f"--values={values}", f"--values={file}", *words)
-        # Not waited for: 'cloudrc run' keeps these values, lays its experiment over them and waits.
+        # 'cloudrc run' keeps these values, lays its experiment over them and waits.
+        line = ["run", "hover", *SHORT, "--mode", "cluster", "-n", NAMESPACE, "--release", NAME]
+        done = cloudrc(*line, "--out", str(tmp_path / name), timeout=PATIENCE)
+        assert (tmp_path / name / "report.json").is_file(), done.stdout + done.stderr
+        return done.returncode, json.loads((tmp_path / name / "report.json").read_text())
 
-    yield upgrade
+    yield fly
     helm("upgrade", NAME, str(CHART), f"--values={values}")
-
-
-def flown(folder: Path) -> tuple[int, dict]:
-    words = ("run", "hover", *SHORT, "--mode", "cluster", *PLACE, "--out", str(folder))
-    done = cloudrc(*words, timeout=PATIENCE)
-    assert (folder / "report.json").is_file(), done.stdout + done.stderr
-    return done.returncode, json.loads((folder / "report.json").read_text())
 
 
 def throttled(component: str) -> float:
@@ -51,48 +51,37 @@ def scaled(name: str, component: str) -> list[str]:
     example = yaml.safe_load((EXAMPLES / f"values-{name}.yaml").read_text())
     cpu = example[component]["resources"]["limits"]["cpu"]
     millicores = round(float(cpu.removesuffix("m")) * pace())
-    return [
-        f"--set={component}.resources.{kind}.cpu={millicores}m" for kind in ("limits", "requests")
-    ]
-
-
-@pytest.fixture(scope="module")
-def plain(installed: None) -> dict[str, float]:
-    """How long the parts of the release as it comes were throttled in all their life [s]."""
-    return {component: throttled(component) for component in ("world", "cloud")}
+    kinds = ("limits", "requests")
+    return [f"--set={component}.resources.{kind}.cpu={millicores}m" for kind in kinds]
 
 
 @pytest.mark.parametrize(
-    ("name", "component"), [("constrained-drone", "world"), ("loaded-cloud", "cloud")]
+    ("name", "component"),
+    [
+        ("constrained-drone", "world"),
+        pytest.param("loaded-cloud", "cloud", marks=pytest.mark.full),
+    ],
 )
 def test_a_constrained_part_is_throttled_yet_keeps_real_time(
-    plain: dict[str, float],
-    with_values: Callable[..., None],
-    tmp_path: Path,
-    note: Callable[[str], None],
-    name: str,
-    component: str,
+    constrained: Constrained, note: Callable[[str], None], name: str, component: str
 ) -> None:
-    with_values(name, *scaled(name, component))
-    code, report = flown(tmp_path / name)
+    plain = throttled(component)
+    code, report = constrained(name, *scaled(name, component))
     assert (code, report["verdict"]) == (0, "success"), report
     numbers = {key: entry["value"] for key, entry in report["numbers"].items()}
     stopped = throttled(component)
     note(
-        f"{name}: throttled {stopped:.2f} s (unconstrained: {plain[component]:.2f} s),"
+        f"{name}: throttled {stopped:.2f} s (unconstrained: {plain:.2f} s),"
         f" lateness p99 {numbers[f'{component}_lateness_p99'] * 1e3:.1f} ms,"
         f" prediction error {numbers['prediction_error_rms'] * 1e3:.1f} mm,"
         f" real-time factor {numbers['real_time_factor']:.3f}"
     )
-    assert stopped > VISIBLE * plain[component]
+    assert stopped > VISIBLE * plain
     assert stopped > 0
     assert numbers["real_time_factor"] >= 0.95
 
 
 @pytest.mark.full
-def test_a_world_that_cannot_keep_up_says_invalid(
-    with_values: Callable[..., None], tmp_path: Path
-) -> None:
-    with_values("invalid")
-    code, report = flown(tmp_path / "invalid")
+def test_a_world_that_cannot_keep_up_says_invalid(constrained: Constrained) -> None:
+    code, report = constrained("invalid")
     assert (code, report["verdict"]) == (6, "invalid")

@@ -5,61 +5,48 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
 
-from tests.e2e.conftest import CHART, NAMESPACE, ROOT, cloudrc, command
-from tests.e2e.neighbours import apply_anywhere
+from tests.e2e.conftest import CHART, NAMESPACE, ROOT, apply, cloudrc, command
 
 ELSEWHERE = f"{NAMESPACE}-bad"
-Refusal = Callable[..., tuple[int, str]]
-"""Release and settings of helm -> exit code and the line that says what is wrong."""
 
 
 @pytest.fixture(scope="module")
 def namespace(cluster: None) -> Iterator[str]:
     """A namespace that allows everything, for releases that are not meant to work."""
-    apply_anywhere([{"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": ELSEWHERE}}])
+    apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": ELSEWHERE}})
     yield ELSEWHERE
     command("kubectl", "delete", "namespace", ELSEWHERE, "--wait=false")
 
 
-@pytest.fixture
-def refusal(namespace: str) -> Iterator[Refusal]:
-    """Install with helm, then let our own command say what is wrong.
-
-    Uninstalled after the test's end: what helps to understand a failure is kept before that.
-    """
-    installed: list[str] = []
-
-    def refused(release: str, *settings: str) -> tuple[int, str]:
-        command("helm", "install", release, CHART, f"-n={namespace}", *settings)
-        installed.append(release)
-        line = ["run", "hover", "--mode", "cluster", "-n", namespace, "--release", release]
-        done = cloudrc(*line, "--timeout", "60")
-        (said,) = [each for each in done.stderr.splitlines() if each.startswith("cloudrc: error:")]
-        assert "Traceback" not in done.stderr
-        return done.returncode, said
-
-    yield refused
-    for release in installed:
-        command("helm", "uninstall", release, f"-n={namespace}")
+def refused(release: str, *settings: str) -> tuple[int, str]:
+    """Install with helm, then let our own command say what is wrong: exit code and message."""
+    command("helm", "install", release, CHART, f"-n={ELSEWHERE}", *settings)
+    line = ["run", "hover", "--mode", "cluster", "-n", ELSEWHERE, "--release", release]
+    done = cloudrc(*line, "--timeout", "60")
+    (said,) = [each for each in done.stderr.splitlines() if each.startswith("cloudrc: error:")]
+    assert "Traceback" not in done.stderr
+    command("helm", "uninstall", release, f"-n={ELSEWHERE}")
+    return done.returncode, said
 
 
-def test_an_image_that_is_not_loaded_is_named(refusal: Refusal) -> None:
-    code, line = refusal("no-image", "--set=image.tag=0.0.0-missing")
+def test_an_image_that_is_not_loaded_is_named(namespace: str) -> None:
+    code, line = refused("no-image", "--set=image.tag=0.0.0-missing")
     assert code == 5
     assert "cloudrc/world:0.0.0-missing" in line or "cloudrc/cloud:0.0.0-missing" in line
     assert "make kind-load" in line
 
 
-def test_netem_without_kernel_support_is_refused_with_advice(refusal: Refusal) -> None:
+@pytest.mark.full
+def test_netem_without_kernel_support_is_refused_with_advice(namespace: str) -> None:
     if has_netem():
         pytest.skip("this kernel has sch_netem")
-    code, line = refusal("no-netem", "--set=link.mode=netem")
+    code, line = refused("no-netem", "--set=link.mode=netem")
     assert code == 5
     assert "sch_netem" in line
     assert "relay" in line
@@ -107,7 +94,7 @@ def test_without_permission_one_sentence_says_so(namespace: str, tmp_path: Path)
 def powerless(folder: Path) -> Path:
     """A kubeconfig of a service account that may do nothing."""
     account = {"name": "powerless", "namespace": ELSEWHERE}
-    apply_anywhere([{"apiVersion": "v1", "kind": "ServiceAccount", "metadata": account}])
+    apply({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": account})
     token = command("kubectl", "create", "token", "powerless", f"-n={ELSEWHERE}").strip()
     config = yaml.safe_load(command("kubectl", "config", "view", "--raw", "--minify"))
     config["users"][0]["user"] = {"token": token}

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import shlex
 
+import pytest
+
 from tests.e2e.conftest import EXAMPLES, NAME, cloudrc, command, eventually, helm, kubectl, read
 
 KINDS = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc,job,pod"
 
 
+@pytest.mark.full
 def test_the_commands_of_the_notes_work_as_printed(installed: None) -> None:
     """All three end by themselves; the second flies `pipes`, for half a minute."""
     printed = [line for line in helm("get", "notes", NAME).splitlines() if line.startswith("  ")]

@@ -25,27 +25,11 @@ MS = 1_000_000
 
 def period(stamp_ms: float, basis_ms: float, **fields: Any) -> Control:
     """Make a control period at `stamp_ms`, cloud's clock, from odometry of `basis_ms`, world's."""
-    at_rest = Control(
-        round(stamp_ms * MS),
-        1,
-        0,
-        round(basis_ms * MS),
-        0.0,
-        nan,
-        nan,
-        ZERO,
-        ZERO,
-        UPRIGHT,
-        ZERO,
-        ZERO,
-        0,
-        ZERO,
-        0.0,
-        ZERO,
-        ZERO,
-        ZERO,
-    )
-    return at_rest._replace(**fields)
+    still: dict[str, Any] = dict.fromkeys(Control._fields, ZERO)
+    still |= {"stamp_ns": round(stamp_ms * MS), "basis_stamp_ns": round(basis_ms * MS)}
+    still |= {"epoch": 1, "counter": 0, "horizon": 0.0, "rtt": nan, "loop_delay": nan}
+    still |= {"orientation_wxyz": UPRIGHT, "waypoint": 0, "yaw_rate": 0.0}
+    return Control(**{**still, **fields})
 
 
 RULES = Path(__file__).resolve().parents[2] / "charts" / "cloudrc" / "files" / "rules.yaml"

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.exposition.ends import DelayJudge, PredictionJudge
 from cloudrc.exposition.live import LiveMetrics
+from cloudrc.exposition.parts import DelayJudge, PredictionJudge
 from cloudrc.records import CommandApplied, Control
 from tests.exposition.conftest import MS, period
 from tests.flights.conftest import records
@@ -23,41 +23,23 @@ def flying_along_x(predicted_lead: float, *, every_ms: int = 10) -> Iterator[Con
         yield period(7000 + at, at, measured=(x, 0.0, 0.0), position=predicted, horizon=0.025)
 
 
-def test_a_prediction_is_compared_at_its_own_instant() -> None:
+@pytest.mark.parametrize(("lead", "every_ms", "judged"), [(0.01, 10, 37), (0, 10, 37), (1, 60, 0)])
+def test_a_prediction_is_compared_at_its_own_instant(
+    lead: float, every_ms: int, judged: int
+) -> None:
+    """The last three wait for a measurement 25 ms later; none is compared across a gap."""
     judge = PredictionJudge()
-    for control in flying_along_x(0.01):
+    for control in flying_along_x(lead, every_ms=every_ms):
         judge.take(control)
-    assert judge.error == pytest.approx((0.01, 0.0, 0.0))
-    assert judge.judged == 37  # the last three wait for a measurement 25 ms later
-    assert judge.square == pytest.approx(37 * 0.01**2)
+    assert judge.judged == judged
+    assert judge.square == pytest.approx(judged * lead**2, abs=1e-12)
+    assert judge.error == pytest.approx((lead, 0, 0) if judged else (math.nan,) * 3, nan_ok=True)
 
 
-def test_a_correct_prediction_between_measurements_has_no_error() -> None:
-    judge = PredictionJudge()
-    for control in flying_along_x(0.0):
-        judge.take(control)
-    assert judge.square == pytest.approx(0.0, abs=1e-18)
-
-
-def test_no_prediction_is_compared_across_a_gap() -> None:
-    judge = PredictionJudge()
-    for control in flying_along_x(0.01, every_ms=60):
-        judge.take(control)
-    assert judge.judged == 0
-    assert math.isnan(judge.error[0])
-
-
-def test_no_prediction_is_compared_across_sessions() -> None:
+def test_predictions_of_other_sessions_and_older_odometry_do_not_count() -> None:
     judge = PredictionJudge()
     judge.take(period(0, 0, horizon=0.01, position=(9.0, 9.0, 9.0)))
     judge.reset()
-    judge.take(period(10, 5))
-    judge.take(period(20, 15))
-    assert judge.square == 0.0
-
-
-def test_older_odometry_is_not_a_measurement() -> None:
-    judge = PredictionJudge()
     for basis in (0, 10, 5, 20, 15, 30):
         x = basis * 1e-3
         judge.take(
@@ -67,19 +49,14 @@ def test_older_odometry_is_not_a_measurement() -> None:
     assert judge.judged >= 3
 
 
-def test_a_delay_estimate_is_compared_with_the_true_delay() -> None:
+@pytest.mark.parametrize(("loop_delay", "error"), [(0.145, -0.02), (0.144, math.nan)])
+def test_a_delay_estimate_is_compared_with_the_true_delay(loop_delay: float, error: float) -> None:
+    """An echo of an unknown command is ignored."""
     judge = DelayJudge()
     judge.sent(period(1000, 500, horizon=0.08))  # a command from odometry of 500 ms
     # World applies it at 600 ms, 100 ms after the odometry, and echoes it 3 ms later.
-    judge.echoed(period(1150, 603, loop_delay=0.145, rtt=0.142), 1145 * MS)
-    assert judge.error == pytest.approx(-0.02)
-
-
-def test_an_echo_of_an_unknown_command_is_ignored() -> None:
-    judge = DelayJudge()
-    judge.sent(period(1000, 500, horizon=0.08))
-    judge.echoed(period(1150, 603, loop_delay=0.144, rtt=0.141), 1145 * MS)
-    assert math.isnan(judge.error)
+    judge.echoed(period(1150, 603, loop_delay=loop_delay, rtt=loop_delay - 0.003), 1145 * MS)
+    assert judge.error == pytest.approx(error, nan_ok=True)
 
 
 @pytest.mark.parametrize("offset_ns", [0, 5_000_000_000])

@@ -1,9 +1,11 @@
-"""The namespace decides the mode of the link; the release shows it; an upgrade keeps it."""
+"""The link's mode follows the namespace; `helm test` verifies the link."""
 
 from __future__ import annotations
 
 import pytest
 
+from cloudrc.cli.link_verify import RELEASE_TIMEOUT
+from cloudrc.cli.parser import build_parser
 from tests.chart.conftest import (
     Lookup,
     Object,
@@ -38,12 +40,8 @@ def modes(lookup: Lookup, values: Object | None = None) -> set[str]:
 )
 def test_auto_follows_the_label_of_the_namespace(lookup: Lookup, mode: str) -> None:
     assert modes(lookup) == {f"--mode={mode}"}
-
-
-@pytest.mark.parametrize("mode", ["relay", "netem"])
-@pytest.mark.parametrize("level", ["", "restricted"])
-def test_a_fixed_mode_ignores_the_namespace(mode: str, level: str) -> None:
-    assert modes(a_namespace(level), {"link": {"mode": mode}}) == {f"--mode={mode}"}
+    for fixed in ("relay", "netem"):
+        assert modes(lookup, {"link": {"mode": fixed}}) == {f"--mode={fixed}"}
 
 
 @pytest.mark.parametrize(
@@ -57,6 +55,7 @@ def test_a_fixed_mode_ignores_the_namespace(mode: str, level: str) -> None:
     ids=["made by helm", "no label", "restricted"],
 )
 def test_an_upgrade_keeps_the_mode(first: Lookup, later: Lookup) -> None:
+    """It keeps the key and the tokens, too."""
     installed = render(lookup=first)
     assert render(lookup=holding(installed, later)) == installed
 
@@ -64,10 +63,7 @@ def test_an_upgrade_keeps_the_mode(first: Lookup, later: Lookup) -> None:
 def test_an_upgrade_obeys_a_new_label() -> None:
     installed = render(lookup=a_namespace())
     assert modes(holding(installed, a_namespace("restricted"))) == {"--mode=relay"}
-
-
-def test_the_pods_have_an_annotation_with_the_mode() -> None:
-    for deployment in of_kind(render(lookup=a_namespace()), "Deployment").values():
+    for deployment in of_kind(installed, "Deployment").values():
         annotations = deployment["spec"]["template"]["metadata"]["annotations"]
         assert annotations["cloudrc/link-mode"] == "auto"
 
@@ -80,3 +76,24 @@ def test_the_notes_show_mode_and_label_command() -> None:
         text = notes({"link": {"mode": mode}}, lookup=a_namespace())
         assert f"mode {mode}" in text
         assert label in text
+
+
+def test_helm_test_verifies_the_link_of_this_release() -> None:
+    objects = render()
+    pods = [thing for thing in objects if thing["kind"] == "Pod"]
+    (test,) = (thing for thing in pods if thing["metadata"]["name"].endswith("-test-link"))
+    annotations, spec = test["metadata"]["annotations"], test["spec"]
+    assert annotations["helm.sh/hook"] == "test"
+    assert int(annotations["helm.sh/hook-weight"]) > 0, "commands flow once a mission has flown"
+    assert "hook-failed" not in annotations["helm.sh/hook-delete-policy"]
+    assert spec["restartPolicy"] == "Never"
+    # Helm waits 300 s for one hook.
+    assert RELEASE_TIMEOUT + 10.0 <= spec["activeDeadlineSeconds"] < 300.0
+    (container,) = spec["containers"]
+    options = build_parser(["link"]).parse_args(container["args"])
+    services = {thing["metadata"]["name"] for thing in objects if thing["kind"] == "Service"}
+    hosts = options.ends.split(",")
+    assert set(hosts) <= services
+    assert {name.rsplit("-", 1)[-1] for name in hosts} == {"world", "cloud"}
+    cloud = containers(pod_specs(objects)["cloud"])["cloud"]
+    assert container["securityContext"] == cloud["securityContext"]

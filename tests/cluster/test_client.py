@@ -1,0 +1,222 @@
+"""The selection of a release, its requests, and calls of kubectl and helm; errors in one line."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from cloudrc.cluster import client
+from cloudrc.cluster.client import ClusterError, Release, UnavailableError, chart_folder, connect
+from cloudrc.cluster.flight import wait_ready
+from cloudrc.cluster.jobs import follow, run_job
+from cloudrc.cluster.pods import find_pod, list_pods
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
+from tests.cluster.conftest import (
+    CONFIG_PLACE,
+    MISSION,
+    FakeApi,
+    end,
+    kubeconfig,
+    pod,
+    start_pod,
+    terminated,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+Pretend = Callable[[str, str], Path]
+
+
+def test_flags_override_the_kubeconfig(api: FakeApi) -> None:
+    assert connect().namespace == "demo"
+    assert connect("elsewhere").namespace == "default"
+    release = connect("elsewhere", "mine", "paper")
+    assert release == Release("elsewhere", "mine", "paper")
+    assert release.flags == ["--context=elsewhere", "--namespace=mine"]
+    assert release.helm_flags == ["--kube-context=elsewhere", "--namespace=mine"]
+
+
+def test_an_unknown_context_lists_the_known_ones(api: FakeApi) -> None:
+    with pytest.raises(MissingPrerequisiteError, match=r"no context 'x'.*elsewhere, here"):
+        connect("x")
+
+
+@pytest.mark.parametrize("text", [None, "", "contexts: 3", ":\n  - x: ["])
+def test_a_missing_kubeconfig_is_reported_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str | None
+) -> None:
+    path = tmp_path / "config"
+    if text is not None:
+        path.write_text(text)
+    monkeypatch.setattr(CONFIG_PLACE, str(path))
+    with pytest.raises(MissingPrerequisiteError, match="kind create cluster") as caught:
+        connect()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        (None, "No such file or directory: .*login-to-nowhere"),
+        ("echo no token >&2; exit 7", "returned 7"),
+        ("echo '{}'", "exec"),
+    ],
+    ids=["missing", "failing", "giving nothing"],
+)
+def test_a_failing_login_program_is_named_in_one_line(
+    tmp_path: Path, script: str | None, words: str
+) -> None:
+    """Runs in its own process, because pytest captures log records."""
+    program = tmp_path / "login-to-nowhere"
+    if script is not None:
+        program.write_text(f"#!/bin/sh\n{script}\n")
+        program.chmod(0o755)
+    config = yaml.safe_load(kubeconfig("http://127.0.0.1:9"))
+    version = "client.authentication.k8s.io/v1"
+    login = {"apiVersion": version, "command": str(program), "interactiveMode": "Never"}
+    config["users"][0]["user"] = {"exec": login}
+    (tmp_path / "config").write_text(yaml.safe_dump(config))
+    done = subprocess.run(
+        [sys.executable, "-m", "cloudrc", "mission", "list", "-n", "demo"],
+        env={**os.environ, "KUBECONFIG": str(tmp_path / "config"), "PYTHONPATH": str(ROOT)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 3, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("cloudrc: error: cannot log in to the cluster in namespace 'demo'")
+    assert re.search(words, line)
+
+
+def test_a_silent_cluster_is_reported_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "config"
+    path.write_text(kubeconfig("http://127.0.0.1:9"))  # the discard port: nobody listens
+    monkeypatch.setattr(CONFIG_PLACE, str(path))
+    with pytest.raises(ClusterError, match=r"does not answer.*refused.*kubectl") as caught:
+        list_pods(connect(), "cloud")
+    assert caught.value.exit_code == 5
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("code", "said", "expected"),
+    [
+        (401, "Unauthorized", "log in"),
+        (403, "pods is forbidden: User me cannot list", "kubectl auth can-i list pods"),
+        (403, "exceeded quota: compute", "free some of the namespace's quota"),
+        (500, "etcd\nis gone", "etcd is gone"),
+    ],
+)
+def test_a_refusal_names_cause_and_next_command(
+    api: FakeApi, release: Release, code: int, said: str, expected: str
+) -> None:
+    api.refuse["GET", "pods"] = code, said
+    with pytest.raises(ClusterError, match=expected) as caught:
+        list_pods(release, "cloud")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_newest_pod_of_the_release_is_found(api: FakeApi, release: Release) -> None:
+    with pytest.raises(ClusterError, match=r"no release 'cloudrc' in namespace 'demo'; install it"):
+        find_pod(release, "cloud")
+    for name in ("old", "new", "ending"):
+        api.put("pods", pod(name, "cloud"))
+    api.put("pods", pod("other", "cloud", labels={"app.kubernetes.io/instance": "other"}))
+    api.get("pods", "ending")["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:59Z"
+    assert find_pod(release, "cloud").metadata.name == "new"
+
+
+def away(api: FakeApi, plural: str, code: int, times: int) -> Callable[[], int]:
+    """Refuse a number of read requests; return a function that counts those left."""
+    original, left = api.answer, times
+
+    def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
+        nonlocal left
+        if method == "GET" and f"/{plural}" in path and left:
+            left -= 1
+            return code, {"message": "etcdserver: leader changed", "code": code}
+        return original(method, path, body)
+
+    api.answer = answer  # type: ignore[method-assign]
+    return lambda: left
+
+
+@pytest.mark.parametrize(("plural", "code"), [("jobs", 429), ("jobs", 503), ("pods", 500)])
+def test_follow_survives_an_outage(
+    running: FakeApi, release: Release, plural: str, code: int
+) -> None:
+    run_job(release, MISSION, name="first")
+    start_pod(running, "first", state=terminated(0, "done"))
+    running.logs["first-x"] = "waypoint 1 of 1 reached\n"
+    end(running, "first", "Complete")
+    left = away(running, plural, code, 3)
+    lines: list[str] = []
+    assert follow(release, "first", lines.append, timeout=10.0).exit_code == 0
+    assert left() == 0
+    left = away(running, "deployments", code, 2)
+    wait_ready(release, timeout=10.0)
+    assert left() == 0
+    told, last = lines
+    assert "leader changed" in told
+    assert last == "waypoint 1 of 1 reached"
+
+
+def test_only_a_short_outage_is_waited_for(
+    running: FakeApi, release: Release, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client, "OUTAGE_MAX", 0.05)
+    run_job(release, MISSION, name="first")
+    left = away(running, "jobs", 403, 5)
+    with pytest.raises(ClusterError, match="can-i get jobs"):
+        follow(release, "first", print, timeout=10.0)
+    assert left() == 4, "a refusal is not repeated"
+    away(running, "jobs", 500, 1_000_000)
+    with pytest.raises(UnavailableError, match="leader changed"):
+        follow(release, "first", print, timeout=10.0)
+
+
+@pytest.mark.parametrize("name", ["helm", "kubectl"])
+def test_a_missing_program_is_named_with_its_page(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(MissingPrerequisiteError, match=f"{name} is not installed; .* http"):
+        client.run(name, ["version"], timeout=1.0)
+
+
+@pytest.mark.parametrize(
+    ("script", "kind", "expected"),
+    [
+        ("exec sleep 60", TimedOutError, r"'helm list' took more than 0\.3 s"),
+        ("echo 'W1120 06:00 beware\nError: UPGRADE FAILED: no\n  - way'", ClusterError, "no - way"),
+        ("echo 'error: no context'", ClusterError, "'helm list' failed: no context"),
+        ("", ClusterError, "no error message"),
+    ],
+)
+def test_the_error_of_a_program_becomes_one_line(
+    pretend: Pretend, script: str, kind: type[CloudrcError], expected: str
+) -> None:
+    pretend("helm", f"exec >&2\n{script}\nexit 1")
+    with pytest.raises(kind, match=expected) as caught:
+        client.run("helm", ["list", "--all"], timeout=0.3 if "sleep" in script else 10.0)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path: Path) -> None:
+    package = tmp_path / "cloudrc"
+    with pytest.raises(MissingPrerequisiteError, match="install cloudrc again"):
+        chart_folder(package)
+    for folder in (tmp_path / "charts" / "cloudrc", package / "_chart"):
+        folder.mkdir(parents=True)
+        (folder / "Chart.yaml").touch()
+        assert chart_folder(package) == folder

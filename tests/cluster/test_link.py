@@ -1,0 +1,298 @@
+"""`cloudrc link set` in a cluster: the change in pods and ConfigMap, its answer and its rights."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import threading
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from cloudrc.cli.main import main
+from cloudrc.cluster.client import ClusterError
+from cloudrc.cluster.link import APPLY_LIMIT, APPLY_SCRIPT, with_files
+from cloudrc.errors import BadInputError
+from cloudrc.link.follow import HANDED_FILE, Handed, read_handed, write_handed
+from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
+from tests.cluster.conftest import FakeApi
+
+Printed = pytest.CaptureFixture[str]
+PROFILE = "uplink: {delay_ms: 45, jitter_ms: 25}\ndownlink: {delay_ms: 45, jitter_ms: 25}\n"
+TRACE = "time_s,delay_ms\n0,40\n1,60\n"
+LINE = ["link", "set", "downlink.delay_ms=120", "-n", "demo"]
+
+
+def item(kind: str, name: str, component: str, **rest: Any) -> dict[str, Any]:
+    labels = {"app.kubernetes.io/component": component}
+    metadata = {"name": name, "labels": labels, "creationTimestamp": "2026-01-01T00:00:00Z"}
+    return {"kind": kind, "metadata": metadata, **rest}
+
+
+class Cluster:
+    """A release behind a fake kubectl, with a record of its calls.
+
+    Attributes:
+        refused: Verb of kubectl -> error message.
+        broken: Pods whose link container cannot be reached.
+        deaf: Pods whose link container applies nothing.
+        cannot: Pod -> word in a profile that its link container refuses.
+    """
+
+    def __init__(self) -> None:
+        running = {"status": {"phase": "Running"}}
+        self.items = [
+            item("ConfigMap", "demo-link", "link", data={"profile.yaml": PROFILE}),
+            item("ConfigMap", "demo-experiment", "shared", data={"experiment.yaml": "{}"}),
+            item("Pod", "world-1", "world", **running),
+            item("Pod", "cloud-1", "cloud", **running),
+            item("Pod", "cloud-0", "cloud", **running),
+        ]
+        self.items[-1]["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:01Z"
+        self.states = {
+            pod: asdict(LinkState("netem", "", "auto", way, {}, "", 1, asked={"delay": 0.12}))
+            for pod, way in (("world-1", "uplink"), ("cloud-1", "downlink"))
+        }
+        self.refused: dict[str, str] = {}
+        self.broken, self.deaf = set[str](), set[str]()
+        self.cannot: dict[str, str] = {}
+        self.asked: list[list[str]] = []
+        self.handed: dict[str, dict[str, Any]] = {}
+        self.kept: dict[str, str] = {}
+
+    def run(self, name: str, words: list[str], *, timeout: float, given: str = "") -> str:
+        assert name == "kubectl"
+        self.asked.append(words)
+        verb = next(word for word in words if word in ("get", "patch", "exec"))
+        if verb in self.refused:
+            raise ClusterError(f"'kubectl {verb}' failed: {self.refused[verb]}")
+        if verb == "get":
+            return json.dumps({"items": self.items})
+        if verb == "patch":
+            self.kept = json.loads(given)["data"]
+            return ""
+        pod = words[words.index("exec") + 2]
+        if pod in self.broken:
+            raise ClusterError("the pod is gone")
+        document, state = json.loads(given), self.states[pod]
+        change, self.handed[pod] = json.loads(document["change"]), document
+        if pod in self.cannot and self.cannot[pod] in document["files"]["profile.yaml"]:
+            state |= {"refused": change["number"], "refusal": "netem cannot do that"}
+        elif pod not in self.deaf:
+            state |= {"change": change["number"], "cause": change["cause"]}
+        return json.dumps(state)
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
+    found = Cluster()
+    monkeypatch.setattr("cloudrc.cluster.link.run", found.run)
+    return found
+
+
+def test_a_change_reaches_both_pods_and_the_configmap(cluster: Cluster, capsys: Printed) -> None:
+    assert main([*LINE, "--context", "kind"]) == 0
+    assert yaml.safe_load(cluster.kept["profile.yaml"]) == {
+        "uplink": {"delay_ms": 45.0, "jitter_ms": 25.0},
+        "downlink": {"delay_ms": 120.0, "jitter_ms": 25.0},
+    }
+    change = json.loads(cluster.kept["change.json"])
+    assert (change["cause"], change["restart"]) == ("downlink.delay_ms=120", False)
+    for name in ("world-1", "cloud-1"):
+        handed = cluster.handed[name]
+        assert handed["files"] == {"profile.yaml": cluster.kept["profile.yaml"]}
+        assert json.loads(handed["change"]) == change
+    asked = cluster.asked
+    verbs = [word for line in asked for word in line if word in ("get", "exec", "patch")]
+    assert verbs == ["get", "exec", "exec", "patch"], "in force first, then for good"
+    assert all(line[:2] == ["--context=kind", "--namespace=demo"] for line in asked)
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[2].split()[:4] == ["downlink", "netem", "120", "ms"]
+
+
+def test_a_local_trace_is_stored_beside_the_profile(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my trace.csv").write_text(TRACE)
+    setting = [f"uplink.trace={tmp_path / 'my trace.csv'}"]
+    cluster.items[0]["data"] |= {"old.csv": "of a profile before"}
+    assert main(["link", "set", *setting, "-n", "demo"]) == 0
+    handed = cluster.handed["world-1"]
+    assert set(handed["files"]) == {"profile.yaml", "uplink-my_trace.csv"}
+    assert handed["files"]["uplink-my_trace.csv"] == cluster.kept["uplink-my_trace.csv"] == TRACE
+    made, new = with_files({"profile.yaml": PROFILE}, None, setting)
+    assert made.restart
+    assert yaml.safe_load(new["profile.yaml"])["uplink"]["trace"] == "uplink-my_trace.csv"
+    # The profile now has the name of the file beside it.
+    again, newer = with_files({**new, "change.json": "{}"}, None, ["downlink.loss=0.1"])
+    assert again.values["uplink"]["trace"] == "uplink-my_trace.csv"
+    assert set(newer) == {"profile.yaml"}
+    assert not again.restart
+    monkeypatch.setattr("cloudrc.cluster.link.SIZE_MAX", 50)
+    with pytest.raises(BadInputError, match="a ConfigMap takes 50"):
+        with_files({"profile.yaml": PROFILE}, None, setting)
+
+
+FORBIDDEN = "Error from server (Forbidden): this is forbidden"
+LATER = "; the ConfigMap has the change, and the pods apply it within 2 minutes"
+
+
+def error(capsys: Printed) -> str:
+    """Return the one line of an error message."""
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+@pytest.mark.parametrize("gone", [["cloud-1"], ["world-1", "cloud-1"]])
+def test_an_unreachable_container_gets_the_change_later(
+    cluster: Cluster, capsys: Printed, gone: list[str]
+) -> None:
+    cluster.broken |= set(gone)
+    assert main(LINE) == 5
+    said = error(capsys)
+    assert said.count("the pod is gone") == len(gone)
+    assert said.endswith(LATER)
+    assert cluster.kept
+
+
+def test_a_change_that_cannot_be_kept_says_where_it_is(cluster: Cluster, capsys: Printed) -> None:
+    cluster.refused["patch"] = FORBIDDEN
+    assert main(LINE) == 5
+    said = error(capsys)
+    assert "the ConfigMap is unchanged: 'kubectl patch' failed" in said
+    for way in ("uplink", "downlink"):
+        assert f"the {way} has the change until its pod is replaced" in said
+    cluster.refused["exec"] = FORBIDDEN
+    assert main(LINE) == 5
+    said = error(capsys)
+    assert said.count("this is forbidden") == 3
+    assert "has the change" not in said
+
+
+def test_a_change_that_one_direction_refuses_does_not_last(
+    cluster: Cluster, capsys: Printed
+) -> None:
+    cluster.cannot["cloud-1"] = "corrupt"
+    assert main(["link", "set", "downlink.corrupt=0.5", "uplink.delay_ms=9", "-n", "demo"]) == 2
+    assert error(capsys) == (
+        "cloudrc: error: the downlink is unchanged: netem cannot do that; the uplink has the "
+        "change; the ConfigMap is unchanged, and restarted pods take it"
+    )
+    assert not cluster.kept
+
+
+def test_a_silent_or_strange_container_is_named(cluster: Cluster, capsys: Printed) -> None:
+    cluster.deaf.add("cloud-1")
+    assert main(LINE) == 4
+    said = error(capsys)
+    assert "the downlink did not apply the change within 5 s; see the log" in said
+    assert said.endswith(f"container link of pod cloud-1{LATER}")
+    cluster.states["cloud-1"].clear()
+    assert main(LINE) == 5
+    assert "a link container has another version: not the state of a link" in error(capsys)
+
+
+def test_a_missing_release_or_pod_is_named(
+    cluster: Cluster, running: FakeApi, capsys: Printed
+) -> None:
+    running.get("pods", "world-1")["status"]["phase"] = "Pending"
+    del cluster.items[2]
+    assert main(LINE) == 5
+    assert "the world pod of release 'cloudrc' does not run" in error(capsys)
+    running.objects.clear()
+    assert main(LINE) == 5
+    assert "no release 'cloudrc'" in error(capsys)
+
+
+# The script in the link container, with a real `sh`.
+
+NOTE = json.dumps({"number": "b2", "cause": "zwölf", "restart": False})
+LONG = "time_s,delay_ms\n" + "0,40\n" * 20_000
+DOCUMENT = write_handed(Handed(NOTE, {"profile.yaml": "uplink: {trace: t.csv}\n", "t": LONG}))
+
+
+def start(folder: Path) -> subprocess.Popen[str]:
+    length = str(len(DOCUMENT.encode()))
+    command = ["sh", "-c", APPLY_SCRIPT, "sh", str(folder), "b2", length]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+
+
+def tell(folder: Path, **state: str) -> str:
+    text = to_text(LinkState("relay", "", "relay", "uplink", {}, "", 1, **state))
+    publish(folder / STATE_FILE, text)
+    return text
+
+
+@pytest.mark.parametrize("state", [{"change": "b2"}, {"change": "a1", "refused": "b2"}])
+def test_the_script_hands_over_a_change_and_prints_the_state(
+    tmp_path: Path, state: dict[str, str]
+) -> None:
+    tell(tmp_path, change="a1", refused="b22")
+    running = start(tmp_path)
+    decided = list[str]()
+
+    def sidecar() -> None:
+        while not (tmp_path / HANDED_FILE).exists():
+            time.sleep(0.005)
+        decided.append(tell(tmp_path, **state))
+
+    thread = threading.Thread(target=sidecar)
+    thread.start()
+    out, err = running.communicate(DOCUMENT, timeout=2 * APPLY_LIMIT)
+    thread.join()
+    assert (running.returncode, out, err) == (0, decided[0], "")
+    assert read_handed((tmp_path / HANDED_FILE).read_text()).change == NOTE
+    assert sorted(os.listdir(tmp_path)) == [HANDED_FILE, STATE_FILE], "no draft is left"
+
+
+@pytest.mark.process
+def test_a_silent_sidecar_leaves_the_old_state(tmp_path: Path) -> None:
+    told = tell(tmp_path, change="a1")
+    out, _ = start(tmp_path).communicate(DOCUMENT, timeout=10 * APPLY_LIMIT)
+    assert out == told
+
+
+@pytest.mark.parametrize(
+    ("folder", "given", "words"),
+    [(".", DOCUMENT[:-1], "the change arrived incomplete"), ("none", "", "no link runs here")],
+)
+def test_what_the_script_cannot_hand_over_is_refused(
+    tmp_path: Path, folder: str, given: str, words: str
+) -> None:
+    tell(tmp_path, change="a1")
+    running = start(tmp_path / folder)
+    _, err = running.communicate(given)
+    assert (running.returncode, err) == (2, f"error: {words};\n")
+    assert os.listdir(tmp_path) == [STATE_FILE]
+
+
+# The Role among the chart's examples.
+
+ROLE = Path(__file__).parents[2] / "charts" / "cloudrc" / "examples" / "link-set-role.yaml"
+KUBECTL_NEEDS = {
+    "get configmaps,pods": {("configmaps", "list"), ("pods", "list")},
+    "patch configmap": {("configmaps", "get"), ("configmaps", "patch")},
+    "exec world-1": {("pods", "get"), ("pods/exec", "create")},
+    "exec cloud-1": {("pods", "get"), ("pods/exec", "create")},
+}
+"""Command of kubectl -> rights that it needs, as an API server has recorded them."""
+
+
+def test_the_role_allows_just_what_its_commands_need(cluster: Cluster) -> None:
+    assert main(LINE) == 0
+    rules = yaml.safe_load(ROLE.read_text())["rules"]
+    allowed = {
+        (what, verb) for rule in rules for what in rule["resources"] for verb in rule["verbs"]
+    }
+    needed = set[tuple[str, str]]()
+    for line in cluster.asked:
+        words = [word for word in line if not word.startswith("-")]
+        assert words[0] != "get" or "--selector" in str(line), "by selector, not by name"
+        needed |= KUBECTL_NEEDS[" ".join(words[:2])]
+    assert needed == allowed

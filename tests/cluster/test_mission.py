@@ -1,0 +1,262 @@
+"""`cloudrc mission` in a cluster: where it goes, what it checks, its output and exit codes."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from cloudrc.cli import mission_cluster
+from cloudrc.cli.main import main
+from cloudrc.cluster import jobs
+from cloudrc.cluster.client import Release
+from cloudrc.drivers import local
+from tests.cluster.conftest import (
+    CONFIG_PLACE,
+    FakeApi,
+    at_look,
+    end,
+    labels,
+    made,
+    pod,
+    start_pod,
+    terminated,
+)
+
+Printed = pytest.CaptureFixture[str]
+WAYPOINTS = "waypoints: [{position_m: [0.5, 0.0, 1.0]}]"
+VERDICT = {0: "SUCCESS: all met", 1: "FAILURE: pipe_contact"}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "one.yaml").write_text(WAYPOINTS)
+    return tmp_path
+
+
+@pytest.fixture
+def lands(running: FakeApi, monkeypatch: pytest.MonkeyPatch) -> FakeApi:
+    """A release whose Jobs succeed as soon as they are followed."""
+    original = jobs.follow
+
+    def follow(release: Release, name: str, *given: Any, timeout: float) -> Any:
+        running.objects["jobs", name]["metadata"]["patience"] = timeout
+        start_pod(running, name, state=terminated(0, "done"))
+        end(running, name, "Complete")
+        return original(release, name, *given, timeout=timeout)
+
+    monkeypatch.setattr(jobs, "follow", follow)
+    return running
+
+
+def fly(api: FakeApi, capsys: Printed, code: int = 0) -> str:
+    """Call `mission run`, whose Job ends with this code; return the Job's name."""
+
+    def land() -> None:
+        *_, (_, job) = (key for key in api.objects if key[0] == "jobs")
+        start_pod(api, job, state=terminated(code, VERDICT[code]))
+        api.logs[f"{job}-x"] = f"waypoint 1 of 1 reached\n{VERDICT[code]}\n"
+        end(api, job, "Failed" if code else "Complete")
+
+    answer = api.answer
+    at_look(api, 3, land)
+    try:
+        assert main(["mission", "run", "one.yaml"]) == code
+    finally:
+        api.answer = answer  # type: ignore[method-assign]
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head.startswith("Job ")
+    assert head.endswith(" in namespace 'demo'")
+    assert lines == ["waypoint 1 of 1 reached", VERDICT[code]]
+    return head.split()[1]
+
+
+def test_list_status_and_logs_show_jobs(running: FakeApi, capsys: Printed) -> None:
+    first = fly(running, capsys, 1)
+    job = fly(running, capsys)
+    assert main(["mission", "list"]) == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head.split() == ["JOB", "STATE", "CREATED", "VERDICT"]
+    assert [row.split()[:2] for row in rows] == [[first, "failed"], [job, "complete"]]
+    assert VERDICT[0] in rows[1]
+    assert main(["mission", "status", job, "-o", "json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["jobs"]
+    assert (found["name"], found["state"], found["exit_code"]) == (job, "complete", 0)
+    assert main(["mission", "logs"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == VERDICT[0]
+    assert main(["mission", "logs", first, "--follow"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == VERDICT[1]
+
+
+def test_an_empty_list_says_how_to_fly(running: FakeApi, capsys: Printed) -> None:
+    assert main(["mission", "list"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("no missions in namespace 'demo'")
+    assert printed.endswith("; fly one: cloudrc mission run FILE\n")
+    assert main(["mission", "logs"]) == 2
+    assert capsys.readouterr().err.startswith("cloudrc: error: no missions ")
+
+
+@pytest.mark.parametrize("verb", ["status", "cancel", "logs"])
+def test_a_missing_job_is_an_error_of_the_cluster(
+    running: FakeApi, capsys: Printed, verb: str
+) -> None:
+    assert main(["mission", verb, "nothing"]) == 5
+    assert re.match("cloudrc: error: .*nothing.*\n$", capsys.readouterr().err)
+
+
+def test_a_missing_release_is_reported_with_a_command(api: FakeApi, capsys: Printed) -> None:
+    assert main(["mission", "run", "one.yaml"]) == 5
+    assert re.match("cloudrc: error: no release.*helm install.*\n$", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f"time_limit_s: .nan\n{WAYPOINTS}", "time_limit_s: nan: must be finite"),
+        ("waypoints: []", "waypoints: none given; give at least one"),
+        ("waypoints: [{position: [0, 0, 1]}]", "did you mean position_m"),
+        ("waypoints: [{position_m: [0, 0, 99]}]", "waypoints.0.position_m.*beyond the fence"),
+    ],
+)
+def test_a_mission_that_cannot_be_flown_makes_no_job(
+    running: FakeApi, folder: Path, capsys: Printed, text: str, words: str
+) -> None:
+    (folder / "wrong.yaml").write_text(text)
+    assert main(["mission", "run", "wrong.yaml"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("cloudrc: error: wrong.yaml")
+    assert re.search(words, said)
+    assert made(running) == []
+
+
+@pytest.mark.parametrize(
+    ("mission", "given", "limit"),
+    [
+        (WAYPOINTS, {"criteria": {"time_limit_s": 300.0}}, 300),
+        (f"time_limit_s: 20\n{WAYPOINTS}", {"criteria": {"time_limit_s": 300.0}}, 20),
+        (WAYPOINTS, {"seed": 4, "link": {"profile": "lossy"}}, 60),
+        (WAYPOINTS, None, 600),
+    ],
+    ids=["the experiment's", "its own", "the default", "unreadable"],
+)
+@pytest.mark.parametrize("queue", [[], ["--queue"]], ids=["at once", "queued"])
+def test_a_jobs_deadline_follows_the_missions_time_limit(
+    lands: FakeApi, folder: Path, mission: str, given: Any, limit: int, queue: list[str]
+) -> None:
+    data = {"experiment.yaml": yaml.safe_dump(given)}
+    metadata = {"name": "cloudrc-experiment", "labels": labels("experiment")}
+    lands.put("configmaps", {"metadata": metadata, "data": data})
+    if given is None:
+        lands.refuse["GET", "configmaps"] = 403, "configmaps is forbidden"
+    (folder / "one.yaml").write_text(mission)
+    assert main(["mission", "run", "one.yaml", *queue]) == 0
+    (job,) = made(lands)
+    deadline = job["spec"]["activeDeadlineSeconds"]
+    assert deadline >= limit + (600 if queue else 0) + 60
+    assert queue or given is None or deadline <= limit + 180
+    assert job["metadata"]["patience"] > deadline
+
+
+def test_run_waits_until_the_release_is_ready(lands: FakeApi, capsys: Printed) -> None:
+    """`helm install` does not wait for the pods."""
+    original, looks = lands.answer, 0
+    lands.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending"))
+
+    def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
+        nonlocal looks
+        looks += "/pods" in path
+        if looks == 4:
+            lands.put("pods", pod("cloud-1", "cloud"))
+        return original(method, path, body)
+
+    lands.answer = answer  # type: ignore[method-assign]
+    assert main(["mission", "run", "pipes"]) == 0
+    assert "container cloud is not ready yet" in capsys.readouterr().out
+    (job,) = made(lands)
+    plan = lands.get("configmaps", job["metadata"]["name"])["data"]["mission.yaml"]
+    assert json.loads(plan) == mission_cluster.read_mission("pipes")
+
+
+def test_the_wait_for_a_release_has_a_timeout(running: FakeApi, capsys: Printed) -> None:
+    running.put("pods", pod("world-1", "world", ready=False))
+    assert main(["mission", "run", "one.yaml", "--timeout", "0.05"]) == 4
+    assert "container world is not ready yet" in capsys.readouterr().err
+    assert made(running) == []
+
+
+def test_an_interrupted_run_says_that_the_job_continues(
+    running: FakeApi, capsys: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*arguments: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(jobs, "follow", interrupted)
+    assert main(["mission", "run", "one.yaml"]) == 130
+    (job,) = made(running)
+    name = job["metadata"]["name"]
+    assert capsys.readouterr().err == (
+        f"Job {name} is still running; cancel it: "
+        f"cloudrc mission cancel {name} --namespace=demo --release=cloudrc\n"
+    )
+
+
+@pytest.fixture
+def flies_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A run on this machine whose API accepts connections and never answers."""
+    monkeypatch.setattr("cloudrc.cli.client.REQUEST_TIMEOUT", 0.05)
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(f"{tmp_path}/silent.sock")
+        server.listen()
+        with local.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
+            yield
+
+
+@pytest.mark.usefixtures("flies_here")
+def test_the_local_run_is_the_default(running: FakeApi, capsys: Printed) -> None:
+    assert main(["mission", "list"]) == 5
+    assert "silent.sock" in capsys.readouterr().err
+    assert running.seen == []
+
+
+@pytest.mark.usefixtures("flies_here")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["cloudrc", "mission", "list", "--release", "cloudrc"],
+        ["cloudrc", "mission", "list", "-n", "demo"],
+        ["cloudrc", "mission", "list", "--context", "here"],
+        ["/usr/local/bin/kubectl-cloudrc", "mission", "list"],
+    ],
+)
+def test_a_flag_or_the_plugin_of_kubectl_selects_the_cluster(
+    running: FakeApi, capsys: Printed, monkeypatch: pytest.MonkeyPatch, words: list[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", words)
+    assert main() == 0
+    assert "no missions in namespace 'demo'" in capsys.readouterr().out
+
+
+def test_a_killed_run_is_ignored(
+    running: FakeApi, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with local.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
+        (file,) = local.places()[0].iterdir()
+        left = file.read_text()
+    file.write_text(left)
+    file.chmod(0o600)
+    assert main(["mission", "list"]) == 0
+    assert "no missions in namespace 'demo'" in capsys.readouterr().out
+    nowhere = str(tmp_path / "none")
+    monkeypatch.setattr(CONFIG_PLACE, nowhere)
+    assert main(["mission", "status"]) == 3
+    assert re.match(".*no run flies here.*KUBECONFIG.*\n$", capsys.readouterr().err)

@@ -1,0 +1,196 @@
+"""Pods are explained, waited for and reached; tokens are read and never printed."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cloudrc.cluster import pods
+from cloudrc.cluster.client import ClusterError, Release
+from cloudrc.cluster.flight import install, wait_ready
+from cloudrc.cluster.pods import list_pods, operator_token, pod_failure
+from cloudrc.errors import CloudrcError, TimedOutError
+from tests.cluster.conftest import TOKEN, FakeApi, deployment, pod
+
+Pretend = Callable[[str, str], Path]
+
+
+def waiting(reason: str, message: str = "") -> dict[str, Any]:
+    return {"waiting": {"reason": reason, "message": message}}
+
+
+def unscheduled(message: str) -> list[dict[str, str]]:
+    return [{"type": "PodScheduled", "status": "False", "message": message}]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"state": waiting("ImagePullBackOff")}, "cloudrc/cloud:0.1.0.*make kind-load"),
+        ({"state": waiting("ErrImageNeverPull")}, "make kind-load"),
+        (
+            {"state": waiting("CreateContainerConfigError", 'secret "mine" not found')},
+            'cannot be created: secret "mine" not found',
+        ),
+        (
+            {
+                "state": waiting("CrashLoopBackOff"),
+                "last": {"terminated": {"exitCode": 3, "message": "port 9100 is\ntaken"}},
+            },
+            r"ends repeatedly \(exit code 3\): port 9100 is taken",
+        ),
+        ({"restarts": 5}, "ends repeatedly$"),
+        ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
+        ({}, "^$"),
+        ({"state": waiting("ContainerCreating")}, "^$"),
+        ({"conditions": unscheduled("pod has unbound immediate volume claims")}, "^$"),
+        ({"restarts": 1}, "^$"),
+    ],
+)
+def test_a_failure_of_a_pod_is_explained(
+    api: FakeApi, release: Release, given: dict[str, Any], expected: str
+) -> None:
+    api.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending", **given))
+    said = pod_failure(list_pods(release, "cloud")[0])
+    assert re.search(expected, said)
+    assert "\n" not in said
+
+
+REFUSED = {"type": "ReplicaFailure", "status": "True", "message": "violates PodSecurity"}
+
+
+@pytest.mark.parametrize(
+    ("body", "error", "words"),
+    [
+        (deployment("cloud", updatedReplicas=0), TimedOutError, "its pod is being created"),
+        (deployment("cloud", replicas=2), TimedOutError, "its pod is being created"),
+        (deployment("cloud", observedGeneration=0), TimedOutError, "its pod is being created"),
+        (deployment("cloud", conditions=[REFUSED]), ClusterError, "violates PodSecurity"),
+        (pod("world-1", "world", ready=False), TimedOutError, "container world is not ready"),
+        (
+            pod("world-1", "world", ready=False, state=waiting("ImagePullBackOff")),
+            ClusterError,
+            "the world pod cannot run: the image",
+        ),
+    ],
+)
+def test_the_wait_for_a_release_ends_with_the_cause(
+    running: FakeApi, release: Release, body: dict[str, Any], error: type[CloudrcError], words: str
+) -> None:
+    wait_ready(release, timeout=0.0)
+    running.put("pods" if "phase" in body["status"] else "deployments", body)
+    with pytest.raises(error, match=words):
+        wait_ready(release, timeout=0.03)
+
+
+@pytest.mark.parametrize(
+    ("said", "hint"),
+    [
+        ("Kubernetes cluster unreachable: Get https://10.0.0.1: refused", "kubectl cluster-info"),
+        ("chart requires >=1.29.0-0 which is incompatible with Kubernetes v1.28.3", "kind create"),
+        ("secrets is forbidden: User me cannot list", "kubectl auth can-i"),
+        ("values don't meet the specifications of the schema(s)\n- link: mdoe", "helm show values"),
+    ],
+)
+def test_a_refusal_of_helm_has_a_hint(
+    release: Release, pretend: Pretend, said: str, hint: str
+) -> None:
+    pretend("helm", f"cat >&2 <<'END'\nError: {said}\nEND\nexit 1")
+    with pytest.raises(ClusterError, match=f"{said.split()[0]}.*{hint}") as caught:
+        install(release, {}, 1.0, print)
+    assert "\n" not in str(caught.value)
+
+
+def test_install_passes_values_to_helm_and_waits_for_pods(
+    running: FakeApi, release: Release, pretend: Pretend, tmp_path: Path
+) -> None:
+    pretend("helm", f'cat > {tmp_path}/values; echo "$@" > {tmp_path}/line')
+    install(release, {"experiment": {"seed": 7}}, 1.0, print)
+    assert json.loads((tmp_path / "values").read_text()) == {"experiment": {"seed": 7}}
+    line = (tmp_path / "line").read_text()
+    assert line.startswith("upgrade --install cloudrc ")
+    assert "--namespace=demo --create-namespace" in line
+
+
+@pytest.mark.parametrize("data", [{}, {"operator": "%%%"}, {"operator": "//4gc2VjcmV0"}])
+def test_a_secret_without_a_token_is_named(
+    running: FakeApi, release: Release, data: dict[str, str]
+) -> None:
+    assert operator_token(release) == TOKEN
+    running.get("secrets", "cloudrc-tokens")["data"] = data
+    with pytest.raises(ClusterError, match=r"'cloudrc-tokens' .* has no token under") as refused:
+        operator_token(release)
+    assert base64.b64decode("c2VjcmV0").decode() + "'" not in str(refused.value)
+
+
+def test_unreadable_tokens_are_reported(running: FakeApi, release: Release) -> None:
+    running.refuse["GET", "secrets"] = (403, "secrets is forbidden")
+    with pytest.raises(ClusterError, match="can-i get secrets"):
+        operator_token(release)
+    template = {"spec": {"containers": [{"name": "cloud"}]}}
+    running.get("deployments", "cloudrc-cloud")["spec"]["template"] = template
+    with pytest.raises(ClusterError, match=r"mounts no tokens: .*another version"):
+        operator_token(release)
+
+
+def test_a_port_is_forwarded_while_the_block_runs(
+    release: Release, pretend: Pretend, tmp_path: Path
+) -> None:
+    pretend(
+        "kubectl",
+        f"echo $$ > {tmp_path}/pid; echo $@ > {tmp_path}/line\n"
+        "echo 'Forwarding from 127.0.0.1:40001 -> 9100'\n"
+        "echo 'Forwarding from 127.0.0.1:40002 -> 9102'\nexec sleep 60",
+    )
+    with pods.forwarded(release, "world-1", [9100, 9102]) as ports:
+        assert ports == {9100: 40001, 9102: 40002}
+        pid = int((tmp_path / "pid").read_text())
+        os.kill(pid, 0)
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+    assert "--namespace=demo port-forward pod/world-1" in (tmp_path / "line").read_text()
+
+
+@pytest.mark.parametrize(
+    ("script", "error", "words"),
+    [
+        (
+            "echo 'error: unable to forward port: pod is gone' >&2; exit 1",
+            ClusterError,
+            "cannot forward ports of pod 'cloud-1'.*pod is gone",
+        ),
+        ("exec sleep 60", TimedOutError, "has not started within"),
+    ],
+)
+def test_a_failed_port_forward_is_reported(
+    release: Release,
+    pretend: Pretend,
+    monkeypatch: pytest.MonkeyPatch,
+    script: str,
+    error: type[CloudrcError],
+    words: str,
+) -> None:
+    monkeypatch.setattr(pods, "START_LIMIT", 0.1 if "sleep" in script else 10.0)
+    pretend("kubectl", script)
+    with pytest.raises(error, match=words), pods.forwarded(release, "cloud-1", [8080]):
+        pytest.fail("there is no way")
+
+
+def test_a_recording_is_copied_unchanged(
+    api: FakeApi, release: Release, pretend: Pretend, tmp_path: Path
+) -> None:
+    api.put("pods", pod("world-1", "world"))
+    source, target = tmp_path / "source", tmp_path / "world.mcap"
+    source.write_bytes(bytes(range(256)) * 100)
+    pretend("kubectl", f"echo $@ > {tmp_path}/line; cat {source}")
+    pods.fetch_recording(release, "world", target)
+    assert target.read_bytes() == source.read_bytes()
+    line = (tmp_path / "line").read_text()
+    assert "exec world-1 --container=world -- cat /var/lib/cloudrc/world.mcap" in line
