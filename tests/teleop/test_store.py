@@ -359,7 +359,7 @@ def test_killed_at_any_commit_waypoints_are_reached_once_in_order(kill):
     assert at > 6
 
 
-WORDS = "A B C away hold resume queue goto cancel cloud full free stop_rotors acknowledge restart"
+WORDS = "A B C away hold resume queue goto cancel cloud full free stop ack restart"
 steps = st.sampled_from(WORDS.split())
 
 
