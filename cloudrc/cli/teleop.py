@@ -214,7 +214,7 @@ def _fly(
     serve_teleop(
         *(service, peer, wire.encode, wire.decode),
         calls=server.bridge.take if server else list,
-        stops=server.bridge.take_stop if server else list,
+        stops=server.bridge.take_stops if server else list,
         tell=tell,
         stop=feed.alive_while(is_over),
     )
