@@ -50,6 +50,10 @@ a held place: create 0.05 A mark hold goto 0.05
   -> states=held setpoint=away:-1 asked=
 goto is a mission of its own: 0.05 goto 0.05 !goto !create away 0.6
   -> states=done name=goto guard=HOLD
+what waits begins only with the disk: create 0.05 A queue full B C 3
+  -> states=done,queued
+once it works: create 0.05 A queue full B C 3 free 1.5
+  -> states=done,flying
 a second mission waits: create 0.05 A !create queue queue B C A B C
   -> states=done,done,flying reached=0,1,2
 between two missions the robot is seen to hold: create 0.05 A queue mute B C 1.0
