@@ -36,14 +36,11 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 FILES_MAX = 8_192
-"""Limit of open files. It is high enough that idle connections leave room for an emergency stop.
-Idle connections use at most 64 MB of memory."""
+"""Limit of open files, so high that idle connections leave room for an emergency stop."""
 LOCK_PERIOD = 0.2
 """Pause between two attempts to open a journal that another teleop process has locked [s]."""
 PAUSE_LIMIT_NS = 500_000_000
 """Longest time that teleop, before it ends, waits for the robot to hold [ns]."""
-SALT_SIZE = 16
-"""Size of the random salt of mission numbers [bytes]."""
 EPILOG = """\
 teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
 --start or --mission it ends after that mission; otherwise on SIGTERM, on Ctrl-C
@@ -59,23 +56,20 @@ read."""
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     process_arguments(parser)
-    parser.add_argument(
-        "--socket", type=Path, required=True, metavar="DIR", help="folder of the two sockets"
+    where = (
+        "serve the API here: [HOST:]PORT (default HOST: 127.0.0.1; PORT 0: any free port) or "
+        "unix:PATH, for your user only (default: no API)"
     )
-    parser.add_argument(
-        "--api",
-        type=api_address,
-        metavar="WHERE",
-        help="serve the API here: [HOST:]PORT (default HOST: 127.0.0.1; PORT 0: any free port) or "
-        "unix:PATH, for your user only (default: no API)",
-    )
-    for flag, metavar, text in (
-        ("--tokens", "DIR", "folder of the token files 'operator' and 'reader'"),
-        ("--audit", "FILE", "log all commands and their callers (JSON lines)"),
-        ("--api-file", "FILE", "write the API's URL to this file"),
-        ("--journal", "FILE", "store missions in this file (default: not stored)"),
+    for flag, metavar, kind, text in (
+        ("--socket", "DIR", Path, "folder of the two sockets"),
+        ("--api", "WHERE", api_address, where),
+        ("--tokens", "DIR", Path, "folder of the token files 'operator' and 'reader'"),
+        ("--audit", "FILE", Path, "log all commands and their callers (JSON lines)"),
+        ("--api-file", "FILE", Path, "write the API's URL to this file"),
+        ("--journal", "FILE", Path, "store missions in this file (default: not stored)"),
     ):
-        parser.add_argument(flag, type=Path, metavar=metavar, help=text)
+        required = flag == "--socket"
+        parser.add_argument(flag, type=kind, metavar=metavar, required=required, help=text)
     first = parser.add_mutually_exclusive_group()
     first.add_argument("--mission", metavar="FILE", help="fly this mission, then exit")
     first.add_argument(
@@ -214,7 +208,7 @@ def _fly(
     serve_teleop(
         *(service, peer, wire.encode, wire.decode),
         calls=server.bridge.take if server else list,
-        stops=server.bridge.take_stop if server else list,
+        stops=server.bridge.take_stops if server else list,
         tell=tell,
         stop=feed.alive_while(is_over),
     )
@@ -226,7 +220,7 @@ def _open_store(
     """Open the store once no other teleop has locked it; return None if stopped before."""
     from cloudrc.teleop.store import MissionStore, StoreLockedError, connect, open_store
 
-    salt, reported = os.urandom(SALT_SIZE), False
+    salt, reported = os.urandom(16), False
     if path is None:
         return MissionStore(connect(), salt)
     while not stop():

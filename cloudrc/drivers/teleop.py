@@ -23,8 +23,7 @@ from cloudrc.records import Fault, MissionEvent
 DATAGRAM_MAX = 8_192
 """Size limit of a datagram [bytes]; all our messages are smaller."""
 DRAIN_MAX = 1024
-"""Limit of the datagrams per wake, above the socket's queue (513 under systemd): a flood cannot
-delay a loop's deadlines."""
+"""Limit of the datagrams per wake, above the socket's queue (513 under systemd), for a flood."""
 PATH_MAX = 107
 """Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
 PERIOD_NS = 20_000_000
@@ -43,8 +42,8 @@ SILENCE_NS = 1_000_000_000
 EVENTS_KEPT = 256
 """Limit of the events that wait while cloud is away."""
 LAST_WORD_NS = 800_000_000
-"""How long cloud, while it ends, still forwards teleop's last hold request [ns]. This is longer
-than teleop repeats the request, and shorter than the 1.5 s that a process has to end."""
+"""How long cloud, while it ends, still forwards teleop's last hold request [ns]: longer than teleop
+repeats it, and shorter than the 1.5 s that a process has to end."""
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
 """Function that decodes a message; it raises a ValueError if the bytes are not a message."""
@@ -124,10 +123,8 @@ class RemoteTeleop:
     def handle_deadline(self, now_ns: int) -> None:
         """Receive teleop's outputs; report a fault once teleop, with telemetry, is silent for 1 s.
 
-        After a stall, starts and waypoints are dropped: teleop may have withdrawn them in a
-        datagram that was lost because the socket was full. Teleop repeats the outputs that are
-        still valid. Outputs are not dropped twice in a row, so that a cloud that is always late can
-        fly.
+        After a stall, starts and waypoints are dropped, but not twice in a row: teleop may have
+        withdrawn them in a datagram that the full socket lost. It repeats what is still valid.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS
@@ -160,10 +157,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud's process while the robot flies, so that teleop can request a hold.
-
-    A pod ends all its containers at once, and teleop's requests pass through cloud.
-    """
+    """Delays the end of cloud while the robot flies: teleop, which ends too, requests a hold."""
 
     def __init__(
         self,
@@ -229,19 +223,10 @@ def turn(
 ) -> int:
     """Run one wake of teleop: receive states, make the queued calls, handle the deadline.
 
-    Args:
-        machine: See `serve_teleop`.
-        peer: The socket to cloud.
-        decode: Decodes a message from cloud.
-        calls: Returns the queued calls.
-        stops: Returns the queued emergency stops.
-        blind: Return value of the last wake; 0 at first.
-        late_ns: Lateness of this wake [ns].
-        now_ns: Now [ns].
-
-    Returns:
-        Number of further wakes that wait, after a stall, for a new datagram; 0 if this wake has
-        done all its work.
+    `calls` and `stops` return the queued calls and emergency stops; the wake is `late_ns` [ns] late
+    at `now_ns` [ns]. `blind` is the return value of the last wake, 0 at first: the number of
+    further wakes that wait, after a stall, for a new datagram. If it is above 0, this wake has only
+    received datagrams.
     """
     arrived, was_blind = peer.receive(), blind
     states = [data for data in arrived if data]  # an empty datagram carries no state

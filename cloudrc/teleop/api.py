@@ -11,6 +11,7 @@ import json
 import os
 import socket
 import threading
+from collections import deque
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from functools import partial
@@ -83,7 +84,7 @@ other requests are refused as too many.
 STARTING = "teleop is starting"
 Call: TypeAlias = Callable[[MissionService, int], Any]
 """Function that takes the service and the time [ns] and returns the answer, or a mission."""
-Urgent: TypeAlias = Literal["stop", "hold"]
+Urgent: TypeAlias = Literal["stop", "hold", ""]
 Address: TypeAlias = tuple[str, int] | Path
 """Host and port, or the path of a Unix socket."""
 
@@ -100,9 +101,9 @@ class Bridge:
     def __init__(self) -> None:
         self.closed, self.overtakings = STARTING, 0
         self.alarm: Callable[[], Any] = lambda: None
-        self._urgent: dict[Urgent, tuple[Call, Future[Any]]] = {}
-        self._waiting: list[tuple[Call, Future[Any]]] = []
-        self._lock = threading.Lock()
+        self._lanes: dict[str, deque[tuple[Call, Future[Any]]]] = {
+            lane: deque() for lane in ("stop", "hold", "")
+        }
         self._service: MissionService | None = None
 
     def open(self, service: MissionService) -> None:
@@ -111,32 +112,28 @@ class Bridge:
 
     def close(self, why: str) -> None:
         """Refuse calls from now on, also a stop that waits."""
-        with self._lock:
-            self.closed = why
-            while self._urgent:
-                self._urgent.popitem()[1][1].set_exception(UnavailableError(why))
+        self.closed, stops = why, self._lanes["stop"]
+        while stops:
+            stops.popleft()[1].set_exception(UnavailableError(why))
 
-    def submit(self, call: Call, urgent: Urgent | None = None) -> Future[Any]:
-        """Queue a call; urgent ones of one kind are one call, and always have room.
+    def submit(self, call: Call, urgent: Urgent = "") -> Future[Any]:
+        """Queue a call; an urgent one has a lane of its own, and always room.
 
         While teleop starts, the bridge accepts only a stop.
 
         Raises:
             UnavailableError: If no call is accepted, or if too many calls wait.
         """
+        if self.closed and not (urgent == "stop" and self.closed == STARTING):
+            raise UnavailableError(self.closed)
+        if not urgent and len(self._lanes[""]) >= WAITING_MAX:
+            raise UnavailableError(f"{WAITING_MAX} requests wait already; try again")
+        self.overtakings += bool(urgent)
         future: Future[Any] = Future()
-        with self._lock:
-            if self.closed and not (urgent == "stop" and self.closed == STARTING):
-                raise UnavailableError(self.closed)
-            if urgent is not None:
-                self.overtakings += 1
-                return self._urgent.setdefault(urgent, (call, future))[1]
-            if len(self._waiting) >= WAITING_MAX:
-                raise UnavailableError(f"{WAITING_MAX} requests wait already; try again")
-            self._waiting.append((call, future))
+        self._lanes[urgent].append((call, future))
         return future
 
-    async def ask(self, call: Call, urgent: Urgent | None = None) -> Any:
+    async def ask(self, call: Call, urgent: Urgent = "") -> Any:
         """Queue a call and return its result; a stop also sends the alarm.
 
         Raises:
@@ -166,17 +163,16 @@ class Bridge:
         return await self.ask(checked)
 
     def take(self) -> list[Callable[[int], None]]:
-        """Return all queued calls for the loop: first a stop, then a hold, then the others."""
-        with self._lock:
-            taken = [self._urgent.pop(each) for each in ("stop", "hold") if each in self._urgent]
-            taken, self._waiting = taken + self._waiting, []
-        return [partial(self._make, *each) for each in taken]
+        """Return all queued calls for the loop: first stops, then holds, then the others."""
+        return [call for lane in self._lanes for call in self._take(lane)]
 
-    def take_stop(self) -> list[Callable[[int], None]]:
-        """Return only a queued stop, which the loop makes before it processes new telemetry."""
-        with self._lock:
-            stop = self._urgent.pop("stop", None)
-        return [] if stop is None else [partial(self._make, *stop)]
+    def take_stops(self) -> list[Callable[[int], None]]:
+        """Return queued stops, which the loop makes before it processes new telemetry."""
+        return self._take("stop")
+
+    def _take(self, lane: str) -> list[Callable[[int], None]]:
+        calls = self._lanes[lane]
+        return [partial(self._make, *calls.popleft()) for _ in range(len(calls))]
 
     def _make(self, call: Call, future: Future[Any], now_ns: int) -> None:
         assert self._service is not None, "calls are taken after `open` only"
@@ -314,29 +310,20 @@ async def hold(bridge: Bridged) -> Any:
 
 @router.post("/resume", response_model=models.MissionView)
 async def resume(bridge: Bridged) -> Any:
-    """Go on with what is held, straight to its next waypoint.
-
-    A pipe's wall in the way is refused (409).
-    """
+    """Go straight on to the next waypoint; a pipe's wall in the way is refused (409)."""
     return await bridge.move(MissionService.resume)
 
 
 @router.post("/goto", response_model=models.MissionView, openapi_extra=_takes(models.GoToRequest))
 async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
-    """Fly straight to a point: a mission of its own, or another place for one that is held.
-
-    A pipe's wall in the way is refused (409).
-    """
+    """Fly straight to a point: a new mission, or a new place for a held one; see resume."""
     leg = await run_in_threadpool(request.app.state.read_goto, body)
     return await bridge.move(lambda service, now_ns: service.go_to(leg, now_ns))
 
 
 @router.post("/estop", response_model=models.Stopped)
 async def stop_rotors(bridge: Bridged) -> Any:
-    """Stop the rotors at once, whatever the robot does.
-
-    It falls, and stays off until acknowledged.
-    """
+    """Stop the rotors at once: the robot falls, and stays off until acknowledged."""
     mission = await bridge.ask(MissionService.stop_rotors, "stop")
     return {"id": mission["id"] if mission else None, "state": "stopping"}
 
@@ -360,10 +347,9 @@ async def show_state(bridge: Bridged) -> Any:
     responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
 )
 async def stream_events(request: Request, bridge: Bridged, after: str = "") -> StreamingResponse:
-    """Tell what happens, as it happens: server-sent events, one for each event of all missions.
+    """Tell all events of missions, from the oldest that is known, as server-sent events.
 
-    They begin with the oldest that is known. Resume with the header Last-Event-ID, or with
-    `?after=ID`.
+    Resume with the header Last-Event-ID, or with `?after=ID`.
     """
     known = (after, request.headers.get("last-event-id", ""))
     number = max(int(text) if text.isdecimal() and len(text) < 16 else 0 for text in known)
@@ -372,17 +358,17 @@ async def stream_events(request: Request, bridge: Bridged, after: str = "") -> S
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
-def _events_after(number: int, service: MissionService, now_ns: int) -> list[Event]:
-    return service.book.events_after(number)
-
-
 async def _stream(request: Request, bridge: Bridge, number: int) -> AsyncIterator[str]:
     """Yield the events after `number` until the client, its token or teleop is gone."""
+
+    def call(service: MissionService, now_ns: int) -> list[Event]:
+        return service.book.events_after(number)
+
     looks = 0
     yield ": cloudrc\n\n"
     while not bridge.closed and await request.scope["caller"]() is not None:
         try:
-            found = await bridge.ask(partial(_events_after, number))
+            found = await bridge.ask(call)
         except CloudrcError:
             return
         for event in found:
@@ -400,8 +386,7 @@ class ApiServer(uvicorn.Server):
 
     Attributes:
         url: "http://HOST:PORT", or "unix:PATH" for a Unix socket.
-        bridge: Bridge to the mission service.
-        gate: Admits the callers, and counts their requests.
+        bridge, gate: As given.
     """
 
     def __init__(self, gate: Gate, bridge: Bridge, address: Address) -> None:

@@ -46,15 +46,12 @@ ORDERS = ("/v1/missions", "/v1/goto")
 COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
 """HTTP status of a refused order -> name under which it is counted."""
 REFUSED = {
-    401: (
-        "token",
-        "a valid token is needed: Authorization: Bearer TOKEN",
-        {"WWW-Authenticate": "Bearer"},
-    ),
-    403: ("role", "this token may look, not command: an operator's is needed", None),
-    429: ("busy", "too many requests; try again in a second", {"Retry-After": "1"}),
+    401: ("token", "a valid token is needed: Authorization: Bearer TOKEN"),
+    403: ("role", "this token may look, not command: an operator's is needed"),
+    429: ("busy", "too many requests; try again in a second"),
 }
-"""HTTP status of a refused request -> name under which it is counted, text and headers."""
+"""HTTP status of a refused request -> name under which it is counted, and text."""
+HEADERS = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}}
 IN_FLIGHT_MAX = 32
 """Limit of the requests of one role that are answered at the same time, including streams."""
 AUDIT_MAX = 8 << 20
@@ -196,9 +193,10 @@ class Gate:
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)
         status = self._refusal(caller, scope)
         if caller is None or status:
-            reason, detail, headers = REFUSED[status]
+            reason, detail = REFUSED[status]
             self.counts[reason] += 1
-            await JSONResponse({"detail": detail}, status, headers)(scope, receive, send)
+            refusal = JSONResponse({"detail": detail}, status, HEADERS.get(status))
+            await refusal(scope, receive, send)
             return
         answer: Message = {"status": 500}
 

@@ -7,11 +7,12 @@ file: the same code checks them and describes their problems.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from math import cos, radians, sin
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import PydanticCustomError
+from pydantic_core import PydanticCustomError, from_json
 
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem as ConfigProblem
@@ -81,6 +82,11 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
 }
 
 
+def told(text: str) -> Any:
+    """Describe a field of an answer."""
+    return Field(description=text)
+
+
 class _Answer(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -88,118 +94,114 @@ class _Answer(BaseModel):
 class Reached(_Answer):
     """Waypoint that was reached."""
 
-    waypoint: int = Field(description="Its index, from 0")
-    time_s: float = Field(description="When, since the mission began [s]")
+    waypoint: int = told("Its index, from 0")
+    time_s: float = told("When, since the mission began [s]")
 
 
 class Failure(_Answer):
     """A rule that was broken."""
 
-    code: str = Field(description="One word, for programs")
-    text: str = Field(description="The same for people")
+    code: str = told("One word, for programs")
+    text: str = told("The same for people")
 
 
 class Verdict(_Answer):
     """Result of a mission that has ended."""
 
-    outcome: Literal["success", "failure", "invalid", "interrupted"] = Field(
-        description="As in report.json"
-    )
-    exit_code: int = Field(description="Of a Job that flew it: 0, 1, 6 or 130")
-    failures: list[Failure] = Field(description="Every rule that was broken")
+    outcome: Literal["success", "failure", "invalid", "interrupted"] = told("As in report.json")
+    exit_code: int = told("Of a Job that flew it: 0, 1, 6 or 130")
+    failures: list[Failure] = told("Every rule that was broken")
 
 
 class Event(_Answer):
     """An event of a mission."""
 
-    id: int = Field(description="Rises with every event of all missions")
-    mission: str = Field(description="Whose")
-    event: str = Field(
-        description="queued, starting, started, reached, held, resumed, goto, restarted, "
+    id: int = told("Rises with every event of all missions")
+    mission: str = told("Whose")
+    event: str = told(
+        "queued, starting, started, reached, held, resumed, goto, restarted, "
         "new_session, board_touched, pipe_touched, paused; at the end done, cancelled, timed_out, "
         "leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over or "
         "end_lost"
     )
-    waypoint: int = Field(description="Index of the waypoint concerned")
-    text: str = Field(description="The same in words")
-    time_s: float = Field(description="Since the mission began [s]")
+    waypoint: int = told("Index of the waypoint concerned")
+    text: str = told("The same in words")
+    time_s: float = told("Since the mission began [s]")
 
 
 class MissionSummary(_Answer):
     """A mission, without its events."""
 
-    id: str = Field(description="Given by teleop")
-    name: str = Field(description="Given by its sender")
-    key: str = Field(description="Likewise")
-    state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"] = Field(
-        description="Where it is"
+    id: str = told("Given by teleop")
+    name: str = told("Given by its sender")
+    key: str = told("Likewise")
+    state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"] = told(
+        "Where it is"
     )
-    waypoint: int = Field(description="Index of the waypoint that is flown to, from 0")
-    waypoints: int = Field(description="How many it has")
-    reached: list[Reached] = Field(description="Those that were reached")
-    verdict: Verdict | None = Field(description="Once it has ended")
+    waypoint: int = told("Index of the waypoint that is flown to, from 0")
+    waypoints: int = told("How many it has")
+    reached: list[Reached] = told("Those that were reached")
+    verdict: Verdict | None = told("Once it has ended")
 
 
 class MissionView(MissionSummary):
     """A mission with its events."""
 
     events: list[Event] = Field(max_length=SHOWN, description="The newest of them, oldest first")
-    events_left_out: int = Field(description="How many there were before those")
+    events_left_out: int = told("How many there were before those")
 
 
 class MissionList(_Answer):
     """All known missions."""
 
-    missions: list[MissionSummary] = Field(description="Oldest first")
+    missions: list[MissionSummary] = told("Oldest first")
 
 
 class Seen(_Answer):
     """The newest telemetry."""
 
-    age_s: float = Field(description="Since it arrived [s]")
-    epoch: int = Field(description="Session that it belongs to")
-    world: str = Field(description="Names world's process")
-    position_m: list[float | None] = Field(description="Of the base, measured [m], world frame")
-    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = Field(
-        description="State of the guard on board"
-    )
-    cause: str = Field(description="Why it is in it; of a robot that has landed, why it landed")
-    guard_for_s: float | None = Field(
-        description="For how long it has been seen in this state [s]; null once it has not been "
+    age_s: float = told("Since it arrived [s]")
+    epoch: int = told("Session that it belongs to")
+    world: str = told("Names world's process")
+    position_m: list[float | None] = told("Of the base, measured [m], world frame")
+    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = told("State of the guard on board")
+    cause: str = told("Why it is in it; of a robot that has landed, why it landed")
+    guard_for_s: float | None = told(
+        "For how long it has been seen in this state [s]; null once it has not been "
         "heard for 1 s: state, cause and all else are those of then"
     )
-    next_step: str = Field(description="What comes next, or what the operator has to do for it")
-    pipe_contacts: int = Field(description="How often a pipe has been touched so far")
-    touch_speed_mps: float | None = Field(description="Of the tip at the board [m/s]")
-    horizon_s: float | None = Field(description="How far cloud looks ahead [s]")
-    rtt_s: float | None = Field(description="Last round trip, hold excluded [s]")
-    loop_delay_s: float | None = Field(description="The same, hold included [s]")
+    next_step: str = told("What comes next, or what the operator has to do for it")
+    pipe_contacts: int = told("How often a pipe has been touched so far")
+    touch_speed_mps: float | None = told("Of the tip at the board [m/s]")
+    horizon_s: float | None = told("How far cloud looks ahead [s]")
+    rtt_s: float | None = told("Last round trip, hold excluded [s]")
+    loop_delay_s: float | None = told("The same, hold included [s]")
 
 
 class StateView(_Answer):
     """The present state of missions and robot."""
 
-    mission: MissionSummary | None = Field(description="The one under way")
-    queue: list[str] = Field(description="Ids of those that wait")
-    cloud_age_s: float | None = Field(
-        description="Since cloud was heard [s], which says at least every 0.2 s that it lives; "
+    mission: MissionSummary | None = told("The one under way")
+    queue: list[str] = told("Ids of those that wait")
+    cloud_age_s: float | None = told(
+        "Since cloud was heard [s], which says at least every 0.2 s that it lives; "
         "null if it never was"
     )
-    seen: Seen | None = Field(description="Null until the robot has been seen")
+    seen: Seen | None = told("Null until the robot has been seen")
 
 
 class Stopped(_Answer):
     """Answer to an emergency stop, which is under way to the robot."""
 
-    id: str | None = Field(description="The mission that was under way and has failed")
-    state: Literal["stopping"] = Field(description="Until the guard on board is in ESTOP")
+    id: str | None = told("The mission that was under way and has failed")
+    state: Literal["stopping"] = told("Until the guard on board is in ESTOP")
 
 
 class Acknowledged(_Answer):
     """Answer to an acknowledgement, which is under way to the robot."""
 
-    state: Literal["acknowledged"] = Field(
-        description="The next mission may fly; a landing low over the ground ends first, and "
+    state: Literal["acknowledged"] = told(
+        "The next mission may fly; a landing low over the ground ends first, and "
         "after a stop or a touch-down the robot takes off only once it has been still, 0.5 m "
         "inside the fence"
     )
@@ -208,16 +210,16 @@ class Acknowledged(_Answer):
 class Problem(_Answer):
     """One value that cannot be used."""
 
-    path: str = Field(description="Keys down to the value, joined by dots")
-    index: int | None = Field(description="Of the waypoint concerned; null if it is none")
-    value: str = Field(description="In words; empty if it is not there")
-    reason: str = Field(description="What it must be, and what to do")
+    path: str = told("Keys down to the value, joined by dots")
+    index: int | None = told("Of the waypoint concerned; null if it is none")
+    value: str = told("In words; empty if it is not there")
+    reason: str = told("What it must be, and what to do")
 
 
 class Refusal(_Answer):
     """Reason why a request is refused."""
 
-    detail: str = Field(description="In words")
+    detail: str = told("In words")
     id: str | None = Field(None, description="The mission that is in the way")
     problems: list[Problem] | None = Field(None, description="Every value that cannot be used")
 
@@ -246,6 +248,12 @@ def read_order(
     `time_limit` [s] and `contact` (the board has to be touched if the mission leads there) are for
     missions that do not say so; `plan` makes a plan from a mission and its time limit [s].
     """
+    with suppress(ValueError, TypeError, KeyError):  # which the model words
+        if (
+            count := len(from_json(body)["waypoints"])
+        ) > MAX_WAYPOINTS:  # fast, also if all are bad
+            reason = f"at most {MAX_WAYPOINTS}; split the mission"
+            raise RefusedError([ConfigProblem(("waypoints",), str(count), reason)])
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # an experiment's mission may have steps in their place
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
@@ -298,10 +306,10 @@ def _parse(body: bytes, model: type[_Request]) -> _Request:
     try:
         return model.model_validate_json(body)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        if first["type"] == "json_invalid":
+        first = error.errors()[0] if error.error_count() == 1 else None
+        if first is not None and first["type"] == "json_invalid":
             problems = [ConfigProblem((), "", f"not JSON: {first['ctx']['error']}")]
-        elif not first["loc"]:
+        elif first is not None and not first["loc"]:
             problems = [ConfigProblem((), "", "must be a mapping of keys")]
         else:
             problems = from_pydantic(error, model, limit=PROBLEMS_MAX)

@@ -67,11 +67,8 @@ OPERATOR_HOLDS = "the operator holds the mission; to continue: cloudrc mission r
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
     """Describe what the robot does next, or what the operator has to do.
 
-    Args:
-        guard: State of the guard.
-        age: Age of the newest telemetry [s].
-        cloud_age: Time since the last message from cloud [s].
-        mission: State of the mission under way; None if there is none.
+    `age` and `cloud_age` are those of telemetry and of the last message from cloud [s]; `mission`
+    is the state of the mission under way, or None.
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
@@ -145,10 +142,8 @@ class MissionService:
     ) -> None:
         """Begin with the missions of a store; nothing flies before the first deadline.
 
-        Args:
-            contact_speed_max: Speed limit for the arm's tip when it touches the board [m/s].
-            book: Missions of this teleop and of earlier ones.
-            scene: Scene with the pipes that may be in the way; None if ways are not checked.
+        `contact_speed_max` limits the speed of the arm's tip at the board [m/s]. Pipes of `scene`
+        may be in the way.
         """
         self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
@@ -173,10 +168,9 @@ class MissionService:
         return self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission, which starts at once or waits in the queue.
+        """Create a mission, which starts at once or waits; return it, and whether it is new.
 
-        Returns:
-            The mission, and whether it is new. An order with a known key returns the known mission.
+        An order with a known key returns the known mission.
         """
         known = self.book.with_key(order.key)
         if known is not None:

@@ -14,6 +14,7 @@ import json
 import os
 import sqlite3
 from collections import Counter, deque
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -39,9 +40,6 @@ STATES = {
     **dict.fromkeys(FAILURES, "failed"),
 }
 """State of a mission after an event; other events do not change the state."""
-STOP = "emergency_stopped"
-FLOWN = {"started", STOP}
-"""Events of a mission that the robot may have flown."""
 SHOWN = 100
 """Limit of the events that are kept per mission; the newest are kept."""
 
@@ -71,7 +69,6 @@ class Mission:
 
     Attributes:
         id: Identifier, such as "m1".
-        order: The order.
         number: Number of the mission on board; below 2^63.
         state: One of the values of `STATES`.
         world: World in which the mission was started; "" before the start.
@@ -168,8 +165,6 @@ COMMIT;
 """
 SQLITE, OLD_JOURNAL = b"SQLite format 3\0", b"\x93CRJ"
 """First bytes of an SQLite file, and of a journal of cloudrc up to version 0.1."""
-SIDE_FILES = ("", "-wal", "-shm", "-journal")
-"""Suffixes of the files that belong to one SQLite database."""
 
 
 def open_store(path: Path, salt: bytes) -> MissionStore:
@@ -199,7 +194,7 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
         raise BadInputError(text) from None
     except sqlite3.DatabaseError as error:
         aside, reason = path.with_name(f"{path.name}.damaged"), " ".join(str(error).split())
-    for ending in SIDE_FILES:
+    for ending in ("", "-wal", "-shm", "-journal"):  # the files of one database
         with suppress(FileNotFoundError):
             Path(f"{path}{ending}").replace(f"{aside}{ending}")
     text = f"journal repaired: {path}: {reason}; its missions are lost, it is kept as {aside}"
@@ -260,10 +255,10 @@ class MissionStore:
         Ids begin again with a new file. `salt`, random bytes, makes the numbers on board differ.
         """
         self._db, self._salt, self.notice = db, salt, notice
-        self._events = 0  # number of the last event
-        self._unsaved: set[str] = set()  # missions with events that are not on the disk
         self.missions: dict[str, Mission] = {}
-        self.trouble, self._keep_ns, self.dropped = "", 0, 0
+        self._unsaved: set[str] = set()  # missions with events that are not on the disk
+        self._events = self._keep_ns = self.dropped = 0  # number of the last event
+        self.trouble = ""
         try:
             self._read()
         except (sqlite3.DatabaseError, LookupError, TypeError, ValueError) as error:
@@ -283,8 +278,9 @@ class MissionStore:
 
     def stopped(self) -> Mission | None:
         """Return the mission that was flown last, if it ended by an emergency stop."""
-        flown = [each for each in self.missions.values() if each.happened.keys() & FLOWN]
-        return flown[-1] if flown and STOP in flown[-1].happened else None
+        events = {"started", "emergency_stopped"}
+        flown = [each for each in self.missions.values() if each.happened.keys() & events]
+        return flown[-1] if flown and "emergency_stopped" in flown[-1].happened else None
 
     def find(self, mission_id: str) -> Mission:
         """Return a mission; raise UnknownMissionError if none has this id."""
@@ -351,7 +347,7 @@ class MissionStore:
         """Close the file, so that the next teleop can open it."""
         self._db.close()
 
-    def _commit(self, new: Mission | None = None, old: list[str] | None = None) -> None:
+    def _commit(self, new: Mission | None = None, old: Sequence[str] = ()) -> None:
         """Write all events that are not on the disk yet, and a new mission; delete old missions.
 
         Raises:
@@ -366,8 +362,7 @@ class MissionStore:
                 order = json.dumps([new.number, _ORDER.dump_python(new.order, mode="json")])
                 row = int(new.id[1:]), order, _status(new)
                 db.execute("INSERT INTO mission VALUES (?, ?, ?)", row)
-            gone = [(int(each[1:]),) for each in old or ()]
-            db.executemany("DELETE FROM mission WHERE n = ?", gone)
+            db.executemany("DELETE FROM mission WHERE n = ?", [(int(each[1:]),) for each in old])
             db.commit()
         except sqlite3.DatabaseError as error:
             with suppress(sqlite3.DatabaseError):

@@ -15,49 +15,20 @@ from tests.drivers.conftest import Release
 SECOND = 1_000_000_000
 
 
-class Cloud:
-    """The inputs of `LastWord`, with a clock that a test moves."""
-
-    def __init__(self) -> None:
-        self.asked = self.flies = False
-        self.now_ns = SECOND
-        self.ends = LastWord(lambda: self.asked, lambda: self.flies, lambda: self.now_ns)
-
-
-@pytest.mark.parametrize("flies", [False, True])
-def test_who_is_not_asked_goes_on(flies: bool) -> None:
-    cloud = Cloud()
-    cloud.flies = flies
-    for _ in range(3):
-        cloud.now_ns += SECOND
-        assert not cloud.ends()
-
-
-def test_with_nothing_in_flight_it_ends_at_once() -> None:
-    cloud = Cloud()
-    cloud.asked = True
-    assert cloud.ends()
-
-
-def test_what_flies_is_waited_for_until_it_is_seen_to_hold() -> None:
-    cloud = Cloud()
-    cloud.asked = cloud.flies = True
-    assert not cloud.ends()
-    cloud.now_ns += LAST_WORD_NS - 1
-    assert not cloud.ends()
-    cloud.flies = False
-    assert cloud.ends()
-
-
-def test_the_delay_ends_at_its_limit_after_the_request() -> None:
-    cloud = Cloud()
-    cloud.flies = True
-    assert not cloud.ends()
-    cloud.now_ns += 10 * SECOND
-    cloud.asked = True
-    assert not cloud.ends()
-    cloud.now_ns += LAST_WORD_NS
-    assert cloud.ends()
+def test_what_flies_is_waited_for_until_it_holds_or_for_its_limit() -> None:
+    asked, flies, now_ns = [False], [True], [SECOND]
+    ends = LastWord(lambda: asked[0], lambda: flies[0], lambda: now_ns[0])
+    for now_ns[0] in (SECOND, 10 * SECOND):
+        assert not ends(), "nobody has asked"
+    asked[0] = True
+    assert not ends()
+    now_ns[0] += LAST_WORD_NS - 1
+    assert not ends()
+    flies[0] = False
+    assert ends(), "it holds"
+    flies[0] = True
+    now_ns[0] += 1
+    assert ends(), "too late"
 
 
 @pytest.fixture

@@ -259,7 +259,10 @@ SWITCHES = {
     **{"deaf": {"uplink": False}, "mute": {"downlink": False}},
     "link": {"uplink": True, "downlink": True},
 }
-VERBS = ("hold", "resume", "stop_rotors", "acknowledge", "pause", "handle_deadline")
+VERBS = {
+    **{verb: verb for verb in ("hold", "resume", "pause")},
+    **{"stop": "stop_rotors", "ack": "acknowledge", "due": "handle_deadline"},
+}
 
 
 def play(flight, script):
@@ -282,7 +285,7 @@ def play(flight, script):
             newest = next(reversed(flight.teleop.book.missions))
             flight.teleop.cancel(action.removeprefix("cancel") or newest, flight.now_ns)
         elif action in VERBS:
-            getattr(flight.teleop, action)(flight.now_ns)
+            getattr(flight.teleop, VERBS[action])(flight.now_ns)
         elif action == "mark":
             flight.mark = len(flight.said)
         else:

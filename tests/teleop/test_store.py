@@ -312,18 +312,6 @@ def test_what_was_refused_is_stored_with_the_next_mission():
     assert [mission.id for mission in flight.teleop.book.open()] == [second]
 
 
-def test_a_waiting_mission_begins_only_with_the_disk():
-    flight, _ = service_flying()
-    waits = flight.create(queue=True)
-    flight.full = True
-    finish(flight)
-    flight.step(seconds=3.0)
-    assert flight.view(waits)["state"] == "queued", "it does not begin before the end is stored"
-    flight.full = False
-    flight.step(seconds=1.5)
-    assert flight.view(waits)["state"] == "flying"
-
-
 def flown(kill, **when):
     """Fly a mission whose process is killed once; say whether it was."""
     flight = ServiceFlight()
@@ -359,7 +347,7 @@ def test_killed_at_any_commit_waypoints_are_reached_once_in_order(kill):
     assert at > 6
 
 
-WORDS = "A B C away hold resume queue goto cancel cloud full free stop_rotors acknowledge restart"
+WORDS = "A B C away hold resume queue goto cancel cloud full free stop ack restart"
 steps = st.sampled_from(WORDS.split())
 
 
