@@ -66,19 +66,27 @@ def quantities(node: Function | ast.ClassDef) -> list[str]:
     return [argument.arg for argument in arguments if is_quantity(argument.annotation)]
 
 
+def comments(node: Function | ast.ClassDef, lines: list[str]) -> dict[str, str]:
+    """Return the comments beside the fields of a class."""
+    fields = [field for field in node.body if isinstance(field, ast.AnnAssign)]
+    return {ast.unparse(f.target): lines[f.lineno - 1].partition("  # ")[2] for f in fields}
+
+
 def without_unit(source: str) -> list[str]:
     """Return the quantities without a unit, as "function: argument"."""
-    found = []
+    found, lines = [], source.splitlines()
     for node in public(ast.parse(source)):
         said = ast.get_docstring(node)
         if said is None or node.name in EXCEPTIONS or re.match(r"_[^_]", node.name):
             continue
         sentences, *pieces = ENTRY.split(said)
         entries = dict(zip(pieces[::2], pieces[1::2], strict=True))
+        beside = comments(node, lines) if isinstance(node, ast.ClassDef) else {}
         for name in quantities(node):
             # A quantity without an entry has its unit in the sentence: "after `seconds` [s]".
             told = re.search(rf"\b{name.replace('_', '[_ ]')}\b", sentences)
-            if not UNIT.search(entries.get(name, sentences if told else "")):
+            text = entries.get(name, sentences if told else "") + beside.get(name, "")
+            if not UNIT.search(text):
                 found.append(f"{node.name}: {name}")
     return found
 
@@ -100,6 +108,7 @@ def test_every_quantity_has_its_unit() -> None:
         ('def _f(x: float):\n    """Move."""', []),
         ('class A(NamedTuple):\n    """A."""\n    x: float', ["A: x"]),
         ('@dataclass(frozen=True)\nclass A:\n    """A."""\n    x: float', ["A: x"]),
+        ('class A(NamedTuple):\n    """A."""\n    x: float  # way [m]', []),
         ('class A:\n    """A."""\n    x: float', []),
     ],
 )

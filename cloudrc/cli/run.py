@@ -133,10 +133,11 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
         print_or_drop(escape(f"{experiment.name}: {facts}, {waypoints}"))
     try:
         report = flight(folder)
-    except (CloudrcError, KeyboardInterrupt):
+    except (CloudrcError, KeyboardInterrupt) as error:
         if not (in_cluster and discard(folder)):
-            again = f"'cloudrc report {folder}' writes its report"
-            print_line(f"the recording is in {folder}; {again}", sys.stderr)
+            unwritten = isinstance(error, KeyboardInterrupt)
+            remedy = f"; 'cloudrc report {folder}' writes its report" if unwritten else ""
+            print_line(f"the recording is in {folder}{remedy}", sys.stderr)
         raise
     finally:
         if in_cluster and options.out is None and folder.exists():

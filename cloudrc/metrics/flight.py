@@ -74,7 +74,7 @@ class Flight:
         return self._within(_columns(self.recording[topic]))
 
     def true_position(self, stamp_ns: Array) -> Array:
-        """Interpolate the true position of the base at instants [ns], world's clock, shape (n,).
+        """Interpolate the true position of the base at `stamp_ns` [ns], world's clock, shape (n,).
 
         Returns:
             Positions [m], shape (n, 3); NaN outside the recording.
@@ -204,13 +204,13 @@ def mean(values: Array) -> float | None:
 
 
 def percentile(values: Array, percent: float) -> float | None:
-    """Compute a percentile of the finite `values`, shape (n,), any unit; None without any."""
+    """Compute the `percent` [%] percentile of the finite `values`, shape (n,); None without any."""
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, percent)) if len(finite) else None
 
 
 def rms(errors: Array) -> float | None:
-    """Compute the RMS length of error vectors, shape (n,) or (n, 3), any unit.
+    """Compute the RMS length of vectors `errors`, shape (n,) or (n, 3), any unit.
 
     Only finite rows count; without any, return None.
     """

@@ -62,7 +62,7 @@ class Verdict:
 
 
 class Moment(NamedTuple):
-    """When and where something happened, as in `Failure`."""
+    """The `time` [s] and the `place` [m] of an event, as in `Failure`."""
 
     time: float | None = None
     place: Vector | None = None
@@ -289,7 +289,7 @@ class Observations:
 
     @classmethod
     def begin(cls, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Begin with the telemetry at the start of the mission; arguments as in `see`."""
+        """Begin with the first telemetry; `touch_speed` [m/s] and the others are as in `see`."""
         return cls(pipe_contacts, 0, finite_or_none(touch_speed), None, slip_ns, slip_ns)
 
     def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:

@@ -115,7 +115,7 @@ def _changes(subject: Subject, uplink: bool) -> Iterator[Span]:
 
 
 def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
-    """Look up the delays that the link profile sets, at times [s] since the start of the flight.
+    """Look up the delays that the link profile sets, by `time` [s] since the flight's start.
 
     Returns:
         Lower and upper bound [s], NaN where a trace no longer exists; None if all values are NaN.

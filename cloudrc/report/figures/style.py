@@ -52,7 +52,7 @@ RC: dict[Any, Any] = {
 
 
 def new_figure(height: float, width: float = PAGE) -> Figure:
-    """Make an empty figure [in], without a display or pyplot."""
+    """Make an empty figure of `height` [in] and `width` [in], without a display or pyplot."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
@@ -74,7 +74,7 @@ def legend_above(axes: Axes, columns: int) -> None:
 
 
 def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1.8) -> None:
-    """Draw a dot of `size` [points] for each value, and its entry in the legend.
+    """Draw dots of `size` [points] at `x` and `y`, any unit, and their entry in the legend.
 
     As pixels inside the SVG file, thousands of dots stay small and fast to display.
     """
