@@ -79,13 +79,13 @@ def without_unit(source: str) -> list[str]:
         said = ast.get_docstring(node)
         if said is None or node.name in EXCEPTIONS or re.match(r"_[^_]", node.name):
             continue
-        sentences, *pieces = ENTRY.split(said)
+        pieces = ENTRY.split(said)[1:]
         entries = dict(zip(pieces[::2], pieces[1::2], strict=True))
         beside = comments(node, lines) if isinstance(node, ast.ClassDef) else {}
         for name in quantities(node):
             # A quantity without an entry has its unit in the sentence: "after `seconds` [s]".
-            told = re.search(rf"\b{name.replace('_', '[_ ]')}\b", sentences)
-            text = entries.get(name, sentences if told else "") + beside.get(name, "")
+            told = re.search(rf"\b{name.replace('_', '[_ ]')}\b", said)
+            text = entries.get(name, said if told else "") + beside.get(name, "")
             if not UNIT.search(text):
                 found.append(f"{node.name}: {name}")
     return found

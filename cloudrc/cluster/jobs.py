@@ -178,7 +178,7 @@ def deadline_of(limit: float, queue: bool) -> int:
 
 
 def follow_limit(limit: float, queue: bool) -> float:
-    """Compute the time after which Kubernetes has ended a Job in any case [s]."""
+    """Compute when Kubernetes has ended a Job in any case [s], from its mission's `limit` [s]."""
     return deadline_of(limit, queue) + END_ALLOWANCE
 
 

@@ -95,9 +95,9 @@ Source: docs/safety.md, "The guard"."""
 
 
 class Breach(NamedTuple):
-    """An invariant that did not hold: world's clock [s], the invariant's name, what happened."""
+    """An invariant that did not hold: its name, and what happened."""
 
-    time: float
+    time: float  # on world's clock [s]
     kind: str
     text: str
 
@@ -485,7 +485,7 @@ def can_stop(speed: float, below: float, above: float) -> bool:
 
 
 def growth(before: Vector, after: Vector) -> float:
-    """Return how much further from rest a reference [m/s] is than a tick before [m/s]."""
+    """Compute how much a reference grows between two ticks, `before` and `after` [m/s]."""
     (ux, uy, uz), (vx, vy, vz) = before, after
     return sqrt(_grown(ux, vx) ** 2 + _grown(uy, vy) ** 2 + _grown(uz, vz) ** 2)
 

@@ -79,7 +79,7 @@ def reading(
 def above(
     flight: Flight, role: str, name: str, bound: float, until: float | None = None
 ) -> tuple[int, float]:
-    """Return how many values of a histogram are above a bucket's bound, and their share [1]."""
+    """Count a histogram's values above `bound` up to `until` [s]; return count and share [1]."""
     live = LiveMetrics(role)
     live.see(seen_by(flight, role, until))
     shown = live.read()[f"cloudrc_{name}"]

@@ -295,7 +295,7 @@ class InProcessTeleop:
         self.ask(MissionService.stop_rotors, now_ns)
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """Stop the process as SIGSTOP does; inside cloud's process it cannot."""
+        """Do not stop for `duration` [s]: teleop inside cloud's process cannot stop alone."""
 
     def run_on(self, host: RestartableEndpoint) -> None:
         """Begin to run on the machine of `host`."""

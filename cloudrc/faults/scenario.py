@@ -28,9 +28,9 @@ class Check:
     """One thing that has to follow: how `measured` compares with `limit`, both in `unit`."""
 
     text: str
-    measured: float
+    measured: float  # [any unit]
     relation: Relation
-    limit: float
+    limit: float  # [any unit]
     unit: str = ""
 
     @property
@@ -69,7 +69,7 @@ class Outcome:
         self.checks.append(Check(text, measured, ">=", limit, unit))
 
     def same(self, text: str, measured: float, limit: float) -> None:
-        """Check that a count is exactly its limit [1]."""
+        """Check that a count, `measured`, is exactly its `limit` [1]."""
         self.checks.append(Check(text, measured, "==", limit))
 
     def true(self, text: str, holds: bool) -> None:

@@ -19,15 +19,12 @@ from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElli
 
 
 class Kind(NamedTuple):
-    """A kind of fault: what happens, and what is drawn at random.
-
-    That is the longest duration [s], 0 for an instant, and the range of `value` [any unit].
-    """
+    """A kind of fault: what happens, and the range of what is drawn at random."""
 
     text: str
-    longest: float = 0.0
-    low: float = 0.0
-    high: float = 0.0
+    longest: float = 0.0  # longest duration [s]; 0 for an instant
+    low: float = 0.0  # smallest `value` [any unit]
+    high: float = 0.0  # largest `value` [any unit]
 
 
 KINDS = {

@@ -87,7 +87,7 @@ def uniforms(key: StreamKey, purpose: Purpose, block: int) -> NDArray[np.float64
 
 @lru_cache(maxsize=_CACHED)
 def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) -> tuple[float, ...]:
-    """Draw standard normal variates, each correlated with its predecessor, shape (256,).
+    """Draw standard normal variates, shape (256,), with a `correlation` [1] of neighbours.
 
     The variates follow the autoregression z_n = c · z_(n-1) + sqrt(1 - c²) · e_n. So every variate
     is exactly standard normal.
@@ -112,7 +112,10 @@ def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) ->
 
 @lru_cache(maxsize=_CACHED)
 def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> tuple[bool, ...]:
-    """Run the two-state chain over a block: True for packets in the bad state, shape (256,)."""
+    """Run the two-state chain over a block: True for packets in the bad state, shape (256,).
+
+    `bad_start` and `bad_end` are the chances per packet that this state starts and ends [1].
+    """
     if not bad_start:
         return (False,) * BLOCK
     draws = iter(uniforms(key, Purpose.STATE, block).tolist())
@@ -156,7 +159,10 @@ def impairments(
 
 @lru_cache(maxsize=_CACHED)
 def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
-    """Draw the damaged packets: index in the block -> flipped bit, as a share of the datagram."""
+    """Draw the damaged packets: index in the block -> flipped bit, as a share of the datagram.
+
+    `corrupt` is the chance of damage per packet, in [0, 1].
+    """
     places = uniforms(key, Purpose.CORRUPT_BIT, block)
     return {n: float(places[n]) for n in _packets_hit(key, Purpose.CORRUPT, block, corrupt)}
 

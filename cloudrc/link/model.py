@@ -184,7 +184,7 @@ class Numbers:
     """Statistics of a stream; an unknown value is NaN.
 
     Attributes:
-        mean: Mean delay [s]; likewise standard deviation, shortest, median, 99 % quantile, longest.
+        mean: Mean delay [s].
         correlation: Correlation of the delays of successive packets [1].
         loss: Share of packets that did not arrive, in [0, 1].
         runs: Length of each run of successive losses.
@@ -194,11 +194,11 @@ class Numbers:
     """
 
     mean: float
-    deviation: float
-    least: float
-    median: float
-    p99: float
-    most: float
+    deviation: float  # standard deviation of the delay [s]
+    least: float  # [s]
+    median: float  # [s]
+    p99: float  # [s]
+    most: float  # [s]
     correlation: float
     loss: float
     runs: tuple[int, ...]

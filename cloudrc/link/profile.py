@@ -48,16 +48,13 @@ def mean_loss(loss: Loss) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of the conditions at one instant; None leaves a value unchanged.
+    """A change of the conditions at one instant; None leaves a value unchanged."""
 
-    The instant `at` is the time since the link came up [s]; for the others see `DirectionProfile`.
-    """
-
-    at: float
-    delay: float | None = None
-    jitter: float | None = None
+    at: float  # since the link came up [s]
+    delay: float | None = None  # mean one-way delay [s]
+    jitter: float | None = None  # [s]
     loss: Loss | None = None
-    rate: float | None = None
+    rate: float | None = None  # [bit/s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +62,7 @@ class Blackout:
     """An interval in which all packets are lost; `start` counts since the link came up [s]."""
 
     start: float
-    duration: float
+    duration: float  # [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,12 +137,12 @@ class DirectionProfile:
 
 
 class Conditions(NamedTuple):
-    """The conditions during one piece of a time line: mean one-way delay [ns], else as above."""
+    """The conditions during one piece of a time line."""
 
-    delay_ns: int
-    jitter: float
+    delay_ns: int  # mean one-way delay [ns]
+    jitter: float  # [s]
     loss: Loss
-    rate: float | None
+    rate: float | None  # [bit/s]
     blackout: bool
 
 
