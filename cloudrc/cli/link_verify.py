@@ -87,12 +87,17 @@ WAYS = {
     "downlink": ("cloud", "world", Kind.COMMAND),
 }
 """Direction -> the end that sends in it, the end that receives, and what."""
-COLOURS = {"ok": "green", "off": "red", "open": "yellow"}
 NAMES = {"mean": "delay, mean", "deviation": "standard deviation", "loss": "lost"}
 SCALES = {"s": (1e3, "ms"), "1": (1e2, "%"), "bit/s": (1e-3, "kbit/s")}
 NOT_JUDGED = "NOT JUDGED"
 """Mark in a note: something that the profile asks for was not verified."""
-VERDICTS = {"off": "not believed", "open": "undecided", "ok": "believed"}
+_MORE = "was not measured for long enough: give more --seconds, or ask again"
+VERDICTS = {
+    "off": ("not believed", "red", "does not match its profile"),
+    "open": ("undecided", "yellow", _MORE),
+    "ok": ("believed", "green", "matches its profile"),
+}
+"""Verdict of the rows, the worst first -> verdict on the link, its colour and a text."""
 _CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
 Report: TypeAlias = dict[str, Any]
@@ -172,7 +177,7 @@ def verify(
     Tests inject faults: by another profile `applied`, and by a function that gets the running link.
     """
     tell("planning the probes")
-    plans, found, notes = make_plans(experiment, seconds, shaper), dict[str, Findings](), []
+    plans, found = make_plans(experiment, seconds, shaper), dict[str, Findings]()
     for look in ("sending probes", "looking again at what is off"):
         tell(f"{look}: {max(plan.sent[-1] for plan in plans.values()):.0f} s")
         with run_link(experiment, shaper, applied) as ways:
@@ -183,15 +188,17 @@ def verify(
         if "off" not in {verdict_of(one.rows) for one in found.values()}:
             break
     tell("")
-    for way, plan in plans.items():
-        if shaper == "netem" and plan.profile.correlation and plan.profile.jitter:
-            notes.append(_on_correlation(way, plan.profile.correlation))
-        if plan.profile.rate and not plan.train:
-            notes.append(f"{way}: rate {NOT_JUDGED}: this machine itself is hardly faster")
-    probes = {
-        way: f"{len(plan.sent)} probes of {plan.flow.size} bytes" for way, plan in plans.items()
-    }
-    return make_report(title, found, probes, notes)
+    notes = [
+        _on_correlation(way, plan.profile.correlation)
+        for way, plan in plans.items()
+        if shaper == "netem" and plan.profile.correlation and plan.profile.jitter
+    ] + [
+        f"{way}: rate {NOT_JUDGED}: this machine itself is hardly faster"
+        for way, plan in plans.items()
+        if plan.profile.rate and not plan.train
+    ]
+    counts = {way: f"{len(p.sent)} probes of {p.flow.size} bytes" for way, p in plans.items()}
+    return make_report(title, found, counts, notes)
 
 
 def make_plans(
@@ -418,7 +425,7 @@ def verify_release(title: str, pods: Pods, limit: float, tell: Tell) -> Report:
         raise TimedOutError(text)
     findings = {way: _findings(way, seen[way], pods[WAYS[way][0]][1]) for way in WAYS}
     counts = {way: max([row["datagrams"] for row in seen[way]["rows"]], default=0) for way in WAYS}
-    probes = {way: f"{count} of the tunnel's own datagrams" for way, count in counts.items()}
+    probes = {way: f"{counts[way]} of the tunnel's own datagrams" for way in WAYS}
     notes = [note for way in WAYS for note in _notes(way, seen[way], findings[way])]
     return make_report(title, findings, probes, notes)
 
@@ -506,7 +513,7 @@ def make_report(
     verdicts = {verdict_of(one.rows) for one in findings.values()}
     return {
         "schemaVersion": 1,
-        "verdict": next(word for verdict, word in VERDICTS.items() if verdict in verdicts),
+        "verdict": next(one[0] for verdict, one in VERDICTS.items() if verdict in verdicts),
         "link": title,
         "shaper": f"shaped by {' and '.join(sorted(shapers))}",
         "causes": [cause._asdict() for cause in find_causes(findings)],
@@ -523,38 +530,27 @@ def make_report(
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        key: value
-        for key, value in values.items()
-        if value not in (None, "", ()) and not (isinstance(value, float) and not isfinite(value))
-    }
+    def is_known(value: Any) -> bool:
+        return value not in (None, "", ()) and not (
+            isinstance(value, float) and not isfinite(value)
+        )
+
+    return {key: value for key, value in values.items() if is_known(value)}
 
 
 def as_text(report: Report) -> str:
     """Format a table per direction, notes, causes, and the verdict in the last line."""
     lines = [escape(f"{report['link']}: {report['shaper']}")]
     for way, found in report["directions"].items():
-        rows = [[way, "asked", "applied", "measured", "allowed", "verdict"]]
-        rows += [_cells(row) for row in found["rows"]]
-        head, *body = table(rows, [1, 2, 3, 4]).splitlines()
-        lines += ["", paint(head, "bold"), paint(escape(f"  {found['probes']}"), "dim")]
-        for line, verdict in zip(body, (row["verdict"] for row in found["rows"]), strict=True):
-            lines.append(line.removesuffix(verdict) + paint(verdict, COLOURS[verdict]))
+        heads = [way, "asked", "applied", "measured", "allowed", "verdict"]
+        head, _, body = table([heads, *map(_cells, found["rows"])], [1, 2, 3, 4]).partition("\n")
+        lines += ["", head, escape(f"  {found['probes']}"), body]
     causes = [f"  {one['way']}: {one['text']}  [{one['code']}]" for one in report["causes"]]
     lines += ["", *map(escape, [*report["notes"], *causes])]
-    partly = any(NOT_JUDGED in note for note in report["notes"])
-    colour, words = {
-        "believed": (
-            "green",
-            f"matches its profile{f', except what is {NOT_JUDGED} (above)' * partly}",
-        ),
-        "not believed": ("red", "does not match its profile"),
-        "undecided": (
-            "yellow",
-            "was not measured for long enough: give more --seconds, or ask again",
-        ),
-    }[report["verdict"]]
-    return "\n".join([*lines, paint(f"{report['verdict'].upper()}: the link {words}", colour)])
+    partly = any(NOT_JUDGED in note for note in report["notes"]) and report["verdict"] == "believed"
+    word, colour, text = next(one for one in VERDICTS.values() if one[0] == report["verdict"])
+    text += f", except what is {NOT_JUDGED} (above)" * partly
+    return "\n".join([*lines, paint(f"{word.upper()}: the link {text}", colour)])
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:

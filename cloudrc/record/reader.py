@@ -248,28 +248,15 @@ def read_contents(path: Path) -> Contents:
     Raises:
         BadInputError: If nothing in the file is readable.
     """
+    contents, sequences = Contents(), array("L")
+    types: dict[int, tuple[str, str]] = {}
+    channels: dict[int, tuple[str, bool]] = {}  # name of the topic; whether it is ours
+    seen: Counter[int] = Counter()  # messages by channel
     with Records(path) as records:
-        return _Collector(records).collect()
-
-
-class _Collector:
-    """Collects the messages of cloudrc's topics, all metadata and all attachments of a file."""
-
-    def __init__(self, records: Records) -> None:
-        self._records = records
-        self._contents = Contents()
-        self._channels: dict[int, tuple[str, bool]] = {}  # name of the topic; whether it is ours
-        self._seen: Counter[int] = Counter()  # messages by channel
-
-    def collect(self) -> Contents:
-        """Read all records, sort the messages, and note what is missing."""
-        contents, records = self._contents, self._records
-        types: dict[int, tuple[str, str]] = {}
-        sequences = array("L")
         for record in records:
             if isinstance(record, Message):
-                self._seen[record.channel_id] += 1
-                topic, ours = self._channels.get(record.channel_id, ("", False))
+                seen[record.channel_id] += 1
+                topic, ours = channels.get(record.channel_id, ("", False))
                 if ours:
                     contents.messages.append((topic, record.log_time, record.data))
                     sequences.append(record.sequence)
@@ -278,70 +265,65 @@ class _Collector:
             elif isinstance(record, Channel):
                 topic, (ros_type, text) = record.topic, types.get(record.schema_id, ("", ""))
                 known = topic in TOPICS and TOPICS[topic].ros_type == ros_type
-                self._channels[record.id] = topic, known and is_known(ros_type, text)
+                channels[record.id] = topic, known and is_known(ros_type, text)
             elif isinstance(record, Metadata):
                 contents.metadata.update(record.metadata)
             elif isinstance(record, Attachment):
                 contents.attachments[record.name] = record.data
-        if not records.data_ended and not contents.messages:
-            raise NothingReadableError(
-                f"{records.path}: holds no readable message: {records.fault}; name another"
-                " recording"
-            )
-        self._sort(sequences)
-        self._note()
-        return contents
+    messages, fault = contents.messages, records.fault
+    if not records.data_ended and not messages:
+        raise NothingReadableError(
+            f"{path}: holds no readable message: {fault}; name another recording"
+        )
+    if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
+        order = sorted(range(len(messages)), key=lambda n: (messages[n][1], sequences[n]))
+        contents.messages = [messages[n] for n in order]
+        contents.remarks += (f"was not in order of time: {late} messages were sorted",)
+    _note(contents, records, [(*channels.get(one, ("", None)), n) for one, n in seen.items()])
+    return contents
 
-    def _sort(self, sequences: array[int]) -> None:
-        contents, messages = self._contents, self._contents.messages
-        if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
-            order = sorted(range(len(messages)), key=lambda n: (messages[n][1], sequences[n]))
-            contents.messages = [messages[n] for n in order]
-            contents.remarks += (f"was not in order of time: {late} messages were sorted",)
 
-    def _note(self) -> None:
-        contents, records = self._contents, self._records
-        cut, lacking = list[str](), list[str]()
-        if records.data_ended and records.cut:
-            contents.remarks += ("had a torn index: all its messages were read",)
-        elif fault := records.fault:
-            if not records.data_ended:
-                count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
-                fault += f": {count} messages were read, the last at {until:.2f} s"
-            (cut if records.cut else lacking).append(fault)
-        lacking += self._lacking(Counter(message[0] for message in contents.messages))
-        told = to_one_line(contents.metadata.get(MISSING, ""))
-        contents.lacking = "; ".join(lacking)
-        contents.note = "; ".join(filter(None, [*cut, *lacking, told]))
+def _note(contents: Contents, records: Records, seen: list[tuple[str, bool | None, int]]) -> None:
+    """Note what is missing; `seen` has topic, whether it is ours, and messages of each channel."""
+    cut, lacking = list[str](), list[str]()
+    if records.data_ended and records.cut:
+        contents.remarks += ("had a torn index: all its messages were read",)
+    elif fault := records.fault:
+        if not records.data_ended:
+            count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
+            fault += f": {count} messages were read, the last at {until:.2f} s"
+        (cut if records.cut else lacking).append(fault)
+    others = {name for name, ours, _ in seen if ours is False}
+    if foreign := sorted(others - TOPICS.keys()):
+        told = f"has topics that cloudrc does not record: {_list(foreign)}"
+        contents.remarks += (to_one_line(told),)
+    if changed := sorted(others & TOPICS.keys()):
+        lacking.append(f"topics of another layout were left out: {', '.join(changed)}")
+    twice = Counter(name for name, ours, _ in seen if ours and TOPICS[name].end != "either")
+    if double := [name for name, count in twice.items() if count > 1]:
+        lacking.append(f"two robots or two recordings are in one file: {', '.join(double)}")
+    if homeless := sum(count for _, ours, count in seen if ours is None):
+        lacking.append(f"{homeless} messages are of no topic")
+    if CLOCK not in contents.metadata:
+        lacking.append("the metadata of cloudrc, which names the clock, is not there")
+    total = sum(count for *_, count in seen)
+    if records.ended and records.stated not in (None, total):
+        lacking.append(f"the index states {records.stated} messages, {total} were read")
+    lacking += _changed(contents) if records.data_ended else ()
+    told = to_one_line(contents.metadata.get(MISSING, ""))
+    contents.lacking = "; ".join(lacking)
+    contents.note = "; ".join(filter(None, [*cut, *lacking, told]))
 
-    def _lacking(self, read: Counter[str]) -> Iterator[str]:
-        """Describe what others have removed or added; `read` are the messages by topic."""
-        metadata, seen = self._contents.metadata, self._seen
-        channels = [self._channels[number] for number in seen if number in self._channels]
-        foreign = sorted({name for name, ours in channels if not ours and name not in TOPICS})
-        if foreign:
-            told = f"has topics that cloudrc does not record: {_list(foreign)}"
-            self._contents.remarks += (to_one_line(told),)
-        if other := sorted({name for name, ours in channels if not ours and name in TOPICS}):
-            yield f"topics of another layout were left out: {', '.join(other)}"
-        twice = Counter(name for name, ours in channels if ours and TOPICS[name].end != "either")
-        if double := [name for name, count in twice.items() if count > 1]:
-            yield f"two robots or two recordings are in one file: {', '.join(double)}"
-        if homeless := sum(seen[number] for number in seen.keys() - self._channels.keys()):
-            yield f"{homeless} messages are of no topic"
-        if CLOCK not in metadata:
-            yield "the metadata of cloudrc, which names the clock, is not there"
-        stated, total = self._records.stated, seen.total()
-        if self._records.ended and stated not in (None, total):
-            yield f"the index states {stated} messages, {total} were read"
-        if not self._records.data_ended:
-            return
-        counts = _parse_counts(metadata.get(COUNTS, ""))
-        topics = [topic for topic in TOPICS if counts and read[topic] != counts.get(topic, 0)]
-        if wrong := [f"{read[topic]} of {counts.get(topic, 0)} on {topic}" for topic in topics]:
-            yield f"messages were removed or added: it holds {_list(wrong)}"
-        if metadata.get(COUNTS) == "" and MISSING not in metadata:
-            yield "it was torn, and another program has put an end to it"
+
+def _changed(contents: Contents) -> Iterator[str]:
+    """Compare a file that was read to its end with what its writer has counted."""
+    metadata, read = contents.metadata, Counter(message[0] for message in contents.messages)
+    counts = _parse_counts(metadata.get(COUNTS, ""))
+    topics = [topic for topic in TOPICS if counts and read[topic] != counts.get(topic, 0)]
+    if wrong := [f"{read[topic]} of {counts.get(topic, 0)} on {topic}" for topic in topics]:
+        yield f"messages were removed or added: it holds {_list(wrong)}"
+    if metadata.get(COUNTS) == "" and MISSING not in metadata:
+        yield "it was torn, and another program has put an end to it"
 
 
 def _list(topics: list[str]) -> str:
@@ -360,23 +342,14 @@ def _parse_counts(text: str) -> dict[str, int]:
 
 @dataclass(slots=True)
 class Recovery:
-    """The result of a recovery.
+    """The result of a recovery."""
 
-    Attributes:
-        size: Size of the damaged file [bytes].
-        kept: Number of objects in the new file, by kind.
-        dropped: Number of objects that are known to be lost, by kind (only "messages").
-        bytes_lost: Size of the part behind the last intact record [bytes].
-        notes: What is missing or doubtful, in words.
-        index_is_new: Whether the old file had no readable index.
-    """
-
-    size: int
-    kept: dict[str, int]
-    dropped: dict[str, int]
-    bytes_lost: int
-    notes: list[str]
-    index_is_new: bool
+    size: int  # of the damaged file [bytes]
+    kept: dict[str, int]  # number of objects in the new file, by kind
+    dropped: dict[str, int]  # number of objects that are known to be lost (only "messages")
+    bytes_lost: int  # behind the last intact record [bytes]
+    notes: list[str]  # what is missing or doubtful, in words
+    index_is_new: bool  # whether the old file had no readable index
 
     @property
     def complete(self) -> bool:

@@ -108,14 +108,8 @@ _Vector3, _Point, _Quaternion, _Pose, _Twist, _PoseWithCovariance, _TwistWithCov
     _type[f"geometry_msgs/msg/{name}"]
     for name in "Vector3 Point Quaternion Pose Twist PoseWithCovariance TwistWithCovariance".split()
 )
-_TwistStamped, _PointStamped, _Odometry = (
-    _type[name]
-    for name in (
-        "geometry_msgs/msg/TwistStamped",
-        "geometry_msgs/msg/PointStamped",
-        "nav_msgs/msg/Odometry",
-    )
-)
+_Odometry, _TwistStamped = _type["nav_msgs/msg/Odometry"], _type["geometry_msgs/msg/TwistStamped"]
+_PointStamped = _type["geometry_msgs/msg/PointStamped"]
 _NO_COVARIANCE = np.zeros(36)
 
 

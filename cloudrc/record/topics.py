@@ -40,8 +40,8 @@ class Topic(NamedTuple):
     end: Literal["world", "cloud", "either"]  # that records the topic
     text: str  # meaning of a row
     fields: tuple[Field, ...]  # the columns after `stamp_ns`
-    stamp_path: str  # dotted path of the row's stamp in the record
-    part: str  # path to a nested record, with a dot at its end; it has what the record has not
+    stamp_path: str = "stamp_ns"  # dotted path of the row's stamp in the record
+    part: str = ""  # path to a nested record, with a dot at its end; it has what the record has not
 
     def paths(self) -> list[str]:
         """Return the dotted path of each field's value in the record."""
@@ -50,19 +50,6 @@ class Topic(NamedTuple):
             field.path or (field.name if field.name in own else f"{self.part}{field.name}")
             for field in self.fields
         ]
-
-
-def _topic(
-    name: str,
-    ros_type: str,
-    source: type[Record],
-    end: Literal["world", "cloud", "either"],
-    text: str,
-    *fields: Field,
-    stamp_path: str = "stamp_ns",
-    part: str = "",
-) -> Topic:
-    return Topic(name, ros_type, source, end, text, fields, stamp_path, part)
 
 
 _POSE_AND_TWIST = (
@@ -101,12 +88,12 @@ _ARRIVAL = (
 
 # fmt: off
 _TABLE = (
-    _topic("/odometry", "nav_msgs/msg/Odometry", rec.TelemetrySent, "world",
+    Topic("/odometry", "nav_msgs/msg/Odometry", rec.TelemetrySent, "world",
         "Measured pose and twist as sent, at the instant of the measurement, world's clock",
-        *_POSE_AND_TWIST,
+        _POSE_AND_TWIST,
         stamp_path="telemetry.odometry.stamp_ns", part="telemetry.odometry."),
-    _topic("/telemetry", "cloudrc_msgs/msg/Telemetry", rec.TelemetrySent, "world",
-        "The other fields of the telemetry sent, world's clock",
+    Topic("/telemetry", "cloudrc_msgs/msg/Telemetry", rec.TelemetrySent, "world",
+        "The other fields of the telemetry sent, world's clock", (
         _EPOCH,
         _COUNTER,
         Field("odometry_stamp_ns", "int", "ns", _ODOMETRY, "telemetry.stamp_ns"),
@@ -120,84 +107,84 @@ _TABLE = (
         Field("touch_speed", "float", "m/s", "of the tip's first touch of the board; NaN before"),
         Field("mission_id", "int", "", "identity of the mission started last; 0 if none"),
         Field("reached", "int", "", f"waypoints reached; {MISSION_OVER} if the mission is over"),
-        Field("cause", "int", "", _CAUSES),
+        Field("cause", "int", "", _CAUSES)),
         part="telemetry."),
-    _topic("/ground_truth", "nav_msgs/msg/Odometry", rec.GroundTruth, "world",
+    Topic("/ground_truth", "nav_msgs/msg/Odometry", rec.GroundTruth, "world",
         "True pose and twist, world's clock",
-        *_POSE_AND_TWIST,
+        _POSE_AND_TWIST,
         stamp_path="odometry.stamp_ns", part="odometry."),
-    _topic("/contact_force", "cloudrc_msgs/msg/ContactForce", rec.GroundTruth, "world",
-        "Force on the touch sensor, world's clock",
-        Field("tip_force", "float", "N", "on the arm's tip")),
-    _topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
-        "Velocity that the guard lets the low-level controller follow, world's clock",
-        Field("reference", "vector", "m/s", "after the guard's caps, world frame")),
-    _topic("/uplink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "cloud",
+    Topic("/contact_force", "cloudrc_msgs/msg/ContactForce", rec.GroundTruth, "world",
+        "Force on the touch sensor, world's clock", (
+        Field("tip_force", "float", "N", "on the arm's tip"),)),
+    Topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
+        "Velocity that the guard lets the low-level controller follow, world's clock", (
+        Field("reference", "vector", "m/s", "after the guard's caps, world frame"),)),
+    Topic("/uplink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "cloud",
         "Telemetry arrived at cloud, including late ones, cloud's clock",
-        *_ARRIVAL),
-    _topic("/downlink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "world",
+        _ARRIVAL),
+    Topic("/downlink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "world",
         "A command arrived at world, including late ones, world's clock",
-        *_ARRIVAL),
-    _topic("/command_applied", "cloudrc_msgs/msg/CommandApplied", rec.CommandApplied, "world",
-        "A command was applied for the first time, world's clock",
+        _ARRIVAL),
+    Topic("/command_applied", "cloudrc_msgs/msg/CommandApplied", rec.CommandApplied, "world",
+        "A command was applied for the first time, world's clock", (
         *(_EPOCH, _COUNTER, _BASIS),
-        Field("velocity", "vector", "m/s", "before the guard's caps, world frame")),
-    _topic("/guard", "cloudrc_msgs/msg/GuardChange", rec.GuardChange, "world",
-        "The guard changed its state, world's clock",
-        Field("state", "int", "", _GUARD), Field("cause", "string", "", "why, in words")),
-    _topic("/contact", "cloudrc_msgs/msg/Contact", rec.Contact, "world",
-        "The robot touched something, world's clock",
+        Field("velocity", "vector", "m/s", "before the guard's caps, world frame"))),
+    Topic("/guard", "cloudrc_msgs/msg/GuardChange", rec.GuardChange, "world",
+        "The guard changed its state, world's clock", (
+        Field("state", "int", "", _GUARD), Field("cause", "string", "", "why, in words"))),
+    Topic("/contact", "cloudrc_msgs/msg/Contact", rec.Contact, "world",
+        "The robot touched something, world's clock", (
         Field("body", "string", "", "the scene's body: pipe_1, board, floor"),
         Field("position", "vector", "m", "of the base, world frame"),
         Field("velocity", "vector", "m/s", "of the base just before, world frame"),
         Field("tip_velocity", "vector", "m/s", "of the arm's tip just before, world frame"),
-        Field("tip", "bool", "", "true if the arm's tip touched, false for any other part")),
-    _topic("/session", "cloudrc_msgs/msg/SessionOpened", rec.SessionOpened, "either",
-        "A session began under a new epoch, clock of its end",
-        _END, _EPOCH, Field("cause", "string", "", "why, in words")),
-    _topic("/estimated_odometry", "nav_msgs/msg/Odometry", rec.Control, "cloud",
+        Field("tip", "bool", "", "true if the arm's tip touched, false for any other part"))),
+    Topic("/session", "cloudrc_msgs/msg/SessionOpened", rec.SessionOpened, "either",
+        "A session began under a new epoch, clock of its end", (
+        _END, _EPOCH, Field("cause", "string", "", "why, in words"))),
+    Topic("/estimated_odometry", "nav_msgs/msg/Odometry", rec.Control, "cloud",
         "Prediction that the controller used, stamped as the command, cloud's clock; it predicts"
         " for basis_stamp_ns + horizon of /delay_estimate",
-        *_POSE_AND_TWIST[:3]),
-    _topic("/setpoint_position", "geometry_msgs/msg/PointStamped", rec.Control, "cloud",
-        "What the controller tracks, cloud's clock",
-        Field("setpoint", "vector", "m", "position to fly to, world frame")),
-    _topic("/cmd_vel", "geometry_msgs/msg/TwistStamped", rec.Control, "cloud",
-        "Velocity commanded, cloud's clock",
+        _POSE_AND_TWIST[:3]),
+    Topic("/setpoint_position", "geometry_msgs/msg/PointStamped", rec.Control, "cloud",
+        "What the controller tracks, cloud's clock", (
+        Field("setpoint", "vector", "m", "position to fly to, world frame"),)),
+    Topic("/cmd_vel", "geometry_msgs/msg/TwistStamped", rec.Control, "cloud",
+        "Velocity commanded, cloud's clock", (
         Field("command", "vector", "m/s", "world frame"),
-        Field("yaw_rate", "float", "rad/s", "about the world's z axis")),
-    _topic("/delay_estimate", "cloudrc_msgs/msg/DelayEstimate", rec.Control, "cloud",
-        "The delay that the prediction bridged, cloud's clock",
+        Field("yaw_rate", "float", "rad/s", "about the world's z axis"))),
+    Topic("/delay_estimate", "cloudrc_msgs/msg/DelayEstimate", rec.Control, "cloud",
+        "The delay that the prediction bridged, cloud's clock", (
         _EPOCH,
         _COUNTER,
         _BASIS,
         Field("horizon", "float", "s", "time by which the odometry was predicted ahead"),
         Field("rtt", "float", "s", "last round trip without the hold; NaN before the first"),
         Field("loop_delay", "float", "s", "last round trip with the hold: tau_n of the paper"),
-        Field("measured", "vector", "m", "position in the odometry used, world frame")),
-    _topic("/pid", "cloudrc_msgs/msg/Pid", rec.Control, "cloud",
-        "Terms of the controller, cloud's clock",
+        Field("measured", "vector", "m", "position in the odometry used, world frame"))),
+    Topic("/pid", "cloudrc_msgs/msg/Pid", rec.Control, "cloud",
+        "Terms of the controller, cloud's clock", (
         Field("waypoint", "int", "", "index of the waypoint flown to; -1 if none"),
         Field("proportional", "vector", "m/s", "term per axis, world frame"),
         Field("integral", "vector", "m/s", "term per axis, world frame"),
-        Field("derivative", "vector", "m/s", "term per axis, world frame")),
-    _topic("/mission", "cloudrc_msgs/msg/MissionEvent", rec.MissionEvent, "cloud",
-        "An event of the mission, cloud's clock",
+        Field("derivative", "vector", "m/s", "term per axis, world frame"))),
+    Topic("/mission", "cloudrc_msgs/msg/MissionEvent", rec.MissionEvent, "cloud",
+        "An event of the mission, cloud's clock", (
         Field("event", "string", "", _EVENTS),
         Field("waypoint", "int", "", "index of the waypoint concerned; -1 if none"),
-        Field("text", "string", "", "the event in words")),
-    _topic("/fault", "cloudrc_msgs/msg/Fault", rec.Fault, "either",
-        "A fault that did not stop the flight, clock of its end",
+        Field("text", "string", "", "the event in words"))),
+    Topic("/fault", "cloudrc_msgs/msg/Fault", rec.Fault, "either",
+        "A fault that did not stop the flight, clock of its end", (
         Field("code", "string", "", _CODES),
-        Field("text", "string", "", "what, where, what to do")),
-    _topic("/count", "cloudrc_msgs/msg/Counted", rec.Counted, "either",
-        "A counter, clock of its end",
+        Field("text", "string", "", "what, where, what to do"))),
+    Topic("/count", "cloudrc_msgs/msg/Counted", rec.Counted, "either",
+        "A counter, clock of its end", (
         _END,
         Field("name", "string", "", _COUNTED),
-        Field("total", "int", "", "count since the start")),
-    _topic("/link", "cloudrc_msgs/msg/LinkChanged", rec.LinkChanged, "either",
+        Field("total", "int", "", "count since the start"))),
+    Topic("/link", "cloudrc_msgs/msg/LinkChanged", rec.LinkChanged, "either",
         "The emulated link of this end was first seen, has changed or is repeated, in real time"
-        " only, clock of its end",
+        " only, clock of its end", (
         Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
         Field("shaper", "string", "", "relay or netem"),
         Field("cause", "string", "", "why it changed; empty before the first change"),
@@ -207,10 +194,10 @@ _TABLE = (
         Field("jitter", "float", "s", "profile's jitter at the start of the time line"),
         Field("loss", "float", "1", "profile's mean loss at the start of the time line"),
         Field("rate", "float", "bit/s", "profile's rate at that instant; NaN without one"),
-        Field("conditions", "string", "", "the profile as JSON")),
-    _topic("/link_check", "cloudrc_msgs/msg/LinkChecked", rec.LinkChecked, "either",
+        Field("conditions", "string", "", "the profile as JSON"))),
+    Topic("/link_check", "cloudrc_msgs/msg/LinkChecked", rec.LinkChecked, "either",
         "A measured quantity of the link to this end, judged in flight, in real time only, clock of"
-        " its end",
+        " its end", (
         Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
         Field("quantity", "string", "", "mean, deviation, round_trip, loss..."),
         Field("asked", "float", "s or 1", "expected from the profile: a delay or a share"),
@@ -219,13 +206,13 @@ _TABLE = (
         Field("high", "float", "s or 1", "highest accepted value"),
         Field("verdict", "string", "",
             "ok, off, or open with too few datagrams; told is not judged"),
-        Field("datagrams", "int", "", "number of datagrams measured")),
-    _topic("/lateness", "cloudrc_msgs/msg/Lateness", rec.Lateness, "either",
-        "The lateness of a wake, in real time only, clock of its end",
+        Field("datagrams", "int", "", "number of datagrams measured"))),
+    Topic("/lateness", "cloudrc_msgs/msg/Lateness", rec.Lateness, "either",
+        "The lateness of a wake, in real time only, clock of its end", (
         _END,
         Field("lateness", "float", "s", "now minus the deadline"),
         Field("busy", "float", "s", "time to handle it"),
-        _SLIP),
+        _SLIP)),
 )
 # fmt: on
 

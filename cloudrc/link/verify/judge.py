@@ -43,7 +43,7 @@ SHARE_TOLERANCE = (0.02, 0.25)
 """Likewise of loss, order and copies."""
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; that of a share is "1"."""
-FEWEST, CHANCE_MAX = 300, 1.5
+FEWEST, CHANCE_MAX = 300, 1.6
 """Datagrams that a verdict takes at least [1]; tolerances that chance may hide in it [1]."""
 
 

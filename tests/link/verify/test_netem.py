@@ -27,11 +27,7 @@ from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.link.verify.judge import Plan
 
 pytestmark = pytest.mark.netem
-SETTINGS = [
-    f"link.{way}.{key}"
-    for way in HOSTS
-    for key in ("delay_ms=400", "jitter_ms=80")  # far above what an emulated machine adds
-]
+ASKED = ("delay_ms=400", "jitter_ms=80")  # far above what an emulated machine adds
 BOTH = {"delay_ms": 400.0, "jitter_ms": 80.0}
 SECONDS = 15.0
 """Time to probe, which a slow machine can [s]."""
@@ -62,8 +58,9 @@ class Link:
 
 
 def planned(*settings: str) -> dict[str, Plan]:
-    more = [f"link.{way}.{one}" for way in HOSTS for one in settings]
-    return make_plans(find_experiment("ideal", [*SETTINGS, *more]), SECONDS, "netem")
+    values = dict(one.split("=") for one in (*ASKED, *settings))
+    texts = [f"link.{way}.{key}={value}" for way in HOSTS for key, value in values.items()]
+    return make_plans(find_experiment("ideal", texts), SECONDS, "netem")
 
 
 @contextmanager
@@ -75,7 +72,7 @@ def running(
         {"uplink": BOTH | up, "downlink": BOTH | up if down is None else down}
     )
     try:
-        with run_link(find_experiment("ideal", SETTINGS), "netem", applied) as ways:
+        with run_link(find_experiment("ideal", []), "netem", applied) as ways:
             yield Link(plans, ways)
     except MissingPrerequisiteError as error:
         pytest.exit(f"netem cannot be tested here: {error}", CloudrcError.exit_code + 2)
