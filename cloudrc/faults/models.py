@@ -56,12 +56,11 @@ class Clock:
 
     def when(self, own_ns: int) -> int:
         """Return the first virtual time [ns] at which it has reached `own_ns` [ns]."""
-        if not self.drift_ppm:
-            return own_ns - self.offset_ns
-        elapsed_ns = own_ns - self.offset_ns
-        now_ns = elapsed_ns * 1_000_000 // (1_000_000 + self.drift_ppm) - 1
-        while self.at(now_ns) < own_ns:
-            now_ns += 1
+        now_ns = own_ns - self.offset_ns
+        if self.drift_ppm:
+            now_ns = now_ns * 1_000_000 // (1_000_000 + self.drift_ppm) - 1
+            while self.at(now_ns) < own_ns:
+                now_ns += 1
         return now_ns
 
 
