@@ -288,7 +288,7 @@ class InProcessTeleop:
         self.ask(MissionService.stop_rotors, now_ns)
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """Stop the process as SIGSTOP does; inside cloud's process it cannot."""
+        """Do nothing: inside cloud's process teleop cannot stand still alone."""
 
     def run_on(self, host: RestartableEndpoint) -> None:
         """Begin to run on the machine of `host`."""
