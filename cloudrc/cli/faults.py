@@ -42,6 +42,7 @@ ACTIONS = {
     "run": "inject faults, or those of a schedule's file, and check the reaction",
     "search": "fly random combinations of faults and check the invariants in every step",
 }
+STORE = Path("faults-found")
 FAILED, INTERRUPTED = 1, 130
 Item = TypeVar("Item")
 
@@ -71,17 +72,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     text = "the cloud has valid keys and tries to break the invariants"
     search_.add_argument("--adversarial", action="store_true", help=text)
     search_.add_argument("--jobs", type=read_count, default=1, metavar="J", help=JOBS)
-    text, store = (
-        "folder for failing schedules, after reduction (default: ./faults-found)",
-        Path("faults-found"),
-    )
-    search_.add_argument("--store", type=_output_path, default=store, metavar="DIR", help=text)
+    text = f"folder for failing schedules, after reduction (default: ./{STORE})"
+    search_.add_argument("--store", type=_output_path, default=STORE, metavar="DIR", help=text)
 
 
 def _name_or_file(text: str) -> str | Path:
     """Parse the name of a fault, or the path of a schedule's file."""
-    is_file = os.path.isfile(text) or text.endswith((".yaml", ".yml"))
-    return input_file(text) if is_file else text
+    is_path = "/" in text or text.endswith((".yaml", ".yml")) or os.path.isfile(text)
+    return input_file(text) if is_path else text
 
 
 def _seed(text: str) -> int:

@@ -194,10 +194,6 @@ def _fly(command: Command, velocity: Sequence[float], **others: Any) -> Command:
     return command._replace(velocity=(x, y, z), **others)
 
 
-def _along(axis: int, speed: float) -> list[float]:
-    return [speed if n == axis else 0.0 for n in range(3)]
-
-
 def _towards_a_face(rng: Generator) -> Lie:
     """Fly towards a face, an edge or a corner of the fence."""
     way: list[int] = rng.choice([-1, 0, 1], 3).tolist()
@@ -218,7 +214,7 @@ def _face_after_face(rng: Generator) -> Lie:
             way = -way
             if rng.random() < 0.3:
                 axis = int(rng.integers(3))
-        return _fly(command, _along(axis, way * FAST))
+        return _fly(command, [way * FAST * (n == axis) for n in range(3)])
 
     return lie
 
@@ -241,14 +237,11 @@ def _on_the_limit(rng: Generator) -> Lie:
     more = float(rng.uniform(1.0, 1.5))
     way: list[int] = rng.choice([-1, 1], 3).tolist()
 
-    def allowed(distance: float) -> float:
-        return 3.0 * (sqrt(0.04 + 2.0 * max(distance - 0.1, 0.0) / 3.0) - 0.2)
-
     def lie(command: Command, control: Control) -> Command:
-        velocity = [
-            way[n] * more * allowed(HIGH[n] - p if way[n] > 0 else p - LOW[n])
-            for n, p in enumerate(control.measured)
-        ]
+        velocity = [0.0] * 3
+        for n, p in enumerate(control.measured):
+            distance = max((HIGH[n] - p if way[n] > 0 else p - LOW[n]) - 0.1, 0.0)
+            velocity[n] = way[n] * more * (3.0 * (sqrt(0.04 + 2.0 * distance / 3.0) - 0.2))
         if rng.random() < 0.005:
             way[int(rng.integers(3))] *= -1
         return _fly(command, velocity)
@@ -304,11 +297,9 @@ def _false_basis(rng: Generator) -> Lie:
     sign = int(rng.choice([-1, 1]))
 
     def lie(command: Command, control: Control) -> Command:
-        moved = _fly(command, (FAST * sign, FAST, 2.0))
-        if rng.random() < 0.3:
-            basis_ns = min(max(command.basis_stamp_ns + sign * shift_ns, -(2**62)), 2**62)
-            return moved._replace(basis_stamp_ns=basis_ns, basis_hold_ns=2**62)
-        return moved
+        basis_ns = min(max(command.basis_stamp_ns + sign * shift_ns, -(2**62)), 2**62)
+        basis = {"basis_stamp_ns": basis_ns, "basis_hold_ns": 2**62} if rng.random() < 0.3 else {}
+        return _fly(command, (FAST * sign, FAST, 2.0), **basis)
 
     return lie
 
@@ -335,9 +326,8 @@ def _refused_and_released(rng: Generator) -> Lie:
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 
     def lie(command: Command, control: Control) -> Command:
-        if control.stamp_ns % pause_ns < NONSENSE_NS:
-            return command._replace(velocity=(nan, nan, nan))
-        return fly(command, control)
+        nonsense = control.stamp_ns % pause_ns < NONSENSE_NS
+        return _fly(command, (nan, nan, nan)) if nonsense else fly(command, control)
 
     return lie
 

@@ -60,12 +60,8 @@ class Flight:
 
     Attributes:
         experiment: What is flown.
-        world: World's process.
-        cloud: Cloud's process.
-        teleop: Teleop.
-        run: The driver.
-        uplink: Link from world to cloud.
-        downlink: Link from cloud to world.
+        world: World's process; `cloud` and `teleop` are the others, `run` is their driver.
+        uplink: Link from world to cloud; `downlink` is the way back.
         watch: The invariants.
         of_world: World's records, if they are kept; `of_cloud` are those of cloud.
         changes: Changes of the guard's state.

@@ -58,18 +58,8 @@ def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Recor
 def reading(
     flight: Flight, role: str, name: str, *labels: str, until: float | None = None
 ) -> float:
-    """Return the value of a metric, the mean of a histogram; NaN if it is absent.
-
-    Args:
-        flight: The flight.
-        role: Role of the process that shows it; see `seen_by`.
-        name: Name of the metric, without its prefix.
-        labels: Values of its labels.
-        until: Virtual time at which it is read [s]; None for the end.
-    """
-    live = LiveMetrics(role)
-    live.see(seen_by(flight, role, until))
-    shown = live.read().get(f"cloudrc_{name}", {})
+    """Return the value of a metric at `until` [s], the mean of a histogram; NaN if it is absent."""
+    shown = _read(flight, role, name, until)
     if isinstance(shown, Histogram):
         count = shown.cumulative()[-1]
         return shown.total / count if count else nan
@@ -80,13 +70,17 @@ def above(
     flight: Flight, role: str, name: str, bound: float, until: float | None = None
 ) -> tuple[int, float]:
     """Count a histogram's values above `bound` up to `until` [s]; return count and share [1]."""
-    live = LiveMetrics(role)
-    live.see(seen_by(flight, role, until))
-    shown = live.read()[f"cloudrc_{name}"]
+    shown = _read(flight, role, name, until)
     assert isinstance(shown, Histogram)
     counts = shown.cumulative()
     count = counts[-1] - counts[shown.bounds.index(bound)]
     return count, count / counts[-1] if counts[-1] else nan
+
+
+def _read(flight: Flight, role: str, name: str, until: float | None) -> Any:
+    live = LiveMetrics(role)
+    live.see(seen_by(flight, role, until))
+    return live.read().get(f"cloudrc_{name}", {})
 
 
 def moves(

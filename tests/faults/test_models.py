@@ -8,73 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.models import FAR_NS, SOCKET_MAX, Clock, RestartableEndpoint
+from cloudrc.faults.models import Clock
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.faults.trial import inject
 from cloudrc.messages import GuardState
-from cloudrc.records import Record
 from cloudrc.teleop.service import MissionService
-
-MS = 1_000_000
-
-
-class Ticker:
-    """An endpoint with a deadline every 10 ms that notes what it is told."""
-
-    sealed = True
-
-    def __init__(self, start_ns: int) -> None:
-        self.due_ns = start_ns
-        self.heard: list[tuple[bytes, int]] = []
-        self.handled: list[int] = []
-
-    def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        self.heard.append((data, now_ns))
-
-    def next_deadline_ns(self) -> int:
-        return self.due_ns
-
-    def handle_deadline(self, now_ns: int) -> None:
-        self.handled.append(now_ns)
-        self.due_ns = now_ns + 10 * MS
-
-    def take_datagrams(self) -> list[bytes]:
-        return [b"sent"]
-
-    def take_records(self) -> list[Record]:
-        return []
-
-
-def run(process: RestartableEndpoint, until_ms: float) -> Ticker | None:
-    while process.next_deadline_ns() <= until_ms * MS:
-        process.handle_deadline(process.next_deadline_ns())
-    return process.inner  # type: ignore[return-value]
-
-
-def test_a_killed_endpoint_is_silent_until_its_successor_runs() -> None:
-    process = RestartableEndpoint(Ticker, Clock())
-    process.at(0.025, process.kill)
-    process.at(0.050, process.start)
-    assert run(process, 30) is None
-    process.receive_datagram(b"lost", 30 * MS)
-    assert process.take_datagrams() == []
-    new = run(process, 60)
-    assert new is not None
-    assert (new.handled, new.heard) == ([50 * MS, 60 * MS], [])
-    process.kill(0)
-    assert process.next_deadline_ns() == FAR_NS
-
-
-def test_datagrams_wait_during_a_freeze_and_arrive_together() -> None:
-    process = RestartableEndpoint(Ticker, Clock())
-    process.at(0.005, lambda now_ns: process.freeze(now_ns, 0.100))
-    run(process, 6)
-    for n in range(SOCKET_MAX + 5):
-        process.receive_datagram(b"%d" % n, (10 + n) * MS // 4)
-    end = run(process, 106)
-    assert end is not None
-    assert [now_ns for _, now_ns in end.heard] == [105 * MS] * SOCKET_MAX
-    assert end.handled == [0, 105 * MS]
 
 
 @given(st.integers(-(2**50), 2**50), st.integers(-500, 500), st.integers(0, 2**45))

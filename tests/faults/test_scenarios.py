@@ -146,6 +146,7 @@ def test_the_list_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
         ("run F1 --seed 9007199254740992", "argument --seed: '9007199254740992' is not a whole"),
         ("run F13 --junit /dev/null/x.xml", "/dev/null/x.xml: cannot be written"),
         ("run none.yaml", "none.yaml: "),
+        ("run /dev/null", "/dev/null: not a regular file"),
         ("run F99", "no fault 'F99'; there are: F1 short-blackout, F2 "),
         ("run cloud-kiled", "; did you mean cloud-killed?"),
         ("search --first -5", "'-5' is not a whole number"),

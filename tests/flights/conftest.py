@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
@@ -39,30 +40,15 @@ CLOCK = bytes(16)
 KEY = Key(b"k" * 32)
 
 
-def bare_robot() -> SimpleNamespace:
+def bare_robot() -> Mock:
     """A robot that flies every accepted command."""
-    guard = SimpleNamespace(
-        state=GuardState.TRACK,
-        cause=Cause.COMMAND,
-        latched=False,
-        armed=True,
-        counts={},
-        changes=[],
-        reference=ZERO,
-        accept_command=lambda command, now_ns: None,
-    )
-    for name in ("forget_commands", "start_mission", "end_mission", "stop", "acknowledge"):
-        setattr(guard, name, lambda *given: None)
-    simulator = SimpleNamespace(
-        tip_force=lambda: 0.0, readings=(ZERO, UPRIGHT, ZERO, ZERO, ZERO * 3), touches=[]
-    )
-    return SimpleNamespace(
-        guard=guard,
-        simulator=simulator,
-        observers=[],
-        run=lambda tick_ns, stop_ns: stop_ns,
-        put_on_ground=lambda now_ns, cause: None,
-    )
+    guard = Mock(state=GuardState.TRACK, cause=Cause.COMMAND, latched=False, armed=True)
+    guard.configure_mock(counts={}, changes=[], reference=ZERO)
+    guard.accept_command.return_value = None
+    readings = (ZERO, UPRIGHT, ZERO, ZERO, ZERO * 3)
+    simulator = Mock(tip_force=lambda: 0.0, readings=readings, touches=[])
+    run = lambda tick_ns, stop_ns: stop_ns  # noqa: E731
+    return Mock(guard=guard, simulator=simulator, observers=[], run=run)
 
 
 def bare_world(
@@ -122,15 +108,18 @@ class BareCloud:
     def hello(self) -> bytes:
         return self.session.greet(Kind.HELLO, self.handshake.make_hello())
 
-    def command(self, now_ns: int = 0) -> bytes:
-        body = codec.encode_command(Command(now_ns, now_ns, 0, ZERO, 0.0))
+    def command(self, now_ns: int = 0, basis_ns: int | None = None, velocity=ZERO) -> bytes:
+        basis_ns = now_ns if basis_ns is None else basis_ns
+        body = codec.encode_command(Command(now_ns, basis_ns, 0, velocity, 0.0))
         return self.session.seal(Kind.COMMAND, body)
+
+    def ask(self, number: int, request: Request, start: Start, mission_id=0, basis_ns=0) -> bytes:
+        asked = OperatorRequest(number, request, start, mission_id, basis_stamp_ns=basis_ns)
+        return self.session.seal(Kind.OPERATOR, codec.encode_operator(asked))
 
     def start(self, number: int, basis_ns: int = 0) -> bytes:
         """Ask for a mission from the spawn: world opens an epoch."""
-        asked = OperatorRequest(number, Request.START, Start.SPAWN, basis_stamp_ns=basis_ns)
-        body = codec.encode_operator(asked)
-        return self.session.seal(Kind.OPERATOR, body)
+        return self.ask(number, Request.START, Start.SPAWN, basis_ns=basis_ns)
 
     def receive(self, data: bytes) -> bytes | None:
         """Take an answer of world; what is to be sent because of it, if anything."""
@@ -269,23 +258,13 @@ HOVER = load_experiment("hover", ["link.profile=ideal"])
 
 
 class Talk:
-    """A sealed world with clouds that the test controls."""
+    """A sealed world with clouds that the test controls; `cloud` is the one that speaks."""
 
-    def __init__(self, nonce: bytes = b"world", key: Key = KEY) -> None:
-        ring = KeyRing(KeySet(KEY))
-        identity = WorldIdentity(SHARED_CLOCK, nonce.ljust(16), ring)
+    def __init__(self, nonce: bytes = b"world") -> None:
+        identity = WorldIdentity(CLOCK, nonce.ljust(16), ring())
         self.world = assembly.build_world(HOVER, identity)
-        self.key, self.now_ns, self.records = key, 0, []
-        self.clouds: dict[bytes, tuple[Session, ClientHandshake]] = {}
-        self.session = self.cloud(b"cloud")[0]
-
-    def cloud(self, nonce: bytes) -> tuple[Session, ClientHandshake]:
-        """The cloud process of this name; from here on the one that speaks."""
-        if nonce not in self.clouds:
-            session = Session(Direction.DOWNLINK, KeyRing(KeySet(self.key)))
-            self.clouds[nonce] = session, ClientHandshake(nonce.ljust(16), SHARED_CLOCK)
-        self.session = self.clouds[nonce][0]
-        return self.clouds[nonce]
+        self.now_ns, self.records = 0, []
+        self.clouds: dict[bytes, BareCloud] = {}
 
     def wait(self, until_ns: int) -> None:
         while self.world.next_deadline_ns() <= until_ns:
@@ -295,52 +274,26 @@ class Talk:
     def send(self, data: bytes) -> None:
         self.world.receive_datagram(data, self.now_ns)
 
-    def hear(self, *kinds: Kind) -> list[tuple[int, int, bytes]]:
-        """Kind, epoch and body of what world has answered; all else is dropped."""
-        heard = []
-        for data in self.world.take_datagrams():
-            try:
-                kind, epoch, _, body = self.session.open(data)
-            except DecodeError:
-                continue
-            if kind in kinds:
-                heard.append((kind, epoch, body))
-        return heard
-
     def hello(self, nonce: bytes) -> int:
-        """Greet as this cloud, up to world's answer; the epoch that it got, 0 if none."""
-        session, handshake = self.cloud(nonce)
-        self.send(session.greet(Kind.HELLO, handshake.make_hello()))
-        answers = self.hear(Kind.CHALLENGE, Kind.ACCEPT)
-        for kind, _, body in answers:
-            if kind == Kind.CHALLENGE:
-                hello = handshake.answer_challenge(codec.decode_challenge(body))
-                self.send(session.greet(Kind.HELLO, hello))
-                answers = self.hear(Kind.ACCEPT)
-        for _, epoch, body in answers:
-            nonces = handshake.receive_accept(epoch, codec.decode_accept(body), asks=True)
-            if nonces is not None:
-                session.begin(epoch, nonces)
-            return epoch
-        return 0
+        """Greet as this cloud, which speaks from here on; the epoch that it got, 0 if none."""
+        self.cloud = self.clouds.setdefault(nonce, BareCloud(nonce, ring()))
+        self.send(self.cloud.hello())
+        for _ in range(2):
+            for data in self.world.take_datagrams():
+                if (reply := self.cloud.receive(data)) is not None:
+                    self.send(reply)
+        return self.cloud.session.epoch
 
     def request(self, number: int, request: Request, start: Start, mission_id: int = 0) -> None:
         self.send(self.asked(number, request, start, mission_id))
 
     def asked(self, number: int, request: Request, start: Start, mission_id: int = 0) -> bytes:
         """A request that is passed on now."""
-        told = OperatorRequest(number, request, start, mission_id, basis_stamp_ns=self.world_ns)
-        return self.session.seal(Kind.OPERATOR, codec.encode_operator(told))
-
-    @property
-    def world_ns(self) -> int:
-        """World's clock."""
-        return self.now_ns - self.world.slip_ns
+        world_ns = self.now_ns - self.world.slip_ns
+        return self.cloud.ask(number, request, start, mission_id, world_ns)
 
     def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None) -> bytes:
-        basis_ns = self.now_ns if basis_ns is None else basis_ns
-        command = Command(self.now_ns, basis_ns, 0, velocity, 0.0)
-        return self.session.seal(Kind.COMMAND, codec.encode_command(command))
+        return self.cloud.command(self.now_ns, basis_ns, velocity)
 
     def take(self, kind: type) -> list:
         self.records += self.world.take_records()

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 from typing import Any
 
 import pytest
 
-from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.faults.models import Clock, RestartableEndpoint
 from cloudrc.faults.schedule import Event, Schedule, shaped
@@ -20,6 +20,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.messages import OperatorRequest, Request, Start
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from tests.conftest import nightly
 from tests.flights.conftest import MS, bare_cloud, bare_world
 
 ENDS = ("world", "cloud")
@@ -39,32 +40,35 @@ class Two:
         self.numbers, self.lives = count(1), count(1)
         delay, jitter = chance.choice((0.001, 0.02, 0.15)), chance.choice((0.0, 0.01, 0.1))
         profile = DirectionProfile(delay=delay, jitter=min(jitter, delay))
-        schedule = Schedule(seed, events=self.link_events())
-        up, down = (shaped(schedule, profile, way) for way in ("up", "down"))
-        self.world = RestartableEndpoint(self.build_world, Clock())
-        self.cloud = RestartableEndpoint(self.build_cloud, Clock(), "cloud")
-        links = LinkDirection(up, seed, uplink=True), LinkDirection(down, seed, uplink=False)
-        self.run = VirtualRun(self.world, self.cloud, *links)
+        kinds = chance.choices(("blackout", "blackout", "loss"), k=chance.randint(0, 4))
+        ways = ("up", "down", "both")
+        events = (Event(n, *self.when(), chance.random(), chance.choice(ways)) for n in kinds)
+        schedule = Schedule(seed, events=tuple(events))
+        up, down = (
+            LinkDirection(shaped(schedule, profile, way), seed, uplink=way == "up")
+            for way in ("up", "down")
+        )
+        self.world, self.cloud = (
+            RestartableEndpoint(partial(self.build, end), Clock(), end) for end in ENDS
+        )
+        self.run = VirtualRun(self.world, self.cloud, up, down)
         whatever = (self.rotate, self.rotate, self.kill, self.pause, self.start, self.start)
         for befalls in chance.choices(whatever, k=chance.randint(2, 12)):
             befalls()
-        self.end_with_key_files()
+        # The last key files are the same, or have a key in common, as after a roll-back.
+        common, alike = chance.choice(KEYS), chance.random() < 0.5
+        other = chance.choice([key for key in KEYS if key != common])
+        files = KeySet(common), KeySet(common, other), KeySet(other, common)
+        for end in chance.sample(ENDS, 2):
+            keys = files[0] if alike else chance.choice(files)
+            self.read(end, CALM + chance.uniform(0.0, 3.0), keys)
 
-    def build_world(self, start_ns: int) -> Any:
-        ring = self.rings["world"] = KeyRing(self.files["world"])
-        return bare_world(b"world %d" % next(self.lives), ring=ring, start_ns=start_ns)
-
-    def build_cloud(self, start_ns: int) -> CloudEndpoint:
-        ring = self.rings["cloud"] = KeyRing(self.files["cloud"])
-        return bare_cloud(b"cloud %d" % next(self.lives), ring, start_ns)
-
-    def link_events(self) -> tuple[Event, ...]:
-        chance, events = self.chance, []
-        for kind in chance.choices(("blackout", "blackout", "loss"), k=chance.randint(0, 4)):
-            at, lasts = self.when()
-            way = chance.choice(("up", "down", "both"))
-            events.append(Event(kind, at, lasts, chance.random(), way))
-        return tuple(events)
+    def build(self, end: str, start_ns: int) -> Any:
+        ring = self.rings[end] = KeyRing(self.files[end])
+        nonce = b"%s %d" % (end.encode(), next(self.lives))
+        if end == "world":
+            return bare_world(nonce, ring=ring, start_ns=start_ns)
+        return bare_cloud(nonce, ring, start_ns)
 
     def when(self) -> tuple[float, float]:
         """When something begins, and how long it lasts [s]."""
@@ -78,11 +82,9 @@ class Two:
         """One end reads another key file, or both do, one after the other."""
         chance, (time, later) = self.chance, self.when()
         current, previous = chance.choice(KEYS[:3]), chance.choice((None, None, *KEYS[:2]))
-        keys = KeySet(current, previous)
-        first, second = chance.sample(ENDS, 2)
-        self.read(first, time, keys)
-        if chance.random() < 0.5:
-            self.read(second, time + later, keys)
+        ends = chance.sample(ENDS, chance.randint(1, 2))
+        for end, at in zip(ends, (time, time + later), strict=False):
+            self.read(end, at, KeySet(current, previous))
 
     def read(self, end: str, time: float, keys: KeySet) -> None:
         def read(now_ns: int) -> None:
@@ -92,38 +94,22 @@ class Two:
 
     def kill(self) -> None:
         end, (time, lasts) = self.chance.choice(ENDS), self.when()
-        mortal: Any = getattr(self, end)
-        self.at(end, time, mortal.kill, "is killed")
-        self.at(end, time + lasts, mortal.start, "starts")
+        self.at(end, time, partial(getattr(self, end).restart, down=lasts), "is away", lasts)
 
     def pause(self) -> None:
         end, (time, lasts) = self.chance.choice(ENDS), self.when()
-        mortal: RestartableEndpoint = getattr(self, end)
-        self.at(end, time, lambda now_ns: mortal.freeze(now_ns, lasts), "stands still", lasts)
+        freeze = partial(getattr(self, end).freeze, duration=lasts)
+        self.at(end, time, freeze, "stands still", lasts)
 
     def start(self) -> None:
         """A mission starts from the spawn: world moves on to the next epoch."""
 
         def ask(now_ns: int) -> None:
-            if isinstance(cloud := self.cloud.inner, CloudEndpoint):
+            if self.cloud.inner is not None:
                 request = OperatorRequest(next(self.numbers), Request.START, Start.SPAWN)
-                cloud.teleop.outputs.append(request)
+                self.cloud.inner.teleop.outputs.append(request)  # type: ignore[attr-defined]
 
         self.at("cloud", self.when()[0], ask, "asks for a start")
-
-    def end_with_key_files(self) -> None:
-        """The same for both, or different ones with a key in common, as after a roll-back."""
-        chance, common = self.chance, self.chance.choice(KEYS)
-        one = KeySet(common)
-        alike = chance.random() < 0.5
-        for end in chance.sample(ENDS, 2):
-            keys = one if alike else self.with_key(common)
-            self.read(end, CALM + chance.uniform(0.0, 3.0), keys)
-
-    def with_key(self, common: Key) -> KeySet:
-        other = self.chance.choice([key for key in KEYS if key != common])
-        files = KeySet(common), KeySet(common, other), KeySet(other, common)
-        return self.chance.choice(files)
 
     def hear_each_other(self) -> bool:
         self.run.fly(lambda: False, round(END * 1e9), lambda of_world, of_cloud: None)
@@ -136,7 +122,7 @@ class Two:
         return silent_ns < 300 * MS and heard_ns < 500 * MS
 
 
-@pytest.mark.parametrize("first", [0, pytest.param(1_000, marks=pytest.mark.full)])
+@pytest.mark.parametrize("first", [0, *nightly(1_000)])
 def test_after_the_rotations_both_ends_hear_each_other(first: int) -> None:
     for seed in range(first, 4 * first or 40):
         two = Two(seed)

@@ -30,18 +30,6 @@ def test_the_paper_flies(profile: str, seed: int) -> None:
     assert n["waypoints_reached"] == 7
 
 
-# In pipe 1 at speed, and just before the board is touched.
-@pytest.mark.parametrize(
-    "start", [11.3, 28.85, *nightly(*(round(0.5 + 1.3 * k, 2) for k in range(24)))]
-)
-def test_a_silent_downlink_is_survived(start: float) -> None:
-    cut = f"link.downlink.blackouts=[{{start_s: {start}, duration_s: 20}}]"
-    flight = fly("paper", "cloud.controller.speed_max=2", cut)
-    assert flight.verdict.failures == ()
-    n = numbers(flight)
-    assert (n["hold_count"], n["pipe_contacts"], n["waypoints_reached"]) == (1, 0, 7)
-
-
 def test_verbatim_flies_although_late_commands_win() -> None:
     flight = fly("paper-verbatim")
     assert flight.verdict.failures == ()

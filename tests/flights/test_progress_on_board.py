@@ -28,11 +28,12 @@ def test_the_robot_stores_every_waypoint_reached() -> None:
         assert shown[count] - event.stamp_ns < 300 * MS
 
 
-def ask(talk: Talk, request: Request, number: int = 0, **fields: int) -> tuple[int, int]:
+def ask(
+    talk: Talk, request: Request, number: int = 0, *, start: Start = Start.HERE, **fields: int
+) -> tuple[int, int]:
     """Return the mission and the progress that the robot shows after a request."""
-    fields = {"start": Start.HERE, "basis_stamp_ns": talk.world_ns} | fields
-    body = codec.encode_operator(OperatorRequest(number, request, **fields))
-    talk.send(talk.session.seal(Kind.OPERATOR, body))
+    asked = OperatorRequest(number, request, start, basis_stamp_ns=talk.now_ns, **fields)
+    talk.send(talk.cloud.session.seal(Kind.OPERATOR, codec.encode_operator(asked)))
     talk.wait(talk.now_ns + 20 * MS)
     telemetry = talk.take(TelemetrySent)[-1].telemetry
     return telemetry.mission_id, telemetry.reached
