@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -345,24 +344,20 @@ def prometheus_image(cluster: None) -> str:
     return found.split()[0]
 
 
-@dataclass
-class Usage:
-    """What the release has used up to an instant [s]."""
-
-    at: float
-    cpu: dict[str, float]
-    """Container -> processor time [s]."""
-    memory: float
-    """Of all containers [bytes]."""
-
-
-def usage() -> Usage:
-    """Read what each process of the release says of itself."""
+def processor_times() -> tuple[float, dict[str, float]]:
+    """Now [s], and what each process of the release says it has used so far [s]."""
     texts = {f"{end}/{name}": text for end in ENDS for name, text in scrapes(end).items()}
-    found = {name: samples(text) for name, text in texts.items()}
-    cpu = {name: value(each, "process_cpu_seconds_total") for name, each in found.items()}
-    memory = [value(each, "process_resident_memory_bytes") for each in found.values()]
-    return Usage(time.monotonic(), cpu, sum(memory))
+    name = "process_cpu_seconds_total"
+    return time.monotonic(), {each: value(samples(t), name) for each, t in texts.items()}
+
+
+def memory() -> float:
+    """Memory of all containers of the release, as the kubelet counts it [bytes]."""
+    node = pod("world")["spec"]["nodeName"]
+    summary = command("kubectl", "get", "--raw", f"/api/v1/nodes/{node}/proxy/stats/summary")
+    found = {each["podRef"]["uid"]: each["containers"] for each in json.loads(summary)["pods"]}
+    mine = [found[pod(end)["metadata"]["uid"]] for end in ENDS]
+    return sum(each["memory"]["workingSetBytes"] for containers in mine for each in containers)
 
 
 @cache  # measured where the release flies; later its pods may just be replaced
