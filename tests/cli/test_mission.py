@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import mission_local
+from cloudrc.cli import mission as command
 from cloudrc.cli.client import Api, token_reader
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
@@ -34,8 +34,8 @@ def api() -> Iterator[Running]:
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(mission_local, "POLL_PERIOD", 0.02)
-    monkeypatch.setattr(mission_local, "API_TIMEOUT", 0.5)
+    monkeypatch.setattr(command, "POLL_PERIOD", 0.02)
+    monkeypatch.setattr(command, "API_TIMEOUT", 0.5)
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "two.yaml").write_text(FILE)
@@ -94,7 +94,7 @@ def test_fly_under_one_key_flies_once_and_leaves_its_verdict(
 ) -> None:
     log = folder / "termination-log"
     log.touch()
-    monkeypatch.setattr(mission_local.write_termination_message, "__defaults__", (log,))
+    monkeypatch.setattr(command, "TERMINATION_LOG", log)
     thread = pilot(api, A)
     end = threading.Thread(target=lambda: (thread.join(), api.post("/v1/missions/m1/cancel")))
     end.start()
@@ -112,7 +112,7 @@ def test_a_stopped_job_cancels_its_mission(
     def stopped(self: object, mission_id: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(mission_local.MissionFollower, "follow", stopped)
+    monkeypatch.setattr(command.MissionFollower, "follow", stopped)
     assert mission("fly", "--mission", "two.yaml") == 130
     assert api.state_of("m1") == "cancelled"
 
@@ -303,5 +303,5 @@ def test_events_can_be_followed(api: Running) -> None:
 
 
 def test_a_shipped_mission_is_read_by_its_name() -> None:
-    mission = mission_local.read_mission("pipes")
+    mission = command.read_mission("pipes")
     assert (mission["name"], len(mission["waypoints"])) == ("pipes", 7)

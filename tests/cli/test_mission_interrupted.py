@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import mission_local
+from cloudrc.cli import mission as command
 from cloudrc.cli.client import Api
 from cloudrc.cli.main import main
 from tests.teleop.conftest import running
@@ -30,7 +30,7 @@ def test_the_printed_command_cancels_this_mission(
 ) -> None:
     path = tmp_path / "one.yaml"
     path.write_text(FILE)
-    monkeypatch.setattr(mission_local.MissionFollower, "follow", _interrupted)
+    monkeypatch.setattr(command.MissionFollower, "follow", _interrupted)
     with running(unix=True) as api:
         others = ["m1"] if flags else []
         for _ in others:

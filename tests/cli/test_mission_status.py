@@ -32,7 +32,7 @@ class Api:
 def status(
     patch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], **state: object
 ) -> list[str]:
-    patch.setattr("cloudrc.cli.client.Api", Api)
+    patch.setattr("cloudrc.cli.mission.Api", Api)
     patch.setattr(Api, "state", state, raising=False)
     assert main(["mission", "status", "--api", "unix:there"]) == 0
     return capsys.readouterr().out.splitlines()[1:]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.cli import client, mission_cluster, mission_local
+from cloudrc.cli import mission as command
 from cloudrc.cli.main import main
 from cloudrc.cli.output import escape
 from cloudrc.cluster import jobs
@@ -79,9 +79,8 @@ def test_events_and_verdicts_are_shown_without_effect(
 ) -> None:
     log = tmp_path / "termination-log"
     log.touch()
-    monkeypatch.setattr(mission_local.write_termination_message, "__defaults__", (log,))
-    for module in (mission_local, client):
-        monkeypatch.setattr(module, "Api", lambda *_: Hostile())
+    monkeypatch.setattr(command, "TERMINATION_LOG", log)
+    monkeypatch.setattr(command, "Api", lambda *_: Hostile())
     assert main(["mission", "fly", "--mission", "pipes", "--api", "unix:there"]) == 1
     assert main(["mission", "run", "pipes", "--api", "unix:there"]) == 1
     assert main(["mission", "logs", "m1", "--api", "unix:there"]) == 0
@@ -95,12 +94,12 @@ def test_text_of_a_pod_is_shown_without_effect(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     job = JobStatus("job-1", "uid", "failed", "now", 1, NAME)
-    monkeypatch.setattr(mission_cluster, "_place", lambda options: None)
+    monkeypatch.setattr(command, "_release", lambda options: None)
     monkeypatch.setattr(jobs, "list_jobs", lambda release: [job])
     monkeypatch.setattr(jobs, "logs", lambda release, name: [NAME])
-    options = argparse.Namespace(id=None, output="table", follow=False)
+    options = argparse.Namespace(id=None, output="table", follow=False, verb="list")
     for verb, lines in (("list", 2), ("logs", 1)):
-        assert mission_cluster.VERBS[verb](options) == 0
+        assert command.JOB_VERBS[verb](options) == 0
         said = capsys.readouterr().out
         assert len(said.splitlines()) == lines
         assert SHOWN in said

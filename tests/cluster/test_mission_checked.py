@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from cloudrc.cli import mission_cluster
+from cloudrc.cli import mission as command
 from cloudrc.cli.main import main
 from cloudrc.cluster import jobs as following
 from cloudrc.cluster.client import Release
@@ -173,4 +173,4 @@ def test_the_shipped_mission_is_posted_unchanged(lands: FakeApi) -> None:
     assert main(["mission", "run", "pipes"]) == 0
     (job,) = made(lands)
     plan = lands.get("configmaps", job["metadata"]["name"])["data"]["mission.yaml"]
-    assert json.loads(plan) == mission_cluster.read_mission("pipes")
+    assert json.loads(plan) == command.read_mission("pipes")
