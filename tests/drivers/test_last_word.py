@@ -80,6 +80,8 @@ def test_a_pod_that_ends_in_flight_holds_the_robot_by_its_word(release: Release)
     assert [release.running[name].returncode for name in pod] == [0, 0]
     time.sleep(0.5)  # without commands the robot also holds, after 0.25 s
     world = release.running["world"]
+    asked = time.monotonic()
     world.send_signal(signal.SIGTERM)
     said, _ = world.communicate(timeout=10)
     assert [line for line in said.splitlines() if "HOLD" in line] == ["guard: HOLD, mission ended"]
+    assert time.monotonic() - asked < 2.0
