@@ -152,8 +152,8 @@ def test_a_supervisor_that_stood_still_still_sees_who_hangs(tmp_path, victim):
     _, errors = run.communicate(timeout=60)
     assert run.returncode == 4
     assert f"the {victim} process was silent" in errors
-    (note,) = (note for note in report(tmp_path / "run")["notes"] if "supervisor" in note)
-    assert "stood still for 6." in note
+    notes = [note for note in report(tmp_path / "run")["notes"] if "supervisor" in note]
+    assert max(float(note.split("stood still for ")[1].split()[0]) for note in notes) >= 6.0
 
 
 PREDICTOR = '''
