@@ -1,19 +1,24 @@
-"""World, cloud and teleop as processes that are killed in flight."""
+"""World, cloud and teleop as processes that are killed, frozen or ended in flight."""
 
 import json
+import resource
 import signal
 import time
 
+import numpy as np
 import pytest
 
 from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.record.columns import Recording
+from cloudrc.record.recover import recover
 from cloudrc.teleop.wire import ALARM, encode
 from tests.conftest import nightly
 from tests.drivers.conftest import LIMIT, TOKEN, Release, ages_at_hold
 
 pytestmark = pytest.mark.process
+PAGE = 4096
+"""Room that is left for the recording [bytes]; the note of its end fits."""
 
 
 @pytest.fixture
@@ -109,3 +114,51 @@ def test_an_emergency_stop_passes_while_teleop_waits_for_disk(release):
     assert release.ask("/v1/state")["seen"]["guard"] == "ESTOP"
     failures = release.mission()["verdict"]["failures"]
     assert failures[0]["code"] == "guard_stopped"  # teleop itself never got the request
+
+
+def test_a_pod_that_ends_in_flight_holds_the_robot_by_its_word(release):
+    """Cloud gets the signal first, when teleop has not sent its hold yet."""
+    release.fly()
+    pod, asked = [release.running[name] for name in ("cloud", "teleop")], time.monotonic()
+    for process in pod:
+        process.send_signal(signal.SIGTERM)
+    for process in pod:
+        process.communicate(timeout=10)
+    assert time.monotonic() - asked < 2.0
+    assert [process.returncode for process in pod] == [0, 0]
+    time.sleep(0.5)  # without commands the robot also holds, after 0.25 s
+    world, asked = release.running["world"], time.monotonic()
+    world.send_signal(signal.SIGTERM)
+    said, _ = world.communicate(timeout=10)
+    assert time.monotonic() - asked < 2.0
+    assert [line for line in said.splitlines() if "HOLD" in line] == ["guard: HOLD, mission ended"]
+
+
+def finish(release):
+    """Wait for the mission's end; return world's recording."""
+    release.until(lambda: release.mission()["state"] == "done")
+    assert [each["waypoint"] for each in release.mission()["reached"]] == [0, 1, 2]
+    release.stop()
+    return Recording.read(release.folder / "world.mcap")
+
+
+@pytest.mark.full
+def test_a_frozen_world_skips_no_tick_and_slips(release):
+    release.fly()
+    release.freeze("world", 0.2)
+    flown = finish(release)
+    assert (np.diff(flown["/ground_truth"]["stamp_ns"]) == 10_000_000).all()
+    applied = flown["/command_applied"]
+    order = list(zip(applied["epoch"].tolist(), applied["counter"].tolist(), strict=True))
+    assert order == sorted(set(order))
+    assert flown["/lateness"]["slip_ns"][-1] >= 130_000_000
+
+
+@pytest.mark.full
+def test_a_full_disk_ends_the_recording_and_not_the_flight(release):
+    release.fly()
+    path, world = release.folder / "world.mcap", release.running["world"]
+    room = path.stat().st_size + PAGE
+    resource.prlimit(world.pid, resource.RLIMIT_FSIZE, (room, room))
+    assert "recording stopped" in finish(release).note
+    assert recover(path, release.folder / "mended.mcap").bytes_lost == 0
