@@ -1,10 +1,4 @@
-"""Serve the metrics and probes of a process over HTTP.
-
-exporter = Exporter("world")
-exporter.serve(("127.0.0.1", 9100))  /metrics, /healthz and /readyz, on separate threads
-exporter.see(records)                on the loop's thread: less than 1 us per record
-exporter.ready(True)                 only in a process that is not an end of the tunnel
-"""
+"""Serve the metrics and probes of a process over HTTP, on threads of their own."""
 
 from __future__ import annotations
 
@@ -52,9 +46,6 @@ class Answer(NamedTuple):
     kind: str = "text/plain; charset=utf-8"
 
 
-Pages = Mapping[str, Callable[[], Answer]]
-
-
 class _Server(socketserver.ThreadingTCPServer):
     """Serves pages by their paths until `close` is called.
 
@@ -67,7 +58,7 @@ class _Server(socketserver.ThreadingTCPServer):
     block_on_close = False
     request_queue_size = 1_024
 
-    def __init__(self, address: tuple[str, int], pages: Pages) -> None:
+    def __init__(self, address: tuple[str, int], pages: Mapping[str, Callable[[], Answer]]) -> None:
         self.pages = pages
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, _Handler)
@@ -126,12 +117,9 @@ class Exporter:
     """The metrics of one process."""
 
     def __init__(self, role: str, *, missions: bool = True) -> None:
-        """Set the role; the exporter serves nothing yet and is not ready.
+        """Set the role, "world", "cloud", "teleop" or "link".
 
-        Args:
-            role: "world", "cloud", "teleop" or "link".
-            missions: Whether this process exports metrics of missions; False in a cloud with a
-                separate teleop.
+        A cloud with a separate teleop exports no metrics of `missions`.
         """
         self._role, self._metrics = role, of_role(role)
         self._live = LiveMetrics(role, missions=missions)
@@ -146,7 +134,7 @@ class Exporter:
         ProcessCollector(registry=self._registry)
 
     def see(self, records: Iterable[Record]) -> None:
-        """Update the metrics with records of this process, oldest first, without waiting."""
+        """Update the metrics with records, oldest first; takes less than 1 us per record."""
         self._seen_at = time.monotonic()
         self._live.see(records)
 
