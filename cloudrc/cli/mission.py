@@ -56,11 +56,9 @@ in the cluster. A run that is found on this machine needs no token."""
 NO_API = "no run with an API flies there; name another folder, or --api URL"
 POLL_PERIOD = 0.5
 """Pause between two polls of a mission [s]."""
-API_TIMEOUT = 180.0
-"""Longest time for which the API may be unreachable in a Job [s]; a pod on another node first loads
-its image."""
-RUN_TIMEOUT = 10.0
-"""Longest time for which the API may be unreachable for a person [s]."""
+RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
+"""Longest times for which the API may be unreachable for a person and for a Job [s]; a pod on
+another node first loads its image."""
 TURN_MAX = 30.0
 """Longest time for a request and the pause after it [s]. A longer time means that this process was
 suspended."""
@@ -273,18 +271,12 @@ def _list(options: argparse.Namespace, api: Api) -> int:
     missions = api.get("/v1/missions")["missions"]
     if options.output != "table":
         return _print({"missions": missions}, options.output)
-    rows = [
-        (
-            each["id"],
-            each["name"],
-            each["state"],
-            f"{len(each['reached'])}/{each['waypoints']}",
-            describe_verdict(each["verdict"]) if each["verdict"] else "",
-        )
-        for each in missions
-    ]
-    heads = ("ID", "NAME", "STATE", "WAYPOINTS", "VERDICT")
-    print(table([heads, *rows]) if rows else "no missions yet")
+    rows = [("ID", "NAME", "STATE", "WAYPOINTS", "VERDICT")]
+    for each in missions:
+        done = f"{len(each['reached'])}/{each['waypoints']}"
+        verdict = describe_verdict(each["verdict"]) if each["verdict"] else ""
+        rows.append((each["id"], each["name"], each["state"], done, verdict))
+    print(table(rows) if missions else "no missions yet")
     return 0
 
 
@@ -444,20 +436,20 @@ def _check(name: str, mission: Json, experiment: Experiment | None) -> float:
     from cloudrc.geometry.scene import load_scene
     from cloudrc.teleop.models import MissionRequest
 
-    problems: list[Problem] = []
+    problems, limit = [], UNKNOWN_LIMIT
     try:
         request = MissionRequest.model_validate_json(json.dumps(mission))
     except ValidationError as error:
         raise_problems(_read(name), from_pydantic(error, MissionRequest), name)
         raise  # if no problem was listed
     if not request.waypoints:
-        problems.append(Problem(("waypoints",), "", "none given; give at least one"))
+        problems = [Problem(("waypoints",), "", "none given; give at least one")]
     elif experiment is not None:
+        limit = experiment.criteria.time_limit_s
         plan = Mission(start=request.start, waypoints=request.waypoints)
-        problems += check_mission(plan, load_scene(experiment.world.scene))
+        problems = check_mission(plan, load_scene(experiment.world.scene))
     raise_problems(_read(name), problems, name)
-    default = UNKNOWN_LIMIT if experiment is None else experiment.criteria.time_limit_s
-    return request.time_limit_s or default
+    return request.time_limit_s or limit
 
 
 def _experiment(release: Release) -> Experiment | None:

@@ -16,6 +16,7 @@ import pytest
 from cloudrc.drivers import local
 from cloudrc.record.columns import Recording
 from tests.conftest import nightly
+from tests.drivers.conftest import FAST, WITHOUT_PAGE
 
 pytestmark = pytest.mark.process
 
@@ -23,20 +24,10 @@ ENDS = ("world", "cloud")
 FLOWN = (0, 6)
 """Exit codes of a finished run, in real time or not: the machine may be busy."""
 COMMAND = [sys.executable, "-m", "cloudrc"]
-WITHOUT_PAGE = """
-import sys
-from cloudrc.cli.main import main
-from cloudrc.report import write
-whole = write.write_report
-write.write_report = lambda *given, **more: whole(*given, **(more | {"page": False}))
-sys.exit(main(sys.argv[1:]))
-"""
 WITHOUT_API = """
 from cloudrc.cli import extras
 extras.EXTRAS["api"] = ("fastapi_is_not_here",)
 """
-FAST = [sys.executable, "-c", WITHOUT_PAGE]
-"""`cloudrc` that writes no page with figures, which takes longer than a short flight."""
 
 
 def start(
@@ -131,7 +122,7 @@ def test_a_killed_supervisor_ends_all_and_leaves_a_recording(tmp_path):
     time.sleep(1.0)
     run.kill()
     run.communicate()
-    wait_until_ended(pids, 3.0)
+    wait_until_ended(pids, 5.0)
     assert not (folder / "mission.mcap").exists()
     subprocess.run([*COMMAND, "report", str(folder)], check=False, capture_output=True)
     assert report(folder)["numbers"]["commands_applied"]["value"] > 10

@@ -28,6 +28,7 @@ from cloudrc.link.relay import (
     instant_ns,
     tighten_slack,
 )
+from tests.drivers.conftest import FAST
 from tests.link.conftest import bind_loopback
 from tools.bench_link.flow import Way, flood, run_flow
 from tools.bench_link.relays import ours
@@ -238,7 +239,7 @@ def test_5000_strangers_a_second_cost_no_hold(tmp_path: Path) -> None:
     holds = []
     for attempt in range(TRIES):
         folder = tmp_path / str(attempt)
-        words = [sys.executable, "-m", "cloudrc", "run", "hover", "--mode", "local"]
+        words = [*FAST, "run", "hover", "--mode", "local"]
         words += ["--set", "mission.waypoints.0.dwell_s=4", "--out", str(folder)]
         run = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         assert run.stdout is not None
