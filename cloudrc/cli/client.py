@@ -1,8 +1,7 @@
-"""Call teleop's API over HTTP.
+"""Call teleop's API over HTTP, at http://HOST:PORT with a token, or at unix:PATH.
 
-The API is at http://HOST:PORT or at unix:PATH. At HOST:PORT each request carries a token. PATH is a
-socket file that only its owner can open. The client reads the token from a file, so that the token
-appears neither in the list of processes nor in a shell's history.
+PATH is a socket file that only its owner can open. The token comes from a file, so that it appears
+neither in the list of processes nor in a shell's history.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import re
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
@@ -32,6 +31,10 @@ comment every 10 s."""
 RETRY_STATUSES = (408, 429, 502, 503, 504)
 """HTTP status codes that mean: a later attempt may succeed."""
 UNIX = "unix:"
+VARIABLE = "CLOUDRC_TOKEN_FILE"
+SIZE_MAX = 4096
+"""Largest token file [bytes], including white space at its end."""
+_TOKEN = re.compile(r"[!-~]{16,512}")
 
 
 class ApiError(CloudrcError):
@@ -63,7 +66,8 @@ class Api:
 
     def get(self, path: str) -> Any:
         """Send a GET request; raise the same errors as `post`."""
-        return self._request("GET", path)
+        with self._answer("GET", path, None, REQUEST_TIMEOUT) as answer:
+            return json.loads(answer.read())
 
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
         """Send a POST request.
@@ -73,7 +77,9 @@ class Api:
             BadInputError: If a value is invalid.
             ApiError: If the API refuses the request.
         """
-        return self._request("POST", path, b"" if body is None else json.dumps(body).encode())
+        data = b"" if body is None else json.dumps(body).encode()
+        with self._answer("POST", path, data, REQUEST_TIMEOUT) as answer:
+            return json.loads(answer.read())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
         """Yield the events after number `after` as they happen, until teleop ends.
@@ -81,56 +87,45 @@ class Api:
         Raises:
             UnreachableError: If the connection breaks.
         """
-        connection, stream = self._open("GET", f"/v1/events?after={after}", None, STREAM_TIMEOUT)
-        try:
+        with self._answer("GET", f"/v1/events?after={after}", None, STREAM_TIMEOUT) as stream:
             for line in stream:
                 if line.startswith(b"data: "):
                     yield json.loads(line.removeprefix(b"data: "))
-        except (OSError, http.client.HTTPException) as error:
-            raise UnreachableError(
-                f"the connection to the API at {self.url} broke: {error}"
-            ) from error
-        finally:
-            connection.close()
 
-    def _request(self, method: str, path: str, body: bytes | None = None) -> Any:
-        connection, answer = self._open(method, path, body, REQUEST_TIMEOUT)
-        try:
-            return json.loads(answer.read())
-        except (OSError, ValueError, http.client.HTTPException) as error:
-            raise UnreachableError(f"no answer from the API at {self.url}: {error}") from error
-        finally:
-            connection.close()
-
-    def _open(
+    @contextmanager
+    def _answer(
         self, method: str, path: str, body: bytes | None, limit: float
-    ) -> tuple[http.client.HTTPConnection, http.client.HTTPResponse]:
-        connection = self._connection(limit)
-        headers = {"Content-Type": "application/json"}
-        token = self._token()
+    ) -> Iterator[http.client.HTTPResponse]:
+        """Send a request; yield an answer that is no refusal."""
+        headers, token = {"Content-Type": "application/json"}, self._token()
         if token:
             headers["Authorization"] = f"Bearer {token}"
-        try:
-            connection.request(method, path, body, headers)
-            answer = connection.getresponse()
-        except (OSError, http.client.HTTPException) as error:
-            connection.close()
-            why = getattr(error, "strerror", None) or error
-            raise UnreachableError(f"the API at {self.url} does not answer ({why})") from None
-        if not 200 <= answer.status < 300:
-            refusal = _refusal(answer, with_token=bool(token))
-            connection.close()
-            raise refusal
-        return connection, answer
+        with closing(self._connection(limit)) as connection:
+            try:
+                connection.request(method, path, body, headers)
+                answer = connection.getresponse()
+                if not 200 <= answer.status < 300:
+                    raise _refusal(answer, with_token=bool(token))
+                yield answer
+            except (OSError, ValueError, http.client.HTTPException) as error:
+                why = getattr(error, "strerror", None) or error
+                raise UnreachableError(f"the API at {self.url} does not answer ({why})") from None
 
     def _connection(self, limit: float) -> http.client.HTTPConnection:
         """Make a connection; use no proxy, because the API is on this machine or in the cluster."""
         if self.url.startswith(UNIX):
-            return _UnixConnection(Path(self.url.removeprefix(UNIX)), limit)
+            return _UnixConnection(self.url.removeprefix(UNIX), timeout=limit)
         parts = urlsplit(self.url)
         secure = parts.scheme == "https"
         kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
         return kind(parts.hostname or "", parts.port, timeout=limit)
+
+
+class _UnixConnection(http.client.HTTPConnection):
+    def connect(self) -> None:
+        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.sock.settimeout(self.timeout)
+        self.sock.connect(self.host)
 
 
 def _is_http(url: str) -> bool:
@@ -147,25 +142,13 @@ def mission_path(mission_id: str) -> str:
     return f"/v1/missions/{quote(mission_id, safe='', errors='surrogateescape')}"
 
 
-class _UnixConnection(http.client.HTTPConnection):
-    def __init__(self, path: Path, limit: float) -> None:
-        super().__init__("localhost", timeout=limit)
-        self._path = path
-
-    def connect(self) -> None:
-        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.sock.settimeout(self.timeout)
-        self.sock.connect(str(self._path))
-
-
 def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcError:
     body: Any = None
     with suppress(OSError, ValueError, http.client.HTTPException):
         body = json.loads(answer.read())
     body = body if isinstance(body, dict) else {}  # it may be another server that answers
     detail = body.get("detail") or f"the API answered {answer.status} {answer.reason}"
-    detail = escape(str(detail))
-    problems = body.get("problems") or []
+    detail, problems = escape(str(detail)), body.get("problems") or []
     if len(problems) > 1:
         parts = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
         lines = [escape(": ".join(words)) for words in parts]
@@ -174,31 +157,20 @@ def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcEr
         return BadInputError(detail)
     if answer.status == 401:
         which = "does not know this token" if with_token else "asks for a token"
-        detail = f"the API {which}; name its file: --token-file FILE or CLOUDRC_TOKEN_FILE"
+        detail = f"the API {which}; name its file: --token-file FILE or {VARIABLE}"
     return UnreachableError(detail) if answer.status in RETRY_STATUSES else ApiError(detail)
-
-
-VARIABLE = "CLOUDRC_TOKEN_FILE"
-SIZE_MAX = 4096
-"""Largest token file [bytes], including white space at its end."""
-_TOKEN = re.compile(r"[!-~]{16,512}")
 
 
 def token_argument(parser: argparse.ArgumentParser) -> None:
     """Declare the argument --token-file."""
-    parser.add_argument(
-        "--token-file",
-        type=Path,
-        metavar="FILE",
-        help=f"file with the API's token (default: from {VARIABLE}, or the release's Secret)",
-    )
+    text = f"file with the API's token (default: from {VARIABLE}, or the release's Secret)"
+    parser.add_argument("--token-file", type=Path, metavar="FILE", help=text)
 
 
 def token_file(options: argparse.Namespace) -> Path | None:
     """Return the token file from the command line, else from the environment, else None."""
-    if options.token_file is not None:
-        return Path(options.token_file)
-    return Path(os.environ[VARIABLE]) if os.environ.get(VARIABLE) else None
+    given = options.token_file or os.environ.get(VARIABLE)
+    return Path(given) if given else None
 
 
 def token_reader(path: Path | None) -> Callable[[], str]:

@@ -1,7 +1,4 @@
-"""Find the run on this machine that a command refers to, and make folders for new runs.
-
-Every run has its own folder; no later run overwrites it.
-"""
+"""Find the run on this machine that a command refers to, and make folders for new runs."""
 
 from __future__ import annotations
 
@@ -19,6 +16,7 @@ from cloudrc.cli.output import print_line
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 _Found = TypeVar("_Found")
+RUNS = Path("runs")
 KUBECTL_PLUGIN = "kubectl-cloudrc"
 """Name of this program when kubectl starts it as a plugin."""
 CONNECT_LIMIT = 1.0
@@ -38,12 +36,7 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
 def find_local_run(
     options: argparse.Namespace, look: Callable[[Path], _Found | None], nobody: str
 ) -> _Found | None:
-    """Find the API or the link of the run that is flying on this machine.
-
-    Do nothing if the flags name a cluster.
-
-    First choice is the run in ./runs/latest. Second choice is this user's only other run, whatever
-    folder it was started in.
+    """Find the API or the link of the run of `--run`, of ./runs/latest, or of the only other run.
 
     Args:
         options: The parsed flags of `run_argument` and of `cluster_flags`.
@@ -54,9 +47,8 @@ def find_local_run(
         The result of `look`; None if the flags name a cluster, or if no run is flying.
 
     Raises:
-        BadInputError: If `--run` is given and no run is flying in its folder, if `--run` is given
-            together with flags of a cluster, or if `--run` is not given and several runs are
-            flying.
+        BadInputError: If no run is flying in the folder of `--run`, if the flags also name a
+            cluster, or if several runs are flying and none is named.
     """
     in_cluster = options.context or options.namespace or options.release
     if options.run is not None:
@@ -71,27 +63,22 @@ def find_local_run(
 
     if (found := look(RUNS / "latest")) is not None:
         return found
-    others = [(run, found) for run in under_way() if (found := look(run)) is not None]
+    others = {run: found for run in under_way() if (found := look(run)) is not None}
     if len(others) > 1:
-        names = " or ".join(f"--run {run}" for run, _ in others)
+        names = " or ".join(f"--run {run}" for run in others)
         raise BadInputError(f"{len(others)} runs are flying here; choose one: {names}")
-    if not others:
-        return None
-    ((run, found),) = others
-    print_line(f"cloudrc: using the run in {run}", sys.stderr)
-    return found
+    for run, found in others.items():
+        print_line(f"cloudrc: using the run in {run}", sys.stderr)
+        return found
+    return None
 
 
 def no_run_error(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
-    """Add to a cluster's error that no run is flying on this machine either.
+    """Add to a cluster's error that no run flies here either, unless the flags name a cluster.
 
-    Args:
-        options: As in `find_local_run`. If they name a context or a namespace, the error is
-            returned unchanged.
-        error: The cluster's error.
-        flags: The flags that name a local run, for the text.
+    `flags` are those that name a local run, for the text.
     """
     if options.context or options.namespace:
         return error
@@ -118,35 +105,28 @@ def link_folder_of(run: Path) -> Path | None:
 def api_url_of(run: Path) -> str | None:
     """Return the URL of the API of this user's run in a folder; None if the run is not flying.
 
-    The URL comes from this user's runtime folder, never from the run's folder: a run's folder may
+    The URL comes from this user's flight files, never from the run's folder: a run's folder may
     come from somebody else and name a foreign server.
     """
+    from cloudrc.cli.client import UNIX
     from cloudrc.drivers.local import under_way
 
-    url = under_way().get(Path(os.path.realpath(run)), "")
-    return url if url and not _is_gone(url) else None
-
-
-def _is_gone(url: str) -> bool:
-    """Return True if no API listens at a URL: a run is announced before its API is up."""
-    from cloudrc.cli.client import UNIX
-
+    url = under_way().get(Path(os.path.realpath(run)))
+    if not url:
+        return None
     try:
-        with socket.socket(socket.AF_UNIX) as listening:
-            listening.settimeout(CONNECT_LIMIT)
-            listening.connect(url.removeprefix(UNIX))
-    except (ConnectionRefusedError, FileNotFoundError):
-        return True
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.settimeout(CONNECT_LIMIT)
+            probe.connect(url.removeprefix(UNIX))
+    except (ConnectionRefusedError, FileNotFoundError):  # announced before its API is up
+        return None
     except OSError:
-        return False  # the command itself reports it better
-    return False
-
-
-RUNS = Path("runs")
+        pass  # the command itself reports it better
+    return url
 
 
 def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
-    """Make the folder of a run.
+    """Make the folder of a run; no later run overwrites it.
 
     Args:
         out: The folder that the user wants; None for the next free `runs/<name>-<n>`.
@@ -157,7 +137,7 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
         BadInputError: If `out` exists and is not an empty folder, or if the folder cannot be made.
     """
     try:
-        folder = _new_folder(out, name)
+        folder = _next_folder(name) if out is None else _make(out)
     except OSError as error:
         where = f"--out {out}" if out else f"{RUNS}/ in the working folder"
         remedy = "name another folder" if out else "name a writable folder with --out"
@@ -165,6 +145,26 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
     if latest and out is None:
         point_latest_to(folder)
     return folder
+
+
+def _make(out: Path) -> Path:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise BadInputError(
+            f"--out {out}: already exists; name a new folder, runs are never overwritten"
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
+def _next_folder(name: str) -> Path:
+    RUNS.mkdir(exist_ok=True)
+    n = 1
+    while True:
+        with contextlib.suppress(FileExistsError):  # also if another process takes it meanwhile
+            folder = RUNS / f"{name}-{n}"
+            folder.mkdir()
+            return folder
+        n += 1
 
 
 def discard(folder: Path) -> bool:
@@ -176,26 +176,6 @@ def discard(folder: Path) -> bool:
     with contextlib.suppress(OSError):  # it contains other files
         folder.rmdir()
     return not folder.exists()
-
-
-def _new_folder(out: Path | None, name: str) -> Path:
-    if out is not None:
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise BadInputError(
-                f"--out {out}: already exists; name a new folder, runs are never overwritten"
-            )
-        out.mkdir(parents=True, exist_ok=True)
-        return out
-    RUNS.mkdir(exist_ok=True)
-    n = 1
-    while True:
-        folder = RUNS / f"{name}-{n}"
-        try:
-            folder.mkdir()  # fails if another process takes the same number at the same time
-        except FileExistsError:
-            n += 1
-            continue
-        return folder
 
 
 def point_latest_to(folder: Path) -> None:

@@ -1,18 +1,35 @@
-"""Run `cloudrc mission`: fly and steer missions, in a local run or in a cluster."""
+"""Run `cloudrc mission`: fly and steer missions, in a local run or in a cluster.
+
+Verbs go to teleop's API. In a cluster a mission is a Kubernetes Job, and the verbs about Jobs go to
+Kubernetes. A command that follows a mission exits with the code of the verdict.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from cloudrc.cli.client import token_argument, token_file, token_reader
-from cloudrc.cli.cluster_flags import release_arguments, timeout_argument
-from cloudrc.cli.find_run import api_url_of, find_local_run, run_argument
-from cloudrc.cli.output import output_argument
+from cloudrc.cli import client
+from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
+from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
+from cloudrc.cli.find_run import api_url_of, find_local_run, no_run_error, run_argument
+from cloudrc.cli.output import escape, format_document, output_argument, print_line, table
+from cloudrc.cli.pool import interrupt_on_signals
+from cloudrc.drivers.machine import Deadline
+from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
 
 if TYPE_CHECKING:
-    from cloudrc.cli.client import Api
+    from cloudrc.cluster.client import Release
+    from cloudrc.cluster.jobs import JobStatus
+    from cloudrc.config.document import Document
+    from cloudrc.config.schema import Experiment
 
 EPILOG = """\
 where:
@@ -36,9 +53,23 @@ robot falls. After an emergency stop or a landing, 'acknowledge' allows the next
 mission. An API in a network asks for a token: give --token-file or
 CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
 in the cluster. A run that is found on this machine needs no token."""
-
-DEBUG = "show the traceback of an error"
 NO_API = "no run with an API flies there; name another folder, or --api URL"
+POLL_PERIOD = 0.5
+"""Pause between two polls of a mission [s]."""
+RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
+"""Longest times for which the API may be unreachable for a person and for a Job [s]; a pod on
+another node first loads its image."""
+TURN_MAX = 30.0
+"""Longest time for a request and the pause after it [s]. A longer time means that this process was
+suspended."""
+TERMINATION_LOG = Path("/dev/termination-log")
+"""File in a pod; `kubectl describe` shows its text after the container has ended."""
+UNKNOWN_LIMIT = 600.0
+"""Time limit of a mission if neither the mission nor the release's experiment has a limit [s]."""
+INTERRUPTED = 130
+
+_Answer = TypeVar("_Answer")
+Json = dict[str, Any]
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,11 +84,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
             formatter_class=parser.formatter_class,
             allow_abbrev=False,
         )
-        verb.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=DEBUG)
-        verb.add_argument(
-            "--api", metavar="URL", help="http://HOST:PORT or unix:PATH of a run or release"
-        )
-        token_argument(verb)
+        debug = "show the traceback of an error"
+        verb.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=debug)
+        url = "http://HOST:PORT or unix:PATH of a run or release"
+        verb.add_argument("--api", metavar="URL", help=url)
+        client.token_argument(verb)
         if name != "fly":
             run_argument(verb)
             release_arguments(verb)
@@ -94,23 +125,17 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the chosen verb."""
-    from cloudrc.cli import mission_cluster, mission_local
-    from cloudrc.cli.client import Api
-
     verb: str = options.verb
     if verb == "fly":
-        return mission_local.fly(options)
-    of_api: Callable[[argparse.Namespace, Api], int] = mission_local.VERBS[verb]
+        return _fly(options)
     if options.api:
-        return of_api(options, Api(options.api, token_reader(token_file(options))))
+        return API_VERBS[verb](options, Api(options.api, token_reader(token_file(options))))
     if (url := find_local_run(options, api_url_of, NO_API)) is not None:
-        return of_api(options, Api(url))  # a local run asks for no token, so send none
-    without_job = verb in mission_cluster.OF_ONE_JOB and options.id is None
-    if verb in mission_cluster.VERBS and not without_job:
-        in_cluster: Callable[[argparse.Namespace], int] = mission_cluster.VERBS[verb]
-        return in_cluster(options)
-    with mission_cluster.api(options) as forwarded:
-        return of_api(options, forwarded)
+        return API_VERBS[verb](options, Api(url))  # a local run asks for no token, so send none
+    if verb in ("run", "list", "logs") or (verb in ("status", "cancel") and options.id):
+        return JOB_VERBS[verb](options)
+    with _forwarded_api(options) as forwarded:
+        return API_VERBS[verb](options, forwarded)
 
 
 def _metres(text: str) -> float:
@@ -119,3 +144,400 @@ def _metres(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is not a number of metres") from None
+
+
+def _read(name: str) -> Document:
+    from cloudrc.config import shipped
+
+    return shipped.read("mission", name, Path())
+
+
+def read_mission(name: str, shown: str = "") -> Json:
+    """Read a mission that cloudrc ships, or a mission file; the API checks the content.
+
+    Raises:
+        BadInputError: If the file does not exist, or if it holds no mission.
+    """
+    mission = dict(_read(name).tree)
+    if mission.pop("steps", None) is not None:
+        raise BadInputError(
+            f"{name}: steps are for experiments; fly them with 'cloudrc run', or give waypoints"
+        )
+    return {"name": Path(name).stem, **mission, **({"name": shown} if shown else {})}
+
+
+class MissionFollower:
+    """Follows one mission, also across restarts of the API, for the cloud pod may be replaced."""
+
+    def __init__(self, api: Api, patience: float) -> None:
+        """Store the API; it may be unreachable for `patience` [s]."""
+        self._api, self._patience, self._last_event = api, patience, 0
+
+    def post(self, mission: Mapping[str, Any]) -> str:
+        """Wait until the API answers, and post a mission; raise the errors of `Api.post`.
+
+        Returns:
+            The mission's id.
+        """
+        view = self._retry(lambda: self._api.post("/v1/missions", mission))
+        print_line(f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}")
+        return str(view["id"])
+
+    def follow(self, mission_id: str) -> Json:
+        """Print the events of a mission until it has ended; return its verdict."""
+        while True:
+            view = self._retry(lambda: self._api.get(mission_path(mission_id)))
+            for event in view["events"]:
+                if event["id"] > self._last_event:
+                    self._last_event = event["id"]
+                    print_line(f"{event['time_s']:7.2f} s  {event['text']}")
+            if view["verdict"] is not None:
+                return dict(view["verdict"])
+            time.sleep(POLL_PERIOD)
+
+    def _retry(self, request: Callable[[], _Answer]) -> _Answer:
+        """Repeat a request until the API answers or was unreachable for too long."""
+        deadline, reported = Deadline(self._patience, TURN_MAX), False
+        while True:
+            try:
+                return request()
+            except UnreachableError as error:
+                if deadline.passed():
+                    waited = f"{error}; gave up after {self._patience:g} s"
+                    raise TimedOutError(waited) from None
+                if not reported:
+                    print_line(f"{error}; waiting")
+                    reported = True
+            time.sleep(POLL_PERIOD)
+
+
+def describe_verdict(verdict: Mapping[str, Any]) -> str:
+    """Describe a verdict in one line."""
+    failures = [f"{failure['code']}: {failure['text']}" for failure in verdict["failures"]]
+    reasons = "; also ".join(failures) or "every waypoint reached, every criterion met"
+    return f"{verdict['outcome'].upper()}: {reasons}"
+
+
+def _fly(options: argparse.Namespace) -> int:
+    """Post a mission and follow it until its verdict; cancel it on Ctrl-C."""
+    if options.api is None:
+        raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
+    interrupt_on_signals()
+    api, mission_id = Api(options.api, token_reader(token_file(options))), ""
+    follower = MissionFollower(api, API_TIMEOUT)
+    try:
+        mission = read_mission(options.mission)
+        mission_id = follower.post({**mission, "key": options.key, "queue": options.queue})
+        verdict = follower.follow(mission_id)
+        text, code = describe_verdict(verdict), int(verdict["exit_code"])
+    except KeyboardInterrupt:
+        if mission_id:
+            with suppress(CloudrcError):
+                api.post(f"{mission_path(mission_id)}/cancel")
+        text, code = "INTERRUPTED: the Job was stopped, its mission is cancelled", INTERRUPTED
+    except CloudrcError as error:
+        _write_termination_message(str(error))
+        raise
+    print_line(text)
+    _write_termination_message(escape(text))
+    return code
+
+
+def _write_termination_message(text: str) -> None:
+    """Write the termination message for Kubernetes, if this is a pod."""
+    with suppress(OSError):  # Kubernetes then takes the last line of the log, which says the same
+        if TERMINATION_LOG.exists():
+            TERMINATION_LOG.write_text(text + "\n", encoding="utf-8")
+
+
+def _run(options: argparse.Namespace, api: Api) -> int:
+    mission, follower = (
+        read_mission(options.mission, options.name),
+        MissionFollower(api, RUN_TIMEOUT),
+    )
+    mission_id = follower.post({**mission, "queue": options.queue})
+    try:
+        verdict = follower.follow(mission_id)
+    except KeyboardInterrupt:
+        state = "is waiting or flying" if options.queue else "is still flying"
+        command = f"cloudrc mission cancel {mission_id}"
+        print_line(f"mission {mission_id} {state}; cancel it: {command}", sys.stderr)
+        raise
+    print_line(describe_verdict(verdict))
+    return int(verdict["exit_code"])
+
+
+def _list(options: argparse.Namespace, api: Api) -> int:
+    missions = api.get("/v1/missions")["missions"]
+    if options.output != "table":
+        return _print({"missions": missions}, options.output)
+    rows = [("ID", "NAME", "STATE", "WAYPOINTS", "VERDICT")]
+    for each in missions:
+        done = f"{len(each['reached'])}/{each['waypoints']}"
+        verdict = describe_verdict(each["verdict"]) if each["verdict"] else ""
+        rows.append((each["id"], each["name"], each["state"], done, verdict))
+    print(table(rows) if missions else "no missions yet")
+    return 0
+
+
+def _status(options: argparse.Namespace, api: Api) -> int:
+    state = api.get(mission_path(options.id) if options.id else "/v1/state")
+    if options.output != "table":
+        return _print(state, options.output)
+    if options.id:
+        _print_state(state)
+        _print_history(state)
+        return 0
+    if state["mission"]:
+        _print_state(state["mission"])
+    else:
+        print("no mission is under way")
+    if state["queue"]:
+        print_line(f"waiting: {', '.join(state['queue'])}")
+    _print_robot(state["seen"], state["cloud_age_s"])
+    return 0
+
+
+def _cancel(options: argparse.Namespace, api: Api) -> int:
+    mission_id = options.id
+    if not mission_id:
+        mission = api.get("/v1/state")["mission"]
+        if mission is None:
+            raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
+        mission_id = mission["id"]
+    _print_state(api.post(f"{mission_path(mission_id)}/cancel"))
+    return 0
+
+
+def _logs(options: argparse.Namespace, api: Api) -> int:
+    if options.follow:
+        for event in api.events():
+            if not options.id or event["mission"] == options.id:
+                _print_events([event])
+    elif options.id:
+        _print_history(api.get(mission_path(options.id)))
+    else:
+        ids = [mission["id"] for mission in api.get("/v1/missions")["missions"]]
+        events = [event for each in ids for event in api.get(mission_path(each))["events"]]
+        _print_events(sorted(events, key=lambda event: int(event["id"])))
+    return 0
+
+
+def _order(options: argparse.Namespace, api: Api) -> int:
+    """Hold, resume, or go to a point."""
+    point = None
+    if options.verb == "goto":
+        point = {"position_m": [options.x, options.y, options.z]}
+    _print_state(api.post(f"/v1/{options.verb}", point))
+    return 0
+
+
+def _estop(options: argparse.Namespace, api: Api) -> int:
+    mission = api.post("/v1/estop")["id"]
+    print("emergency stop: sent, and repeated until the rotors have stopped", flush=True)
+    if mission:
+        print_line(f"mission {mission} has failed")
+    return 0
+
+
+def _acknowledge(options: argparse.Namespace, api: Api) -> int:
+    api.post("/v1/acknowledge")
+    print(
+        "acknowledged: the next mission may fly; a landing close to the ground is completed first\n"
+        "after a stop or a touchdown the robot takes off only once it is at rest, and at least "
+        "0.5 m inside the fence"
+    )
+    return 0
+
+
+API_VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
+    "run": _run,
+    "list": _list,
+    "status": _status,
+    "cancel": _cancel,
+    "logs": _logs,
+    **dict.fromkeys(("goto", "hold", "resume"), _order),
+    "estop": _estop,
+    "acknowledge": _acknowledge,
+}
+
+
+def _print_state(mission: Json) -> None:
+    """Print the state of a mission in one line."""
+    where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
+    name = f" ({mission['name']})" if mission["name"] else ""
+    verdict = f"; {describe_verdict(mission['verdict'])}" if mission["verdict"] else ""
+    print_line(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
+
+
+def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
+    """Print what the newest telemetry tells, and the age of cloud's last message [s], if any."""
+    heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
+    if seen is None:
+        print(f"no telemetry from the robot yet; is the link up? cloud heard {heard}")
+        return
+    where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
+    if seen["guard_for_s"] is None:
+        past = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
+        print_line(f"{past}; cloud heard {heard}")
+        print_line(f"last seen at ({where}) m: {seen['cause']}")
+    else:
+        rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
+        print_line(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
+        print_line(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
+    print_line(f"next: {seen['next_step']}")
+
+
+def _print_history(mission: Json) -> None:
+    if left_out := mission.get("events_left_out", 0):
+        print_line(f"{mission['id']:<4}{left_out} earlier events are not shown")
+    _print_events(mission["events"])
+
+
+def _print_events(events: Iterable[Json]) -> None:
+    for event in events:
+        print_line(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
+
+
+def _print(document: Json, form: str) -> int:
+    print(format_document({"schemaVersion": 1, **document}, form))
+    return 0
+
+
+def _release(options: argparse.Namespace) -> Release:
+    try:
+        return release_from_flags(options)
+    except MissingPrerequisiteError as error:
+        raise no_run_error(options, error, "--run, --api") from None
+
+
+@contextmanager
+def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
+    """Forward a port to a release's API while the block runs."""
+    release, path = _release(options), token_file(options)
+    from cloudrc.cluster.pods import api_url, operator_token
+
+    token = operator_token(release) if path is None else ""
+    with api_url(release) as url:
+        yield Api(url, token_reader(path) if path else lambda: token)
+
+
+def _check(name: str, mission: Json, experiment: Experiment | None) -> float:
+    """Check a mission as the API does, before its Job is created; return its time limit [s].
+
+    Raises:
+        BadInputError: If the mission is invalid; the text lists all problems.
+    """
+    from pydantic import ValidationError
+
+    from cloudrc.config.mission_check import check_mission
+    from cloudrc.config.problems import Problem, from_pydantic, raise_problems
+    from cloudrc.config.schema import Mission
+    from cloudrc.geometry.scene import load_scene
+    from cloudrc.teleop.models import MissionRequest
+
+    problems, limit = [], UNKNOWN_LIMIT
+    try:
+        request = MissionRequest.model_validate_json(json.dumps(mission))
+    except ValidationError as error:
+        raise_problems(_read(name), from_pydantic(error, MissionRequest), name)
+        raise  # if no problem was listed
+    if not request.waypoints:
+        problems = [Problem(("waypoints",), "", "none given; give at least one")]
+    elif experiment is not None:
+        limit = experiment.criteria.time_limit_s
+        plan = Mission(start=request.start, waypoints=request.waypoints)
+        problems = check_mission(plan, load_scene(experiment.world.scene))
+    raise_problems(_read(name), problems, name)
+    return request.time_limit_s or limit
+
+
+def _experiment(release: Release) -> Experiment | None:
+    """Read the experiment of a release; None if this user's rights or this version prevent it."""
+    from pydantic import ValidationError
+
+    from cloudrc.cluster.client import FILE, ClusterError, experiment_text
+    from cloudrc.config.document import parse_yaml
+    from cloudrc.config.schema import Experiment
+    from cloudrc.config.shipped import check_name
+
+    with suppress(ClusterError, BadInputError, ValidationError):
+        tree, _ = parse_yaml(experiment_text(release), FILE)
+        experiment = Experiment.model_validate_json(json.dumps(tree or {}))
+        check_name("scene", experiment.world.scene)
+        return experiment
+    return None
+
+
+def _run_job(options: argparse.Namespace) -> int:
+    mission, release = read_mission(options.mission, options.name), _release(options)
+    from cloudrc.cluster.flight import wait_ready
+    from cloudrc.cluster.jobs import follow, follow_limit, run_job
+    from cloudrc.cluster.pods import find_deployment
+
+    find_deployment(release, "cloud")
+    limit = _check(options.mission, mission, _experiment(release))
+    # After 'helm install' without --wait this takes some seconds: the link starts last.
+    wait_ready(release, timeout=options.timeout, tell=print_line)
+    job = run_job(release, mission, limit=limit, queue=options.queue)
+    print(f"Job {job.name} in namespace '{release.namespace}'", flush=True)
+    try:
+        ended = follow(release, job.name, print_line, timeout=follow_limit(limit, options.queue))
+    except KeyboardInterrupt:
+        command = f"cloudrc mission cancel {job.name} {' '.join(release.cloudrc_flags)}"
+        print(f"Job {job.name} is still running; cancel it: {command}", file=sys.stderr)
+        raise
+    if ended.exit_code is None:
+        print_line(ended.message)
+    return 1 if ended.exit_code is None else ended.exit_code
+
+
+def _show_jobs(options: argparse.Namespace) -> int:
+    """List all Jobs, or show one."""
+    release = _release(options)
+    from cloudrc.cluster.jobs import list_jobs, read_job
+
+    shows_all = options.verb == "list"
+    jobs: list[JobStatus] = list_jobs(release) if shows_all else [read_job(release, options.id)]
+    if options.output != "table":
+        return _print({"jobs": [asdict(job) for job in jobs]}, options.output)
+    if not jobs:
+        print(f"no missions {release.where}; fly one: cloudrc mission run FILE")
+        return 0
+    heads = [("JOB", "STATE", "CREATED", "VERDICT")] if shows_all else []
+    print(table([*heads, *((job.name, job.state, job.created, job.message) for job in jobs)]))
+    return 0
+
+
+def _cancel_job(options: argparse.Namespace) -> int:
+    release, path = _release(options), token_file(options)
+    from cloudrc.cluster.jobs import cancel
+
+    print_line(cancel(release, options.id, token_reader(path)() if path else None))
+    return 0
+
+
+def _job_logs(options: argparse.Namespace) -> int:
+    release, job = _release(options), options.id
+    from cloudrc.cluster.jobs import follow, list_jobs, logs
+
+    if job is None:
+        jobs = list_jobs(release)
+        if not jobs:
+            raise BadInputError(f"no missions {release.where}")
+        job = jobs[-1].name
+    if options.follow:
+        follow(release, job, print_line, timeout=86_400.0)
+    else:
+        for line in logs(release, job):
+            print_line(line)
+    return 0
+
+
+JOB_VERBS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "run": _run_job,
+    "list": _show_jobs,
+    "status": _show_jobs,
+    "cancel": _cancel_job,
+    "logs": _job_logs,
+}

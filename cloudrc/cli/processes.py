@@ -189,10 +189,7 @@ def _addresses(name: str, family: int) -> list[str]:
 def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0)) -> Address:
     """Resolve an address once, before the loop starts: the loop must not wait for a name server.
 
-    Args:
-        flag: Flag of the address, for messages.
-        where: The address.
-        listen: Own address of the process, whose family the result has; [::] reaches both families.
+    The result has the family of `listen`, the process's own address; [::] reaches both families.
 
     Raises:
         BadInputError: If the host cannot be resolved; the text names the flag.
@@ -396,8 +393,7 @@ def _run_relay(options: argparse.Namespace) -> int:
     settle()
     if options.fifo:
         refused = ask_for_fifo()
-        result = f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO"
-        _log(result)
+        _log(f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO")
     relay = open_relay(options, *links.values())
     if exporter is not None:
         for way, loaded in read_profiles(experiment).items():
@@ -496,7 +492,7 @@ class RelayControl:
             links: The links "uplink" and "downlink".
             first: The profiles that the links have started with.
             asked: Called with a direction and its newly requested mean delay [s].
-            relay: The relay. Before a change it takes in the datagrams that have arrived.
+            relay: The relay of the links.
         """
         from cloudrc.cli.link_run import make_profile_loader
 

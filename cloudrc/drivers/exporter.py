@@ -1,10 +1,4 @@
-"""Serve the metrics and probes of a process over HTTP.
-
-exporter = Exporter("world")
-exporter.serve(("127.0.0.1", 9100))  /metrics, /healthz and /readyz, on separate threads
-exporter.see(records)                on the loop's thread: less than 1 us per record
-exporter.ready(True)                 only in a process that is not an end of the tunnel
-"""
+"""Serve the metrics and probes of a process over HTTP, on threads of their own."""
 
 from __future__ import annotations
 
@@ -40,8 +34,9 @@ CONFIG_DIGITS = 12
 STILL_MAX = 5.0
 """Time without a record after which a loop counts as standing still [s]; a healthy loop makes a
 record every second."""
-CPU_COUNTS = Path("/sys/fs/cgroup/cpu.stat")
-"""File of the kernel with a container's CPU counts."""
+CGROUP = Path("/sys/fs/cgroup")
+CPU_COUNTS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
+"""Files with a container's CPU counts: cgroup version 2, then two mounts of version 1."""
 
 
 class Answer(NamedTuple):
@@ -50,9 +45,6 @@ class Answer(NamedTuple):
     status: int
     content: str
     kind: str = "text/plain; charset=utf-8"
-
-
-Pages = Mapping[str, Callable[[], Answer]]
 
 
 class _Server(socketserver.ThreadingTCPServer):
@@ -67,7 +59,7 @@ class _Server(socketserver.ThreadingTCPServer):
     block_on_close = False
     request_queue_size = 1_024
 
-    def __init__(self, address: tuple[str, int], pages: Pages) -> None:
+    def __init__(self, address: tuple[str, int], pages: Mapping[str, Callable[[], Answer]]) -> None:
         self.pages = pages
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, _Handler)
@@ -104,34 +96,37 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing: a request comes every few seconds."""
 
 
-def read_throttling(path: Path = CPU_COUNTS) -> Readings:
+def read_throttling(root: Path = CGROUP) -> Readings:
     """Read how much the CPU limit has throttled this container; empty outside a container.
 
-    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us).
+    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
+    Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
     """
-    try:
-        counts = dict(line.split() for line in path.read_text().splitlines())
-    except OSError:
-        return {}
-    if "nr_periods" not in counts:
-        return {}
-    return {
-        "cloudrc_cpu_periods_total": unlabelled(int(counts["nr_periods"])),
-        "cloudrc_cpu_throttled_periods_total": unlabelled(int(counts["nr_throttled"])),
-        "cloudrc_cpu_throttled_seconds_total": unlabelled(int(counts["throttled_usec"]) * 1e-6),
-    }
+    for name in CPU_COUNTS:
+        try:
+            words = (line.split() for line in (root / name).read_text().splitlines())
+        except OSError:
+            continue
+        counts = {key: int(number) for key, number in words}
+        if "nr_periods" in counts:
+            stopped = (
+                counts.get("throttled_usec", 0) * 1e-6 + counts.get("throttled_time", 0) * 1e-9
+            )
+            return {
+                "cloudrc_cpu_periods_total": unlabelled(counts["nr_periods"]),
+                "cloudrc_cpu_throttled_periods_total": unlabelled(counts["nr_throttled"]),
+                "cloudrc_cpu_throttled_seconds_total": unlabelled(stopped),
+            }
+    return {}
 
 
 class Exporter:
     """The metrics of one process."""
 
     def __init__(self, role: str, *, missions: bool = True) -> None:
-        """Set the role; the exporter serves nothing yet and is not ready.
+        """Set the role, "world", "cloud", "teleop" or "link".
 
-        Args:
-            role: "world", "cloud", "teleop" or "link".
-            missions: Whether this process exports metrics of missions; False in a cloud with a
-                separate teleop.
+        A cloud with a separate teleop exports no metrics of `missions`.
         """
         self._role, self._metrics = role, of_role(role)
         self._live = LiveMetrics(role, missions=missions)
@@ -146,7 +141,7 @@ class Exporter:
         ProcessCollector(registry=self._registry)
 
     def see(self, records: Iterable[Record]) -> None:
-        """Update the metrics with records of this process, oldest first, without waiting."""
+        """Update the metrics with records, oldest first; takes less than 1 us per record."""
         self._seen_at = time.monotonic()
         self._live.see(records)
 

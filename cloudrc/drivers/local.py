@@ -157,11 +157,6 @@ class Child:
                 records.append(from_line(line.decode()))
         return records
 
-    def last_words(self) -> str:
-        """Return the last line of the process's log, or a text that says that the log is empty."""
-        lines = self.log.read_text(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "it left no message"
-
 
 class LocalRun:
     """The four processes of one run.
@@ -187,10 +182,7 @@ class LocalRun:
         self.notes: tuple[str, ...] = ()
 
     def fly(self, limit: float) -> None:
-        """Fly until teleop reports the end of the mission; then all processes have ended.
-
-        Args:
-            limit: Longest duration [s].
+        """Fly until the mission is over, at most `limit` [s]; then all processes have ended.
 
         Raises:
             ProcessDiedError: If a process ends too early; the message names the process.
@@ -263,7 +255,7 @@ class LocalRun:
     def _watch(self, limit: float) -> None:
         deadline, paused = Deadline(limit, PAUSE), 0.0
         teleop = next(child for child in self._children if child.name == "teleop")
-        self._forgive_silence()
+        heard_from = time.monotonic()
         while teleop.process.poll() is None:
             self._see(self._listen())
             if deadline.passed():
@@ -272,10 +264,14 @@ class LocalRun:
                 stood = f"stood still for {deadline.pause - paused:.1f} s; the flight went on"
                 self.notes += (f"the supervisor of this run {stood}",)
                 self._see([Fault(0, "supervisor", self.notes[-1])])
-                self._forgive_silence()
-                paused = deadline.pause
+                heard_from, paused = time.monotonic(), deadline.pause
             self._check_alive()
-            self._check_silence()
+            for child in self._children:
+                if time.monotonic() - max(child.heard, heard_from) > SILENCE_LIMIT:
+                    raise TimedOutError(
+                        f"the {child.name} process was silent for {SILENCE_LIMIT:g} s and was "
+                        f"ended; see {child.log}"
+                    )
         self._check_alive()
         self._see(self._listen())
 
@@ -290,26 +286,15 @@ class LocalRun:
             records += child.take(data)
         return records
 
-    def _forgive_silence(self) -> None:
-        for child in self._children:
-            child.heard = time.monotonic()
-
-    def _check_silence(self) -> None:
-        for child in self._children:
-            if time.monotonic() - child.heard > SILENCE_LIMIT:
-                raise TimedOutError(
-                    f"the {child.name} process was silent for {SILENCE_LIMIT:g} s and was ended; "
-                    f"see {child.log}"
-                )
-
     def _check_alive(self) -> None:
         for child in self._children:
             code = child.process.poll()
             if code is None or (child.name == "teleop" and code == 0):
                 continue
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
+            said = child.log.read_text(errors="replace").strip() or "it left no message"
             raise ProcessDiedError(
-                f"the {child.name} process died in flight ({how}): {child.last_words()}; "
+                f"the {child.name} process died in flight ({how}): {said.splitlines()[-1]}; "
                 f"see {child.log}"
             )
 

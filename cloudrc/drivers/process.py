@@ -95,10 +95,7 @@ class Feed:
     def __init__(self, descriptor: int, *, watched: bool = True) -> None:
         """Make the pipe non-blocking.
 
-        Args:
-            descriptor: File descriptor of the pipe.
-            watched: Whether a supervisor reads the pipe. If nobody does, as in a container, only
-                events are written, as lines of a log.
+        If no supervisor watches it, as in a container, it gets only events, as lines of a log.
         """
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
@@ -218,10 +215,7 @@ class LinkNotes:
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
         """Return the records about the link that follow these records of the end.
 
-        Args:
-            records: Records that the end has just made; a mission may begin at one of them.
-            now_ns: The machine's monotonic clock [ns].
-            slip_ns: Lag of the end's own clock [ns].
+        `now_ns` is the machine's monotonic clock, `slip_ns` the lag of the end's own clock [ns].
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))
@@ -298,11 +292,7 @@ class EndProcess:
     ) -> None:
         """Run the endpoint until `stop()`, then complete its recording.
 
-        Args:
-            endpoint: World or cloud.
-            stop: Whether this end has to stop; create it before anything slow.
-            flies: Whether the robot follows the commands of cloud.
-            slip_ns: Lag of world's clock [ns].
+        `flies` tells whether the robot follows cloud; `slip_ns` is the lag of world's clock [ns].
         """
         feed, thread = Feed.on_stdout(watched=self.watched), RecordingThread(self.recorder)
         choose = FlightsOnly(flies) if self.flights_only else list

@@ -425,7 +425,8 @@ class ApiServer(uvicorn.Server):
     def counts(self) -> dict[str, int]:
         """Number of requests by outcome, and number of lost lines of the audit log."""
         audit = self.gate.audit
-        return {**self.gate.counts, "audit_dropped": audit.dropped if audit else 0}
+        counts = {**self.gate.counts, "audit_dropped": audit.dropped if audit else 0}
+        return {f"api_{name}": count for name, count in counts.items()}
 
     def start(self) -> None:
         """Start serving."""

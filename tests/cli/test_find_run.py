@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.find_run import QUIET_LIMIT
+from cloudrc.cli.find_run import QUIET_LIMIT, new_folder
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
+from cloudrc.errors import BadInputError
 from tests.teleop.conftest import Running, running
 
 Printed = pytest.CaptureFixture[str]
@@ -41,35 +42,22 @@ def flying(folder: Path) -> Iterator[Running]:
         yield api
 
 
-def test_the_emergency_stop_reaches_the_only_run_from_any_folder(
-    tmp_path: Path, capsys: Printed
-) -> None:
-    with flying(tmp_path / "out") as api:
+def test_an_emergency_stop_finds_the_run(tmp_path: Path, elsewhere: Path, capsys: Printed) -> None:
+    """First ./runs/latest, then the only other run; with several others one has to be named."""
+    with flying(tmp_path / "a") as a:
         assert main(["mission", "estop"]) == 0
-        assert len(api.alarms) == 1
-    said = capsys.readouterr()
-    assert said.out.startswith("emergency stop: sent")
-    assert said.err == f"cloudrc: using the run in {tmp_path / 'out'}\n"
-
-
-def test_with_several_runs_one_has_to_be_named(tmp_path: Path, capsys: Printed) -> None:
-    with flying(tmp_path / "a") as a, flying(tmp_path / "b") as b:
-        assert main(["mission", "estop"]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        for name in "ab":
-            assert f"--run {tmp_path / name}" in line
-        assert (a.alarms, b.alarms) == ([], [])
-        assert main(["mission", "estop", "--run", str(tmp_path / "b")]) == 0
-        assert (len(a.alarms), len(b.alarms)) == (0, 1)
-
-
-def test_the_newest_run_of_this_folder_comes_first(
-    tmp_path: Path, elsewhere: Path, capsys: Printed
-) -> None:
-    with flying(tmp_path / "a") as a, flying(elsewhere / "runs" / "latest") as here:
-        assert main(["mission", "estop"]) == 0
-        assert (len(a.alarms), len(here.alarms)) == (0, 1)
-        assert capsys.readouterr().err == ""
+        assert capsys.readouterr().err == f"cloudrc: using the run in {tmp_path / 'a'}\n"
+        with flying(tmp_path / "b") as b:
+            assert main(["mission", "estop"]) == 2
+            (line,) = capsys.readouterr().err.splitlines()
+            for name in "ab":
+                assert f"--run {tmp_path / name}" in line
+            assert (len(a.alarms), len(b.alarms)) == (1, 0)
+            assert main(["mission", "estop", "--run", str(tmp_path / "b")]) == 0
+            with flying(elsewhere / "runs" / "latest") as here:
+                assert main(["mission", "estop"]) == 0
+                assert (len(a.alarms), len(b.alarms), len(here.alarms)) == (1, 1, 1)
+                assert capsys.readouterr().err == ""
 
 
 def test_runs_without_an_answering_api_are_ignored(tmp_path: Path, elsewhere: Path) -> None:
@@ -113,13 +101,6 @@ def test_a_local_run_gets_no_token(
         assert main(["mission", "estop", "--api", api.url]) == 2
 
 
-def test_without_a_run_the_error_says_how_to_name_one(capsys: Printed) -> None:
-    assert main(["mission", "estop"]) == 3
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "no run flies here" in line
-    assert "--run, --api" in line
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -160,7 +141,7 @@ def test_link_set_finds_the_only_run(tmp_path: Path, capsys: Printed) -> None:
 
 
 @pytest.mark.parametrize("kubectl", ["perhaps there", "missing"])
-def test_link_set_ignores_a_killed_run(
+def test_link_set_takes_a_live_relay_and_ignores_a_killed_one(
     tmp_path: Path,
     elsewhere: Path,
     capsys: Printed,
@@ -169,7 +150,12 @@ def test_link_set_ignores_a_killed_run(
 ) -> None:
     if kubectl == "missing":
         monkeypatch.setenv("PATH", str(elsewhere))
-    dead = with_link(elsewhere / "runs" / "latest", killed=True)
+    fresh = with_link(elsewhere / "runs" / "latest")
+    assert main(SET) == 2
+    assert "runs/latest: no link is up there (yet)" in capsys.readouterr().err
+    old = fresh.stat().st_mtime - QUIET_LIMIT
+    os.utime(fresh / "link", (old, old))
+    dead = fresh
     assert main(SET) == 3
     assert "no run flies here (start one: cloudrc run; or name one: --run)" in (
         capsys.readouterr().err
@@ -181,12 +167,6 @@ def test_link_set_ignores_a_killed_run(
     assert f"{tmp_path / 'out'}: no link is up there" in capsys.readouterr().err
 
 
-def test_link_set_finds_an_unannounced_run_by_its_files(elsewhere: Path, capsys: Printed) -> None:
-    with_link(elsewhere / "runs" / "latest")
-    assert main(SET) == 2
-    assert "runs/latest: no link is up there (yet)" in capsys.readouterr().err
-
-
 def test_the_kubectl_plugin_never_uses_a_local_run(
     elsewhere: Path, monkeypatch: pytest.MonkeyPatch, capsys: Printed
 ) -> None:
@@ -194,3 +174,25 @@ def test_the_kubectl_plugin_never_uses_a_local_run(
     with local.announced(with_link(elsewhere / "runs" / "latest")):
         assert main() == 3
     assert "KUBECONFIG" in capsys.readouterr().err
+
+
+def test_folders_are_numbered_and_latest_is_the_newest(elsewhere: Path) -> None:
+    names = [new_folder(None, "paper-local-seed1").as_posix() for _ in range(3)]
+    assert names == [f"runs/paper-local-seed1-{n}" for n in (1, 2, 3)]
+    assert Path("runs/latest").resolve() == Path(names[-1]).resolve()
+    assert new_folder(elsewhere / "a" / "b", "x").is_dir()
+    assert new_folder(elsewhere / "a" / "b", "x").is_dir(), "an empty one"
+
+
+def test_existing_files_are_not_overwritten(elsewhere: Path) -> None:
+    (elsewhere / "full").mkdir()
+    for file in ("full/report.json", "file"):
+        (elsewhere / file).write_text("{}")
+    for name in ("full", "file"):
+        with pytest.raises(BadInputError, match=r"never overwritten"):
+            new_folder(elsewhere / name, "x")
+    Path("runs").write_text("a file")
+    with pytest.raises(BadInputError, match=r"^runs/ in the working folder: .*with --out$"):
+        new_folder(None, "x")
+    with pytest.raises(BadInputError, match=r"^--out runs/x: .*name another folder$"):
+        new_folder(Path("runs/x"), "x")

@@ -9,13 +9,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
-from cloudrc.cli import mission_local
+from cloudrc.cli import mission as command
 from cloudrc.cli.client import Api, token_reader
 from cloudrc.cli.main import main
+from cloudrc.cli.output import escape
+from cloudrc.cluster import jobs
+from cloudrc.cluster.jobs import JobStatus
 from cloudrc.drivers import local
-from tests.teleop.conftest import A, B, Running, running
+from cloudrc.errors import BadInputError
+from cloudrc.teleop.store import SHOWN as EVENTS
+from cloudrc.teleop.store import Order
+from tests.teleop.conftest import PLAN, A, B, Running, running
 
+Printed = pytest.CaptureFixture[str]
 FILE = """
 description: Two points
 start: here
@@ -34,8 +42,8 @@ def api() -> Iterator[Running]:
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(mission_local, "POLL_PERIOD", 0.02)
-    monkeypatch.setattr(mission_local, "API_TIMEOUT", 0.5)
+    monkeypatch.setattr(command, "POLL_PERIOD", 0.02)
+    monkeypatch.setattr(command, "API_TIMEOUT", 0.5)
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "two.yaml").write_text(FILE)
@@ -73,9 +81,7 @@ def pilot(api: Running, *points: tuple[float, float, float]) -> threading.Thread
     return thread
 
 
-def test_run_follows_to_the_verdict(
-    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_follows_to_the_verdict(api: Running, mission: Command, capsys: Printed) -> None:
     thread = pilot(api, A, B)
     assert mission("run", "two.yaml") == 0
     thread.join()
@@ -90,11 +96,11 @@ def test_fly_under_one_key_flies_once_and_leaves_its_verdict(
     mission: Command,
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Printed,
 ) -> None:
     log = folder / "termination-log"
     log.touch()
-    monkeypatch.setattr(mission_local.write_termination_message, "__defaults__", (log,))
+    monkeypatch.setattr(command, "TERMINATION_LOG", log)
     thread = pilot(api, A)
     end = threading.Thread(target=lambda: (thread.join(), api.post("/v1/missions/m1/cancel")))
     end.start()
@@ -106,27 +112,43 @@ def test_fly_under_one_key_flies_once_and_leaves_its_verdict(
     assert len(api.get("/v1/missions")["missions"]) == 1
 
 
+def _interrupted(*arguments: object) -> None:
+    raise KeyboardInterrupt
+
+
 def test_a_stopped_job_cancels_its_mission(
-    api: Running, mission: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def stopped(self: object, mission_id: str) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(mission_local.MissionFollower, "follow", stopped)
-    assert mission("fly", "--mission", "two.yaml") == 130
-    assert api.state_of("m1") == "cancelled"
-
-
-def test_a_second_mission_is_refused_and_names_the_first(
-    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
+    api: Running, mission: Command, monkeypatch: pytest.MonkeyPatch, capsys: Printed
 ) -> None:
     api.post("/v1/missions", {"waypoints": [{"position_m": B}]})
     assert mission("fly", "--mission", "two.yaml") == 5
     assert "mission m1 is" in capsys.readouterr().err
+    monkeypatch.setattr(command.MissionFollower, "follow", _interrupted)
+    assert mission("fly", "--mission", "two.yaml", "--queue") == 130
+    assert api.state_of("m2") == "cancelled"
+
+
+@pytest.mark.parametrize(
+    ("flags", "word"), [([], "is still flying"), (["--queue"], "is waiting or flying")]
+)
+def test_an_interrupted_run_names_the_command_that_cancels_it(
+    flags: list[str], word: str, monkeypatch: pytest.MonkeyPatch, capsys: Printed
+) -> None:
+    monkeypatch.setattr(command.MissionFollower, "follow", _interrupted)
+    with running(unix=True) as api:
+        if flags:
+            api.post_local("/v1/missions", {"waypoints": [{"position_m": [0.5, -1.0, 1.0]}]})
+        assert main(["mission", "run", "two.yaml", "--api", api.url, *flags]) == 130
+        mine = "m2" if flags else "m1"
+        advice = capsys.readouterr().err
+        assert advice == f"mission {mine} {word}; cancel it: cloudrc mission cancel {mine}\n"
+        assert main([*advice.split("cloudrc ")[1].split(), "--api", api.url]) == 0
+        missions = Api(api.url).get("/v1/missions")["missions"]
+        ended = {each["id"] for each in missions if each["state"] == "cancelled"}
+        assert ended == {mine}, "no other mission"
 
 
 def test_a_mission_that_cannot_be_flown_ends_with_2(
-    mission: Command, folder: Path, capsys: pytest.CaptureFixture[str]
+    mission: Command, folder: Path, capsys: Printed
 ) -> None:
     (folder / "bad.yaml").write_text("waypoints: [{position_m: [99, 0, 1]}, {position: [0, 0, 1]}]")
     assert mission("run", "bad.yaml") == 2
@@ -139,7 +161,7 @@ def test_a_mission_that_cannot_be_flown_ends_with_2(
     assert "pipes" in capsys.readouterr().err
 
 
-def test_an_api_that_is_not_there_ends_with_4_or_5(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_api_that_is_not_there_ends_with_4_or_5(capsys: Printed) -> None:
     away = ["--api", "http://127.0.0.1:9"]
     assert main(["mission", "status", *away]) == 5
     assert main(["mission", "fly", "--mission", "two.yaml", *away]) == 4
@@ -152,17 +174,13 @@ def test_an_api_that_is_not_there_ends_with_4_or_5(capsys: pytest.CaptureFixture
     "url",
     ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://", "http://[::1", "http://h:x"],
 )
-def test_an_invalid_url_of_the_api_is_an_error(
-    url: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_invalid_url_of_the_api_is_an_error(url: str, capsys: Printed) -> None:
     assert main(["mission", "status", "--api", url]) == 2
     said = f"cloudrc: error: --api {url}: give http://HOST:PORT or unix:PATH\n"
     assert capsys.readouterr().err == said
 
 
-def test_the_operators_verbs(
-    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_operators_verbs(api: Running, mission: Command, capsys: Printed) -> None:
     assert mission("status") == 0
     assert "no mission is under way" in capsys.readouterr().out
     assert mission("cancel") == 2
@@ -179,9 +197,7 @@ def test_the_operators_verbs(
     assert "beyond the fence" in capsys.readouterr().err
 
 
-def test_list_status_and_logs(
-    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_list_status_and_logs(api: Running, mission: Command, capsys: Printed) -> None:
     assert mission("list") == 0
     assert capsys.readouterr().out == "no missions yet\n"
     api.post("/v1/missions", {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]})
@@ -205,9 +221,7 @@ def test_list_status_and_logs(
     assert "no mission 'm9'" in capsys.readouterr().err
 
 
-def test_the_local_run_is_found_and_needs_no_token(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_local_run_is_found_and_needs_no_token(folder: Path, capsys: Printed) -> None:
     with running(unix=True) as api:
         with local.announced(folder / "runs" / "latest", api.url):
             assert main(["mission", "status"]) == 0
@@ -222,7 +236,7 @@ def test_the_local_run_is_found_and_needs_no_token(
 
 
 def test_emergency_stop_and_acknowledgement(
-    api: Running, mission: Command, capsys: pytest.CaptureFixture[str]
+    api: Running, mission: Command, capsys: Printed
 ) -> None:
     assert mission("estop") == 0
     assert api.alarms
@@ -248,36 +262,36 @@ def test_the_token_file_comes_from_flag_or_environment(
     api: Running,
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Printed,
 ) -> None:
-    command = ["mission", "hold", "--api", api.url]
-    assert main(command) == 5
+    hold = ["mission", "hold", "--api", api.url]
+    assert main(hold) == 5
     assert "asks for a token; name its file: --token-file FILE" in capsys.readouterr().err
     (folder / "wrong").write_text("not-the-operators-token\n")
     (folder / "wrong").chmod(0o644)
     monkeypatch.setenv("CLOUDRC_TOKEN_FILE", str(folder / "wrong"))
-    assert main(command) == 5
+    assert main(hold) == 5
     error = capsys.readouterr().err
     assert "does not know this token" in error
     path = folder / "wrong"
     assert f"warning: {path} can be read by others: chmod 600 {path}\n" in error
-    assert main([*command, "--token-file", str(api.folder.name) + "/reader"]) == 5
+    assert main([*hold, "--token-file", str(api.folder.name) + "/reader"]) == 5
     error = capsys.readouterr().err
     assert "may look, not command" in error
     assert "warning" not in error
-    assert main([*command, "--token-file", str(api.token_file)]) == 5
+    assert main([*hold, "--token-file", str(api.token_file)]) == 5
     assert "no mission is under way" in capsys.readouterr().err
     (folder / "wrong").write_text("two words")
-    assert main(command) == 2
+    assert main(hold) == 2
     assert "holds no token" in capsys.readouterr().err
-    assert main([*command, "--token-file", "none"]) == 2
+    assert main([*hold, "--token-file", "none"]) == 2
     error = capsys.readouterr().err
     assert "--token-file none: No such file or directory" in error
     assert "two words" not in error
 
 
 def test_without_run_and_cluster_both_remedies_are_named(
-    capsys: pytest.CaptureFixture[str],
+    capsys: Printed,
 ) -> None:
     assert main(["mission", "status"]) == 3
     error = capsys.readouterr().err
@@ -286,7 +300,7 @@ def test_without_run_and_cluster_both_remedies_are_named(
     assert error.count("\n") == 1
 
 
-def test_a_missing_verb_or_point_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_verb_or_point_is_refused(capsys: Printed) -> None:
     assert main(["mission"]) == 2
     assert main(["mission", "goto", "1", "2"]) == 2
     assert main(["mission", "holt"]) == 2
@@ -302,6 +316,114 @@ def test_events_can_be_followed(api: Running) -> None:
     stream.close()
 
 
-def test_a_shipped_mission_is_read_by_its_name() -> None:
-    mission = mission_local.read_mission("pipes")
-    assert (mission["name"], len(mission["waypoints"])) == ("pipes", 7)
+SEEN = {"position_m": [1.0, 2.0, 0.7], "rtt_s": 0.09, "guard": "TRACK", "cause": "fresh command"}
+OLD = {**SEEN, "age_s": 3.2, "guard_for_s": None, "next_step": "wait"}
+NEW = {**SEEN, "age_s": 0.02, "guard_for_s": 4.5, "next_step": "the robot flies"}
+
+
+@pytest.mark.parametrize(
+    ("seen", "cloud_age", "lines"),
+    [
+        (OLD, 0.1, ["robot not heard for 3.2 s (guard TRACK then); cloud heard 0.1 s ago",
+                    "last seen at (1.00, 2.00, 0.70) m: fresh command", "next: wait"]),
+        (NEW, 0.02, ["robot at (1.00, 2.00, 0.70) m, seen 0.02 s ago, round trip 90 ms",
+                     "guard TRACK for 4.5 s: fresh command", "next: the robot flies"]),
+        (None, None, ["no telemetry from the robot yet; is the link up? cloud heard never"]),
+    ],
+    ids=["not heard", "heard", "never heard"],
+)  # fmt: skip
+def test_old_values_of_the_robot_are_marked_as_old(
+    seen: object,
+    cloud_age: object,
+    lines: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Printed,
+) -> None:
+    state = {"mission": None, "queue": [], "seen": seen, "cloud_age_s": cloud_age}
+    monkeypatch.setattr(Api, "get", lambda api, path: state)
+    assert main(["mission", "status", "--api", "unix:there"]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == lines
+
+
+NAME = "far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"
+SHOWN = r"far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"
+
+
+def harmless(said: str) -> bool:
+    """Check that a text shows the name without control characters."""
+    return SHOWN in said and all(c.isprintable() or c == "\n" for c in said)
+
+
+@pytest.fixture
+def forged() -> Iterator[Running]:
+    """An API whose journal holds a name that controls terminals; the API itself refuses it."""
+    with running(unix=True) as one:
+        made = one.bridge.submit(lambda service, now_ns: service.create(Order(PLAN, NAME), now_ns))
+        made.result(10.0)
+        yield one
+
+
+def test_a_missions_name_is_shown_without_effect(forged: Running, capsys: Printed) -> None:
+    for words in ("list", "status", "status m1", "hold", "cancel"):
+        main(["mission", *words.split(), "--api", forged.url])
+        said = capsys.readouterr().out
+        assert harmless(said)
+        assert [line for line in said.splitlines() if line.startswith("m9")] == []
+    for form, read in (("json", json.loads), ("yaml", yaml.safe_load)):
+        assert main(["mission", "list", "--api", forged.url, "-o", form]) == 0
+        said = capsys.readouterr().out
+        assert [c for c in said if (c != "\n" and ord(c) < 32) or 127 <= ord(c) < 160] == []
+        assert read(said)["missions"][0]["name"] == NAME
+    with pytest.raises(BadInputError) as refused:
+        forged.post_local("/v1/missions", {NAME: 2, "waypoints": [{"position_m": [99.0, 0, 1]}]})
+    assert harmless(str(refused.value))
+
+
+def test_events_verdicts_and_pods_are_shown_without_effect(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: Printed
+) -> None:
+    log = folder / "termination-log"
+    log.touch()
+    monkeypatch.setattr(command, "TERMINATION_LOG", log)
+    event = {"id": 1, "mission": NAME, "time_s": 1.0, "text": NAME}
+    failure = {"code": NAME, "text": NAME}
+    verdict = {"outcome": NAME, "exit_code": 1, "failures": [failure]}
+    posted = {"id": NAME, "state": NAME, "waypoints": 1}
+    monkeypatch.setattr(Api, "post", lambda api, path, body=None: posted)
+    monkeypatch.setattr(Api, "get", lambda api, path: {"events": [event], "verdict": verdict})
+    assert main(["mission", "fly", "--mission", "pipes", "--api", "unix:there"]) == 1
+    assert main(["mission", "run", "pipes", "--api", "unix:there"]) == 1
+    assert main(["mission", "logs", "m1", "--api", "unix:there"]) == 0
+    for said, lines in ((capsys.readouterr().out, 7), (log.read_text(), 1)):
+        assert (len(said.splitlines()), harmless(said)) == (lines, True)
+    job = JobStatus("job-1", "uid", "failed", "now", 1, NAME)
+    monkeypatch.setattr(command, "_release", lambda options: None)
+    monkeypatch.setattr(jobs, "list_jobs", lambda release: [job])
+    monkeypatch.setattr(jobs, "logs", lambda release, name: [NAME])
+    for verb, lines in (("list", 2), ("logs", 1)):
+        assert main(["mission", verb, "-n", "demo"]) == 0
+        said = capsys.readouterr().out
+        assert (len(said.splitlines()), harmless(said)) == (lines, True)
+
+
+@pytest.mark.parametrize("verb", ["status", "cancel", "logs"])
+def test_an_invalid_id_is_no_mission(verb: str, forged: Running, capsys: Printed) -> None:
+    for given in ("\x1b[31m", "m1?x", "m 1", "..", "a/b", "tür", "\udcff", "%", "m1#"):
+        assert main(["mission", verb, given, "--api", forged.url]) == 5
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.isprintable()
+        shown = {"a/b": "Not Found", "\udcff": "no mission '\ufffd'"}
+        assert shown.get(given, f"no mission '{escape(given)}'") in line
+
+
+def test_left_out_events_are_counted(forged: Running, capsys: Printed) -> None:
+    mission = forged.flight.teleop.book.find("m1")
+    for _ in range(EVENTS):
+        noted = forged.bridge.submit(lambda service, _: service.book.note(mission, "goto", "to"))
+        noted.result(10.0)
+    left_out = mission.happened.total() - EVENTS
+    for words in ("status", "logs"):
+        assert main(["mission", words, "m1", "--api", forged.url]) == 0
+        said = capsys.readouterr().out
+        assert f"m1  {left_out} earlier events are not shown\n" in said
+        assert said.count("\nm1 ") >= EVENTS

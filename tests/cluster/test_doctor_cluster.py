@@ -25,7 +25,7 @@ CHART = Path(__file__).resolve().parents[2] / "charts" / "cloudrc" / "Chart.yaml
 @pytest.fixture(autouse=True)
 def programs(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Make only these programs available; skip slow checks that are not about a cluster."""
-    for name in ("mujoco_steps", "udp_loopback", "timer", "graphics"):
+    for name in ("mujoco_steps", "udp_loopback", "timer"):
         monkeypatch.setattr(checks, name, lambda name=name: checks.Check(name, "ok", ""))
     found = {"helm", "kubectl"}
     monkeypatch.setattr(shutil, "which", lambda name: f"/nowhere/{name}" if name in found else None)

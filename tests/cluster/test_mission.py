@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from cloudrc.cli import mission_cluster
+from cloudrc.cli import mission as command
 from cloudrc.cli.main import main
 from cloudrc.cluster import jobs
 from cloudrc.cluster.client import Release
@@ -184,7 +184,7 @@ def test_run_waits_until_the_release_is_ready(lands: FakeApi, capsys: Printed) -
     assert "container cloud is not ready yet" in capsys.readouterr().out
     (job,) = made(lands)
     plan = lands.get("configmaps", job["metadata"]["name"])["data"]["mission.yaml"]
-    assert json.loads(plan) == mission_cluster.read_mission("pipes")
+    assert json.loads(plan) == command.read_mission("pipes")
 
 
 def test_the_wait_for_a_release_has_a_timeout(running: FakeApi, capsys: Printed) -> None:

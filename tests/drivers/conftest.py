@@ -71,6 +71,17 @@ def ages_at_hold(recording: Recording) -> list[float]:
     return ages
 
 
+WITHOUT_PAGE = """
+import sys
+from cloudrc.cli.main import main
+from cloudrc.report import write
+whole = write.write_report
+write.write_report = lambda *given, **more: whole(*given, **(more | {"page": False}))
+sys.exit(main(sys.argv[1:]))
+"""
+FAST = [sys.executable, "-c", WITHOUT_PAGE]
+"""`cloudrc` that writes no page with figures, which takes longer than a short flight."""
+
 LIMIT = 30.0
 TOKEN = "operator-token-of-the-tests"
 KEY = bytes(range(100, 132))
@@ -83,10 +94,11 @@ waypoints:
 
 
 class Release:
-    """A release without its link: three processes, a journal, an API."""
+    """A release without its link: three processes, a journal, an API; some ends record."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *recorded: str) -> None:
         self.folder, self.running, self.all = folder, {}, []
+        self.recorded = recorded
         self.world, self.cloud = (f"127.0.0.1:{port}" for port in free_ports(2))
         (folder / "config.yaml").write_text(dump(load_experiment("paper")))
         (folder / "key").write_bytes(KEY)
@@ -106,7 +118,8 @@ class Release:
                        "--audit", "audit.jsonl", "--journal", "journal/missions"],
         }  # fmt: skip
         (self.folder / "api.json").unlink(missing_ok=True) if name == "teleop" else None
-        self.running[name] = self.run(name, "--config", "config.yaml", *flags[name])
+        record = ["--record", f"{name}.mcap"] if name in self.recorded else []
+        self.running[name] = self.run(name, "--config", "config.yaml", *flags[name], *record)
 
     def run(self, *words: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "cloudrc", *words]
@@ -122,6 +135,12 @@ class Release:
         for name in names:
             self.running[name].kill()
             self.running[name].communicate()
+
+    def freeze(self, name: str, duration: float) -> None:
+        """Let a process stand still for `duration` [s]."""
+        self.running[name].send_signal(signal.SIGSTOP)
+        time.sleep(duration)
+        self.running[name].send_signal(signal.SIGCONT)
 
     def end(self) -> None:
         for process in self.all:

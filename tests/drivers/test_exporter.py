@@ -178,22 +178,25 @@ def test_a_record_costs_less_than_a_microsecond(end: str, flight: Flight) -> Non
 
 
 @pytest.mark.parametrize(
-    ("text", "counts"),
+    ("file", "text", "counts"),
     [
-        ("usage_usec 4402130\nnr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n",
+        ("cpu.stat", "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n",
          [120, 17, pytest.approx(1.25)]),
-        ("usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),
-        ("", []),
-        (None, []),
+        ("cpu,cpuacct/cpu.stat", "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n",
+         [4, 2, pytest.approx(0.5)]),
+        ("cpu.stat", "usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),
+        ("cpu.stat", "", []),
+        ("cpu.stat", None, []),
     ],
-    ids=["limited", "unlimited", "empty", "missing"],
+    ids=["limited", "version 1", "unlimited", "empty", "missing"],
 )  # fmt: skip
 def test_throttling_is_read_from_the_kernel(
-    text: str | None, counts: list[float], tmp_path: Path
+    file: str, text: str | None, counts: list[float], tmp_path: Path
 ) -> None:
     if text is not None:
-        (tmp_path / "cpu.stat").write_text(text)
-    read = read_throttling(tmp_path / "cpu.stat")
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text(text)
+    read = read_throttling(tmp_path)
     assert [value for reading in read.values() for value in dict(reading).values()] == counts
 
 

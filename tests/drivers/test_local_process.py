@@ -1,7 +1,8 @@
-"""Local mode with real processes that are interrupted, killed or stopped."""
+"""Local mode with real processes that are interrupted, killed or stopped; its operator and link."""
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -9,26 +10,36 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from cloudrc.drivers import local as flights
+from cloudrc.drivers import local
+from cloudrc.record.columns import Recording
 from tests.conftest import nightly
+from tests.drivers.conftest import FAST, WITHOUT_PAGE
 
 pytestmark = pytest.mark.process
 
 ENDS = ("world", "cloud")
 FLOWN = (0, 6)
 """Exit codes of a finished run, in real time or not: the machine may be busy."""
-HOVER = ["hover", "--mode", "local", "--set", "mission.waypoints.0.dwell_s={dwell}"]
+COMMAND = [sys.executable, "-m", "cloudrc"]
+WITHOUT_API = """
+from cloudrc.cli import extras
+extras.EXTRAS["api"] = ("fastapi_is_not_here",)
+"""
 
 
-def start(folder: Path, *settings: str, dwell: float = 20.0) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "cloudrc", "run", *HOVER, "--out", str(folder)]
-    command[-3] = command[-3].format(dwell=dwell)
-    for setting in settings:
-        command += ["--set", setting]
+def start(
+    folder: Path, *settings: str, dwell: float = 20.0, command: list[str] = FAST
+) -> subprocess.Popen[str]:
+    words = ["run", "hover", "--mode", "local", "--out", str(folder)]
+    for setting in (f"mission.waypoints.0.dwell_s={dwell}", *settings):
+        words += ["--set", setting]
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+    return subprocess.Popen(
+        [*command, *words], stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
 
 
 def children(parent: int) -> dict[str, int]:
@@ -64,19 +75,24 @@ def alive(pid: int) -> bool:
     return True
 
 
+def wait_until_ended(pids: dict[str, int], limit: float) -> None:
+    """Wait until all processes have ended, at most `limit` [s]."""
+    until = time.monotonic() + limit
+    while any(alive(pid) for pid in pids.values()):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, *nightly(signal.SIGTERM, signal.SIGHUP)])
 def test_ctrl_c_ends_all_processes_in_2_s_and_leaves_a_report(tmp_path, how):
-    run = start(tmp_path / "run")
+    run = start(tmp_path / "run", command=COMMAND)
     pids = wait_until_flying(run)
     assert set(pids) == {"relay", "world", "teleop", "cloud"}
     words = Path(f"/proc/{pids['world']}/cmdline").read_text().split("\0")
     (key,) = (Path(word.removeprefix("--key=")) for word in words if word.startswith("--key="))
     assert key.exists()
     os.kill(run.pid, how)
-    asked = time.monotonic()
-    while any(alive(pid) for pid in pids.values()):
-        assert time.monotonic() - asked < 2.0
-        time.sleep(0.02)
+    wait_until_ended(pids, 2.0)
     run.communicate(timeout=60)
     assert run.returncode == 130
     assert report(tmp_path / "run")["verdict"] == "interrupted"
@@ -99,75 +115,48 @@ def test_a_process_that_dies_ends_the_run_and_is_named(tmp_path, victim):
     assert report(tmp_path / "run")["verdict"] in ("interrupted", "invalid")
 
 
-def test_the_processes_end_when_their_supervisor_is_killed(tmp_path):
-    run = start(tmp_path / "run")
-    pids = wait_until_flying(run)
-    run.kill()
-    run.communicate()
-    until = time.monotonic() + 3.0
-    while any(alive(pid) for pid in pids.values()):
-        assert time.monotonic() < until
-        time.sleep(0.05)
-
-
-def operate(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    verb, *rest = words
-    command = [sys.executable, "-m", "cloudrc", "mission", verb, "--run", str(folder), *rest]
-    return subprocess.run(command, capture_output=True, text=True)
-
-
-def test_the_operator_stops_moves_and_cancels_a_run_that_flies(tmp_path):
+def test_a_killed_supervisor_ends_all_and_leaves_a_recording(tmp_path):
     folder = tmp_path / "run"
     run = start(folder)
-    wait_until_flying(run)
-    assert json.loads((folder / "api.json").read_text())["url"] == flights.under_way()[folder]
-    assert operate(folder, "run", "hover").returncode == 5  # a mission already flies
-    assert "held" in operate(folder, "hold").stdout
-    assert operate(folder, "goto", "0", "0", "99").returncode == 2
-    assert operate(folder, "goto", "0.3", "0", "0.8").returncode == 0
-    time.sleep(3.0)
-    status = json.loads(operate(folder, "status", "-o", "json").stdout)
-    assert status["mission"]["state"] == "held"
-    assert status["seen"]["position_m"] == pytest.approx([0.3, 0.0, 0.8], abs=0.1)
-    assert "flying" in operate(folder, "resume").stdout
-    anywhere = [sys.executable, "-m", "cloudrc", "mission", "status", "-o", "json"]
-    found = subprocess.run(anywhere, capture_output=True, text=True, cwd="/")
-    assert found.stderr == f"cloudrc: using the run in {folder}\n"
-    assert json.loads(found.stdout)["mission"]["state"] == "flying"
-    assert "INTERRUPTED" in operate(folder, "cancel").stdout
-    run.communicate(timeout=60)
-    assert run.returncode == 130
-    assert report(folder)["failures"][0]["code"] == "cancelled"
-    audit = [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
-    said = [(line["action"].rpartition("/")[2], line["status"], line["client"]) for line in audit]
-    done = [("missions", 409), ("hold", 200), ("goto", 422), ("goto", 200), ("resume", 200)]
-    assert said[:5] == [(action, status, "local") for action, status in done]
-    assert said[5][0] == "cancel"
-    assert flights.under_way() == {}
+    pids = wait_until_flying(run)
+    time.sleep(1.0)
+    run.kill()
+    run.communicate()
+    wait_until_ended(pids, 5.0)
+    assert not (folder / "mission.mcap").exists()
+    subprocess.run([*COMMAND, "report", str(folder)], check=False, capture_output=True)
+    assert report(folder)["numbers"]["commands_applied"]["value"] > 10
+    assert (folder / "mission.mcap").exists()
+    assert (folder / "report.html").exists()
 
 
-def test_without_fastapi_it_flies_without_an_api_and_says_so(tmp_path):
-    program = (
-        "import sys; from cloudrc.cli import extras; "
-        "extras.EXTRAS['api'] = ('fastapi_is_not_here',); "
-        "from cloudrc.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    )
-    words = ["run", *HOVER, "--out", str(tmp_path / "run")]
-    words[-3] = words[-3].format(dwell=0.1)
-    command = [sys.executable, "-c", program, *words]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=90)
-    assert run.returncode == 0
-    assert "no operator's API in this run" in run.stderr
-    assert "pip install 'cloudrc[api]'" in run.stderr
+@pytest.mark.parametrize("victim", ["relay", *nightly("teleop", "world", "cloud")])
+def test_a_supervisor_that_stood_still_still_sees_who_hangs(tmp_path, victim):
+    run = start(tmp_path / "run", dwell=30.0)
+    pids = wait_until_flying(run)
+    os.kill(run.pid, signal.SIGSTOP)
+    time.sleep(local.SILENCE_LIMIT + 1.0)
+    os.kill(run.pid, signal.SIGCONT)
+    time.sleep(1.0)
+    assert all(alive(pid) for pid in pids.values()), "the flight goes on"
+    os.kill(pids[victim], signal.SIGSTOP)
+    wait_until_ended(pids, 10.0)
+    _, errors = run.communicate(timeout=60)
+    assert run.returncode == 4
+    assert f"the {victim} process was silent" in errors
+    notes = " ".join(report(tmp_path / "run")["notes"])
+    stood = re.findall(r"supervisor of this run stood still for ([\d.]+) s", notes)
+    assert max(map(float, stood)) >= local.SILENCE_LIMIT + 1.0
 
 
 PREDICTOR = '''
-"""A predictor that {does}."""
+"""A predictor that is slow and talks."""
 import time
 from cloudrc.cloud.predictors import Predictor
 class Odd(Predictor):
     def predict(self, odometry, horizon):
-        {statement}
+        print("hello")
+        time.sleep(0.05)
         return odometry
 def build() -> Predictor:
     """Make it."""
@@ -175,14 +164,18 @@ def build() -> Predictor:
 '''
 
 
-def predictor(folder: Path, does: str, statement: str) -> str:
-    """Write such a plug-in; return the setting that selects it."""
-    (folder / "odd.py").write_text(PREDICTOR.format(does=does, statement=statement))
-    return f"cloud.predictor={folder}/odd.py"
-
-
-def test_a_slow_predictor_is_reported_and_the_flight_continues(tmp_path):
-    run = start(tmp_path / "run", predictor(tmp_path, "is slow", "time.sleep(0.05)"), dwell=2.0)
+def test_a_late_link_a_slow_plug_in_and_no_fastapi_end_no_run(tmp_path):
+    """Before the link is up world has no telemetry to tell of, but it is alive."""
+    (tmp_path / "odd.py").write_text(PREDICTOR)
+    late = f"blackouts=[{{start_s: 0, duration_s: {local.SILENCE_LIMIT + 1.0}}}]"
+    links = (f"link.uplink.{late}", f"link.downlink.{late}")
+    command = [sys.executable, "-c", WITHOUT_API + WITHOUT_PAGE]
+    run = start(
+        tmp_path / "run",
+        *(*links, f"cloud.predictor={tmp_path}/odd.py"),
+        dwell=2.0,
+        command=command,
+    )
     output, errors = run.communicate(timeout=90)
     document = report(tmp_path / "run")
     assert run.returncode in FLOWN, errors
@@ -190,67 +183,102 @@ def test_a_slow_predictor_is_reported_and_the_flight_continues(tmp_path):
     assert document["numbers"]["missed_periods"]["value"] > 100
     assert "a plug-in is slow" in output
     assert any("a plug-in is slow" in note for note in document["notes"])
-
-
-def test_what_a_plug_in_prints_goes_to_the_log(tmp_path):
-    run = start(tmp_path / "run", predictor(tmp_path, "talks", "print('hello')"), dwell=0.5)
-    _, errors = run.communicate(timeout=60)
-    assert run.returncode in FLOWN, errors
     assert "hello" in (tmp_path / "run" / "cloud.log").read_text()
+    assert "no operator's API in this run" in errors
+    assert "pip install 'cloudrc[api]'" in errors
 
 
-@pytest.mark.parametrize("victim", ["relay", *nightly("teleop", "world", "cloud")])
-def test_a_process_that_hangs_ends_the_run_and_is_named(tmp_path, victim):
-    run = start(tmp_path / "run")
-    pids = wait_until_flying(run)
-    os.kill(pids[victim], signal.SIGSTOP)
-    stopped = time.monotonic()
-    while any(alive(pid) for pid in pids.values()):
-        assert time.monotonic() - stopped < 10.0
-        time.sleep(0.05)
-    _, errors = run.communicate(timeout=60)
-    assert run.returncode == 4
-    assert f"the {victim} process was silent" in errors
+WITHIN = 0.005
+"""Tolerance of a median one-way delay beside other tests [s]."""
+LEGS = (0.5, 8.9), (9.2, 9.95), (10.2, 12.0)
+"""Intervals of the profile `handover`: before the fading, during it, and in the next cell [s]."""
+EDGE = 0.01
+"""Uncertainty of the start of a time line, which is the next datagram [s]."""
 
 
-def test_a_link_that_comes_up_late_ends_no_run(tmp_path):
-    """Without a session world has no telemetry to tell of, but it is alive."""
-    late = f"blackouts=[{{start_s: 0, duration_s: {flights.SILENCE_LIMIT + 1.0}}}]"
-    run = start(tmp_path / "run", f"link.uplink.{late}", f"link.downlink.{late}")
-    wait_until_flying(run)
-    os.kill(run.pid, signal.SIGINT)
-    run.communicate(timeout=60)
-    assert run.returncode == 130
+def call(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*COMMAND, *words, "--run", str(folder)], capture_output=True, text=True)
 
 
-def test_a_supervisor_that_stood_still_takes_the_flight_up_again(tmp_path):
-    run = start(tmp_path / "run", dwell=8.0)
-    wait_until_flying(run)
-    os.kill(run.pid, signal.SIGSTOP)
-    time.sleep(flights.SILENCE_LIMIT + 1.0)
-    os.kill(run.pid, signal.SIGCONT)
-    _, errors = run.communicate(timeout=60)
-    assert run.returncode in FLOWN, errors
-    (note,) = (note for note in report(tmp_path / "run")["notes"] if "supervisor" in note)
-    assert "stood still for 6." in note
+def set_link(folder: Path, *words: str) -> float:
+    """Change the link; return how long it took to be in force [s]."""
+    return json.loads(call(folder, "link", "set", *words, "-o", "json").stdout)["seconds"]
 
 
-def test_a_run_whose_supervisor_was_killed_gets_a_report(tmp_path):
+def operate(folder: Path) -> None:
+    """Hold, move and resume the mission of a run, found by its folder and from anywhere."""
+    assert call(folder, "mission", "run", "hover").returncode == 5  # a mission already flies
+    assert "held" in call(folder, "mission", "hold").stdout
+    assert call(folder, "mission", "goto", "0", "0", "99").returncode == 2
+    assert call(folder, "mission", "goto", "0.3", "0", "0.8").returncode == 0
+    time.sleep(3.0)
+    status = json.loads(call(folder, "mission", "status", "-o", "json").stdout)
+    assert status["mission"]["state"] == "held"
+    assert status["seen"]["position_m"] == pytest.approx([0.3, 0.0, 0.8], abs=0.1)
+    assert "flying" in call(folder, "mission", "resume").stdout
+    anywhere = [*COMMAND, "mission", "status", "-o", "json"]
+    found = subprocess.run(anywhere, capture_output=True, text=True, cwd="/")
+    assert found.stderr == f"cloudrc: using the run in {folder}\n"
+    assert json.loads(found.stdout)["mission"]["state"] == "flying"
+
+
+def test_an_operator_steers_a_run_and_sets_its_link(tmp_path, figure):
     folder = tmp_path / "run"
-    run = start(folder)
-    pids = wait_until_flying(run)
-    time.sleep(1.0)
-    run.kill()
-    run.communicate()
-    until = time.monotonic() + 3.0
-    while any(alive(pid) for pid in pids.values()) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert not (folder / "mission.mcap").exists()
-    command = [sys.executable, "-m", "cloudrc", "report", str(folder)]
-    subprocess.run(command, check=False, capture_output=True)
-    assert report(folder)["numbers"]["commands_applied"]["value"] > 10
-    assert (folder / "mission.mcap").exists()
-    assert (folder / "report.html").exists()
+    run = start(folder, dwell=30.0, command=COMMAND)
+    wait_until_flying(run)
+    assert json.loads((folder / "api.json").read_text())["url"] == local.under_way()[folder]
+    time.sleep(2.0)
+    took = [set_link(folder, "downlink.delay_ms=120", "downlink.jitter_ms=0")]
+    time.sleep(2.0)
+    took.append(set_link(folder, "--profile", "handover"))
+    changed = time.monotonic()
+    operate(folder)
+    time.sleep(max(0.0, changed + LEGS[-1][1] + 0.5 - time.monotonic()))
+    assert "INTERRUPTED" in call(folder, "mission", "cancel").stdout
+    output, _ = run.communicate(timeout=60)
+    assert run.returncode == 130
+    assert report(folder)["failures"][0]["code"] == "cancelled"
+    audit = [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
+    said = [(line["action"].rpartition("/")[2], line["status"], line["client"]) for line in audit]
+    done = [("missions", 409), ("hold", 200), ("goto", 422), ("goto", 200), ("resume", 200)]
+    assert said[:5] == [(action, status, "local") for action, status in done]
+    assert said[5][0] == "cancel"
+    assert local.under_way() == {}
+
+    assert "link: downlink 120 ms (downlink.delay_ms=120, downlink.jitter_ms=0)" in output
+    assert not (folder / "link").exists()
+    figure("link set, local: in force after", min(took), "<=", 1.0, "s")
+    assert max(took) < 2.0, "on a busy machine"
+    numbers = report(folder)["numbers"]
+    for way in ("uplink", "downlink"):
+        late = {name: numbers[f"release_error_{name}_{way}"] for name in ("p50", "p99", "p999")}
+        assert 0.0 < late["p50"]["value"] <= late["p99"]["value"] <= late["p999"]["value"]
+        assert late["p50"]["value"] < WITHIN
+        assert numbers[f"released_early_{way}"] == {"value": 0.0, "unit": "1"}
+        assert numbers[f"relay_overflow_{way}"]["value"] == 0.0
+    check_delays(Recording.read(folder / "mission.mcap"))
+    page = (folder / "report.html").read_text()
+    assert "Triangles: the link was set in flight (1: downlink.delay_ms=120" in page
+
+
+def check_delays(recording: Recording) -> None:
+    """Check that the delays of the downlink follow its changes."""
+    link, delays = recording["/link"], recording["/downlink_delay"]["delay"]
+    told = {cause: stamp - age * 1e9 for cause, stamp, age, uplink in
+            zip(link["cause"], link["stamp_ns"], link["age"], link["uplink"], strict=True)
+            if not uplink}  # fmt: skip
+    first, second = told["downlink.delay_ms=120, downlink.jitter_ms=0"], told["profile handover"]
+    sent_ns = recording["/downlink_delay"]["stamp_ns"] - delays * 1e9
+    assert np.median(delays[sent_ns < first]) == pytest.approx(0.045, abs=WITHIN)
+    between = (sent_ns > first + 1e8) & (sent_ns < second)
+    assert np.median(delays[between]) == pytest.approx(0.120, abs=WITHIN)
+    sent = (sent_ns - second) * 1e-9
+    steady, fading, after = (np.median(delays[(sent > a) & (sent < b)]) for a, b in LEGS)
+    assert steady == pytest.approx(0.025, abs=WITHIN)
+    assert 0.045 < fading < 0.080, "50 ms, and more to keep the order"
+    assert after == pytest.approx(0.035, abs=WITHIN)
+    dark = (sent > 10.0 + EDGE) & (sent < 10.05 - EDGE)
+    assert not dark.any(), "what was sent while the robot was handed over never arrives"
 
 
 @pytest.mark.full

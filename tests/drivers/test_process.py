@@ -30,6 +30,7 @@ from cloudrc.drivers.process import (
     in_words,
     to_line,
 )
+from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
 from cloudrc.link.relay import ReleaseErrors
 from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
@@ -90,6 +91,25 @@ def test_it_ends_if_its_supervisor_was_killed_before_its_start(tmp_path: Path) -
     os.close(orphan)
     assert ended
     assert (tmp_path / "relay.log").read_text().startswith("cloudrc relay: ")  # as after a signal
+
+
+def test_cloud_ends_once_nothing_flies_or_after_its_last_word() -> None:
+    asked = flies = False
+    now_ns = 1_000_000_000
+    ends = LastWord(lambda: asked, lambda: flies, lambda: now_ns)
+    assert not ends()
+    flies = True
+    assert not ends()
+    now_ns += 10_000_000_000
+    asked = True
+    assert not ends()
+    now_ns += LAST_WORD_NS - 1
+    assert not ends()
+    flies = False
+    assert ends()
+    flies = True
+    now_ns += 1
+    assert ends()
 
 
 def test_processes_of_one_machine_share_their_clock() -> None:

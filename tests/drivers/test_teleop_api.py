@@ -19,8 +19,9 @@ FILES = 256
 """Limit of open files that the process starts with."""
 
 
-@pytest.fixture
-def address(tmp_path):
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    tmp_path = tmp_path_factory.mktemp("teleop")
     (tmp_path / "config.yaml").write_text(dump(load_experiment("hover")))
     (tmp_path / "operator").write_text(TOKEN)
     (tmp_path / "operator").chmod(0o644)

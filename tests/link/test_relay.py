@@ -40,6 +40,7 @@ from cloudrc.link.relay import (
     tighten_slack,
 )
 from cloudrc.tunnel.codec import Kind, encode_header
+from tests.drivers.conftest import FAST
 from tools.bench_link.flow import EPOCH, SEED, SIZE, Flow, judge, run_flow, since_first_ns
 from tools.bench_link.relays import fifo_allowed, measure_profiles, ours, profiles_of
 
@@ -361,7 +362,7 @@ def test_5000_strangers_a_second_cost_no_hold(tmp_path: Path) -> None:
     holds = []
     for attempt in range(TRIES):
         folder = tmp_path / str(attempt)
-        words = [sys.executable, "-m", "cloudrc", "run", "hover", "--mode", "local"]
+        words = [*FAST, "run", "hover", "--mode", "local"]
         words += ["--set", "mission.waypoints.0.dwell_s=4", "--out", str(folder)]
         run = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         assert run.stdout is not None

@@ -1,31 +1,38 @@
-"""World, cloud and teleop as processes that are killed in flight."""
+"""World, cloud and teleop as processes that are killed, frozen or ended in flight."""
 
 import json
+import resource
 import signal
 import time
 
+import numpy as np
 import pytest
 
 from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.drivers.teleop import UnixPeer
-from cloudrc.teleop.store import open_store
+from cloudrc.record.columns import Recording
+from cloudrc.record.reader import recover
 from cloudrc.teleop.wire import ALARM, encode
 from tests.conftest import nightly
-from tests.drivers.conftest import LIMIT, TOKEN, Release
+from tests.drivers.conftest import LIMIT, TOKEN, Release, ages_at_hold
 
 pytestmark = pytest.mark.process
+PAGE = 4096
+"""Room that is left for the recording [bytes]; the note of its end fits."""
 
 
 @pytest.fixture
 def release(tmp_path):
-    one = Release(tmp_path)
+    one = Release(tmp_path, "world")
     yield one
     one.end()
 
 
 @pytest.mark.parametrize("killed", [("cloud", "teleop"), *nightly(("teleop",), ("cloud",))])
 def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
+    """Before, cloud stands still: nothing that it has computed before is flown."""
     release.fly()
+    release.freeze("cloud", 1.0)
     release.kill(*killed)
     for name in killed:
         release.start(name)
@@ -38,6 +45,12 @@ def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     assert names.count("started") == 1
     assert names.count("resumed") == ("teleop" in killed)
     assert ("new_session" in names) == (killed == ("cloud",))  # a new teleop knows no other session
+    release.stop()
+    flown = Recording.read(release.folder / "world.mcap")
+    ages, applied = ages_at_hold(flown), flown["/command_applied"]
+    assert ages
+    assert all(0.25 < age <= 0.252 + 1e-9 for age in ages)
+    assert (applied["stamp_ns"] - applied["basis_stamp_ns"]).max() <= 252_000_000
 
 
 def test_a_killed_world_ends_the_job_with_world_restarted(release):
@@ -49,7 +62,7 @@ def test_a_killed_world_ends_the_job_with_world_restarted(release):
     assert "world_restarted" in out.splitlines()[-1]
 
 
-def test_a_second_teleop_waits_for_the_journal_and_takes_over(release):
+def test_an_ended_teleop_holds_and_its_waiting_successor_resumes(release):
     release.fly()
     first = release.running["teleop"]
     old = (release.folder / "api.json").read_text()
@@ -61,24 +74,12 @@ def test_a_second_teleop_waits_for_the_journal_and_takes_over(release):
         Api(url, lambda: TOKEN).get("/v1/state")
     first.send_signal(signal.SIGTERM)
     first.communicate(timeout=2.0)
+    assert first.returncode == 0
     release.until(lambda: release.mission()["state"] == "done")
-
-
-def test_an_ended_teleop_holds_and_its_successor_resumes(release):
-    release.fly()
-    teleop = release.running["teleop"]
-    began = time.monotonic()
-    teleop.send_signal(signal.SIGTERM)
-    teleop.communicate(timeout=10)
-    assert time.monotonic() - began < 2.0
-    assert teleop.returncode == 0
-    store = open_store(release.folder / "journal" / "missions", b"")
-    last = store.events_after(0)[-1]
-    store.close()
-    assert (last["event"], "paused by shutdown" in last["text"]) == ("paused", True)
-    release.start("teleop")
-    release.until(lambda: release.mission()["state"] == "done")
-    assert [reached["waypoint"] for reached in release.mission()["reached"]] == [0, 1, 2]
+    mission = release.ask(f"/v1/missions/{release.mission()['id']}")
+    assert [reached["waypoint"] for reached in mission["reached"]] == [0, 1, 2]
+    paused = [event["text"] for event in mission["events"] if event["event"] == "paused"]
+    assert ["paused by shutdown" in text for text in paused] == [True]
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
@@ -115,6 +116,49 @@ def test_an_emergency_stop_passes_while_teleop_waits_for_disk(release):
     assert failures[0]["code"] == "guard_stopped"  # teleop itself never got the request
 
 
-def test_all_end_within_two_seconds_of_sigterm(release):
+def test_a_pod_that_ends_in_flight_holds_the_robot_by_its_word(release):
+    """Cloud gets the signal first, when teleop has not sent its hold yet."""
     release.fly()
-    assert max(release.stop().values()) < 2.0
+    pod, asked = [release.running[name] for name in ("cloud", "teleop")], time.monotonic()
+    for process in pod:
+        process.send_signal(signal.SIGTERM)
+    for process in pod:
+        process.communicate(timeout=10)
+    assert time.monotonic() - asked < 2.0
+    assert [process.returncode for process in pod] == [0, 0]
+    time.sleep(0.5)  # without commands the robot also holds, after 0.25 s
+    world, asked = release.running["world"], time.monotonic()
+    world.send_signal(signal.SIGTERM)
+    said, _ = world.communicate(timeout=10)
+    assert time.monotonic() - asked < 2.0
+    assert [line for line in said.splitlines() if "HOLD" in line] == ["guard: HOLD, mission ended"]
+
+
+def finish(release):
+    """Wait for the mission's end; return world's recording."""
+    release.until(lambda: release.mission()["state"] == "done")
+    assert [each["waypoint"] for each in release.mission()["reached"]] == [0, 1, 2]
+    release.stop()
+    return Recording.read(release.folder / "world.mcap")
+
+
+@pytest.mark.full
+def test_a_frozen_world_skips_no_tick_and_slips(release):
+    release.fly()
+    release.freeze("world", 0.2)
+    flown = finish(release)
+    assert (np.diff(flown["/ground_truth"]["stamp_ns"]) == 10_000_000).all()
+    applied = flown["/command_applied"]
+    order = list(zip(applied["epoch"].tolist(), applied["counter"].tolist(), strict=True))
+    assert order == sorted(set(order))
+    assert flown["/lateness"]["slip_ns"][-1] >= 130_000_000
+
+
+@pytest.mark.full
+def test_a_full_disk_ends_the_recording_and_not_the_flight(release):
+    release.fly()
+    path, world = release.folder / "world.mcap", release.running["world"]
+    room = path.stat().st_size + PAGE
+    resource.prlimit(world.pid, resource.RLIMIT_FSIZE, (room, room))
+    assert "recording stopped" in finish(release).note
+    assert recover(path, release.folder / "mended.mcap").bytes_lost == 0

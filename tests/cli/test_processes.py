@@ -1,0 +1,304 @@
+"""World, cloud and relay as commands: flags, addresses, recordings, sizes, stopping at start."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+
+from cloudrc import assembly
+from cloudrc.cli import processes
+from cloudrc.cli.main import main
+from cloudrc.cli.processes import (
+    ipv4_addresses,
+    open_exporter,
+    open_peer,
+    open_recorder,
+    open_relay,
+    read_address,
+    read_profiles,
+    read_size,
+    resolve_address,
+    show_address,
+)
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.state import summary
+from cloudrc.link.verify.monitor import Asked, LinkMonitor, Load
+from cloudrc.record.columns import Recording
+from cloudrc.record.recorder import Recorder
+from cloudrc.records import MissionEvent
+from tests.record.conftest import MS, counted, world_records
+
+FREE = "127.0.0.1:9"
+ENDS = ("world", "cloud")
+END = ["--listen", FREE, "--peer", FREE]
+RELAY = ["--world-side", FREE, "--cloud-side", FREE, "--world", FREE, "--cloud", FREE]
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+Printed = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def key(tmp_path: Path) -> list[str]:
+    (tmp_path / "key").write_bytes(b"k" * 32)
+    (tmp_path / "key").chmod(0o600)
+    return ["--key", str(tmp_path / "key")]
+
+
+@pytest.fixture
+def taken() -> Iterator[str]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
+        udp.bind(("127.0.0.1", 0))
+        tcp.bind(udp.getsockname())
+        tcp.listen()
+        yield f"127.0.0.1:{udp.getsockname()[1]}"
+
+
+def run(command: str, key: list[str], *last: str) -> int:
+    """Run a process with usable flags; the last flags replace earlier ones."""
+    flags = RELAY if command == "relay" else [*END, *key]
+    return main([command, "--config", "hover", *flags, *last])
+
+
+@pytest.mark.parametrize("more", [[], ["--peer", FREE, "--route", "route"]])
+@pytest.mark.parametrize("end", ENDS)
+def test_an_end_has_a_peer_or_a_route(end: str, more: list[str], capsys: Printed) -> None:
+    assert main([end, "--config", "hover", "--listen", FREE, "--key", "key", *more]) == 2
+    assert "--peer" in capsys.readouterr().err
+
+
+# The process would close the socket at its end, but here the test process goes on.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize(
+    ("command", "flag", "code", "said"),
+    [
+        ("world", "--listen", 2, "--listen {}: cannot receive there: Address already in use; name"),
+        ("cloud", "--listen", 2, "--listen {}: cannot receive there: Address already in use; name"),
+        ("relay", "--world-side", 2, "--world-side {}: cannot receive there: Address already in"),
+        ("world", "--metrics", 3, "metrics cannot be served on {}: Address already in use; end"),
+    ],
+)
+def test_an_address_in_use_is_reported_with_its_flag(
+    command: str, flag: str, code: int, said: str, taken: str, key: list[str], capsys: Printed
+) -> None:
+    assert run(command, key, flag, taken) == code
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"cloudrc: error: {said.format(taken)}")
+
+
+def no_such_name(*asked: object) -> NoReturn:
+    raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+
+@pytest.mark.parametrize(
+    ("command", "flag"),
+    [("world", "--peer"), ("cloud", "--peer"), ("relay", "--world"), ("relay", "--cloud")],
+)
+def test_an_unresolvable_name_is_reported_at_the_start(
+    command: str, flag: str, key: list[str], monkeypatch: pytest.MonkeyPatch, capsys: Printed
+) -> None:
+    look_up = socket.getaddrinfo
+    monkeypatch.setattr(
+        socket, "getaddrinfo", lambda *a: no_such_name() if a[0] == "nowhere" else look_up(*a)
+    )
+    assert run(command, key, flag, "nowhere:7400") == 2
+    assert capsys.readouterr().err == (
+        f"cloudrc: error: {flag} nowhere:7400: nowhere cannot be resolved (Name or service not"
+        " known); name a host that has an IPv4 address, or the address itself\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [("127.0.0.1:7400", ("127.0.0.1", 7400)), ("[::1]:7400", ("::1", 7400)), ("[::]:1", ("::", 1))],
+)
+def test_an_address_of_ipv6_is_in_brackets(text: str, address: tuple[str, int]) -> None:
+    assert read_address(text) == address
+    assert show_address(address) == text
+    with pytest.raises(argparse.ArgumentTypeError, match=r"put an IPv6 address in brackets"):
+        read_address("::1:7400")
+
+
+def test_without_ipv6_all_addresses_are_those_of_ipv4(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*asked: object) -> None:
+        raise OSError("Address family not supported by protocol")
+
+    monkeypatch.setattr(socket, "socket", refuse)
+    assert read_address("[::]:7400") == ("0.0.0.0", 7400)
+
+
+def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def look_up(name: str, port: None, family: int, kind: int) -> list[tuple[Any, ...]]:
+        return [(family, kind, 17, "", ("::5", 0))] if family == socket.AF_INET6 else no_such_name()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "getaddrinfo", look_up)
+        with pytest.raises(OSError, match="IPv6 addresses alone, and a link is shaped over IPv4"):
+            ipv4_addresses("cloud")
+        assert resolve_address("--peer", ("cloud", 1), ("::1", 2)) == ("::5", 1)
+    with pytest.raises(BadInputError, match=r"cannot be resolved \(not a name"):
+        resolve_address("--peer", ("x" * 64 + ".test", 1))
+
+
+def test_the_peer_is_resolved_once_before_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The control loop once asked a name server for every datagram, and waited for it."""
+    asked: list[object] = []
+
+    def look_up(name: str, *rest: object) -> list[tuple[Any, ...]]:
+        asked.append(name)
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.9", 0))]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "getaddrinfo", look_up)
+        options = argparse.Namespace(listen=("127.0.0.1", 0), peer=("cloud", 7400), route=None)
+        peer = open_peer(options)
+    with peer.socket:
+        assert (peer.address, asked) == (("127.0.0.9", 7400), ["cloud"])
+
+
+# Here, too, the socket stays open after the command.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize("end", ENDS)
+def test_an_end_stopped_at_its_start_completes_its_recording(
+    end: str,
+    key: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Printed,
+) -> None:
+    """The first process of a container ignores signals without a handler."""
+    build = getattr(assembly, f"build_{end}")
+
+    def stop_and_build(*arguments: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return build(*arguments)
+
+    monkeypatch.setattr(assembly, f"build_{end}", stop_and_build)
+    record = tmp_path / "end.mcap"
+    (tmp_path / "key").chmod(0o644)
+    route = [end, "--config", "hover", "--route", str(tmp_path / "route"), *key]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        listen = f"127.0.0.1:{probe.getsockname()[1]}"
+    assert main([*route, "--listen", listen, "--record", str(record)]) == 0
+    assert record.read_bytes().endswith(MCAP_MAGIC)
+    errors = capsys.readouterr().err
+    assert f"warning: {tmp_path / 'key'} can be read by others: chmod 600" in errors
+    assert f"sends nothing until {tmp_path / 'route'} exists" in errors
+
+
+@pytest.mark.parametrize(
+    ("text", "bytes_"),
+    [("1Gi", 2**30), ("500M", 5e8), ("1.5Ki", 1536), ("4096", 4096), ("2k", 2e3), ("1m", 1e-3)]
+    + [(text, None) for text in ("", "1GB", "-1", "1 Gi", "nan")],
+)
+def test_sizes_are_read_as_in_kubernetes(text: str, bytes_: float | None) -> None:
+    if bytes_ is not None:
+        assert read_size(text) == bytes_
+        return
+    with pytest.raises(argparse.ArgumentTypeError, match="such as 500M or 1Gi"):
+        read_size(text)
+
+
+@pytest.mark.parametrize("elsewhere", [None, Path("sockets")])
+def test_cloud_with_a_teleop_process_exports_no_mission_metrics(elsewhere: Path | None) -> None:
+    options = argparse.Namespace(metrics=("127.0.0.1", 0), teleop=elsewhere)
+    exporter = open_exporter(options, "cloud")
+    assert exporter is not None
+    exporter.see([MissionEvent(0, "started", 0, "")])
+    assert ("cloudrc_mission_state" in exporter.text()) is (elsewhere is None)
+    exporter.close()
+
+
+def started(path: Path | None, size_max: float | None = None) -> Recorder:
+    options = argparse.Namespace(record=path, record_max=size_max)
+    return open_recorder(options, "world", b"id")
+
+
+def record(recorder: Recorder, seconds: int = 1) -> Recorder:
+    for start in range(0, 1000 * seconds, 500):
+        recorder.put(world_records(50, start * MS))
+        while recorder.drain():
+            pass
+        recorder.flush(sync=False)
+    return recorder
+
+
+def test_a_restart_keeps_the_recording_of_a_crash(tmp_path: Path) -> None:
+    path, before = tmp_path / "world.mcap", tmp_path / "world.before.mcap"
+    path.touch()  # an empty one is not kept
+    killed = record(started(path))
+    left = path.read_bytes()
+    again = started(path)
+    again.put(counted(3))
+    again.close()
+    assert before.read_bytes() == left
+    assert len(Recording.read(before)["/odometry"]) == 100
+    assert len(Recording.read(path)["/count"]) == 3
+    killed.close()
+    left = path.read_bytes()
+    started(path).close()
+    started(None).close()
+    assert before.read_bytes() == left, "only the previous one is kept"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_both_recordings_together_stay_within_the_limit(tmp_path: Path) -> None:
+    path, limit = tmp_path / "world.mcap", 200_000
+    for _ in range(3):
+        recorder = record(started(path, limit), 30)
+        recorder.close()
+        assert "the file has reached its size limit" in recorder.error
+        sizes = [each.stat().st_size for each in tmp_path.iterdir()]
+        assert sum(sizes) < limit + 2 * 16_000, "each recording ends with its open chunk"
+    assert len(sizes) == 2
+
+
+@pytest.mark.parametrize("key", ["trace", "table"])
+def test_a_trace_named_by_the_link_is_read_within_bounds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str
+) -> None:
+    kept: list[Load] = []
+
+    def begin(self: LinkMonitor, asked: Asked, path: Path | None, load: Load) -> None:
+        kept.append(load)
+
+    monkeypatch.setattr(LinkMonitor, "begin", begin)
+    options = argparse.Namespace(link=None, route=tmp_path / "route")
+    processes.link_monitor(options, load_experiment("paper"), uplink=False)
+    load, path, text = kept[0], tmp_path / "trace.csv", "time_s,delay_ms\n0,45\n1,50\n"
+    profile = {"uplink": {key: str(path), "distribution": "table" if key == "table" else "normal"}}
+    path.write_text(text)
+    assert load(profile)[0].trace or load(profile)[0].table
+    path.write_text(text + "\n" * processes.TRACE_MAX)
+    with pytest.raises(BadInputError, match="longer than 2097152 bytes; give a CSV file"):
+        load(profile)
+    profile["uplink"][key] = "/dev/null"  # an endless device would fill the memory
+    with pytest.raises(BadInputError, match="not a file; give a CSV file"):
+        load(profile)
+
+
+def test_the_requested_delay_of_a_relay_is_that_of_the_trace(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("time_s,delay_ms\n0,40\n5,90\n")
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}\n")
+    first = read_profiles(load_experiment(str(mine)))
+    delays = {way: summary(loaded.direction)["delay"] for way, loaded in first.items()}
+    assert delays == {"uplink": 0.04, "downlink": 0.025}
+
+
+def test_a_side_of_a_relay_that_cannot_reach_its_end_is_refused() -> None:
+    here = dict.fromkeys(("world_side", "cloud_side"), ("127.0.0.1", 0))
+    ends = {"world": ("198.51.100.7", 7400), "cloud": ("127.0.0.1", 7400)}
+    links = [LinkDirection(DirectionProfile(), 1, uplink) for uplink in (True, False)]
+    with pytest.raises(BadInputError, match="cannot reach --world from --world-side"):
+        open_relay(argparse.Namespace(**here, **ends), *links)
