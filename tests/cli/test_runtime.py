@@ -175,7 +175,6 @@ def test_the_peer_is_resolved_once_before_the_loop(
 
 # Here, too, the socket stays open after the command.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("end", ["world", "cloud"])
 def test_an_end_stopped_at_its_start_completes_its_recording(
     end: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
