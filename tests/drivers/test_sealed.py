@@ -79,8 +79,8 @@ def test_only_the_drivers_that_ask_send_what_an_end_says() -> None:
 
 
 def test_only_the_ends_make_a_session() -> None:
-    makers = {"tunnel/session.py", "world/endpoint.py", "cloud/endpoint.py"}
-    assert calls("Session") - {"cli/bench.py", "tunnel/handshake.py"} == makers
+    users = {"cli/bench.py", "tunnel/handshake.py", "tunnel/session.py"}
+    assert calls("Session") - users == {"tunnel/end.py"}
 
 
 @pytest.mark.parametrize("end", ["world", "cloud"])
