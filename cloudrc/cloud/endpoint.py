@@ -48,15 +48,7 @@ class MissedPeriods:
         self._forgiven_ns = NEVER_NS  # when all missed periods will be forgiven
 
     def miss(self, count: int, now_ns: int) -> list[Fault]:
-        """Count missed periods.
-
-        Args:
-            count: Number of missed periods of 10 ms.
-            now_ns: Cloud's monotonic clock [ns].
-
-        Returns:
-            A fault to report, or nothing.
-        """
+        """Count missed periods of 10 ms at `now_ns` [ns]; return a fault to report, or nothing."""
         full_ns = now_ns + MISSED_MAX * FORGIVEN_NS
         if self._forgiven_ns <= now_ns:
             self._missed, self._reported, self._forgiven_ns = 0, False, now_ns
