@@ -94,13 +94,4 @@ def signals_stay_as_they_were() -> Iterator[None]:
     for number, handler in handlers.items():
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
-
-
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    """Give back what a process of its own would keep: its signals, and what it has frozen."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-    gc.unfreeze()
+    gc.unfreeze()  # a command may freeze what it has loaded

@@ -1,8 +1,10 @@
-"""Generated files are current, and every link and every file that a page names exists."""
+"""Generated files are current; links, named files and cited sources lead somewhere."""
 
 from __future__ import annotations
 
+import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,16 @@ PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), ROOT / "charts" / "clou
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]*)(?:#([^)\s]+))?\)")
 OUTPUTS = docs.outputs()
 FILE = re.compile(r"`([\w./*-]+(?:\.(?:py|yaml|md|svg)|/))`")
+FOLDERS = "cloudrc", "charts", "tests", "tools"
+ENTRY = re.compile(r"\bSource:(.*?)(?=\n\s*\n|\b(?:Source|Deviation):|\Z)", re.DOTALL)
+PAGE = re.compile(r'([\w./-]+\.md)((?:, "[^"]+")*)')
+VAGUE = re.compile(r"\bDESIGN\b|\b[Tt]he design\b|\b[Ff]ault F\d+")
+PUBLIC = re.compile(
+    r"\bRFC \d|[\w-]+\(\d\)|\bLinux, |\bKubernetes, |\bFoundationDB, |\bWireGuard, |\biproute2 "
+    r"|\bYAML 1\.2|\bXDG Base Directory|\bIEEE conference template|\bthe authors' published code"
+    r"|\bthe paper, (?:eqs?\. \(\d|[\w ]+ figure|network conditions)"
+    r"|\b[A-Z]\. [A-Z]\w+.*\b(?:19|20)\d\d\b"  # an article or a book, with its year
+)
 
 
 def anchors(page: Path) -> set[str]:
@@ -30,9 +42,6 @@ def test_a_generated_file_is_current(path: Path) -> None:
 
 def test_no_generated_file_is_left_over() -> None:
     assert docs.leftovers() == [], "run: make docs"
-
-
-def test_the_notes_on_topics_are_about_topics() -> None:
     assert SAMPLING.keys() == TOPICS.keys()
 
 
@@ -56,3 +65,58 @@ def test_the_list_of_pages_names_every_page() -> None:
     listed = {path for path, _ in LINK.findall((ROOT / "docs" / "README.md").read_text())}
     pages = {path.relative_to(ROOT / "docs").as_posix() for path in ROOT.glob("docs/**/*.md")}
     assert pages - {"README.md"} <= listed
+
+
+# Sources in docstrings and comments
+
+
+def entries(text: str, suffix: str) -> Iterator[str]:
+    """Yield the sources in the docstrings and comments of a file, each on one line."""
+    if "Source:" not in text:
+        return
+    comments = re.findall(
+        r"<!--.*?-->" if suffix == ".xml" else r"(?:(?<!\S)#[^\n]*\n?[ \t]*)+", text, re.S
+    )
+    blocks = [re.sub(r"^[ \t]*#", "", comment, flags=re.MULTILINE) for comment in comments]
+    if suffix == ".py":
+        values = (node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Expr))
+        blocks += [str(value.value) for value in values if isinstance(value, ast.Constant)]
+    for block in blocks:
+        yield from (" ".join(entry.split()) for entry in ENTRY.findall(block))
+
+
+def unresolved(entry: str) -> list[str]:
+    """Return the parts of an entry that cannot be resolved."""
+    found, pages = VAGUE.findall(entry), PAGE.findall(entry)
+    for name, quoted in pages:
+        headings = re.findall('"([^"]+)"', quoted)
+        if (ROOT / name).is_file():
+            text = (ROOT / name).read_text(encoding="utf-8")
+            there = re.findall(r"^(?:#+|\|) +(.+?) *(?:\||$)", text, re.MULTILINE)
+            found += [heading for heading in headings if heading not in there]
+        if not headings or not (ROOT / name).is_file():
+            found.append(name)
+    return found if pages or PUBLIC.search(entry) else [*found, entry]
+
+
+def test_every_source_resolves() -> None:
+    paths = (path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.*")))
+    files = [path for path in paths if path.suffix in {".py", ".yaml", ".xml"}]
+    cited = [(path, entry) for path in files for entry in entries(path.read_text(), path.suffix)]
+    assert cited
+    wrong = [(str(path), found) for path, entry in cited if (found := unresolved(entry))]
+    assert wrong == []
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ('X = 1\n"""A limit. Source:\nDESIGN, section 5."""', ["DESIGN", "DESIGN, section 5."]),
+        ('# Source: docs/reference/plant.md, "Robot",\n# "Wings".', ["Wings"]),
+        ("# Source: plant.md", ["plant.md"]),
+        ('def f():\n    """Do.\n\n    Source: measured.\n\n    RFC 1"""', ["measured."]),
+        ('# Source: docs/reference/faults.md, "F5"; RFC 791. Deviation: DESIGN', []),
+    ],
+)
+def test_a_source_that_leads_nowhere_is_found(text: str, found: list[str]) -> None:
+    assert [part for entry in entries(text, ".py") for part in unresolved(entry)] == found

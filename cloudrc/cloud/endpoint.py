@@ -10,8 +10,7 @@ operator requests.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from dataclasses import dataclass
+from collections import Counter
 from math import nan
 
 from cloudrc.cloud.loop import ControlLoop
@@ -22,30 +21,17 @@ from cloudrc.cloud.operator import (
     make_robot_status,
 )
 from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
-from cloudrc.records import Arrival, Counted, Fault, MissionEvent, Record, SessionOpened
+from cloudrc.records import Arrival, Counted, Fault, MissionEvent, SessionOpened
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import REPEATED, USED, Channel
+from cloudrc.tunnel.channel import REPEATED, USED
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
-from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake, HandshakeLog
-from cloudrc.tunnel.keys import Key, KeyRing
-from cloudrc.tunnel.session import NO_EPOCH, Session
+from cloudrc.tunnel.end import Identity, TunnelEnd
+from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
+from cloudrc.tunnel.keys import Key
+from cloudrc.tunnel.session import NO_EPOCH
 
-
-@dataclass(frozen=True, slots=True)
-class CloudIdentity:
-    """Identity and keys of cloud's end.
-
-    Attributes:
-        clock_id: 16 bytes that identify this machine's monotonic clock.
-        nonce: 16 bytes that identify this process; new at every start.
-        ring: The pre-shared keys; None if both ends are in one process.
-    """
-
-    clock_id: bytes
-    nonce: bytes
-    ring: KeyRing | None = None
-
-
+CloudIdentity = Identity
+"""The identity of cloud's end."""
 MISSED_MAX = 50
 """Number of missed periods, not yet forgiven, from which on cloud reports a fault [periods]. Every
 machine misses a few periods."""
@@ -62,15 +48,7 @@ class MissedPeriods:
         self._forgiven_ns = NEVER_NS  # when all missed periods will be forgiven
 
     def miss(self, count: int, now_ns: int) -> list[Fault]:
-        """Count missed periods.
-
-        Args:
-            count: Number of missed periods of 10 ms.
-            now_ns: Cloud's monotonic clock [ns].
-
-        Returns:
-            A fault to report, or nothing.
-        """
+        """Count missed periods of 10 ms at `now_ns` [ns]; return a fault to report, or nothing."""
         full_ns = now_ns + MISSED_MAX * FORGIVEN_NS
         if self._forgiven_ns <= now_ns:
             self._missed, self._reported, self._forgiven_ns = 0, False, now_ns
@@ -107,7 +85,7 @@ COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in ever
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
-class CloudEndpoint:
+class CloudEndpoint(TunnelEnd):
     """The remote controller's end of the tunnel; an `Endpoint`.
 
     Attributes:
@@ -133,15 +111,10 @@ class CloudEndpoint:
             newest_wins: Whether late telemetry is dropped.
             start_ns: Cloud's monotonic clock now [ns].
         """
-        self._loop = loop
-        self.teleop = teleop
-        self._identity = identity
-        self._session = Session(Direction.DOWNLINK, identity.ring)
+        super().__init__(identity, Direction.DOWNLINK, newest_wins)
+        self._loop, self.teleop = loop, teleop
         self._handshake = ClientHandshake(identity.nonce, identity.clock_id)
-        self._complaints = HandshakeLog()
-        self._channel = Channel(newest_wins)
         self._hellos = 0
-        self._clock_is_shared = False
         self._setpoint: Setpoint | None = None
         self._world = ""  # identifies the world process of the session
         self.guard = GuardState.GROUND
@@ -155,9 +128,6 @@ class CloudEndpoint:
         self._flying_ns = start_ns
         self._commanded_ns = NEVER_NS
         self._count_ns = start_ns + COUNT_PERIOD_NS
-        self._datagrams: list[bytes] = []
-        self._records: list[Record] = []
-        self._counts: defaultdict[str, int] = defaultdict(int)
 
     @property
     def counts(self) -> Counter[str]:
@@ -165,34 +135,14 @@ class CloudEndpoint:
         return Counter(self._counts | self._loop.counts)
 
     @property
-    def epoch(self) -> int:
-        """Epoch of the session; 0 for none."""
-        return self._session.epoch
-
-    @property
     def mission_over(self) -> bool:
         """Whether the mission has ended, and the robot holds or does not answer for GIVE_UP_NS."""
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 
-    @property
-    def sealed(self) -> bool:
-        """Whether the datagrams are authenticated."""
-        return self._session.sealed
-
     def next_deadline_ns(self) -> int:
         """Return when the next command is due [ns]."""
         return self._tick_ns
-
-    def take_datagrams(self) -> list[bytes]:
-        """Return the datagrams to send."""
-        datagrams, self._datagrams = self._datagrams, []
-        return datagrams
-
-    def take_records(self) -> list[Record]:
-        """Return the records since the last call."""
-        records, self._records = self._records, []
-        return records
 
     def handle_deadline(self, now_ns: int) -> None:
         """Send the datagrams that are due at `now_ns` [ns]; skip missed periods."""
@@ -275,8 +225,7 @@ class CloudEndpoint:
         return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
 
     def _greet(self, hello: bytes, key: Key) -> None:
-        self._datagrams.append(self._session.greet(Kind.HELLO, hello, key))
-        self._counts["sent"] += 1
+        self._queue([self._session.greet(Kind.HELLO, hello, key)])
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
         """Begin the epoch that world assigns to this process, if the epoch is new."""
@@ -364,7 +313,3 @@ class CloudEndpoint:
         self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
         for name, count in sorted((self._counts | self._loop.counts).items()):
             self._records.append(Counted(now_ns, "cloud", name, count))
-
-    def _send(self, kind: int, body: bytes) -> None:
-        self._datagrams.append(self._session.seal(kind, body))
-        self._counts["sent"] += 1

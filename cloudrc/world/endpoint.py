@@ -14,7 +14,6 @@ from the spawn.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from dataclasses import dataclass
 from math import hypot, isnan, nan
 
 from cloudrc.messages import (
@@ -35,16 +34,14 @@ from cloudrc.records import (
     Counted,
     Fault,
     GroundTruth,
-    Record,
     SessionOpened,
     TelemetrySent,
 )
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import REPEATED, USED, Channel
+from cloudrc.tunnel.channel import REPEATED, USED
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
-from cloudrc.tunnel.handshake import HandshakeLog, ServerHandshake
-from cloudrc.tunnel.keys import KeyRing
-from cloudrc.tunnel.session import Session
+from cloudrc.tunnel.end import Identity, TunnelEnd
+from cloudrc.tunnel.handshake import ServerHandshake
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Touch
 from cloudrc.world.robot import Robot
@@ -162,21 +159,8 @@ class PaceMonitor:
         return [Fault(now_ns, "late", text)] if is_news else []
 
 
-@dataclass(frozen=True, slots=True)
-class WorldIdentity:
-    """The identity of world's end, fixed at its start.
-
-    Attributes:
-        clock_id: 16 bytes that name this machine's monotonic clock.
-        nonce: 16 bytes that name this process; every start has new ones.
-        ring: The pre-shared keys; None if both ends are in one process.
-    """
-
-    clock_id: bytes
-    nonce: bytes
-    ring: KeyRing | None = None
-
-
+WorldIdentity = Identity
+"""The identity of world's end."""
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
 CATCH_UP_NS = 50_000_000
@@ -187,7 +171,7 @@ COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # used in every per
 _new = tuple.__new__  # makes a named tuple in half the time of its own constructor
 
 
-class WorldEndpoint:
+class WorldEndpoint(TunnelEnd):
     """The robot's end of the tunnel; an `Endpoint`."""
 
     def __init__(
@@ -211,25 +195,19 @@ class WorldEndpoint:
                 longer is stale.
             start_ns: The monotonic clock now [ns].
         """
-        self.robot, self._sensors, self._identity = robot, sensors, identity
+        super().__init__(identity, Direction.UPLINK, newest_wins)
+        self.robot, self._sensors = robot, sensors
         self._tick_ns, self._slip_ns = start_ns, 0  # world's clock and its lag
         self._pace = PaceMonitor()
-        self._session = Session(Direction.UPLINK, identity.ring)
         self._door = ServerHandshake(
             self._session, identity.nonce, identity.clock_id, command_age_max_ns
         )
-        self._channel = Channel(newest_wins)
-        self._complaints = HandshakeLog()
         self._command_age_max_ns = command_age_max_ns
-        self._clock_is_shared = False
         self._stalled_wake_ns = NEVER_NS
         self._odometry_ns = start_ns
         self._count_ns = start_ns + COUNT_PERIOD_NS
         self._waiting: tuple[int, int, Command] | None = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
-        self._datagrams: list[bytes] = []
-        self._records: list[Record] = []
-        self._counts: defaultdict[str, int] = defaultdict(int)
         self._orders = Orders(robot.guard, self._counts, command_age_max_ns)
 
     @property
@@ -238,19 +216,9 @@ class WorldEndpoint:
         return Counter(self._counts | self.robot.guard.counts)
 
     @property
-    def epoch(self) -> int:
-        """Epoch of the session; 0 for none."""
-        return self._session.epoch
-
-    @property
     def slip_ns(self) -> int:
         """Lag of world's clock behind the monotonic clock [ns]."""
         return self._slip_ns
-
-    @property
-    def sealed(self) -> bool:
-        """Whether the datagrams are authenticated."""
-        return self._session.sealed
 
     def next_deadline_ns(self) -> int:
         """Return when the next odometry is due [ns], monotonic clock."""
@@ -260,16 +228,6 @@ class WorldEndpoint:
         """Run every tick up to and including `now_ns`, and send the telemetry that becomes due."""
         self._session.follow_keys()
         self._advance(self._follow(now_ns) + 1)
-
-    def take_datagrams(self) -> list[bytes]:
-        """Return the datagrams to send."""
-        datagrams, self._datagrams = self._datagrams, []
-        return datagrams
-
-    def take_records(self) -> list[Record]:
-        """Return the records since the last call."""
-        records, self._records = self._records, []
-        return records
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
         """Handle one datagram. Count and drop an invalid datagram."""
@@ -434,11 +392,3 @@ class WorldEndpoint:
         if used and guard.state is TRACK:
             self._waiting = (epoch, counter, command)
         self._counts[outcome] += 1
-
-    def _send(self, kind: int, body: bytes) -> None:
-        self._datagrams.append(self._session.seal(kind, body))
-        self._counts["sent"] += 1
-
-    def _queue(self, datagrams: list[bytes]) -> None:
-        self._datagrams += datagrams
-        self._counts["sent"] += len(datagrams)

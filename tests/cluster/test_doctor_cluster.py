@@ -71,7 +71,7 @@ def test_docker_without_a_daemon_is_not_ok(
 ) -> None:
     monkeypatch.undo()
     monkeypatch.setattr(shutil, "which", lambda name: str(pretend(name, script)))
-    assert next(check for check in checks.programs() if check.name == "docker").state == state
+    assert next(check for check in checks._programs() if check.name == "docker").state == state
 
 
 @pytest.mark.parametrize(

@@ -235,5 +235,5 @@ def test_only_what_checks_the_seal_sends_what_an_end_says() -> None:
     takers = {name for name in calls("take_datagrams") if not name.startswith("faults/")}
     assert takers == {"drivers/realtime.py", "drivers/virtual.py"}
     assert "drivers/virtual.py" not in calls("socket")
-    makers = {"tunnel/session.py", "world/endpoint.py", "cloud/endpoint.py"}
-    assert calls("Session") - {"cli/bench.py", "tunnel/handshake.py"} == makers
+    users = {"cli/bench.py", "tunnel/handshake.py", "tunnel/session.py"}
+    assert calls("Session") - users == {"tunnel/end.py"}

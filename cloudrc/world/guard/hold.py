@@ -25,14 +25,13 @@ STILL_SPEED = 0.1
 LAND_SPEED = 0.5
 """Speed of the descent [m/s]. Source: docs/reference/plant.md, "Landing"."""
 STILL_SHARE = 0.2
-"""A descent has stopped when its speed is below this share of the planned speed [1]. The share
-matters with a low speed cap: there every descent is slower than STILL_SPEED, and would count as
-touched down."""
+"""A descent has stopped when its speed is below this share of the planned speed [1]: with a low
+speed cap every descent is slower than STILL_SPEED."""
 TOUCH_DOWN_NS = 400_000_000
 """Time without motion after which a descent has touched down [ns]."""
 STILL_TICKS = 200
-"""Number of ticks at rest after which the robot counts as lying still [1]: 0.4 s. A robot that was
-thrown up is also at rest at its highest point, but for less time."""
+"""Number of ticks at rest after which the robot lies still: 0.4 s. A robot that was thrown up is
+also at rest at its highest point, but for less time."""
 POSITION_GAIN = 0.8
 """Gain of the position hold: velocity towards the hold point per distance from that point [1/s]."""
 DAMPING_GAIN = 1.6
@@ -41,9 +40,8 @@ HOLD_SPEED_MAX = 0.5
 """Largest speed that the position hold asks for [m/s]."""
 INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
 """Position hold: integral gain [1/s^2], largest integral term per axis [m/s], and largest distance
-from the hold point at which it integrates [m]. The arm makes the robot lopsided, and the low-level
-controller's own integral is too small. Without the integral of the position hold, the robot would
-stand 30 mm off the hold point."""
+from the hold point at which it integrates [m]. Without it the lopsided robot would stand 30 mm off
+the hold point."""
 TAKE_OFF_MARGIN = 0.5
 """Smallest distance from the fence's walls at which a stopped robot may take off [m]. A tilted
 robot scrapes along the floor before it rises, by at most 0.35 m:

@@ -26,8 +26,8 @@ STOP_COEFFICIENT = 1.0 / (2.0 * BRAKE)
 """Braking distance divided by the square of the speed [s^2/m]."""
 FENCE_REACTION, FENCE_MARGIN = 0.6, WALL_MARGIN
 """Reaction time [s] and margin [m] towards a wall or the ceiling of the fence: the guard limits the
-speed v so that FENCE_REACTION · v + v^2/6 <= distance - FENCE_MARGIN. Towards the floor, the guard
-uses REACTION and FLOOR_MARGIN, because the robot climbs readily.
+speed v so that FENCE_REACTION · v + v^2/6 <= distance - FENCE_MARGIN. Towards the floor it uses
+REACTION and FLOOR_MARGIN, because the robot climbs readily.
 Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With these values, a hostile
 cloud can move the robot 0.3 m beyond the fence, because the low-level controller follows late."""
 FAR = 1e6
@@ -42,9 +42,8 @@ speed [m/s]."""
 LOW_HEIGHT, LOW_SPEED = 0.25, 1.0
 """Below LOW_HEIGHT [m] above the fence's floor, the horizontal speed is at most LOW_SPEED [m/s]."""
 SINK_LEAD_MAX = 0.5
-"""Largest difference by which the reference may sink faster than the robot [m/s]. If the reference
-sank faster than a free fall, the low-level controller would turn the robot over and could not
-brake."""
+"""Largest difference by which the reference may sink faster than the robot [m/s]. Otherwise the
+low-level controller would turn the robot over and could not brake."""
 ROUNDING_FACTOR = 1.0 - 2.0**-45
 """Factor on the speed cap that leaves room for rounding errors [1]."""
 
@@ -195,13 +194,13 @@ def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float
 AGE_MAX_NS = 10_000_000_000
 """Largest command age that an experiment may allow [ns]."""
 GROUND_WAIT_MIN_NS = 10_000_000_000
-"""Lower limit of the time for which a robot on the ground waits for a mission's first command [ns].
-The command arrives at least one round trip after the start: 0.6 s with the profile `satellite`."""
+"""Lower limit of the time for which a robot on the ground waits for a mission's first command [ns],
+which arrives a round trip after the start."""
 RAMP_MIN = 1.0
 """Lower limit of the time for which the reference speeds up slowly after a HOLD [s]."""
 COMMAND_MAX = 1000.0
-"""Largest value of a command that the guard shortens to a cap [m/s, rad/s]. The guard rejects a
-command with a larger value: it comes from a bug, and its direction is as wrong as its length.
+"""Largest value of a command that the guard shortens to a cap [m/s, rad/s]; a larger value comes
+from a bug, and its direction is as wrong as its length.
 Source: docs/reference/faults.md, "F23"."""
 
 

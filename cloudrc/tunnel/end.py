@@ -1,0 +1,70 @@
+"""What both ends of the tunnel have in common: identity, session, outgoing datagrams, records."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+from cloudrc.records import Record
+from cloudrc.tunnel.channel import Channel
+from cloudrc.tunnel.codec import Direction
+from cloudrc.tunnel.handshake import HandshakeLog
+from cloudrc.tunnel.keys import KeyRing
+from cloudrc.tunnel.session import Session
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """The identity of an end, fixed at its start.
+
+    Attributes:
+        clock_id: 16 bytes that identify this machine's monotonic clock.
+        nonce: 16 bytes that identify this process; new at every start.
+        ring: The pre-shared keys; None if both ends are in one process.
+    """
+
+    clock_id: bytes
+    nonce: bytes
+    ring: KeyRing | None = None
+
+
+class TunnelEnd:
+    """The common part of world's and cloud's `Endpoint`."""
+
+    def __init__(self, identity: Identity, sends: Direction, newest_wins: bool) -> None:
+        self._identity = identity
+        self._session = Session(sends, identity.ring)
+        self._channel = Channel(newest_wins)
+        self._complaints = HandshakeLog()
+        self._clock_is_shared = False
+        self._datagrams: list[bytes] = []
+        self._records: list[Record] = []
+        self._counts: defaultdict[str, int] = defaultdict(int)
+
+    @property
+    def epoch(self) -> int:
+        """Epoch of the session; 0 for none."""
+        return self._session.epoch
+
+    @property
+    def sealed(self) -> bool:
+        """Whether the datagrams are authenticated."""
+        return self._session.sealed
+
+    def take_datagrams(self) -> list[bytes]:
+        """Return the datagrams to send."""
+        datagrams, self._datagrams = self._datagrams, []
+        return datagrams
+
+    def take_records(self) -> list[Record]:
+        """Return the records since the last call."""
+        records, self._records = self._records, []
+        return records
+
+    def _send(self, kind: int, body: bytes) -> None:
+        self._datagrams.append(self._session.seal(kind, body))
+        self._counts["sent"] += 1
+
+    def _queue(self, datagrams: list[bytes]) -> None:
+        self._datagrams += datagrams
+        self._counts["sent"] += len(datagrams)
