@@ -30,6 +30,16 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Give back what a process of its own would keep: its signals, and what it has frozen."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    gc.unfreeze()
+
+
 @pytest.fixture(autouse=True)
 def flights_of_others_are_not_seen(
     request: pytest.FixtureRequest,

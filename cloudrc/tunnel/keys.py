@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from cryptography.hazmat.primitives.hashes import SHA256
@@ -22,9 +21,12 @@ KEY_SIZE = 32
 _LABEL = b"cloudrc %d " % VERSION
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, slots=True)
 class Key:
     """A secret pre-shared key of 32 bytes.
+
+    Attributes:
+        name: Short public name that distinguishes two keys.
 
     Raises:
         ValueError: If the secret is not 32 bytes long, or if all bytes are zero; the message does
@@ -32,21 +34,16 @@ class Key:
     """
 
     _secret: bytes
+    _tag_key: bytes = field(init=False, compare=False)
+    name: str = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
         if len(self._secret) != KEY_SIZE:
             raise ValueError(f"a key has {KEY_SIZE} bytes, not {len(self._secret)}")
         if not any(self._secret):
             raise ValueError("an all-zero key is refused: everybody knows it")
-
-    @cached_property
-    def name(self) -> str:
-        """Short public name that distinguishes two keys."""
-        return self.derive(b"", b"name")[:4].hex()
-
-    @cached_property
-    def _tag_key(self) -> bytes:
-        return self.derive(b"", b"greeting")
+        object.__setattr__(self, "_tag_key", self.derive(b"", b"greeting"))
+        object.__setattr__(self, "name", self.derive(b"", b"name")[:4].hex())
 
     def derive(self, salt: bytes, use: bytes) -> bytes:
         """Derive 32 bytes for one use."""
