@@ -457,7 +457,7 @@ def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
 def _counting(
     stop: Callable[[], bool], relay: Relay, exporter: Exporter | None
 ) -> Callable[[], bool]:
-    """Wrap `stop` in a function that also exports the relay's counts once a second."""
+    """Make a function that returns `stop()` and, once a second, exports the relay's counts."""
     due = 0.0
 
     def ask() -> bool:

@@ -92,8 +92,7 @@ class Orders:
             waited: Whether the request may have waited in the socket during a stall.
 
         Raises:
-            DecodeError: "stale" or "future" for a start that is not recent. Somebody may have
-                delayed the request, and the mission may be over.
+            DecodeError: If the stamp of a start request is too old ("stale") or in the future.
         """
         kind, guard = request.request, self._guard
         starts = kind is Request.START
