@@ -66,21 +66,22 @@ def execute(options: argparse.Namespace) -> int:
     source, output, only = options.source, options.output, options.direction
     if not (source.is_dir() or source.is_file()):
         raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")
+    halve = options.halve_rtt
+    found: dict[str, Packets] = {}
     if not _is_run(source):
-        packets = _from_log(source, only, halve=options.halve_rtt, trust_units=options.trust_units)
-        _write(packets, output, only or "uplink")
-        return 0
-    require("a trace of a run", ("record",))
-    recording = _recording(source)
-    if only is not None or options.halve_rtt:
-        packets = (
-            _halves(recording, source) if options.halve_rtt else one_way(recording, source, only)
-        )
-        _write(packets, output, only or "uplink")
-        return 0
-    both = {way: one_way(recording, source, way) for way in DIRECTIONS}
-    for way, packets in both.items():
-        _write(packets, output.with_stem(f"{output.stem}-{way}"), way)
+        packets = _from_log(source, only, halve=halve, trust_units=options.trust_units)
+        found[only or "uplink"] = packets
+    else:
+        require("a trace of a run", ("record",))
+        recording = _recording(source)
+        if halve:
+            found[only or "uplink"] = _halves(recording, source)
+        else:
+            ways = (only,) if only else DIRECTIONS
+            found = {way: one_way(recording, source, way) for way in ways}
+    for way, packets in found.items():
+        own = output.with_stem(f"{output.stem}-{way}") if len(found) > 1 else output
+        _write(packets, own, way)
     return 0
 
 
@@ -164,13 +165,7 @@ def _recording(path: Path) -> Recording:
 def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     """Match sent and arrived datagrams by epoch and counter; of duplicates the first counts.
 
-    Args:
-        recording: Recording of both ends.
-        path: Path of the recording, for messages.
-        direction: Direction of the link.
-
-    Raises:
-        BadInputError: If the recording holds no one-way delays.
+    Raise a BadInputError that names `path` if the recording of both ends holds no one-way delays.
     """
     from cloudrc.link.logs import Log
 
@@ -212,8 +207,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 def _halves(recording: Recording, path: Path) -> Packets:
     """Estimate each packet's delay as half of a round trip, at the time of sending the command.
 
-    Lost packets are not visible in this estimate. Telemetry repeats an echo until the next command
-    arrives; the repeated echoes count once.
+    Losses do not show. Telemetry repeats an echo until the next command; the repeats do not count.
     """
     from cloudrc.link.logs import Log
 

@@ -1,7 +1,7 @@
 """Run `cloudrc link run`: the sidecar with its clock, sockets, programs and threads.
 
-/link.json on the metrics port shows the state of the shaper. To build an answer, the process starts
-tc and ip. Therefore an answer is cached for one second.
+/link.json on the metrics port shows the state of the shaper. An answer takes calls of tc and ip, so
+it is cached for one second. Every `cloudrc link` imports this module, so it imports little itself.
 """
 
 from __future__ import annotations
@@ -30,15 +30,13 @@ from cloudrc.cli.processes import (
     warn_if_exposed,
 )
 from cloudrc.drivers.process import StopSignal
-from cloudrc.link.follow import Load
-from cloudrc.link.netem import NOT_FOUND, Answer
-from cloudrc.link.sidecar import Near, look_near, write_told
 from cloudrc.records import Counted
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.link.follow import Profiles
-    from cloudrc.link.sidecar import Machine, Sidecar
+    from cloudrc.link.follow import Load, Profiles
+    from cloudrc.link.netem import Answer
+    from cloudrc.link.sidecar import Machine, Near, Sidecar
 
 EPILOG = ""
 STATUS_PERIOD = 1.0
@@ -209,15 +207,11 @@ class Metrics:
         self._exporter.see([Counted(stamp_ns, "link", name, n) for name, n in counts.items()])
 
 
-def inspect_network(host: str, inside: tuple[str, ...] = ()) -> Near | None:
-    """Find the netem qdiscs of a network namespace and its route to a host.
+def inspect_network(host: str) -> Near | None:
+    """Find the netem qdiscs of this network namespace and its route to a host (IPv4 address)."""
+    from cloudrc.link.sidecar import look_near
 
-    Args:
-        host: IPv4 address.
-        inside: Prefix of commands for another namespace, such as "ip netns exec NAME"; empty for
-            the namespace of this process.
-    """
-    programs = Programs(prefix=inside)
+    programs = Programs()
     try:
         return look_near(programs, host)
     finally:
@@ -238,6 +232,8 @@ class LinkStatusSource:
 
     def text(self) -> str:
         """Return the state as JSON; return the previous answer if tc or ip hangs."""
+        from cloudrc.link.sidecar import write_told
+
         if not self._lock.acquire(timeout=STATUS_PERIOD):
             return self._text
         try:
@@ -259,15 +255,9 @@ class Programs:
     Therefore one lasting `tc -batch -` makes all changes and listings of qdiscs.
     """
 
-    def __init__(self, tables: str = "", prefix: Sequence[str] = ()) -> None:
-        """Store the settings; start no process.
-
-        Args:
-            tables: Folder with the distribution tables of tc.
-            prefix: Words before each command, such as "ip netns exec NAME".
-        """
+    def __init__(self, tables: str = "") -> None:
+        """Start no process yet; `tables` is the folder with the distribution tables of tc."""
         self._environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
-        self._prefix = tuple(prefix)
         self._tc: subprocess.Popen[bytes] | None = None
 
     def __call__(self, words: Sequence[str]) -> Answer:
@@ -290,10 +280,12 @@ class Programs:
             self._tc = None
 
     def _once(self, words: Sequence[str]) -> Answer:
-        command, environment = (*self._prefix, *words), self._environment
+        from cloudrc.link.netem import NOT_FOUND, Answer
+
+        environment = self._environment
         try:
             done = subprocess.run(
-                command, capture_output=True, text=True, env=environment, timeout=TOOL_TIMEOUT
+                words, capture_output=True, text=True, env=environment, timeout=TOOL_TIMEOUT
             )
         except FileNotFoundError:
             return Answer(NOT_FOUND, "", "")
@@ -305,13 +297,13 @@ class Programs:
 
     def _ask(self, line: str, *, lists: bool) -> Answer:
         """Send a line to the lasting tc; raise an OSError if tc does not answer."""
+        from cloudrc.link.netem import Answer
+
         tc, pipe = self._tc, subprocess.PIPE
         if tc is None:
-            command, errors = (*self._prefix, *_BATCH), subprocess.STDOUT
-            tc = subprocess.Popen(
-                command, 0, stdin=pipe, stdout=pipe, stderr=errors, env=self._environment
+            self._tc = tc = subprocess.Popen(
+                _BATCH, 0, stdin=pipe, stdout=pipe, stderr=subprocess.STDOUT, env=self._environment
             )
-            self._tc = tc
         assert tc.stdin is not None
         assert tc.stdout is not None
         tc.stdin.write(f"{line}\n{_END}\n".encode())

@@ -1,12 +1,8 @@
 """Run `cloudrc link verify`: compare a link with its profile, by probes or in flight.
 
-On this machine the link runs as one process per direction, and probes go both ways. netem is
-verified between two network namespaces, joined by a veth pair, as between two pods. This needs
-root, changes nothing outside the namespaces, and deletes them at the end.
-
-Of a release the tunnel's own datagrams are the probes. Each end judges the direction that it
-receives and serves the result at /link.json of its metrics port; there each link container shows
-what it shapes.
+On this machine the link runs as one process per direction; netem runs in two network namespaces,
+joined by a veth pair, as between two pods. In a release each end judges the tunnel's own datagrams
+and serves the result at /link.json of its metrics port; each link container shows what it shapes.
 """
 
 from __future__ import annotations
@@ -32,7 +28,7 @@ import numpy as np
 from cloudrc.assembly import link_profile
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.link import VERIFY_DEFAULT
-from cloudrc.cli.link_run import inspect_network
+from cloudrc.cli.link_run import Programs, inspect_network
 from cloudrc.cli.output import escape, format_document, paint, table
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cluster.pods import METRICS, NO_PROXY
@@ -300,11 +296,12 @@ def _advise(text: str) -> str:
 
 
 def _ended(name: str, code: int, log: str) -> CloudrcError:
+    """Pass on the error of a process: the last line of its log, and its exit code."""
     last = (log.strip().splitlines() or ["it left no message"])[-1]
     words = _advise(last.removeprefix("cloudrc: error: "))
-    for kind in (BadInputError, MissingPrerequisiteError, TimedOutError):
-        if code == kind.exit_code:
-            return kind(f"the {name} is not shaped: {words}")
+    known = {one.exit_code: one for one in (BadInputError, MissingPrerequisiteError, TimedOutError)}
+    if code in known:
+        return known[code](f"the {name} is not shaped: {words}")
     return InvalidRunError(f"the {name} is not shaped: its process ended with {code}: {words}")
 
 
@@ -352,12 +349,8 @@ def _open_namespaces() -> Iterator[dict[str, Way]]:
 
 
 def _ip(*words: str) -> None:
-    try:
-        done = subprocess.run(("ip", *words), capture_output=True, text=True, timeout=10.0)
-        failure = " ".join(done.stderr.split()) if done.returncode else ""
-    except FileNotFoundError:
-        failure = "no program ip (package iproute2)"
-    if failure:
+    if (answer := Programs()(("ip", *words))).code:
+        failure = " ".join(answer.error.split()) or "no program ip (package iproute2)"
         raise MissingPrerequisiteError(f"ip {' '.join(words)}: {failure}; use --shaper relay")
 
 
@@ -447,11 +440,9 @@ def _may_change(found: Mapping[str, Any]) -> bool:
 
 def _findings(way: str, found: Mapping[str, Any], link: str) -> Findings:
     """Combine the receiver's verdict with what the sender's link reports at a URL."""
-    kind = WAYS[way][2]
-    try:
+    kind, told = WAYS[way][2], Told("", "", None)
+    with contextlib.suppress(ValueError):
         told = read_told(fetch(f"{link}/link.json"))
-    except ValueError:
-        told = Told("", "", None)
     known = read_evidence(told, read_metrics(fetch(f"{link}/metrics")))
     flow = Flow(0, way == "uplink", kind, SIZES[kind])
     plan = Plan(DirectionProfile(), flow, np.arange(float(RUN_LENGTH)) * PERIOD)
@@ -530,12 +521,8 @@ def make_report(
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    def is_known(value: Any) -> bool:
-        return value not in (None, "", ()) and not (
-            isinstance(value, float) and not isfinite(value)
-        )
-
-    return {key: value for key, value in values.items() if is_known(value)}
+    unknown = (None, "", (), inf, -inf)
+    return {key: one for key, one in values.items() if one not in unknown and one == one}
 
 
 def as_text(report: Report) -> str:

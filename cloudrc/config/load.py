@@ -115,27 +115,20 @@ class ResolvedExperiment(Experiment):
 
 
 def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment for a flight, and import the plug-ins that it names.
+    """Load an experiment for a flight by name or path, and import the plug-ins that it names.
 
-    Args:
-        name: Name of a shipped experiment, or path of a file.
-        settings: Texts `key=value` that override the file, in any order.
-
-    Returns:
-        The complete, checked experiment; its paths are absolute.
+    The texts `key=value` in `settings` override the file, in any order. Paths become absolute.
 
     Raises:
-        BadInputError: If the experiment has problems. The message is one line, or a summary and one
-            line for each problem.
+        BadInputError: If the experiment has problems; one line, or a summary and a line for each.
     """
     return _load_experiment(str(name), settings, build=True)
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment without its plug-ins, for a process that runs no cloud.
+    """Load an experiment for a process that runs no cloud: plug-ins are not imported nor checked.
 
-    This differs from `load_experiment`: plug-ins are neither imported nor checked, and have only
-    the parameters that the file gives. The config.yaml of a run gives all parameters.
+    They have only the parameters that the file gives; the config.yaml of a run gives all.
     """
     return _load_experiment(str(name), settings, build=False)
 
@@ -347,15 +340,10 @@ class Edit(NamedTuple):
 
 
 def edit_profile(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
-    """Change a link profile.
+    """Replace the present profile by `profile` if that is given, and set values in it.
 
     A value that the user sets stays in force: it is removed from the time line (changes, trace).
     The rest of the time line continues.
-
-    Args:
-        before: The present profile.
-        profile: Name or path of a profile that replaces it; None to edit the present one.
-        settings: Values to set, such as "downlink.delay_ms=120".
 
     Raises:
         BadInputError: If the request is empty or not valid.

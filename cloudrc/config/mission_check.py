@@ -64,12 +64,10 @@ def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
         else:
             name = scene.pipes[hit[index]].name
             reason = f"the robot would be within {CLEARANCE_MIN:g} m of the wall of {name}"
+        position = mission.waypoints[index].position_m
         before = mission.waypoints[index - 1].position_m if index else start
-        if index - 1 in wrong:
-            before = None
-        near = find_nearest_legal(
-            scene, mission.waypoints[index].position_m, float(yaws[index]), before
-        )
+        legal = None if index - 1 in wrong else before
+        near = find_nearest_legal(scene, position, float(yaws[index]), legal)
         if near is not None:
             reason += f"; nearest legal point found: {_point(np.array(near))}"
         yield _at_point(index, positions[index], reason)
@@ -77,9 +75,7 @@ def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
         rest = f"{len(wrong) - _REPORTED} more waypoints are beyond the fence or at a pipe's wall"
         yield Problem(("waypoints",), "", rest)
     if not len(wrong):
-        yield from _check_ways(
-            np.vstack([positions[0] if start is None else start, positions]), scene
-        )
+        yield from _check_ways(np.vstack([start or positions[0], positions]), scene)
 
 
 def _check_ways(positions: Array, scene: Scene) -> Iterator[Problem]:

@@ -43,16 +43,9 @@ def merged(
 ) -> Iterator[tuple[int, Row]]:
     """Merge the records of both ends, oldest first, into one sequence of rows on world's clock.
 
-    Only the stamp of each row is converted; other times in a row stay on the clock that their
-    description names.
-
-    Args:
-        world_records: World's records, on world's clock.
-        cloud_records: Cloud's records, on cloud's clock.
-        offset_ns: World's clock minus cloud's clock [ns].
-
-    Yields:
-        The log time [ns] and the row; of rows with equal log times, world's rows come first.
+    Yield log time [ns] and row; of equal log times, world's rows come first. `offset_ns` is world's
+    clock minus cloud's clock [ns]. Only the stamp of each row is converted; other times in a row
+    stay on the clock that their description names.
     """
     world, cloud = _logged(world_records, 0), _logged(cloud_records, offset_ns)
     return heapq.merge(world, cloud, key=itemgetter(0))

@@ -105,15 +105,9 @@ def _first_ns(recording: Recording) -> int:
 
 
 def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Convert instants from the clock of world's machine to world's clock, which may lag.
+    """Convert instants [ns], shape (n,), from the clock of world's machine to world's, which lags.
 
-    Args:
-        telemetry: World's table of telemetry, with stamps on world's clock and their lag, which is
-            interpolated linearly.
-        machine_ns: Instants on the machine's clock [ns], shape (n,).
-
-    Returns:
-        The instants on world's clock [ns], shape (n,); in rising order if `machine_ns` is.
+    The lag at each stamp of world's telemetry is interpolated linearly; rising order is kept.
     """
     lag_ns = telemetry["slip_ns"]
     if not lag_ns.any():
@@ -209,12 +203,10 @@ def _join(world: Contents, cloud: Contents) -> Mission:
 
 
 def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
-    """Cut a pod's recording, which may hold several missions, down to the last one.
+    """Cut a pod's recording, which may hold several missions, down to the last that was started.
 
-    Returns:
-        The last mission that was started, and whether the recording contains the mission's end.
-        Then the mission is complete, although a pod's file is open when it is copied, so that the
-        file's own end may be missing.
+    Return also whether it holds the mission's end. Then the mission is complete, although a pod's
+    file is open when it is copied, so that the file's own end may be missing.
     """
     contents = mission.contents
     began, ended = _last_mission(contents)

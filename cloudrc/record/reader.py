@@ -13,6 +13,7 @@ import os
 from array import array
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from io import BufferedReader
 from itertools import pairwise
@@ -56,8 +57,6 @@ MESSAGE_COST = 128
 """Memory of a message's Python objects, in addition to the message's bytes [bytes]."""
 LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
-CHANNELS_MAX = 65_535
-"""Limit of the number of channels plus schemas in a file; MCAP numbers both with 16 bits."""
 LOSSY_SHARE_MAX = 0.999
 """Largest value of `Recovery.share` if anything is missing [1]."""
 KINDS = {
@@ -318,9 +317,11 @@ def _note(contents: Contents, records: Records, seen: list[tuple[str, bool | Non
 def _changed(contents: Contents) -> Iterator[str]:
     """Compare a file that was read to its end with what its writer has counted."""
     metadata, read = contents.metadata, Counter(message[0] for message in contents.messages)
-    counts = _parse_counts(metadata.get(COUNTS, ""))
-    topics = [topic for topic in TOPICS if counts and read[topic] != counts.get(topic, 0)]
-    if wrong := [f"{read[topic]} of {counts.get(topic, 0)} on {topic}" for topic in topics]:
+    counts: dict[str, int] = {}
+    with suppress(ValueError):
+        counts = json.loads(metadata.get(COUNTS) or "{}")
+    pairs = [(topic, read[topic], counts.get(topic, 0)) for topic in TOPICS if counts]
+    if wrong := [f"{found} of {n} on {topic}" for topic, found, n in pairs if found != n]:
         yield f"messages were removed or added: it holds {_list(wrong)}"
     if metadata.get(COUNTS) == "" and MISSING not in metadata:
         yield "it was torn, and another program has put an end to it"
@@ -330,14 +331,6 @@ def _list(topics: list[str]) -> str:
     """List the first topics, and give the number of the others."""
     more = len(topics) - LISTED_MAX
     return ", ".join(topics[:LISTED_MAX]) + f" and {more} more topics" * (more > 0)
-
-
-def _parse_counts(text: str) -> dict[str, int]:
-    """Parse the value of `COUNTS`: messages by topic; empty if there is none."""
-    try:
-        return {str(topic): int(count) for topic, count in json.loads(text).items()}
-    except (AttributeError, TypeError, ValueError):
-        return {}
 
 
 @dataclass(slots=True)
@@ -391,7 +384,6 @@ class _Copy:
         self._writer: Any = Writer(new, compression=CompressionType.ZSTD, enable_data_crcs=True)
         self._schemas: dict[int, tuple[Schema, int]] = {}  # old number -> its new number
         self._channels: dict[int, tuple[Channel, int]] = {}
-        self._defined = 0
         self._kept = {"messages": 0, "attachments": 0, "metadata": 0}
         self._homeless = 0  # messages of no channel
         self._told = ""  # what the recording itself says is missing
@@ -453,12 +445,6 @@ class _Copy:
         """Register a schema or channel; register each definition of its number only once."""
         if record.id in known and known[record.id][0] == record:
             return
-        self._defined += 1
-        if self._defined > CHANNELS_MAX:
-            raise BadInputError(
-                f"{self._records.path}: defines more than {CHANNELS_MAX} channels and schemas;"
-                " use another file"
-            )
         if isinstance(record, Schema):
             number = self._writer.register_schema(record.name, record.encoding, record.data)
         else:

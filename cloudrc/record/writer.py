@@ -55,13 +55,10 @@ class McapWriter:
     """Writes the rows of one end, or of a whole mission, to one MCAP file."""
 
     def __init__(self, target: Path | IO[bytes], *, clock: str, clock_id: str = "") -> None:
-        """Open the file and write its header; every method may raise an OSError.
+        """Open a file, or use a stream that the caller closes; any method may raise an OSError.
 
-        Args:
-            target: A path, overwritten if it exists, or a binary stream that the caller closes.
-            clock: End whose clock the stamps use: "world" or "cloud".
-            clock_id: Identity of the machine's clock, such as the kernel's boot id; "" if unknown.
-                Files with the same identity need no clock offset.
+        The stamps use the clock of the end `clock`, "world" or "cloud". `clock_id` identifies the
+        machine's clock ("" if unknown); files of the same one need no clock offset.
         """
         self._owned = isinstance(target, Path)
         # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.
@@ -142,10 +139,9 @@ class McapWriter:
                     raise
 
     def abandon(self, reason: str) -> int:
-        """End the file after an error: cut off the torn end, and note the reason if there is space.
+        """Cut off the torn end after an error, and note the reason if there is space.
 
-        Returns:
-            Number of records that were written but are lost.
+        Return the number of records that were written but are lost.
         """
         note: Any = RecordBuilder()  # without type annotations
         end: Any = RecordBuilder()

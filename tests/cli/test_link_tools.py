@@ -12,7 +12,6 @@ from cloudrc.cli import link_record
 from cloudrc.cli.link import ACTIONS
 from cloudrc.cli.main import main
 from cloudrc.link.traces import read_table, read_trace
-from tests.record.conftest import world_records, write
 
 Printed = pytest.CaptureFixture[str]
 PING = "\n".join(
@@ -116,13 +115,6 @@ def test_an_unusable_source_is_refused_in_one_line(
     assert says in message
     assert message.count("\n") == 1
     assert not (here / "t.csv").exists()
-
-
-def test_a_recording_without_round_trips_has_no_halves(here: Path, capsys: Printed) -> None:
-    recording = write(here / "world.mcap", world_records(5))
-    assert main(["link", "record", str(recording), "-o", "t.csv", "--halve-rtt"]) == 2
-    said = "world.mcap: holds no round trip; give the folder of a run that flew\n"
-    assert capsys.readouterr().err.endswith(said)
 
 
 @pytest.mark.parametrize(

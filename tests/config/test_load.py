@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.assembly import link_profile
-from cloudrc.config import document, load, shipped
+from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
 from cloudrc.config.load import (
     ResolvedExperiment,
@@ -183,14 +183,6 @@ def test_paths_start_at_the_file_that_names_them(
     assert from_here.downlink.trace == str(links / "trace.csv")
     assert from_here.report.metrics == (str(links / "b.py"),)
     assert from_here.mission == experiment.mission
-
-
-def test_a_trace_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read: list[Path] = []
-    monkeypatch.setitem(load.FILE_READERS, "trace", read.append)
-    (tmp_path / "traced.yaml").write_text("uplink: {trace: trace.csv}\n")
-    load_experiment("paper", [f"link.profile={tmp_path}/traced.yaml"])
-    assert read == [tmp_path / "trace.csv"]
 
 
 # PyYAML converts Unicode's other line ends to line feeds; NUL is refused.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import signal
@@ -12,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import lru_cache
@@ -25,11 +24,12 @@ from numpy.typing import NDArray
 
 from cloudrc.assembly import link_profile
 from cloudrc.cli.link_run import Programs
+from cloudrc.cli.link_verify import inside
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
-from cloudrc.link.netem import STRETCH, Netem, table, write_tables
+from cloudrc.link.netem import STRETCH, Answer, Netem, Run, table, write_tables
 from cloudrc.link.profile import Blackout, Change, DirectionProfile
 from cloudrc.tunnel.codec import Kind
 
@@ -60,7 +60,6 @@ LATE = 0.1
 """Lateness of a step where the machine now and then stands still [s]."""
 ROOT = Path(__file__).resolve().parents[2]
 SIZE = 172
-_CLONE_NEWNET = 0x40000000
 _SO_TIMESTAMPNS = 35  # include/uapi/asm-generic/socket.h
 
 
@@ -97,22 +96,16 @@ def laboratory() -> Iterator[None]:
                 sh("ip", "netns", "del", name)
 
 
-@contextmanager
-def inside(name: str) -> Iterator[None]:
-    """Move this thread to a namespace; sockets opened in it stay there."""
-    library = ctypes.CDLL(None, use_errno=True)
-    with open("/proc/thread-self/ns/net") as home, open(f"/run/netns/{name}") as there:
-        assert library.setns(there.fileno(), _CLONE_NEWNET) == 0, os.strerror(ctypes.get_errno())
-        try:
-            yield
-        finally:
-            library.setns(home.fileno(), _CLONE_NEWNET)
-
-
 @lru_cache(maxsize=1)
-def run_near(tables: Path) -> Programs:
+def run_near(tables: Path) -> Run:
     """Run tc and ip in the near namespace."""
-    return Programs(str(tables), ("ip", "netns", "exec", NEAR))
+    programs = Programs(str(tables))
+
+    def run(words: Sequence[str]) -> Answer:
+        with inside(NEAR):
+            return programs(words)
+
+    return run
 
 
 def real_netem(tables: Path, profile: DirectionProfile, origin_ns: int = 0) -> Netem:

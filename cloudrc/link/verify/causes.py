@@ -162,33 +162,33 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
-    """Look at what can be read; of the datagrams, a share `lost` [1] did not arrive."""
+    """Look at what can be read, the surest first; a share `lost` [1] did not arrive."""
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
     sent, unread, late, stopped = (
         value or 0 for value in (known.sent, known.unread, known.late, known.throttled)
     )
-    if known.shaper == "none" and "sch_netem" in known.why:
-        yield "no_sch_netem", f"{known.why}; set link.mode=relay, which needs none"
-    if known.shaper == "none" and elsewhere:
-        yield "wrong_interface", f"the flow leaves by {where}, but the qdisc is on {elsewhere}"
-    if known.shaper == "none" or known.restored:
-        yield "no_qdisc", f"somebody else removed or changed the qdisc on {where}"
-    if known.passed is not None and known.passed + unread < PASSED * sent * (1.0 - lost):
-        yield "bypassed", f"of {sent} datagrams only {known.passed} passed the shaper"
-    if (known.layers or 0) > 1:
-        yield "shaped_twice", f"the flow passes {known.layers} shapers: remove all but one"
+    unshaped, passed = known.shaper == "none", sent if known.passed is None else known.passed
     longest = max(late * (late > LATE), sqrt(stopped) * CPU_PERIOD * (stopped > STOPPED))
-    slower = [row for row in off.values() if (_ratio(row) > 1.0) != (row.name == "rate")]
+    slower = any((_ratio(row) > 1.0) != (row.name == "rate") for row in off.values())
     excess = off["mean"].measured - off["mean"].asked if "mean" in off else 0.0
-    if unread > UNREAD * sent or (slower and 0.0 <= excess < longest):
-        yield (
-            "throttled",
-            f"the shaper lacks CPU time ({unread} of {sent} datagrams not read; 1 % released later "
-            f"than {in_unit(late, 's')}; stopped in {stopped:.0%} of the periods): raise its limit "
-            "or take load off the machine",
-        )
-    if lost > 0.999:
-        yield "nothing_arrives", "not one datagram arrives: is the route open?"
+    table = (
+        ("no_sch_netem", unshaped and "sch_netem" in known.why,
+         f"{known.why}; set link.mode=relay, which needs none"),
+        ("wrong_interface", unshaped and elsewhere,
+         f"the flow leaves by {where}, but the qdisc is on {elsewhere}"),
+        ("no_qdisc", unshaped or known.restored,
+         f"somebody else removed or changed the qdisc on {where}"),
+        ("bypassed", passed + unread < PASSED * sent * (1.0 - lost),
+         f"of {sent} datagrams only {passed} passed the shaper"),
+        ("shaped_twice", (known.layers or 0) > 1,
+         f"the flow passes {known.layers} shapers: remove all but one"),
+        ("throttled", unread > UNREAD * sent or (slower and 0.0 <= excess < longest),
+         f"the shaper lacks CPU time ({unread} of {sent} datagrams not read; 1 % released later "
+         f"than {in_unit(late, 's')}; stopped in {stopped:.0%} of the periods): raise its limit or "
+         "take load off the machine"),
+        ("nothing_arrives", lost > 0.999, "not one datagram arrives: is the route open?"),
+    )  # fmt: skip
+    yield from ((code, text) for code, holds, text in table if holds)
 
 
 def _ratio(row: Row) -> float:

@@ -145,10 +145,8 @@ class LinkMonitor:
             return []
         if self._fresh:  # a time line that runs is not judged: where it began is not known here
             last_ns = max(Timeline(profile).last_ns for profile in self._asked)
-            self._since_ns, self._due_ns = (
-                now_ns + SETTLE_NS + last_ns,
-                now_ns + SETTLE_NS + CHECK_NS,
-            )
+            settled_ns = now_ns + SETTLE_NS
+            self._since_ns, self._due_ns = settled_ns + last_ns, settled_ns + CHECK_NS
             self._fresh, self._suspects = False, set()
         if now_ns < self._since_ns:
             self._forget()
@@ -210,8 +208,8 @@ class LinkMonitor:
         means = np.sum([[_first_come(link) for link in plan.links] for plan in self._plans], axis=0)
         low, high = np.quantile(means, (TAIL, 1.0 - TAIL)).tolist()
         bands = {"round_trip": (float(means.mean()), low, high + ENDS)}
-        expected = Expected(bands, np.zeros(0), known=False)
-        return [judge_value("round_trip", expected, float(np.mean(self._trips)))]
+        drawn = Expected(bands, np.zeros(0), known=False)
+        return [judge_value("round_trip", drawn, float(np.mean(self._trips)))]
 
 
 def _in_order(arrivals: Sequence[_Heard]) -> tuple[Stream, int, bool]:

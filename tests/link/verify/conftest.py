@@ -160,15 +160,9 @@ def arrivals(
     uplink: bool = False,
     netem: bool = False,
 ) -> list[Arrival]:
-    """Return what an end notes of a flight.
+    """Return what cloud (`uplink`) or world notes of a flight of some seconds.
 
-    Args:
-        profile: Of the link.
-        seconds: Duration [s].
-        seed: Of its draws; the experiment's is 1.
-        overhead: Delay that the ends add [s]; NaN: they share no clock.
-        uplink: Whether cloud receives telemetry; else world receives commands.
-        netem: Whether netem shapes.
+    The ends add `overhead` [s]; NaN: they share no clock. The experiment's seed is 1.
     """
     model = LinkDirection(profile, seed, uplink=uplink)
     link = VirtualNetem(profile, seed) if netem else model
