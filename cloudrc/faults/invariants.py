@@ -103,21 +103,13 @@ class Breach(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Limits that the guard has to keep.
+    """Limits that the guard has to keep."""
 
-    Attributes:
-        speed: Largest reference [m/s].
-        acceleration: Largest growth of the reference [m/s^2].
-        yaw_rate: Largest yaw rate [rad/s].
-        age_ns: Largest age of a command's basis [ns].
-        hold_ns: Time in a mission after which HOLD becomes LAND [ns].
-    """
-
-    speed: float = 6.0
-    acceleration: float = 12.0
-    yaw_rate: float = 1.0
-    age_ns: int = 250_000_000
-    hold_ns: int = 60_000_000_000
+    speed: float = 6.0  # of the reference [m/s]
+    acceleration: float = 12.0  # growth of the reference [m/s^2]
+    yaw_rate: float = 1.0  # [rad/s]
+    age_ns: int = 250_000_000  # of a command's basis [ns]
+    hold_ns: int = 60_000_000_000  # time in a mission after which HOLD becomes LAND [ns]
 
     @classmethod
     def of(cls, guard: ResolvedGuard) -> Limits:
@@ -132,31 +124,18 @@ class Limits(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of all robots of a flight, which follow each other.
-
-    Attributes:
-        breaches: The first breaches of each kind.
-        counts: Number of breaches, by kind.
-        margin: Smallest distance of the base to the fence, the floor excepted [m].
-        speed: Largest reference [m/s].
-        landed_on: What the robot touched while it landed, the floor excepted.
-    """
+    """Collects the breaches of all robots of a flight, which follow each other."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
-        self.breaches: list[Breach] = []
-        self.counts: Counter[str] = Counter()
-        self.margin, self.speed = 9.0, 0.0
-        self.landed_on: set[str] = set()
+        self.breaches: list[Breach] = []  # the first ones of each kind
+        self.counts: Counter[str] = Counter()  # of breaches, by kind
+        self.margin = 9.0  # smallest distance of the base to the fence, the floor excepted [m]
+        self.speed = 0.0  # largest reference [m/s]
+        self.landed_on: set[str] = set()  # what it touched while landing, the floor excepted
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
-        """Check every step of a robot from now on.
-
-        Args:
-            robot: The robot.
-            start_ns: Time of its first step [ns].
-            honest: Whether its cloud is honest; then a hit is a breach.
-        """
+        """Check every step of a robot from `start_ns` [ns] on; if `honest`, a hit is a breach."""
         robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
@@ -472,12 +451,8 @@ class RobotInvariants:
 def can_stop(speed: float, below: float, above: float) -> bool:
     """Tell whether the robot can stop before the face of the fence that it flies towards.
 
+    Along one axis it has a `speed` [m/s], and distances to the faces `below` and `above` it [m].
     Source: docs/reference/plant.md, "Stop rule": 0.2 v + v^2/6 <= distance - 0.1.
-
-    Args:
-        speed: Component of the velocity along an axis [m/s].
-        below: Distance to the face at the axis' lower end [m].
-        above: Distance to the face at the axis' upper end [m].
     """
     if speed > 0.0:
         return speed * (0.2 + speed / 6.0) <= above - 0.1 + SLACK
