@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cloudrc.record.recover import recover
 
 from cloudrc.cli.main import main
 from cloudrc.config import document
@@ -26,7 +25,7 @@ from cloudrc.link.traces import read_trace
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
-from cloudrc.record.reader import read_contents
+from cloudrc.record.reader import read_contents, recover
 from cloudrc.records import GroundTruth
 from cloudrc.report.document import write_json
 from cloudrc.report.folder import read_run
