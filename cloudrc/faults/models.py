@@ -332,7 +332,7 @@ class SeparateTeleop(InProcessTeleop):
     """
 
     def __init__(self, contact_speed_max: float, phase_ns: int) -> None:
-        """Start; `contact_speed_max` as above [m/s], first wake at `phase_ns` < `PERIOD_NS` [ns]."""
+        """Start; `contact_speed_max` as above [m/s], the first wake at `phase_ns` [ns]."""
         self._host: RestartableEndpoint | None = None
         self._peer = _Peer(lambda: self.service is not None)
         self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)
