@@ -67,8 +67,8 @@ class Flight:
         *settings: str,  # of the experiment `paper`, as `--set` takes them
         seed: int = 1,
         cloud_clock: Clock | None = None,  # None if the two ends share a clock
-        uplink: Shape | None = None,  # changes the link from world to cloud
-        downlink: Shape | None = None,  # changes the link from cloud to world
+        uplink: Shape = replace,  # changes the link from world to cloud; by default nothing
+        downlink: Shape = replace,  # changes the link from cloud to world
         honest: bool = True,  # whether a contact is a breach
         keep: bool = True,  # whether all records are kept and hashed
         start: bool = True,  # whether the experiment's mission is ordered at once
@@ -184,14 +184,14 @@ class Flight:
         return self.robot.guard.state, self.robot.guard.cause.words
 
     def _build_world(self, start_ns: int) -> WorldEndpoint:
-        identity = WorldIdentity(SHARED, self._nonce("world"), self._read_key("world"))
+        identity = WorldIdentity(SHARED, *self._begin("world"))
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self.watch.attach(world.robot, start_ns, honest=self._honest)
         self.world_starts_ns.append(start_ns)
         return world
 
     def _build_cloud(self, start_ns: int) -> Endpoint:
-        identity = CloudIdentity(self._clock_id, self._nonce("cloud"), self._read_key("cloud"))
+        identity = CloudIdentity(self._clock_id, *self._begin("cloud"))
         teleop: Operator = self.teleop.join(start_ns)
         if self._words is not None:
             teleop = HostileOperator(teleop, self._words)
@@ -211,19 +211,17 @@ class Flight:
         identity = CloudIdentity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
 
-    def _make_link(self, shape: Shape | None, *, up: bool) -> LinkDirection:
+    def _make_link(self, shape: Shape, *, up: bool) -> LinkDirection:
         resolved = self.experiment.uplink if up else self.experiment.downlink
-        profile = assembly.link_profile(resolved)
-        profile = profile if shape is None else shape(profile)
+        profile = shape(assembly.link_profile(resolved))
         return LinkDirection(profile, self.experiment.seed, uplink=up)
 
-    def _nonce(self, end: str) -> bytes:
+    def _begin(self, end: str) -> tuple[bytes, KeyRing]:
+        """Return the nonce and the keys of an end's new process."""
         self.generations[end] += 1
-        return f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)
-
-    def _read_key(self, end: str) -> KeyRing:
-        ring = self.rings[end] = KeyRing(self.secrets[end])
-        return ring
+        self.rings[end] = KeyRing(self.secrets[end])
+        nonce = f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)
+        return nonce, self.rings[end]
 
     def _sink(self, of_world: list[Record], of_cloud: list[Record]) -> None:
         if self._keep:

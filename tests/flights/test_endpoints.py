@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, Start
 from cloudrc.records import (
-    Arrival,
     CommandApplied,
     Contact,
     GroundTruth,
@@ -59,16 +58,6 @@ def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(
     telemetry = talk.take(TelemetrySent)[-1].telemetry
     told = telemetry.stamp_ns, telemetry.echo_stamp_ns, telemetry.echo_hold_ns
     assert told == (30 * MS, 21_300_000, 8 * MS)
-
-
-def test_late_and_repeated_commands_are_counted_and_not_flown(talk: Talk) -> None:
-    first, second = talk.command((0.0, 0.0, 1.0)), talk.command((0.0, 0.0, 2.0))
-    for data in (second, first, second):
-        talk.send(data)
-    counts = talk.counts()
-    assert (counts["used"], counts["late"], counts["repeated"]) == (1, 1, 1)
-    assert [applied.velocity for applied in talk.take(CommandApplied)] == [(0.0, 0.0, 2.0)]
-    assert [arrival.used for arrival in talk.take(Arrival)] == [True, False, False]
 
 
 @pytest.mark.parametrize(
