@@ -158,15 +158,14 @@ def run(options: argparse.Namespace) -> int:
     if options.junit is not None:
         options.junit.parent.mkdir(parents=True, exist_ok=True)
         options.junit.write_text(as_junit(results, options.seed), encoding="utf-8")
-    passed = sum(result.passed for result in results)
-    failed = len(results) - passed
+    count, failed = len(results), sum(not result.passed for result in results)
     if options.output != "table":
         print(format_document(as_json(results, options.seed), options.output))
     else:
-        print(f"\nseed {options.seed}: {passed} of {len(results)} passed, {failed} failed")
+        print(f"\nseed {options.seed}: {count - failed} of {count} passed, {failed} failed")
     if cause:
-        message = f"cloudrc: {cause}; {len(results)} of {len(chosen)} faults were run before"
-        print(message, file=sys.stderr, flush=True)
+        text = f"cloudrc: {cause}; {count} of {len(chosen)} faults were run before"
+        print(text, file=sys.stderr, flush=True)
     return code or (FAILED if failed else 0)
 
 

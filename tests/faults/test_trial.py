@@ -189,11 +189,7 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints: list[int], kinds: se
     events = [{"mission": "m", "event": "reached", "waypoint": n} for n in waypoints]
     events.append({"mission": "n", "event": "reached", "waypoint": 0})
     book = SimpleNamespace(events_after=lambda number: events)
-    flight: Any = SimpleNamespace(
-        listeners=[],
-        watch=Watch(Limits()),
-        teleop=SimpleNamespace(service=SimpleNamespace(book=book)),
-        run=SimpleNamespace(now_ns=0),
-    )
+    teleop, run = SimpleNamespace(service=SimpleNamespace(book=book)), SimpleNamespace(now_ns=0)
+    flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()), teleop=teleop, run=run)
     OrderInvariant(flight).check_waypoints()
     assert set(flight.watch.counts) == kinds
