@@ -20,7 +20,8 @@ hold       TRACK begins at least `SETTLE_NS` after the last TRACK, and a HOLD fo
            impossible commands.
 tick       Each step of the physics has a tick of the guard.
 
-All limits come from the configuration, none from the guard.
+All limits come from the configuration and from docs/, none from the guard: from "Stop rule" and
+"Leaving HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, "The guard" in safety.md.
 """
 
 from __future__ import annotations
@@ -56,42 +57,31 @@ STILL = 0.12
 STANDS = 0.2
 """Speed per axis up to which a robot stands when its rotors stop [m/s]."""
 FALL = 1.0
-"""Speed of descent of a robot that fell after its rotors stopped [m/s]. A drop from the guard's
-0.02 m reaches 0.7."""
+"""Speed of a robot that fell after its rotors stopped [m/s]; a drop from 0.02 m reaches 0.7."""
 REST = 0.5
-"""Length added to the stopping distance of a robot without commands [m]: it swings back. In 200
-flights of the search, half of them with a hostile cloud, at most 0.20 was used."""
+"""Length added to the stopping distance without commands [m]: it swings back by up to 0.2."""
 FALL_MAX = 1.5
-"""Distance from the fence at which people are safe [m]. Source: docs/safety.md, "The guard"."""
+"""Distance from the fence at which people are safe [m]."""
 BRAKE_NS = 200_000_000
-"""Time in which a descent that the operator has acknowledged is stopped [ns].
-Source: docs/reference/plant.md, "Stop rule"."""
+"""Time in which a descent that the operator has acknowledged is stopped [ns]."""
 REELS_NS = 1_000_000_000
 """Time after a hit in which the hit explains the robot's motion [ns]."""
 THROWN_NS = 3_000_000_000
 """Time after a hit in which the robot may be thrown out of the fence [ns]."""
-RESUME_COMMANDS = 10
-RESUME_NS = 500_000_000
-"""Time within which RESUME_COMMANDS fresh commands end a HOLD [ns].
-Source: docs/reference/plant.md, "Leaving HOLD"."""
+RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
+"""So many fresh commands within this time end a HOLD [ns]."""
 SETTLE_NS = 1_000_000_000
-"""Shortest time from one TRACK to the next, and from one HOLD to the next [ns].
-Source: docs/reference/faults.md, "F5"."""
-INVALID_COMMANDS = 5
-INVALID_NS = 1_000_000_000
-"""Time within which INVALID_COMMANDS impossible commands make the robot land [ns].
-Source: docs/reference/faults.md, "F23"."""
+"""Shortest time from one TRACK to the next, and from one HOLD to the next [ns]."""
+INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
+"""So many impossible commands within this time make the robot land [ns]."""
 INVALID = ("range", "future")
 """Reasons for which the guard rejects impossible commands."""
 GROUND_NS = 10_000_000_000
-"""Shortest time for which a robot on the ground waits for a mission's first command [ns].
-Source: docs/safety.md, "The guard"."""
+"""Shortest time for which a robot on the ground waits for a mission's first command [ns]."""
 RAMP = 3.0
-"""Largest growth of the reference after a HOLD [m/s^2].
-Source: docs/reference/plant.md, "Leaving HOLD"."""
+"""Largest growth of the reference after a HOLD [m/s^2]."""
 RAMP_MIN = 1.0
-"""Shortest time for which the reference grows slowly [s]; it is longer if the cap is higher.
-Source: docs/safety.md, "The guard"."""
+"""Shortest time for which the reference grows slowly [s]; it is longer if the cap is higher."""
 
 
 class Breach(NamedTuple):
