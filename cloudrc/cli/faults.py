@@ -6,15 +6,14 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable, Generator
-from contextlib import closing
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
 from cloudrc.cli.parser import COUNT_MAX, input_file, read_count
-from cloudrc.cli.pool import WorkerDiedError, interrupt_on_signals, map_in_order
+from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -32,7 +31,6 @@ examples:
 
 exit codes: 0 all checks passed, 1 a check failed, 2 bad input,
   6 a worker was killed, 130 interrupted"""
-JOBS = "number of parallel processes, at most one per core (default: 1)"
 SEED_MAX = 2**53 - 1 - COUNT_MAX
 """Largest first seed: the seeds counted from it must stay below 2^53."""
 MINUTES_MAX = 10_000.0
@@ -43,8 +41,7 @@ ACTIONS = {
     "search": "fly random combinations of faults and check the invariants in every step",
 }
 STORE = Path("faults-found")
-FAILED, INTERRUPTED = 1, 130
-Item = TypeVar("Item")
+FAILED = 1
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,28 +49,20 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
     parsers = {}
     for name, text in ACTIONS.items():
-        parsers[name] = actions.add_parser(
-            name, help=text, description=text[0].upper() + text[1:] + "."
-        )
+        description = f"{text[0].upper()}{text[1:]}."
+        parsers[name] = actions.add_parser(name, help=text, description=description)
         output_argument(parsers[name])
-    run_, search_ = parsers["run"], parsers["search"]
-    what = run_.add_mutually_exclusive_group(required=True)
+    what = parsers["run"].add_mutually_exclusive_group(required=True)
     text = "name of the fault, its number: F13, or a schedule's file (.yaml)"
     what.add_argument("name", nargs="?", type=_name_or_file, metavar="NAME", help=text)
     what.add_argument("--all", action="store_true", help="every fault")
-    run_.add_argument("--seed", type=_seed, default=1, metavar="N", help="seed (default: 1)")
-    run_.add_argument("--jobs", type=read_count, default=1, metavar="J", help=JOBS)
-    text = "write the results as JUnit XML"
-    run_.add_argument("--junit", type=_output_path, metavar="FILE", help=text)
-    text = "duration (default: 1)"
-    search_.add_argument("--minutes", type=_minutes, default=1.0, metavar="M", help=text)
-    text = "first seed (default: 1)"
-    search_.add_argument("--first", type=_seed, default=1, metavar="SEED", help=text)
+    for name, options in OPTIONS.items():
+        for option, (read, default, metavar, text) in options.items():
+            parsers[name].add_argument(
+                option, type=read, default=default, metavar=metavar, help=text
+            )
     text = "the cloud has valid keys and tries to break the invariants"
-    search_.add_argument("--adversarial", action="store_true", help=text)
-    search_.add_argument("--jobs", type=read_count, default=1, metavar="J", help=JOBS)
-    text = f"folder for failing schedules, after reduction (default: ./{STORE})"
-    search_.add_argument("--store", type=_output_path, default=STORE, metavar="DIR", help=text)
+    parsers["search"].add_argument("--adversarial", action="store_true", help=text)
 
 
 def _name_or_file(text: str) -> str | Path:
@@ -105,6 +94,24 @@ def _output_path(text: str) -> Path:
     if not ((existing.is_dir() or existing == path) and os.access(existing, os.W_OK)):
         raise argparse.ArgumentTypeError(f"{text}: cannot be written")
     return path
+
+
+JOBS = (read_count, 1, "J", "number of parallel processes, at most one per core (default: 1)")
+STORED = f"folder for failing schedules, after reduction (default: ./{STORE})"
+OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
+    "run": {
+        "--seed": (_seed, 1, "N", "seed (default: 1)"),
+        "--jobs": JOBS,
+        "--junit": (_output_path, None, "FILE", "write the results as JUnit XML"),
+    },
+    "search": {
+        "--minutes": (_minutes, 1.0, "M", "duration (default: 1)"),
+        "--first": (_seed, 1, "SEED", "first seed (default: 1)"),
+        "--jobs": JOBS,
+        "--store": (_output_path, STORE, "DIR", STORED),
+    },
+}
+"""Options of each action: how a value is read, the default, its name in the help, the help."""
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -147,35 +154,19 @@ def run(options: argparse.Namespace) -> int:
             _print_result(result, options.all)
 
     jobs = [(each.name, options.seed) for each in chosen]
-    cause, code = _take_each(map_in_order(_run, jobs, options.jobs), take)
+    cause, code = take_each(map_in_order(_run, jobs, options.jobs), take)
     if options.junit is not None:
         options.junit.parent.mkdir(parents=True, exist_ok=True)
         options.junit.write_text(as_junit(results, options.seed), encoding="utf-8")
-    passed = sum(result.passed for result in results)
-    failed = len(results) - passed
+    count, failed = len(results), sum(not result.passed for result in results)
     if options.output != "table":
         print(format_document(as_json(results, options.seed), options.output))
     else:
-        print(f"\nseed {options.seed}: {passed} of {len(results)} passed, {failed} failed")
+        print(f"\nseed {options.seed}: {count - failed} of {count} passed, {failed} failed")
     if cause:
-        message = f"cloudrc: {cause}; {len(results)} of {len(chosen)} faults were run before"
-        print(message, file=sys.stderr, flush=True)
+        text = f"cloudrc: {cause}; {count} of {len(chosen)} faults were run before"
+        print(text, file=sys.stderr, flush=True)
     return code or (FAILED if failed else 0)
-
-
-def _take_each(
-    results: Generator[Item, Any, None], take: Callable[[Item], None]
-) -> tuple[str, int]:
-    """Take all results; return what ended them early and its exit code, or "" and 0."""
-    try:
-        with closing(results):
-            for result in results:
-                take(result)
-    except KeyboardInterrupt:
-        return "interrupted", INTERRUPTED
-    except WorkerDiedError as error:
-        return str(error), error.exit_code
-    return "", 0
 
 
 def _run(job: tuple[str, int]) -> Result:
@@ -242,7 +233,7 @@ def search(options: argparse.Namespace) -> int:
     if shown:
         print(f"{kind} schedules from seed {options.first} on, for {options.minutes:g} min")
     flights = searched.run(options.minutes, map_in_order, options.jobs)
-    cause, code = _take_each(flights, take)
+    cause, code = take_each(flights, take)
     again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
     again += f" --first {searched.next}"
     document = searched.document()

@@ -11,21 +11,26 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
 from types import FrameType
-from typing import TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from cloudrc.errors import InvalidRunError
+from cloudrc.metrics.verdict import EXIT_CODES
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
+Stop: TypeAlias = tuple[str, int]
+"""What ended work early, and its exit code."""
 PARENT_PERIOD = 0.5
 """Period in which a worker checks whether its parent still runs [s]."""
 BATCH_MAX = 1000
 """Maximum number of tasks that a pool gets at once. Before Python 3.11.6, a pool hangs if it gets
 more than 16,384 tasks at once (cpython issue 105829)."""
-WORKER_KILLED = "a worker was killed, perhaps by the kernel because memory ran out"
+WORKER_KILLED = (
+    "a worker was killed, perhaps by the kernel because memory ran out; use fewer processes"
+)
 
 
 class WorkerDiedError(InvalidRunError):
@@ -91,13 +96,26 @@ def map_in_order(
             while futures:
                 yield futures.popleft().result()
     except BrokenProcessPool as error:
-        raise WorkerDiedError(f"{WORKER_KILLED}: try fewer '--jobs'") from error
+        raise WorkerDiedError(WORKER_KILLED) from error
     except BaseException:  # Ctrl-C, or the caller wants no more results
         for worker in multiprocessing.active_children():
             worker.kill()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def take_each(results: Generator[Result, Any, None], take: Callable[[Result], None]) -> Stop:
+    """Take all results; return what ended them early and its exit code, or "" and 0."""
+    try:
+        with closing(results):
+            for result in results:
+                take(result)
+    except KeyboardInterrupt:
+        return "interrupted", EXIT_CODES["interrupted"]
+    except WorkerDiedError as error:
+        return str(error), error.exit_code
+    return "", 0
 
 
 @contextmanager

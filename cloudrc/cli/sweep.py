@@ -10,13 +10,12 @@ import math
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.find_run import new_folder
 from cloudrc.cli.output import escape, format_document, format_number, print_or_drop, table
-from cloudrc.cli.pool import WORKER_KILLED, WorkerDiedError, map_in_order
+from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.metrics.verdict import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
@@ -99,18 +98,14 @@ def fly_seeds(options: argparse.Namespace) -> int:
     folder = new_folder(options.out, f"{loaded.name}-virtual-{options.seeds}seeds")
     work = [(options.experiment, options.set, folder, n + 1) for n in range(options.seeds)]
     reports: list[dict[str, Any]] = []
-    stopped, code = "", 0
-    try:
-        with closing(map_in_order(_fly_one, work, len(work))) as finished:
-            for report in finished:
-                reports.append(report)
-                _show_run(options, report, f"{len(reports)}/{len(work)}")
-                if report["verdict"] == "interrupted":  # with one core, this process flies
-                    raise KeyboardInterrupt
-    except KeyboardInterrupt:
-        stopped, code = "interrupted", EXIT_CODES["interrupted"]
-    except WorkerDiedError as error:
-        stopped, code = WORKER_KILLED, error.exit_code
+
+    def take(report: dict[str, Any]) -> None:
+        reports.append(report)
+        _show_run(options, report, f"{len(reports)}/{len(work)}")
+        if report["verdict"] == "interrupted":  # with one core, this process flies
+            raise KeyboardInterrupt
+
+    stopped, code = take_each(map_in_order(_fly_one, work, len(work)), take)
     if stopped:
         text = f"\ncloudrc: {stopped}: {len(reports)} of {len(work)} seeds are finished"
         print_or_drop(text, sys.stderr)

@@ -58,52 +58,27 @@ def silent(start: float, duration: float, **changes: object) -> Shape:
 class Flight:
     """World, cloud, teleop and link, from the start on.
 
-    Attributes:
-        experiment: What is flown.
-        world: World's process; `cloud` and `teleop` are the others, `run` is their driver.
-        uplink: Link from world to cloud; `downlink` is the way back.
-        watch: The invariants.
-        of_world: World's records, if they are kept; `of_cloud` are those of cloud.
-        changes: Changes of the guard's state.
-        world_starts_ns: Start of each process of world [ns], world's clock.
-        generations: Number of processes of each end so far.
-        rings: Keys of the running processes, by end; `secrets` are the contents of the key files.
-        listeners: Get world's new records and the time [ns] every 100 ms.
+    `rings` are the keys of the running processes, `secrets` the contents of the key files.
+    `listeners` get world's new records and the time [ns] every 100 ms.
     """
 
     def __init__(
         self,
-        *settings: str,
+        *settings: str,  # of the experiment `paper`, as `--set` takes them
         seed: int = 1,
-        cloud_clock: Clock | None = None,
-        uplink: Shape | None = None,
-        downlink: Shape | None = None,
-        honest: bool = True,
-        keep: bool = True,
-        start: bool = True,
-        life: int = 1,
-        lies: Sequence[Lie] = (),
-        words: Words | None = None,
+        cloud_clock: Clock | None = None,  # None if the two ends share a clock
+        uplink: Shape = replace,  # changes the link from world to cloud; by default nothing
+        downlink: Shape = replace,  # changes the link from cloud to world
+        honest: bool = True,  # whether a contact is a breach
+        keep: bool = True,  # whether all records are kept and hashed
+        start: bool = True,  # whether the experiment's mission is ordered at once
+        life: int = 1,  # makes the nonces differ from those of another flight
+        lies: Sequence[Lie] = (),  # change cloud's commands, one after the other
+        words: Words | None = None,  # takes the operator's place in cloud
         second: float | None = None,
-        separate: bool = False,
+        separate: bool = False,  # whether teleop is a process of its own, not in cloud's
     ) -> None:
-        """Prepare a flight.
-
-        Args:
-            settings: Changes of the experiment `paper`, as `--set` takes them.
-            seed: Seed of everything random.
-            cloud_clock: Cloud's clock; None if the two ends share a clock.
-            uplink: Changes the link from world to cloud.
-            downlink: Changes the link from cloud to world.
-            honest: Whether a contact is a breach.
-            keep: Whether all records are kept and hashed.
-            start: Whether the experiment's mission is ordered at once.
-            life: Makes the nonces differ from those of another flight.
-            lies: Change cloud's commands, one after the other.
-            words: Takes the operator's place in cloud.
-            second: When another cloud asks for the robot [s].
-            separate: Whether teleop is a process of its own, not in cloud's.
-        """
+        """Prepare a flight; another cloud asks for the robot at `second` [s]."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
@@ -209,14 +184,14 @@ class Flight:
         return self.robot.guard.state, self.robot.guard.cause.words
 
     def _build_world(self, start_ns: int) -> WorldEndpoint:
-        identity = WorldIdentity(SHARED, self._nonce("world"), self._read_key("world"))
+        identity = WorldIdentity(SHARED, *self._begin("world"))
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self.watch.attach(world.robot, start_ns, honest=self._honest)
         self.world_starts_ns.append(start_ns)
         return world
 
     def _build_cloud(self, start_ns: int) -> Endpoint:
-        identity = CloudIdentity(self._clock_id, self._nonce("cloud"), self._read_key("cloud"))
+        identity = CloudIdentity(self._clock_id, *self._begin("cloud"))
         teleop: Operator = self.teleop.join(start_ns)
         if self._words is not None:
             teleop = HostileOperator(teleop, self._words)
@@ -236,19 +211,17 @@ class Flight:
         identity = CloudIdentity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
 
-    def _make_link(self, shape: Shape | None, *, up: bool) -> LinkDirection:
+    def _make_link(self, shape: Shape, *, up: bool) -> LinkDirection:
         resolved = self.experiment.uplink if up else self.experiment.downlink
-        profile = assembly.link_profile(resolved)
-        profile = profile if shape is None else shape(profile)
+        profile = shape(assembly.link_profile(resolved))
         return LinkDirection(profile, self.experiment.seed, uplink=up)
 
-    def _nonce(self, end: str) -> bytes:
+    def _begin(self, end: str) -> tuple[bytes, KeyRing]:
+        """Return the nonce and the keys of an end's new process."""
         self.generations[end] += 1
-        return f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)
-
-    def _read_key(self, end: str) -> KeyRing:
-        ring = self.rings[end] = KeyRing(self.secrets[end])
-        return ring
+        self.rings[end] = KeyRing(self.secrets[end])
+        nonce = f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)
+        return nonce, self.rings[end]
 
     def _sink(self, of_world: list[Record], of_cloud: list[Record]) -> None:
         if self._keep:

@@ -20,7 +20,8 @@ hold       TRACK begins at least `SETTLE_NS` after the last TRACK, and a HOLD fo
            impossible commands.
 tick       Each step of the physics has a tick of the guard.
 
-All limits come from the configuration, none from the guard.
+All limits come from the configuration and from docs/, none from the guard: from "Stop rule" and
+"Leaving HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, "The guard" in safety.md.
 """
 
 from __future__ import annotations
@@ -56,42 +57,31 @@ STILL = 0.12
 STANDS = 0.2
 """Speed per axis up to which a robot stands when its rotors stop [m/s]."""
 FALL = 1.0
-"""Speed of descent of a robot that fell after its rotors stopped [m/s]. A drop from the guard's
-0.02 m reaches 0.7."""
+"""Speed of a robot that fell after its rotors stopped [m/s]; a drop from 0.02 m reaches 0.7."""
 REST = 0.5
-"""Length added to the stopping distance of a robot without commands [m]: it swings back. In 200
-flights of the search, half of them with a hostile cloud, at most 0.20 was used."""
+"""Length added to the stopping distance without commands [m]: it swings back by up to 0.2."""
 FALL_MAX = 1.5
-"""Distance from the fence at which people are safe [m]. Source: docs/safety.md, "The guard"."""
+"""Distance from the fence at which people are safe [m]."""
 BRAKE_NS = 200_000_000
-"""Time in which a descent that the operator has acknowledged is stopped [ns].
-Source: docs/reference/plant.md, "Stop rule"."""
+"""Time in which a descent that the operator has acknowledged is stopped [ns]."""
 REELS_NS = 1_000_000_000
 """Time after a hit in which the hit explains the robot's motion [ns]."""
 THROWN_NS = 3_000_000_000
 """Time after a hit in which the robot may be thrown out of the fence [ns]."""
-RESUME_COMMANDS = 10
-RESUME_NS = 500_000_000
-"""Time within which RESUME_COMMANDS fresh commands end a HOLD [ns].
-Source: docs/reference/plant.md, "Leaving HOLD"."""
+RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
+"""So many fresh commands within this time end a HOLD [ns]."""
 SETTLE_NS = 1_000_000_000
-"""Shortest time from one TRACK to the next, and from one HOLD to the next [ns].
-Source: docs/reference/faults.md, "F5"."""
-INVALID_COMMANDS = 5
-INVALID_NS = 1_000_000_000
-"""Time within which INVALID_COMMANDS impossible commands make the robot land [ns].
-Source: docs/reference/faults.md, "F23"."""
+"""Shortest time from one TRACK to the next, and from one HOLD to the next [ns]."""
+INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
+"""So many impossible commands within this time make the robot land [ns]."""
 INVALID = ("range", "future")
 """Reasons for which the guard rejects impossible commands."""
 GROUND_NS = 10_000_000_000
-"""Shortest time for which a robot on the ground waits for a mission's first command [ns].
-Source: docs/safety.md, "The guard"."""
+"""Shortest time for which a robot on the ground waits for a mission's first command [ns]."""
 RAMP = 3.0
-"""Largest growth of the reference after a HOLD [m/s^2].
-Source: docs/reference/plant.md, "Leaving HOLD"."""
+"""Largest growth of the reference after a HOLD [m/s^2]."""
 RAMP_MIN = 1.0
-"""Shortest time for which the reference grows slowly [s]; it is longer if the cap is higher.
-Source: docs/safety.md, "The guard"."""
+"""Shortest time for which the reference grows slowly [s]; it is longer if the cap is higher."""
 
 
 class Breach(NamedTuple):
@@ -103,21 +93,13 @@ class Breach(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Limits that the guard has to keep.
+    """Limits that the guard has to keep."""
 
-    Attributes:
-        speed: Largest reference [m/s].
-        acceleration: Largest growth of the reference [m/s^2].
-        yaw_rate: Largest yaw rate [rad/s].
-        age_ns: Largest age of a command's basis [ns].
-        hold_ns: Time in a mission after which HOLD becomes LAND [ns].
-    """
-
-    speed: float = 6.0
-    acceleration: float = 12.0
-    yaw_rate: float = 1.0
-    age_ns: int = 250_000_000
-    hold_ns: int = 60_000_000_000
+    speed: float = 6.0  # of the reference [m/s]
+    acceleration: float = 12.0  # growth of the reference [m/s^2]
+    yaw_rate: float = 1.0  # [rad/s]
+    age_ns: int = 250_000_000  # of a command's basis [ns]
+    hold_ns: int = 60_000_000_000  # time in a mission after which HOLD becomes LAND [ns]
 
     @classmethod
     def of(cls, guard: ResolvedGuard) -> Limits:
@@ -132,31 +114,18 @@ class Limits(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of all robots of a flight, which follow each other.
-
-    Attributes:
-        breaches: The first breaches of each kind.
-        counts: Number of breaches, by kind.
-        margin: Smallest distance of the base to the fence, the floor excepted [m].
-        speed: Largest reference [m/s].
-        landed_on: What the robot touched while it landed, the floor excepted.
-    """
+    """Collects the breaches of all robots of a flight, which follow each other."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
-        self.breaches: list[Breach] = []
-        self.counts: Counter[str] = Counter()
-        self.margin, self.speed = 9.0, 0.0
-        self.landed_on: set[str] = set()
+        self.breaches: list[Breach] = []  # the first ones of each kind
+        self.counts: Counter[str] = Counter()  # of breaches, by kind
+        self.margin = 9.0  # smallest distance of the base to the fence, the floor excepted [m]
+        self.speed = 0.0  # largest reference [m/s]
+        self.landed_on: set[str] = set()  # what it touched while landing, the floor excepted
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
-        """Check every step of a robot from now on.
-
-        Args:
-            robot: The robot.
-            start_ns: Time of its first step [ns].
-            honest: Whether its cloud is honest; then a hit is a breach.
-        """
+        """Check every step of a robot from `start_ns` [ns] on; if `honest`, a hit is a breach."""
         robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
@@ -472,12 +441,8 @@ class RobotInvariants:
 def can_stop(speed: float, below: float, above: float) -> bool:
     """Tell whether the robot can stop before the face of the fence that it flies towards.
 
+    Along one axis it has a `speed` [m/s], and distances to the faces `below` and `above` it [m].
     Source: docs/reference/plant.md, "Stop rule": 0.2 v + v^2/6 <= distance - 0.1.
-
-    Args:
-        speed: Component of the velocity along an axis [m/s].
-        below: Distance to the face at the axis' lower end [m].
-        above: Distance to the face at the axis' upper end [m].
     """
     if speed > 0.0:
         return speed * (0.2 + speed / 6.0) <= above - 0.1 + SLACK

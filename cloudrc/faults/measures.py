@@ -40,13 +40,7 @@ def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
 
 
 def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Record]:
-    """Return the records of a process up to `until` [s] of virtual time; all without it.
-
-    Args:
-        flight: The flight.
-        role: "world", "cloud" or "teleop".
-        until: Virtual time [s].
-    """
+    """Return the records of world, cloud or teleop up to `until` [s] of virtual time, or all."""
     records: Iterable[Record] = flight.of_world if role == "world" else flight.of_cloud
     records = flight.teleop.events if role == "teleop" else records
     if until is None:

@@ -65,31 +65,19 @@ class Clock:
 
 
 class RestartableEndpoint:
-    """World or cloud in a process that a scenario can kill, freeze and start; an `Endpoint`.
-
-    Attributes:
-        inner: The end that runs; None while there is no process.
-        tamper: Changes the datagrams that arrive; None for no change.
-        clock: The process's clock.
-    """
+    """World or cloud in a process that a scenario can kill, freeze and start; an `Endpoint`."""
 
     sealed = True  # a flight's ends have keys
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
-        """Start the first process.
-
-        Args:
-            build: Makes an end that starts at an instant of its own clock [ns].
-            clock: The process's clock.
-            name: "world" or "cloud", for the records.
-        """
+        """Start the first process; `build` makes an end at an instant of its own clock [ns]."""
         self._build, self.clock, self._name = build, clock, name
-        self.tamper: Tamper | None = None
+        self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._scheduled, self._frozen_until_ns = 0, -1
         self._waiting: list[bytes] = []
         self._left: list[Record] = []
         self._actions: list[tuple[int, int, Action]] = []
-        self.inner: Endpoint | None = build(clock.at(0))
+        self.inner: Endpoint | None = build(clock.at(0))  # None while there is no process
         self._set_deadline()
 
     def at(self, seconds: float, action: Action) -> None:
@@ -190,18 +178,13 @@ class RestartableEndpoint:
 
 
 class EndpointGroup:
-    """Ends that share a socket: each hears all datagrams; an `Endpoint` itself.
-
-    Attributes:
-        members: The ends; only the records of the first are recorded.
-        others: Records of the other ends, oldest first.
-    """
+    """Ends that share a socket: each hears all datagrams; an `Endpoint` itself."""
 
     sealed = True
 
     def __init__(self, members: Sequence[Endpoint]) -> None:
         self.members = members
-        self.others: list[Record] = []
+        self.others: list[Record] = []  # of all ends but the first, oldest first
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
         """See `Endpoint`."""
@@ -231,28 +214,20 @@ class EndpointGroup:
 
 
 class InProcessTeleop:
-    """Teleop inside cloud's process, with a disk that survives its restarts; an `Operator`.
-
-    Attributes:
-        service: The service that runs; None while teleop is down.
-        events: All events of missions, oldest first.
-        outputs: See `Operator`.
-    """
+    """Teleop inside cloud's process, with a disk that survives its restarts; an `Operator`."""
 
     outcome: Outcome | None = None
     settled = True
 
     def __init__(self, contact_speed_max: float, name: bytes = b"desk") -> None:
-        """Start for the first time.
+        """Start; `contact_speed_max` is the limit of the arm's tip at the board [m/s].
 
-        Args:
-            contact_speed_max: Speed limit of the arm's tip at the board [m/s].
-            name: Makes its mission numbers differ from those of another teleop.
+        A `name` makes its mission numbers differ from those of another teleop.
         """
         self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
         self._disk = b""  # the bytes of its database
-        self.events: list[MissionEvent] = []
-        self.service: MissionService | None = None
+        self.events: list[MissionEvent] = []  # of all missions, oldest first
+        self.service: MissionService | None = None  # while teleop is down
         self.outputs: Sequence[Output | Fault] = []
         self.start()
 
@@ -357,12 +332,7 @@ class SeparateTeleop(InProcessTeleop):
     """
 
     def __init__(self, contact_speed_max: float, phase_ns: int) -> None:
-        """Start for the first time.
-
-        Args:
-            contact_speed_max: Speed limit of the arm's tip at the board [m/s].
-            phase_ns: Time of the first wake, below `PERIOD_NS` [ns].
-        """
+        """Start; `contact_speed_max` as above [m/s], the first wake at `phase_ns` [ns]."""
         self._host: RestartableEndpoint | None = None
         self._peer = _Peer(lambda: self.service is not None)
         self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)

@@ -88,24 +88,14 @@ Inject: TypeAlias = Callable[[Outcome, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """A fault and what must follow from it.
+    """A fault and what must follow from it, in words and as checks."""
 
-    Attributes:
-        number: Number in docs/reference/faults.md: 13 for F13.
-        name: Name on the command line: cloud-killed.
-        injects: What is done, in words.
-        expects: What the robot does and within what time, in words.
-        loses: What may be lost.
-        shows: What the user sees, or which metric moves.
-        inject: Injects the fault, and checks.
-    """
-
-    number: int
-    name: str
+    number: int  # in docs/reference/faults.md: 13 for F13
+    name: str  # on the command line: cloud-killed
     injects: str
-    expects: str
-    loses: str
-    shows: str
+    expects: str  # what the robot does, and within what time
+    loses: str  # what may be lost
+    shows: str  # what the user sees, or which metric moves
     inject: Inject
 
     @property

@@ -106,32 +106,23 @@ class Event:
 class Schedule:
     """All faults of one flight.
 
-    Attributes:
-        seed: Seed of the link, and of everything random in the faults.
-        profile: Profile of the link.
-        events: Faults, in any order.
-        duplicate: Share of datagrams that arrive twice, in [0, 1].
-        reorder: Share of datagrams that overtake others, in [0, 1].
-        cloud_offset: Cloud's clock minus world's [s]; 0 for one shared clock.
-        cloud_drift: How fast cloud's clock is [ppm].
-        policy: Policy of a hostile cloud; "" for an honest cloud.
-        duration: Duration of the flight [s].
-        separate: Whether teleop is a process of its own, as in production.
-        hold_max: Time in a mission after which HOLD becomes LAND [s].
+    The seed is that of the link, and of everything random in the faults. With `separate`, teleop is
+    a process of its own, as in production.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
     seed: Annotated[int, Field(ge=0, le=2**63)]
     profile: str = "paper-p2"
     events: tuple[Event, ...] = ()
-    duplicate: Share = 0.0
-    reorder: Share = 0.0
+    duplicate: Share = 0.0  # of datagrams that arrive twice
+    reorder: Share = 0.0  # of datagrams that overtake others
     cloud_offset: Annotated[float, Field(ge=-OFFSET_MAX, le=OFFSET_MAX)] = 0.0
-    cloud_drift: Annotated[int, Field(ge=-100_000, le=100_000)] = 0
-    policy: str = ""
-    duration: Annotated[float, Field(ge=0.1, le=DURATION_MAX)] = 60.0
+    """Cloud's clock minus world's [s]; 0 for one shared clock."""
+    cloud_drift: Annotated[int, Field(ge=-100_000, le=100_000)] = 0  # how fast cloud's is [ppm]
+    policy: str = ""  # of a hostile cloud; "" for an honest one
+    duration: Annotated[float, Field(ge=0.1, le=DURATION_MAX)] = 60.0  # [s]
     separate: bool = False
-    hold_max: Annotated[float, Field(ge=0.1, le=3600.0)] = 60.0
+    hold_max: Annotated[float, Field(ge=0.1, le=3600.0)] = 60.0  # HOLD becomes LAND then [s]
 
     @property
     def teleop_is_separate(self) -> bool:
@@ -190,12 +181,10 @@ def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change
 
 def dump(schedule: Schedule, note: str = "") -> str:
     """Write a schedule as YAML, with a note at its top."""
+    values, plain = asdict(schedule).items(), asdict(Schedule(0))
     document: dict[str, Any] = {
-        name: value
-        for name, value in asdict(schedule).items()
-        if name != "events" and value != getattr(Schedule(0), name)
+        name: value for name, value in values if name == "seed" or value != plain[name]
     }
-    document["seed"] = schedule.seed
     document["events"] = [
         {name: value for name, value in asdict(event).items() if value or name == "at"}
         for event in sorted(schedule.events, key=lambda event: event.at)

@@ -36,19 +36,12 @@ def fly_seed(job: Job) -> Finding:
 
 
 class Search:
-    """A search and its result so far.
-
-    Attributes:
-        kind: One of `KINDS`.
-        first: First seed.
-        next: Seed after the last one that was flown.
-        failures: Schedules that broke an invariant, shrunk, as plain values.
-    """
+    """A search of one of `KINDS` and its result so far; `next` is the next seed."""
 
     def __init__(self, kind: str, first: int, store: Path) -> None:
         """Prepare a search; `store` is the folder for failing schedules, made when needed."""
         self.kind, self.first, self.next, self._store = kind, first, first, store
-        self.failures: list[dict[str, Any]] = []
+        self.failures: list[dict[str, Any]] = []  # schedules that broke an invariant, shrunk
         self._checked: Counter[str] = Counter()
         self._broken: Counter[str] = Counter()
         self._margin, self._speed, self._flown, self._seconds = 9.0, 0.0, 0.0, 0.0

@@ -66,25 +66,15 @@ IMPOSSIBLE = (nan, inf, -inf)
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of a schedule.
-
-    Attributes:
-        schedule: The schedule.
-        breaches: The invariants that broke first; none if all held.
-        sha256: Hash of all records, if they were kept.
-        margin: Smallest distance of the base to the fence's walls and ceiling [m].
-        speed: Largest reference [m/s].
-        holds: Number of HOLDs during a mission.
-        missions: Number of missions that were done.
-    """
+    """Result of a schedule."""
 
     schedule: Schedule
-    breaches: tuple[Breach, ...]
-    sha256: str = ""
-    margin: float = 9.0
-    speed: float = 0.0
-    holds: int = 0
-    missions: int = 0
+    breaches: tuple[Breach, ...]  # that were first; none if all invariants held
+    sha256: str = ""  # of all records, if they were kept
+    margin: float = 9.0  # smallest distance of the base to the fence's walls and ceiling [m]
+    speed: float = 0.0  # largest reference [m/s]
+    holds: int = 0  # during a mission
+    missions: int = 0  # that were done
 
     @property
     def kinds(self) -> set[str]:
@@ -93,12 +83,9 @@ class Finding:
 
 
 def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
-    """Fly a schedule.
+    """Fly a schedule with `settings` of the experiment, as `--set` takes them.
 
-    Args:
-        schedule: The schedule.
-        settings: Changes of the experiment, as `--set` takes them.
-        keep: Whether records are kept and hashed; this doubles the time.
+    With `keep` the records are kept and hashed, which doubles the time.
 
     Raises:
         BadInputError: If there is no such profile or policy.

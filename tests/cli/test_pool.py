@@ -68,7 +68,7 @@ def test_results_before_a_worker_was_killed_are_kept(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("cloudrc.cli.pool.BATCH_MAX", KILLED)
     results: list[int] = []
     done = map_in_order(_kill_at_five, range(9), 2)
-    with pytest.raises(WorkerDiedError, match=r"a worker was killed.*fewer '--jobs'"):
+    with pytest.raises(WorkerDiedError, match=r"a worker was killed.*use fewer processes"):
         results.extend(each for each in done if time.sleep(0.1) is None)  # take them slowly
     assert results[:KILLED] == list(range(KILLED))
 

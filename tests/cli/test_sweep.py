@@ -61,7 +61,7 @@ def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture
     ("error", "code", "word"),
     [
         (KeyboardInterrupt(), 130, "interrupted"),
-        (WorkerDiedError("killed"), 6, "a worker was killed"),
+        (WorkerDiedError("a worker was killed"), 6, "a worker was killed"),
     ],
 )
 def test_an_interrupted_sweep_keeps_what_is_finished(

@@ -74,22 +74,13 @@ class FakeRobot:
         ms: int = 2,
         reference: Vector | None = None,
         position: Vector | None = None,
-        turns: bool | None = None,
-        fresh: bool = True,
+        turns: bool | None = None,  # whether the rotors turn; by default in flight
+        fresh: bool = True,  # whether a fresh command comes before each step in TRACK
     ) -> set[str]:
-        """Be in a state for some time; return the kinds of breaches so far.
-
-        Args:
-            state: State of the guard.
-            ms: Duration [ms].
-            reference: New reference [m/s]; None for the last one.
-            position: New position [m]; None for the last one.
-            turns: Whether the rotors turn; by default in flight.
-            fresh: Whether a fresh command comes before each step in TRACK.
-        """
+        """Be in a state for some time; return the kinds of breaches so far."""
         self.guard.state = state
-        self.guard.reference = self.guard.reference if reference is None else reference
-        self.position = self.position if position is None else position
+        self.guard.reference = reference or self.guard.reference
+        self.position = position or self.position
         speeds = TURNING if (state in FLOWN if turns is None else turns) else STOPPED
         for _ in range(ms // 2):
             if state is TRACK and fresh:

@@ -11,12 +11,11 @@ from typing import Any
 import pytest
 
 from cloudrc.faults import invariants
-from cloudrc.faults.adversary import POLICIES, choose, dishonesty
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import OrderInvariant, checked_in, fly
-from cloudrc.messages import ZERO, Command, GuardState, Request
+from cloudrc.messages import ZERO, Command, GuardState
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
@@ -55,17 +54,6 @@ def test_it_causes_none_with_a_stiffer_low_level_controller(seed: int) -> None:
     """Three times the default integral removes the steady error of 32 mm."""
     hostile = replace(choose(seed), events=(), duration=15.0)
     assert fly(hostile, "world.low_level.integral_limit_xy=0.30").breaches == ()
-
-
-def test_a_hostile_cloud_makes_every_request() -> None:
-    lie, words = dishonesty(Schedule(27, policy="operators-voice"))
-    flight, heard = Flight(seed=27, honest=False, lies=[lie], words=words), set[Request]()
-    ear = dict.fromkeys(("see_step", "see_command", "see_session"), lambda *_: None)
-    hear = SimpleNamespace(**ear, see_request=lambda request, _: heard.add(request.request))
-    flight.robot.observers.append(hear)
-    flight.fly(15.0)
-    assert flight.watch.breaches == []
-    assert heard == set(Request) - {Request.PROGRESS}
 
 
 @pytest.mark.parametrize(
@@ -201,11 +189,7 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints: list[int], kinds: se
     events = [{"mission": "m", "event": "reached", "waypoint": n} for n in waypoints]
     events.append({"mission": "n", "event": "reached", "waypoint": 0})
     book = SimpleNamespace(events_after=lambda number: events)
-    flight: Any = SimpleNamespace(
-        listeners=[],
-        watch=Watch(Limits()),
-        teleop=SimpleNamespace(service=SimpleNamespace(book=book)),
-        run=SimpleNamespace(now_ns=0),
-    )
+    teleop, run = SimpleNamespace(service=SimpleNamespace(book=book)), SimpleNamespace(now_ns=0)
+    flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()), teleop=teleop, run=run)
     OrderInvariant(flight).check_waypoints()
     assert set(flight.watch.counts) == kinds

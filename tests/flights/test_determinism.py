@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import os
+import re
 import subprocess
 import sys
 import time
@@ -82,24 +82,11 @@ def test_the_flight_is_the_same_whatever_the_wall_clock_does(
         figure("steps and drifts of the wall clock: flights that differ", differs, "==", 0)
 
 
-WALL = ("time", "time_ns", "localtime", "gmtime", "ctime", "strftime")
-
-
-def wall_clocks(tree: ast.AST) -> list[str]:
-    """Find calls that read a wall clock."""
-    found = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute):
-            text = ast.unparse(node)
-            if text in {f"time.{name}" for name in WALL} | {"time.CLOCK_REALTIME"}:
-                found.append(text)
-            if node.attr in ("now", "utcnow", "today") and "date" in text:
-                found.append(text)
-        elif isinstance(node, ast.ImportFrom) and node.module == "time":
-            found += [alias.name for alias in node.names if alias.name in WALL]
-    return found
-
-
+WALL = re.compile(
+    r"\btime\.(time|time_ns|localtime|gmtime|ctime|strftime|CLOCK_REALTIME)\b"
+    r"|from time import|\bdate(time)?\.(now|utcnow|today)\b"
+)
+"""What reads a wall clock."""
 CONTROL_PATH = ("world/", "cloud/", "teleop/", "tunnel/", "link/", "endpoint", "drivers/")
 ALLOWED = {
     # The kernel stamps datagrams and probes by this clock; only ages of 0 to 50 ms are used.
@@ -114,12 +101,5 @@ def test_nothing_on_the_control_path_reads_a_wall_clock() -> None:
     places = {path.relative_to(ROOT / "cloudrc").as_posix(): path for path in PACKAGE}
     mine = {place: path for place, path in places.items() if place.startswith(CONTROL_PATH)}
     assert len(mine) > 60
-    reads = {place for place, path in mine.items() if wall_clocks(ast.parse(path.read_text()))}
+    reads = {place for place, path in mine.items() if WALL.search(path.read_text())}
     assert reads - ALLOWED == set()
-
-
-@pytest.mark.parametrize(
-    "code", ["time.time()", "from time import time_ns", "datetime.now()", "datetime.date.today()"]
-)
-def test_the_check_finds_a_wall_clock(code: str) -> None:
-    assert wall_clocks(ast.parse(code))

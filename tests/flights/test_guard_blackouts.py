@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, partial
-from itertools import product
 
 import numpy as np
 import pytest
@@ -14,9 +13,7 @@ from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, silent
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import GuardState
 from cloudrc.records import Control, GuardChange, MissionEvent
-from tests.conftest import nightly
 from tests.flights.conftest import fly_on, join
 
 Figure = Callable[..., None]
@@ -124,19 +121,6 @@ def test_a_silence_at_the_missions_end_lets_the_robot_hold() -> None:
     assert measures.calm_after(flight, hold.stamp_ns * 1e-9, flight.now) <= 1.0
 
 
-INSTANTS = [round(0.5 + 1.3 * k, 2) for k in range(24)]
-
-
-@pytest.mark.parametrize("ways", [BOTH, BOTH[:1], BOTH[1:]])
-@pytest.mark.parametrize(
-    "cut", [(11.3, 0.3), (22.1, 5.0), *nightly(*product(INSTANTS, [0.3, 1.0, 5.0, 20.0]))]
-)
-def test_a_silence_touches_nothing(cut: tuple[float, float], ways: tuple[str, ...]) -> None:
-    for cap in ("2", "6"):
-        speed = f"cloud.controller.speed_max={cap}"
-        is_flown(cut_off(*cut, speed, ways=ways).fly_mission(200.0))
-
-
 def fly_records(*settings: str, until: float = 0.0):
     ends = join(load_experiment("paper", settings))
     limit_ns = round((until or 150) * 1e9)
@@ -159,15 +143,6 @@ def test_a_silent_downlink_freezes_until_the_echo_is_back() -> None:
     after = next(r for r in control if r.stamp_ns > 31.3e9 and any(r.command))
     assert max(abs(a - b) for a, b in zip(after.integral, before.integral, strict=True)) < 0.1
     assert [r for r in of_cloud if isinstance(r, MissionEvent)][-1].event == "done"
-
-
-def test_a_lost_downlink_lands_the_robot_and_ends_the_run() -> None:
-    cut = "link.downlink.blackouts=[{start_s: 11.3, duration_s: 1000}]"
-    ends, of_world, _ = fly_records(cut, "guard.hold_max_s=20")
-    changes = [r for r in of_world if isinstance(r, GuardChange)]
-    assert [r.state for r in changes[-3:]] == [GuardState.HOLD, GuardState.LAND, GuardState.LAND]
-    assert changes[-1].cause == "touched down, rotors stopped"
-    assert ends.cloud.teleop.outcome.code == "guard_stopped"
 
 
 @pytest.mark.parametrize(

@@ -6,18 +6,16 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudIdentity
-from cloudrc.cloud.operator import Operator
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
-from cloudrc.records import Fault, GuardChange
-from cloudrc.teleop.wire import ALARM, Output, RobotStatus
+from cloudrc.records import GuardChange
+from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
 from cloudrc.world.endpoint import WorldIdentity
 from tests.flights.conftest import SHARED_CLOCK, Ends, fly_on, join
 
 HOVER = load_experiment("hover", ["link.profile=ideal"])
 S = 1_000_000_000
-LAG_NS = 2 * S
 ELSEWHERE = (5.0, 5.0, 1.0)
 ESTOP = GuardState.ESTOP
 
@@ -83,47 +81,6 @@ def test_used_up_numbers_last_until_the_next_session(ends: Ends) -> None:
     world = ends.run._world = assembly.build_world(HOVER, identity, lambda: ends.run.now_ns)
     fly_on(ends.run, 7 * S)
     assert world.robot.guard.state is ESTOP
-
-
-class Lagging:
-    """A teleop in its own process whose messages are late."""
-
-    outcome, settled = None, True
-
-    def __init__(self, teleop: Operator) -> None:
-        self._teleop = teleop
-        self._late: list[tuple[int, Output | Fault]] = []
-        self.outputs: list[Output | Fault] = []
-        self.epochs: dict[int, int] = {}  # epochs seen, and when first [ns]
-
-    def see(self, seen: RobotStatus, now_ns: int) -> None:
-        self.epochs.setdefault(seen.epoch, now_ns)
-        self._teleop.see(seen, now_ns)
-
-    def handle_deadline(self, now_ns: int) -> None:
-        self._teleop.handle_deadline(now_ns)
-        self._late += [(now_ns + LAG_NS, said) for said in self._teleop.take_outputs()]
-        while self._late and self._late[0][0] <= now_ns:
-            self.outputs.append(self._late.pop(0)[1])
-
-    def take_outputs(self) -> list[Output | Fault]:
-        outputs, self.outputs = self.outputs, []
-        return outputs
-
-
-def test_a_slow_teleop_starts_missions_in_the_session_it_saw() -> None:
-    """Its first start is under way while cloud restarts, and arrives in the next session."""
-    ends = join(HOVER)
-    teleop = ends.cloud.teleop = Lagging(ends.cloud.teleop)
-    assert states(ends, 1.5) == []
-    ends.run._cloud = assembly.build_cloud(
-        HOVER, CloudIdentity(SHARED_CLOCK, b"another".ljust(16)), lambda: ends.run.now_ns, teleop
-    )
-    of_world, _ = fly_on(ends.run, 4 * LAG_NS)
-    changes = [record for record in of_world if isinstance(record, GuardChange)]
-    _, second, _ = teleop.epochs.values()  # the third is that of the start from the spawn
-    assert changes[0].stamp_ns >= second + LAG_NS
-    assert changes[-1].state is GuardState.TRACK
 
 
 def test_without_a_session_only_an_alarm_waits() -> None:

@@ -64,16 +64,6 @@ def test_a_rotation_costs_one_short_hold_at_most(first: str, second: str, apart:
     assert flight.count("tag") <= 12 * apart / 60 + 2, "no alert"
 
 
-@pytest.mark.parametrize("ends", [("world",), ("cloud",), ENDS])
-def test_ends_that_start_amid_a_rotation_find_their_key(ends: tuple[str, ...]) -> None:
-    flight = Flight(*HOVER)
-    for end in ends:
-        flight.replace_key(end, NEW)
-    flight.fly(2.0)
-    assert key(flight) == (NEW if len(ends) == 2 else SECRET).current
-    assert held(flight) == []
-
-
 @pytest.mark.promise("old-keys-end")
 @pytest.mark.parametrize("first", ENDS)
 def test_a_dropped_key_ends_its_session_at_once(first: str) -> None:
@@ -87,12 +77,3 @@ def test_a_dropped_key_ends_its_session_at_once(first: str) -> None:
     flight.fly(flight.now + 2.0)
     assert key(flight) == NEW.current
     assert flight.guard_now()[0] is GuardState.TRACK
-
-
-@pytest.mark.parametrize(("first", "second"), [ENDS, ENDS[::-1]])
-def test_a_key_dropped_before_the_change_costs_one_hold(first: str, second: str) -> None:
-    """One end has both keys, and their session still has the old one."""
-    flight = rotated((second, KeySet(SECRET.current, NEW.current), 1.0), (first, ONLY, 3.0))
-    assert key(flight) == NEW.current
-    (hold,) = held(flight)
-    assert hold < HOLD_MAX + 1.0

@@ -152,9 +152,3 @@ def test_the_check_finds_reverted_commands(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.parametrize("first", list(product(BASIC, repeat=2)))
 def test_no_interleaving_of_ten_reverts_a_command(first: tuple[str, ...], figure: Figure) -> None:
     figure(BACK.format("10"), 0, "==", 0, count=explore(BASIC, 8, first))
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("first", list(ACTIONS))
-def test_no_interleaving_of_7_with_restarts_reverts_a_command(first: str) -> None:
-    explore(list(ACTIONS), 6, (first,))

@@ -136,18 +136,6 @@ def test_undrawable_data_gives_one_line_of_error(run: Path) -> None:
     assert json.loads((run / "report.json").read_text())["verdict"] == "failure"
 
 
-@pytest.mark.parametrize("name", ["config.yaml", "mission.mcap"])
-def test_a_report_does_not_wait_for_pipes(
-    run: Path, name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (run / name).unlink()
-    os.mkfifo(run / name)
-    (run / "world.mcap").write_bytes(b"")
-    assert main(["report", str(run)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("cloudrc: error: ")
-
-
 # Links.
 
 

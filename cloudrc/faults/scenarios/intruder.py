@@ -61,12 +61,8 @@ def _check_no_effect(
 ) -> None:
     """Fly with hostile datagrams beside the honest ones; the flight must be the same.
 
-    Args:
-        outcome: Takes the checks.
-        seed: Seed of the flight.
-        makes: Makes the hostile datagrams to world, and perhaps to cloud.
-        refusals: Counts of world that have to rise.
-        since: When the hostile datagrams begin [s].
+    `makes` make those to world, and perhaps to cloud, from `since` on [s]; the counts `refusals` of
+    world have to rise.
     """
     sender, clean, flight = HostileSender(), Flight(seed=seed).fly_mission(), Flight(seed=seed)
     for process, make in zip((flight.world, flight.cloud), makes, strict=False):
