@@ -163,7 +163,7 @@ class Source(NamedTuple):
     folder: Path  # where a relative path in the value starts
 
     def absolute(self, path: str) -> Path:
-        """Resolve a path that is written at this place; no path raises an exception."""
+        """Resolve a path that this file contains; never raise an exception."""
         return Path(os.path.realpath(self.folder / os.path.expanduser(path)))
 
 

@@ -93,7 +93,7 @@ def _check_ways(positions: Array, scene: Scene) -> Iterator[Problem]:
 
 
 def _check_steps(steps: Steps, scene: Scene) -> str:
-    """Say what is wrong with the box of setpoints; "" if nothing is."""
+    """Check the box that setpoints are drawn from; return the problem, or "" if there is none."""
     axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     with np.errstate(over="ignore"):  # infinity is beyond the fence

@@ -268,7 +268,7 @@ def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log
 
 
 def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
-    """Reject one-way delays that are missing, or if the clocks differ or step, in both ways."""
+    """Reject a log without one-way delays, or whose two clocks differ, or one of which steps."""
     if any(not {"send", "receive"} <= trip["delay"].keys() for trip in arrived):
         raise BadInputError(f"{log.name} (irtt's server sent no stamps): has round trips; {HALVE}")
     both = [int(trip["delay"][key]) for trip in arrived for key in ("send", "receive")]

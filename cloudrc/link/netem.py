@@ -358,7 +358,7 @@ class Steps:
         }
 
     def in_words(self) -> str:
-        """Describe the steps so far, at least one."""
+        """Describe how late the steps of the time line were; needs at least one step."""
         applied, late, over, median_ns, worst_ns = self.counts().values()
         return (
             f"{applied} steps of the time line, late by {median_ns * 1e-6:.2f} ms in the median "

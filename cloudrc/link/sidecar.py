@@ -60,7 +60,7 @@ class Shaper(Protocol):
         """Return the number of datagrams so far, by outcome."""
 
     def released(self) -> dict[str, int]:
-        """Return how late datagrams left since the beginning; empty if unknown."""
+        """Return by how much datagrams left too late, as counts; empty if unknown."""
 
     def close(self) -> None:
         """Stop shaping and leave nothing behind."""

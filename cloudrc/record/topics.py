@@ -143,8 +143,8 @@ _TABLE = (
         "A session began under a new epoch, clock of its end", (
         _END, _EPOCH, Field("cause", "string", "", "why, in words"))),
     Topic("/estimated_odometry", "nav_msgs/msg/Odometry", rec.Control, "cloud",
-        "Prediction that the controller used, stamped as the command, cloud's clock; it predicts"
-        " for basis_stamp_ns + horizon of /delay_estimate",
+        "Prediction that the controller used, of the state at basis_stamp_ns + horizon (both in"
+        " /delay_estimate); its stamp is that of the command, cloud's clock",
         _POSE_AND_TWIST[:3]),
     Topic("/setpoint_position", "geometry_msgs/msg/PointStamped", rec.Control, "cloud",
         "What the controller tracks, cloud's clock", (
