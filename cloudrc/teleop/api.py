@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import uvicorn
-from fastapi import APIRouter, Depends, FastAPI, HTTPException, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, HTTPException, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
@@ -257,6 +257,7 @@ def _takes(model: type[Section]) -> dict[str, Any]:
 
 Body = Annotated[bytes, Depends(_body)]
 Bridged = Annotated[Bridge, Depends(_bridge)]
+After = Annotated[int, Query(ge=0, lt=10**15)]
 router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUSALS)
 
 
@@ -346,13 +347,13 @@ async def show_state(bridge: Bridged) -> Any:
     response_class=StreamingResponse,
     responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
 )
-async def stream_events(request: Request, bridge: Bridged, after: str = "") -> StreamingResponse:
+async def stream_events(request: Request, bridge: Bridged, after: After = 0) -> StreamingResponse:
     """Tell all events of missions, from the oldest that is known, as server-sent events.
 
     Resume with the header Last-Event-ID, or with `?after=ID`.
     """
-    known = (after, request.headers.get("last-event-id", ""))
-    number = max(int(text) if text.isdecimal() and len(text) < 16 else 0 for text in known)
+    known = request.headers.get("last-event-id", "")
+    number = max(after, int(known) if known.isdecimal() and len(known) < 16 else 0)
     await bridge.ask(lambda service, now_ns: None)  # refuse now what cannot be served
     stream, headers = _stream(request, bridge, number), {"Cache-Control": "no-store"}
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)

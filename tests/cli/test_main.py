@@ -53,11 +53,6 @@ def test_help_fits_80_columns(command: str, capsys: pytest.CaptureFixture[str]) 
     assert all(name in text for name in COMMANDS) or command
 
 
-def test_no_argument_prints_help(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([]) == 0
-    assert "examples:" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("line", "words"),
     [

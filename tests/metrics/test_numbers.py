@@ -15,12 +15,10 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from cloudrc.records import Arrival, Control, Counted, Fault, GuardChange, Lateness, MissionEvent
 from tests.metrics.conftest import (
-    DONE,
     ONE_PIPE,
     PERIOD,
     SECOND,
     START,
-    Log,
     at,
     flown,
     paper,
@@ -123,7 +121,7 @@ def held() -> Flight:
     log = flown()
     log.world += [
         GuardChange(at(2.0), GuardState.HOLD, "command age"),
-        GuardChange(at(3.5), GuardState.TRACK, "fresh command"),
+        GuardChange(at(3.5), GuardState.TRACK, "not the start"),
         GuardChange(at(9.5), GuardState.HOLD, "command age"),
     ]
     return log.flight()
@@ -272,12 +270,6 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
 def test_numbers(fly: Callable[[], Flight], expected: dict[str, object]) -> None:
     flight = fly()
     assert {name: SHIPPED[name].measure(flight) for name in expected} == expected
-
-
-def test_time_zero_is_the_first_track() -> None:
-    log: Log = flown()
-    log.world.append(GuardChange(at(4), GuardState.TRACK, "fresh command again"))
-    assert (log.flight().start_ns, log.flight().end_ns) == (START, DONE)
 
 
 def flight_of(recording: Recording) -> Flight:

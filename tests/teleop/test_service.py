@@ -43,11 +43,11 @@ def failure(flight, mission_id="m1"):
 
 SCRIPTS = """
 a flight: create 0.05 A B C
-  -> states=done reached=0,1,2 guard=HOLD failure= settled=True
+  -> states=done reached=0,1,2 guard=HOLD failure= settled=True over=True
 held, moved, resumed: create 0.05 A !resume hold goto 0.05 resume !create B
   -> states=flying reached=0,1 last=reached asked=START
 a held place: create 0.05 A mark hold goto 0.05
-  -> states=held setpoint=away:-1 asked=
+  -> states=held setpoint=away:-1 asked= over=False
 goto is a mission of its own: 0.05 goto 0.05 !goto !create away 0.6
   -> states=done name=goto guard=HOLD
 what waits begins only with the disk: create 0.05 A queue full B C 3
@@ -218,6 +218,7 @@ def outcome(flight):
         "reached": [str(each["waypoint"]) for each in missions[0].reached] if missions else [],
         "guard": [flight.guard.name],
         "settled": [str(flight.teleop.settled)],
+        "over": [str(flight.teleop.over)],
         "asked": sorted({said.request.name for said in requests} - {"PROGRESS"}),
         "setpoint": [f"{place(flight.setpoints[-1])}:{flight.setpoints[-1].waypoint}"],
         "waypoint": [str(flight.setpoints[-1].waypoint)],
@@ -242,18 +243,6 @@ def test_what_follows_from_a_script(name, script, expected):
     for each in expected.split():
         key, _, value = each.partition("=")
         assert ",".join(found[key]) == value, key
-
-
-def test_a_mission_is_flown_and_every_waypoint_noted_once():
-    flight, mission_id = service_flying(name="round")
-    assert not flight.teleop.over
-    finish(flight)
-    view = flight.view(mission_id)
-    assert (view["id"], view["name"]) == ("m1", "round")
-    assert flight.names(mission_id) == ["starting", "started", *["reached"] * 3, "done"]
-    assert [event["id"] for event in view["events"]] == [1, 2, 3, 4, 5, 6]
-    assert view["verdict"] == {"outcome": "success", "exit_code": 0, "failures": []}
-    assert flight.teleop.over
 
 
 def test_every_end_of_a_mission_is_counted_under_its_own_name():
