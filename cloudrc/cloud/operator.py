@@ -87,7 +87,7 @@ class EmergencyStopRepeater:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
     def restart_numbers(self) -> None:
-        """Forget the number of the stop and the number that world acted on."""
+        """Start numbering from 0, for a new session: no stop is under way, world has seen none."""
         self._number = self._acted_on = self._due_ns = 0
 
     def see(self, guard: GuardState, acted_on: int) -> None:

@@ -172,7 +172,7 @@ class Exporter:
         self._link.tell = tell
 
     def unresolved(self, count: int) -> None:
-        """Set how many times the peer's name could not be resolved, from any thread."""
+        """Set the count of failed look-ups of the peer's name. Any thread may call this."""
         self._live.see([Counted(0, "link", "unresolved", count)])
 
     def recording(self, sync_age: Callable[[], float | None]) -> None:

@@ -23,13 +23,13 @@ class Observer(Protocol):
     """Sees what a robot receives and does, and changes nothing. Times are on world's clock [ns]."""
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
-        """See a step of the physics: when it began, from which readings, with which commands."""
+        """Observe a physics step before it runs: its time, and the readings and rotor speeds it uses."""
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """See a command after the guard's answer; `rejection` is None for an accepted command."""
+        """Observe a command after the guard's answer; `rejection` is None for an accepted command."""
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """See an operator request after it was carried out."""
+        """Observe an operator request after it was carried out."""
 
     def see_session(self, now_ns: int) -> None:
         """See a new session begin: earlier commands no longer count."""

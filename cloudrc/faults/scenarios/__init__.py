@@ -1,4 +1,4 @@
-"""The faults that are injected in virtual time, by the part that fails."""
+"""The faults that are injected in virtual time, in one module per part that fails."""
 
 from __future__ import annotations
 
