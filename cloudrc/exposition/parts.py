@@ -180,8 +180,8 @@ class DelayJudge:
     """Compares each delay estimate with the true time until the command was applied.
 
     An echo gives the instant at which world applied the command, on world's clock: the stamp of the
-    echoing odometry minus the hold time. The echo also gives the command's age on cloud's clock, and
-    so the command.
+    echoing odometry minus the hold time. The echo also gives the command's age on cloud's clock,
+    and so the command.
 
     Attributes:
         error: Newest error: estimate minus true time [s]; NaN before the first.

@@ -140,7 +140,7 @@ class Recorder:
             self.error = f"{self._path}: a record of type {kind} cannot be written: {error}"
 
     def _stop(self, error: OSError) -> None:
-        """Close the file after an error, so that it stays readable; later records are not written."""
+        """Close the file after an error, so that it stays readable; drop all later records."""
         self._ended = True
         reason = f"recording stopped: {TROUBLE.get(error.errno or 0, error.strerror or error)}"
         self.error = (

@@ -111,7 +111,7 @@ class Bridge:
         self._service, self.closed = service, ""
 
     def close(self, why: str) -> None:
-        """Refuse all calls from now on, and also an emergency stop that still waits for its answer."""
+        """Refuse all calls from now on, and an emergency stop that still waits for its answer."""
         self.closed, stops = why, self._lanes["stop"]
         while stops:
             stops.popleft()[1].set_exception(UnavailableError(why))

@@ -23,10 +23,10 @@ class Observer(Protocol):
     """Sees what a robot receives and does, and changes nothing. Times are on world's clock [ns]."""
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
-        """Observe a physics step before it runs: its time, and the readings and rotor speeds it uses."""
+        """Observe a physics step: its begin, and the readings and rotor speeds that it uses."""
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Observe a command after the guard's answer; `rejection` is None for an accepted command."""
+        """Observe a command and the guard's answer; `rejection` is None if the guard accepts it."""
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
         """Observe an operator request after it was carried out."""
