@@ -203,7 +203,7 @@ def _towards_a_face(rng: Generator) -> Lie:
 
 
 def _face_after_face(rng: Generator) -> Lie:
-    """Fly from a face to the opposite one, for the longest run-up; then along another axis."""
+    """Fly from a face of the fence to the opposite face, at most speed; then along another axis."""
     axis, way = int(rng.integers(3)), 1.0
     near = float(rng.uniform(0.1, 2.0))
 

@@ -353,8 +353,8 @@ class RobotInvariants:
     ) -> None:
         """Check how the rotors stop: on a request, after a hit, or where the robot stands.
 
-        Stopped rotors are recognised by the constant that the robot gives to the simulator: hard
-        braking also commands speeds of 0.
+        Speeds of 0 do not prove that the rotors are stopped: hard braking commands them, too.
+        Therefore the check looks for the constant `STOPPED`, which only a stop gives the simulator.
         """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
         if state is ESTOP and was is not ESTOP and self._honest and not asked:

@@ -165,7 +165,7 @@ def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> Direction
 
 
 def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change:
-    """Make the conditions from an instant on, with all faults that are active then."""
+    """Return the change at the instant `at` [s]: the profile with all faults active then."""
     delay, jitter, loss = profile.delay, profile.jitter, profile.loss
     for event in active:
         if event.kind == "delay":

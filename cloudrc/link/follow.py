@@ -163,7 +163,7 @@ class _HandedFile(ProfileFile):
 
 
 class Profiles:
-    """The profile's file and the document, which need not exist: each change takes effect once."""
+    """The profile's file, and a document that may be missing. Each change is applied once."""
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]

@@ -230,11 +230,11 @@ class Lane:
         return {**self._counts, "unread": self._stamps.dropped}
 
     def released(self) -> dict[str, int]:
-        """Return how late datagrams left since the beginning; any thread may call this.
+        """Return by how much datagrams left too late; any thread may call this.
 
         Returns:
-            The values of `ReleaseErrors.in_ns`, the number of datagrams for which there was no room
-            (`overflow`) or that waited for this process for `AGE_MAX_NS` or longer (`stalled`).
+            The values of `ReleaseErrors.in_ns`, and two counts of datagrams: `overflow`, for which
+            there was no room, and `stalled`, which waited `AGE_MAX_NS` or longer for this process.
             Empty before the first datagram.
         """
         told = self.errors.in_ns()
@@ -385,7 +385,7 @@ class Relay(Lanes):
         return {**self.outcomes(), **self.errors().in_ns()}
 
     def released(self, way: str) -> dict[str, int]:
-        """Return how late datagrams of "uplink" or "downlink" left, as from `Lane.released`."""
+        """Return `Lane.released` of "uplink" or "downlink"."""
         return self._ways[way].released()
 
 
@@ -440,7 +440,7 @@ class RelayShaper(Lanes):
         return self.outcomes() | self.recent()
 
     def released(self) -> dict[str, int]:
-        """Return how late datagrams left since the beginning, as from `Lane.released`."""
+        """Return `Lane.released` of this direction."""
         return self._lane.released()
 
     def close(self) -> None:

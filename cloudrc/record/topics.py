@@ -196,7 +196,8 @@ _TABLE = (
         Field("rate", "float", "bit/s", "profile's rate at that instant; NaN without one"),
         Field("conditions", "string", "", "the profile as JSON"))),
     Topic("/link_check", "cloudrc_msgs/msg/LinkChecked", rec.LinkChecked, "either",
-        "A measured quantity of the link to this end, judged in flight, in real time only, clock of"
+        "A measured quantity of the link to the end that writes this, and whether it is as asked;"
+        " only in `local` and `cluster` mode, clock of"
         " its end", (
         Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
         Field("quantity", "string", "", "mean, deviation, round_trip, loss..."),

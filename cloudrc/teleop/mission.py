@@ -95,9 +95,9 @@ class LegWatch:
 class Teleop:
     """State machine that flies missions one after the other.
 
-    Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, a verb for each wish of the
-    operator, and `take_outputs` after each of them. A setpoint is valid until the next one, within
-    its session. All times `now_ns` are of the caller's clock [ns].
+    Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, and a verb for each wish of
+    the operator. After every one of these calls, call `take_outputs`. A setpoint is valid until the
+    next one, within its session. All times `now_ns` are of the caller's clock [ns].
 
     Attributes:
         state: State of the mission.

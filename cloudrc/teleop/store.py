@@ -289,7 +289,7 @@ class MissionStore:
         return self.missions[mission_id]
 
     def has_ended(self, number: int) -> bool:
-        """Return whether the mission with this number on board is over."""
+        """Return whether a mission is over; `number` is the number that the robot uses for it."""
         return any(mission.number == number and mission.ended for mission in self.missions.values())
 
     def with_key(self, key: str) -> Mission | None:
