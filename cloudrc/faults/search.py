@@ -133,7 +133,7 @@ def shrink(schedule: Schedule, fails: Callable[[Schedule], bool]) -> Schedule:
 
 
 def _simpler(schedule: Schedule) -> Iterator[Schedule]:
-    """Yield schedules with fewer faults: without all, a half, a quarter ... one; then weaker ones."""
+    """Yield schedules without all faults, a half, a quarter ... one; then with weaker faults."""
     events, size = schedule.events, len(schedule.events)
     while size:
         for at in range(0, len(events), size):
