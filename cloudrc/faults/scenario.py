@@ -114,7 +114,13 @@ def scenario(
     number: int, name: str, *, injects: str, expects: str, loses: str = "none", shows: str
 ) -> Callable[[Inject], Scenario]:
     """Make a `Scenario` of the function that injects the fault; the arguments are its fields."""
-    return lambda inject: Scenario(number, name, injects, expects, loses, shows, inject)
+
+    def make(inject: Inject) -> Scenario:
+        # A pool pickles a function by its name, and the scenario takes the place of the function.
+        inject.__qualname__ += ".inject"
+        return Scenario(number, name, injects, expects, loses, shows, inject)
+
+    return make
 
 
 class Result(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import xml.etree.ElementTree as Xml
 from pathlib import Path
@@ -45,6 +46,11 @@ def test_a_fault_passes_its_checks(scenario: Scenario) -> None:
 
 
 @pytest.mark.promise("one-seed-one-run")
+def test_each_fault_reaches_another_process() -> None:
+    for each in SCENARIOS:
+        assert pickle.dumps(each)
+
+
 def test_one_seed_is_one_run() -> None:
     first, second, other = (find("F13").run(seed) for seed in (3, 3, 4))
     assert first.sha256 == second.sha256 != other.sha256
