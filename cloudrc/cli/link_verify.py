@@ -433,7 +433,7 @@ def fetch(url: str) -> str:
 
 
 def _may_change(found: Mapping[str, Any]) -> bool:
-    """Whether waiting helps: a time line that loops is never judged in flight."""
+    """Return whether a verdict may still come; a time line that loops never gets one."""
     loops = any(row["quantity"] == "time_line" and row.get("measured") for row in found["rows"])
     return bool(found["verdict"] == "open") and not loops
 

@@ -108,8 +108,8 @@ class Sent(NamedTuple):
     Attributes:
         edit: The edited profile.
         files: Files for the ConfigMap.
-        states: State after the change of each direction that reports its state.
-        failed: Errors of the directions that report no state.
+        states: For each direction that reports its state: the state after the change.
+        failed: For each other direction: the error.
     """
 
     edit: Edit

@@ -189,8 +189,8 @@ class Profiles:
     def _is_known(self, loaded: Loaded) -> bool:
         """Remember a change; return whether the same change has arrived before.
 
-        `helm upgrade` changes the profile but keeps the note with the number of the previous
-        change. Therefore the values count, too.
+        `helm upgrade` changes the profile, but leaves the number of the previous change beside it.
+        So equal numbers do not prove equal changes: the contents must be equal, too.
         """
         number = loaded.change.number
         if not number:

@@ -241,7 +241,7 @@ def _in_order(arrivals: Sequence[_Heard]) -> tuple[Stream, int, bool]:
 
 
 def _first_come(stream: Stream) -> float:
-    """Return the mean delay of the datagrams that none sent later overtook [s]."""
+    """Return the mean delay [s], without the datagrams that a later one overtook."""
     arrival = np.where(np.isnan(stream.delays), inf, stream.sent + stream.delays)
     first = arrival <= np.minimum.accumulate(arrival[::-1])[::-1]
     return float(stream.delays[first & np.isfinite(arrival)].mean())
