@@ -133,7 +133,7 @@ def _ages_at_hold(flight: Flight) -> list[tuple[GuardChange, float]]:
 
 
 def resumed_after(flight: Flight, back: float) -> float:
-    """Return how long after `back` [s] the guard was in TRACK again [s]."""
+    """Return the delay [s] from the instant `back` [s] until the guard was in TRACK again."""
     times = [time for time in changes_into(flight, GuardState.TRACK) if time >= back - 1e-9]
     return times[0] - back if times else nan
 

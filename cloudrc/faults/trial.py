@@ -216,7 +216,8 @@ class OrderInvariant:
     def see(self, records: list[Record], now_ns: int) -> None:
         """Check that no command is older than one before, or of an epoch that has ended.
 
-        A new process of world counts epochs on from what its cloud knows, which may be nothing.
+        A restarted world continues from the last epoch that its cloud knows. If cloud knows none,
+        world starts at the first epoch again, which is allowed.
         """
         for record in records:
             if isinstance(record, CommandApplied):

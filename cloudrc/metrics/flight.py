@@ -187,7 +187,10 @@ def add_metric(name: str, unit: str, meaning: str, measure: Measure) -> None:
 
 
 def metric(unit: str) -> Callable[[Measure], Measure]:
-    """Make a function a shipped metric in `unit`: its name, and the first line of its docstring."""
+    """Register the decorated function as a shipped metric with this unit.
+
+    The function's name is the metric's name; the first line of its docstring is the meaning.
+    """
 
     def add(measure: Measure) -> Measure:
         meaning = (measure.__doc__ or "").partition("\n")[0]

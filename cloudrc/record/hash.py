@@ -2,8 +2,9 @@
 
 The bytes of a record are little-endian and the same in every process. They consist of length and
 name of the record's type; numbers (integers with 64 bits, floats as IEEE 754 doubles, truth values
-with one byte); vectors; and strings as UTF-8, each after its 32-bit length. Within a group the
-order is that of the fields; the fields of a nested record replace its field.
+with one byte); vectors; and strings as UTF-8, each after its 32-bit length. The numbers
+keep the order of the fields; so do the vectors and the strings. A field that holds a record is
+replaced by the fields of that record.
 """
 
 from __future__ import annotations

@@ -205,8 +205,8 @@ def _join(world: Contents, cloud: Contents) -> Mission:
 def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
     """Cut a pod's recording, which may hold several missions, down to the last that was started.
 
-    Return also whether it holds the mission's end. Then the mission is complete, although a pod's
-    file is open when it is copied, so that the file's own end may be missing.
+    Return also whether the recording contains the end of that mission. If it does, the mission is
+    complete, even if the end of the file is missing: a pod still writes its file when it is copied.
     """
     contents = mission.contents
     began, ended = _last_mission(contents)
