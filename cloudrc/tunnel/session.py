@@ -4,8 +4,8 @@ Each direction of an epoch has one key, derived by HKDF from a pre-shared key, b
 the epoch. One key is enough for an epoch: 2^32 datagrams take over a year. A datagram changes no
 state before its tag is verified.
 
-Counters restart with every epoch. Greetings have no epoch yet, so they keep counting: the link draws
-impairments by epoch and counter, and a greeting with a repeated counter would be lost every time.
+Counters restart with every epoch. Greetings have no epoch yet, so they keep counting: the link
+draws impairments by epoch and counter, and would lose a greeting with a repeated counter each time.
 
 Two ends in one process need no keys: virtual time has no wire to protect, and sealing would take a
 twentieth of the flight's time. Drivers with a socket refuse such a session (`Endpoint.sealed`), so

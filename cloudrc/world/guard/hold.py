@@ -130,8 +130,8 @@ class Descent:
     """Detects touch-down, and whether a descent may still stop in the air.
 
     After an acknowledgement a descent stops in the air only if the robot sinks freely and is high
-    enough. A robot that stops lower, or while it touches something, would scrape along the ground or
-    a pipe.
+    enough. A robot that stops lower, or while it touches something, would scrape along the ground
+    or a pipe.
 
     Attributes:
         speed: Speed of the descent [m/s].
