@@ -29,7 +29,7 @@ from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
-from cloudrc.link.netem import STRETCH, Answer, Netem, Run, table, write_tables
+from cloudrc.link.netem import STRETCH, Answer, Netem, table, write_tables
 from cloudrc.link.profile import Blackout, Change, DirectionProfile
 from cloudrc.tunnel.codec import Kind
 
@@ -96,16 +96,18 @@ def laboratory() -> Iterator[None]:
                 sh("ip", "netns", "del", name)
 
 
-@lru_cache(maxsize=1)
-def run_near(tables: Path) -> Run:
-    """Run tc and ip in the near namespace."""
-    programs = Programs(str(tables))
+class NearPrograms(Programs):
+    """Runs tc and ip in the near namespace."""
 
-    def run(words: Sequence[str]) -> Answer:
+    def __call__(self, words: Sequence[str]) -> Answer:
         with inside(NEAR):
-            return programs(words)
+            return super().__call__(words)
 
-    return run
+
+@lru_cache(maxsize=1)
+def run_near(tables: Path) -> NearPrograms:
+    """Give the programs that all tests share."""
+    return NearPrograms(str(tables))
 
 
 def real_netem(tables: Path, profile: DirectionProfile, origin_ns: int = 0) -> Netem:
