@@ -139,7 +139,9 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(
     assert {"config.yaml", "mission.mcap", "report.json", "environment.json"} <= left
     assert {"world.mcap", "cloud.mcap", "world-link.metrics", "cloud-teleop.log"} <= left
     assert not (tmp_path / "runs").exists()
-    assert "upgrade --install cloudrc" in (tmp_path / "helm").read_text()
+    line = (tmp_path / "helm").read_text()
+    assert "upgrade --install cloudrc " in line
+    assert "--namespace=demo --create-namespace" in line
 
 
 @pytest.mark.parametrize("out", [[], ["--out", "out"]], ids=["runs", "out"])

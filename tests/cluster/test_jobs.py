@@ -73,11 +73,6 @@ def test_a_job_has_owner_nodes_and_rights_of_its_release(
     assert pod["containers"][0]["securityContext"] == TELEOP["securityContext"]
     assert not pod.keys() & where.keys()
     assert pod["automountServiceAccountToken"] is False
-    # On OpenShift a release has no security contexts of its own.
-    spec = cloud["spec"]["template"]["spec"]
-    del spec["securityContext"]
-    run_job(release, MISSION, name="third")
-    assert "securityContext" not in pod_of(running, "third")
 
 
 def test_a_job_has_an_unused_and_short_name(running: FakeApi, release: Release) -> None:
@@ -146,6 +141,7 @@ def test_jobs_are_listed_with_their_state_oldest_first(running: FakeApi, release
     start_pod(running, "two")
     found = [(status.name, status.state) for status in list_jobs(release)]
     assert found == [("one", "complete"), ("two", "flying"), ("three", "pending")]
+    assert "has ended already" in cancel(release, "one")
     delete_job(release, "one")
     with pytest.raises(ClusterError, match='"one" not found'):
         logs(release, "one")
@@ -159,9 +155,6 @@ def test_a_job_that_cannot_be_made_leaves_nothing(running: FakeApi, release: Rel
     with pytest.raises(ClusterError, match="can-i create jobs"):
         run_job(release, MISSION)
     assert made(running) == []
-    running.objects.clear()
-    with pytest.raises(ClusterError, match="no release"):
-        run_job(release, MISSION)
 
 
 def test_the_mission_of_a_job_is_cancelled_by_its_key(teleop: FakeTeleop, release: Release) -> None:
@@ -170,9 +163,6 @@ def test_the_mission_of_a_job_is_cancelled_by_its_key(teleop: FakeTeleop, releas
     assert cancel(release, "first") == "mission m2 (up) of Job 'first' is cancelled"
     assert teleop.posted == ["/v1/missions/m2/cancel"]
     assert teleop.tokens == {f"Bearer {TOKEN}"}
-    teleop.tokens.clear()
-    cancel(release, "first", "a-token-of-mine-alone")
-    assert teleop.tokens == {"Bearer a-token-of-mine-alone"}
     teleop.refuses = True
     with pytest.raises(ClusterError, match="it is over"):
         cancel(release, "first")
@@ -189,12 +179,3 @@ def test_a_job_that_has_not_posted_is_deleted(
     later = "cloudrc mission cancel --namespace=demo --release=cloudrc"
     assert (later in said) == (phase == "Pending")
     assert (teleop.posted, made(running)) == ([], [])
-
-
-def test_cancelling_an_ended_job_changes_nothing(
-    running: FakeApi, teleop: FakeTeleop, release: Release
-) -> None:
-    run_job(release, MISSION, name="first")
-    end(running, "first", "Complete")
-    assert "has ended already" in cancel(release, "first")
-    assert teleop.posted == []
