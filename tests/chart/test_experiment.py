@@ -115,11 +115,9 @@ UNKNOWN = "experiment.mission: no mission 'nonsense' .*pipe"
             {"experiment": {"link": {"profile": "./mine.yaml"}}},
             "experiment.link.profile: no profile './mine.yaml'.*profile under link.profile",
         ),
-        ({"mission": {"enabled": True, "plan": "pipe"}}, "no mission 'pipe'.*one of hover, pipes"),
         ({"experiment": {"mission": "nonsense"}}, UNKNOWN),
         ({"experiment": {"mission": "./a.yaml"}}, "experiment.mission: .*write the mission there"),
         ({"experiment": {"cloud": {"predictor": "./my.py"}}}, r"cloud.predictor: '\./my.py' is a"),
-        ({"experiment": {"cloud": {"controller": {"name": "a/b.py"}}}}, "controller: 'a/b.py'"),
         *(
             (
                 {"link": {"profile": {"downlink": {key: "t.csv"}}}},
@@ -127,13 +125,9 @@ UNKNOWN = "experiment.mission: no mission 'nonsense' .*pipe"
             )
             for key in FILE_READERS
         ),
-        *(
-            (
-                {"link": {"profile": over}, "experiment": {"link": {"uplink": {key: "/my/t.csv"}}}},
-                f"experiment.link: uplink.{key} names '/my/t.csv', but link.traces has no",
-            )
-            for key in FILE_READERS
-            for over in ("wifi", None)
+        (
+            {"link": {"profile": "wifi"}, "experiment": {"link": {"uplink": {"trace": "/t.csv"}}}},
+            "experiment.link: uplink.trace names '/t.csv', but link.traces has no",
         ),
     ],
 )

@@ -12,7 +12,7 @@ import cloudrc
 from cloudrc.config.load import load_mission
 from cloudrc.config.mission_check import check_mission
 from cloudrc.geometry.scene import load_scene
-from tests.chart.conftest import CHART, Object, containers, of_kind, pod_specs, render
+from tests.chart.conftest import CHART, Object, of_kind, pod_specs, render
 
 EXAMPLES = {
     name: list(yaml.safe_load_all((CHART / "examples" / f"{name}.yaml").read_text()))
@@ -124,12 +124,3 @@ def test_the_chart_makes_the_same_job_as_the_example() -> None:
     (theirs,), (ours,) = (template["spec"]["containers"] for template in (theirs, ours))
     for key in ("securityContext", "volumeMounts", "resources"):
         assert theirs[key] == ours[key]
-
-
-def test_the_services_do_not_select_mission_pods() -> None:
-    objects = render(ENABLED)
-    templates = [job["spec"]["template"] for job in jobs(ENABLED)]
-    for service in of_kind(objects, "Service").values():
-        for template in [*templates, of_kind(objects, "Pod")["test"]]:
-            assert not service["spec"]["selector"].items() <= template["metadata"]["labels"].items()
-    assert containers(pod_specs(objects)["mission"]).keys() == {"mission"}

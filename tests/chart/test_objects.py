@@ -12,7 +12,6 @@ from tests.chart.conftest import (
     CHART,
     METADATA,
     Object,
-    component,
     containers,
     notes,
     of_kind,
@@ -53,7 +52,6 @@ def test_objects_have_the_labels_that_selectors_need() -> None:
         ("cloudrc", {}, "cloudrc-world"),
         ("my-cloudrc", {}, "my-cloudrc-world"),
         ("demo", {"fullnameOverride": "robot"}, "robot-world"),
-        ("1rel", {"fullnameOverride": "robot"}, "robot-world"),
         ("d" * 53, {}, "d" * 46 + "-world"),
     ],
 )
@@ -63,10 +61,9 @@ def test_names_follow_release_and_override(release: str, values: dict[str, str],
     assert max(len(thing["metadata"]["name"]) for thing in objects) <= 63
 
 
-@pytest.mark.parametrize("release", ["1rel", "my.rel"])
-def test_an_invalid_name_is_refused(release: str) -> None:
-    with pytest.raises(Exception, match=f"the name '{release}-cloudrc' .* set fullnameOverride"):
-        render(release=release)
+def test_an_invalid_name_is_refused() -> None:
+    with pytest.raises(Exception, match=r"the name 'my\.rel-cloudrc' .* set fullnameOverride"):
+        render(release="my.rel")
 
 
 def test_annotations_and_placement_of_the_user_are_used() -> None:
@@ -136,9 +133,7 @@ def test_the_notes_are_three_commands_for_this_release() -> None:
     for words in (wait, fly, logs):
         assert words[words.index("--namespace") + 1] == "lab-7"
     deployments = of_kind(render(release="flight"), "Deployment")
-    key, value = wait[wait.index("--selector") + 1].split("=")
-    selected = [component(t) for t in deployments.values() if t["metadata"]["labels"][key] == value]
-    assert sorted(selected) == ["cloud", "world"]
+    assert wait[wait.index("--selector") + 1] == "app.kubernetes.io/instance=flight"
     options = build_parser([fly[1]]).parse_args(fly[1:])
     assert (fly[0], options.namespace, options.release) == ("cloudrc", "lab-7", "flight")
     name = next(w.partition("/")[2] for w in logs if w.startswith("deployment/"))
@@ -165,11 +160,7 @@ CLOSED = "No Prometheus may scrape"
         ({"experiment": {"link": SATELLITE}}, SLOW, False),
         ({}, CLOSED, True),
         ({"metrics": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]}}, CLOSED, False),
-        (
-            {"networkPolicy": {"enabled": False}},
-            "WARNING: networkPolicy.enabled is false",
-            True,
-        ),
+        ({"networkPolicy": {"enabled": False}}, "WARNING: networkPolicy.enabled is false", True),
     ],
 )
 def test_the_notes_warn_of_what_will_not_work(values: Object, words: str, warns: bool) -> None:
