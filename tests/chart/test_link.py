@@ -36,7 +36,6 @@ def modes(lookup: Lookup, values: Object | None = None) -> set[str]:
         (a_namespace("baseline"), "relay"),
         (a_namespace("restricted"), "relay"),
     ],
-    ids=["unseen", "no label", "privileged", "baseline", "restricted"],
 )
 def test_auto_follows_the_label_of_the_namespace(lookup: Lookup, mode: str) -> None:
     assert modes(lookup) == {f"--mode={mode}"}

@@ -108,10 +108,7 @@ def test_an_example_fits_the_release_of_the_readme(name: str, tmp_path: Path) ->
     selected = policy["spec"]["podSelector"]["matchLabels"]
     assert selected.items() <= pod["metadata"]["labels"].items()
     (tmp_path / "mission.yaml").write_text(config["data"]["mission.yaml"])
-    mission = load_mission(tmp_path / "mission.yaml")
-    assert check_mission(mission, load_scene("pipes")) == []
-    if name == "mission-paper":
-        assert mission.waypoints == load_mission("pipes").waypoints
+    assert check_mission(load_mission(tmp_path / "mission.yaml"), load_scene("pipes")) == []
 
 
 def test_the_chart_makes_the_same_job_as_the_example() -> None:

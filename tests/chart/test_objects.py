@@ -49,7 +49,6 @@ def test_objects_have_the_labels_that_selectors_need() -> None:
     ("release", "values", "name"),
     [
         ("demo", {}, "demo-cloudrc-world"),
-        ("cloudrc", {}, "cloudrc-world"),
         ("my-cloudrc", {}, "my-cloudrc-world"),
         ("demo", {"fullnameOverride": "robot"}, "robot-world"),
         ("d" * 53, {}, "d" * 46 + "-world"),
@@ -109,24 +108,6 @@ def test_each_pod_has_one_image() -> None:
     assert found["cloud"] == "ghcr.io/me/cloudrc/cloud:9.9.9"
 
 
-def test_the_tunnels_services_are_headless_and_early() -> None:
-    services = of_kind(render(), "Service")
-    for end in ("world", "cloud"):
-        spec = services[end]["spec"]
-        assert spec["clusterIP"] == "None"
-        assert spec["publishNotReadyAddresses"] is True
-        assert [(port["port"], port["protocol"]) for port in spec["ports"]] == [(7400, "UDP")]
-
-
-def test_the_link_set_role_may_change_one_configmap() -> None:
-    """The experiment's ConfigMap has the guard's limits."""
-    role = values_of(CHART / "examples" / "link-set-role.yaml")
-    (changing,) = (rule for rule in role["rules"] if set(rule["verbs"]) - {"get", "list", "create"})
-    assert changing["verbs"] == ["get", "patch"]
-    assert (changing["resources"], changing["resourceNames"]) == (["configmaps"], ["cloudrc-link"])
-    assert "cloudrc-link" in of_kind(render(release="cloudrc"), "ConfigMap")
-
-
 def test_the_notes_are_three_commands_for_this_release() -> None:
     text = notes(release="flight", namespace="lab-7")
     wait, fly, logs = (shlex.split(line) for line in text.splitlines() if line.startswith("  "))
@@ -152,11 +133,6 @@ CLOSED = "No Prometheus may scrape"
     [
         ({}, SLOW, False),
         ({"link": SATELLITE}, SLOW, True),
-        (
-            {"link": SATELLITE, "experiment": {"guard": {"command_age_max_ms": 800}}},
-            SLOW,
-            False,
-        ),
         ({"experiment": {"link": SATELLITE}}, SLOW, False),
         ({}, CLOSED, True),
         ({"metrics": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]}}, CLOSED, False),

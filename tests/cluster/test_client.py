@@ -123,7 +123,7 @@ def away(api: FakeApi, plural: str, code: int, times: int) -> Callable[[], int]:
     return lambda: left
 
 
-@pytest.mark.parametrize(("plural", "code"), [("jobs", 429), ("jobs", 503), ("pods", 500)])
+@pytest.mark.parametrize(("plural", "code"), [("jobs", 429), ("pods", 500)])
 def test_follow_survives_an_outage(
     running: FakeApi, release: Release, plural: str, code: int
 ) -> None:
@@ -157,13 +157,10 @@ def test_only_a_short_outage_is_waited_for(
         follow(release, "first", print, timeout=10.0)
 
 
-@pytest.mark.parametrize("name", ["helm", "kubectl"])
-def test_a_missing_program_is_named_with_its_page(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_a_missing_program_is_named_with_its_page(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(MissingPrerequisiteError, match=f"{name} is not installed; .* http"):
-        client.run(name, ["version"], timeout=1.0)
+    with pytest.raises(MissingPrerequisiteError, match=r"helm is not installed; .* http"):
+        client.run("helm", ["version"], timeout=1.0)
 
 
 @pytest.mark.parametrize(

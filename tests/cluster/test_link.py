@@ -35,14 +35,7 @@ def item(kind: str, name: str, component: str, **rest: Any) -> dict[str, Any]:
 
 
 class Cluster:
-    """A release behind a fake kubectl, with a record of its calls.
-
-    Attributes:
-        refused: Verb of kubectl -> error message.
-        broken: Pods whose link container cannot be reached.
-        deaf: Pods whose link container applies nothing.
-        cannot: Pod -> word in a profile that its link container refuses.
-    """
+    """A release behind a fake kubectl, with a record of its calls."""
 
     def __init__(self) -> None:
         running = {"status": {"phase": "Running"}}
@@ -58,9 +51,9 @@ class Cluster:
             pod: asdict(LinkState("netem", "", "auto", way, {}, "", 1, asked={"delay": 0.12}))
             for pod, way in (("world-1", "uplink"), ("cloud-1", "downlink"))
         }
-        self.refused: dict[str, str] = {}
-        self.broken, self.deaf = set[str](), set[str]()
-        self.cannot: dict[str, str] = {}
+        self.refused: dict[str, str] = {}  # verb of kubectl -> error message
+        self.broken, self.deaf = set[str](), set[str]()  # pods that are away, or apply nothing
+        self.cannot: dict[str, str] = {}  # pod -> word in a profile that it refuses
         self.asked: list[list[str]] = []
         self.handed: dict[str, dict[str, Any]] = {}
         self.kept: dict[str, str] = {}
@@ -264,6 +257,8 @@ KUBECTL_NEEDS = {
 def test_the_role_allows_just_what_its_commands_need(cluster: Cluster) -> None:
     assert main(LINE) == 0
     rules = yaml.safe_load(ROLE.read_text())["rules"]
+    (changing,) = (rule for rule in rules if "patch" in rule["verbs"])
+    assert changing["resourceNames"] == ["cloudrc-link"], "another one has the guard's limits"
     allowed = {
         (what, verb) for rule in rules for what in rule["resources"] for verb in rule["verbs"]
     }
