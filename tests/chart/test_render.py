@@ -76,17 +76,10 @@ def test_helm_renders_the_same_objects(path: Path) -> None:
     assert "WARNING" not in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (["--kube-version", "1.28.0"], f"requires kubeVersion: {METADATA['kubeVersion']}"),
-        (["--kube-version", OLDEST, "--set", "link.mod=netem"], "mod"),
-    ],
-)
-def test_helm_refuses_an_older_cluster_and_an_unknown_value(flags: list[str], words: str) -> None:
-    done = helm("template", "demo", str(CHART), *flags)
+def test_helm_refuses_an_older_cluster() -> None:
+    done = helm("template", "demo", str(CHART), "--kube-version", "1.28.0")
     assert done.returncode != 0
-    assert words in done.stderr
+    assert f"requires kubeVersion: {METADATA['kubeVersion']}" in done.stderr
 
 
 def _comparable(objects: Iterable[Object]) -> dict[tuple[str, str], Object]:

@@ -169,7 +169,6 @@ def test_a_missing_program_is_named_with_its_page(monkeypatch: pytest.MonkeyPatc
         ("exec sleep 60", TimedOutError, r"'helm list' took more than 0\.3 s"),
         ("echo 'W1120 06:00 beware\nError: UPGRADE FAILED: no\n  - way'", ClusterError, "no - way"),
         ("echo 'error: no context'", ClusterError, "'helm list' failed: no context"),
-        ("", ClusterError, "no error message"),
     ],
 )
 def test_the_error_of_a_program_becomes_one_line(

@@ -111,14 +111,13 @@ def held() -> Flight:
     return log.flight()
 
 
-def resting(*, moved: bool = False, short: bool = False, touched: bool = False) -> Flight:
+def resting(*, moved: bool = False, touched: bool = False) -> Flight:
     log = flown(lambda t: (0.97, 0.0, 1.001))
     log.change(
         Control,
         lambda n, c: c._replace(setpoint=(0.0 if moved and c.stamp_ns < at(5) else 1.0, 0.0, 1.0)),
     )
-    if not short:
-        log.change(MissionEvent, lambda n, e: None if e.event == "done" else e)
+    log.change(MissionEvent, lambda n, e: None if e.event == "done" else e)
     if touched:
         pressing(log, 14, lambda n: 0.2)
     return log.flight()
@@ -226,7 +225,6 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
         "duration": approx(15.0),  # without an end it lasts as its recording
     },
     lambda: resting(moved=True): {"steady_error_x": None},
-    lambda: resting(short=True): {"steady_error_x": None},
     lambda: resting(touched=True): {"steady_error_x": None},
     slow_machine: {
         "world_slip": approx(0.5),

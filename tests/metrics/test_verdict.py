@@ -73,12 +73,6 @@ def met(speed: float) -> Log:
     return world(Contact(at(8), "board", ZERO, ZERO, (speed, 0.0, 0.0), True), log=flown)
 
 
-def restarted() -> Log:
-    log = world(SessionOpened(at(6), "world", 3, "world restarted"))
-    log.cloud.append(SessionOpened(at(6.1), "cloud", 3, "world accepted"))
-    return log
-
-
 @pytest.mark.parametrize(
     ("log", "limits", "outcome", "found"),
     [
@@ -117,7 +111,12 @@ def test_rules(
             (world(GuardChange(at(5), state, "why")), "guard_intervened", f"{state.name}: why", 5.0)
             for state in (GuardState.LAND, GuardState.ESTOP, GuardState.GROUND)
         ),
-        (restarted(), "world_restarted", "a new session in flight: world restarted", 6.0),
+        (
+            world(SessionOpened(at(6), "world", 3, "world restarted")),
+            "world_restarted",
+            "a new session in flight: world restarted",
+            6.0,
+        ),
         (ended("timed_out"), "timed_out", "why", 10.0),
     ],
 )
@@ -133,11 +132,7 @@ def test_a_failure_says_what_when_and_where(log: Log, code: str, text: str, time
     ("kind", "change", "words"),
     [
         (Arrival, lambda n, a: a, "fresh commands arrived, but no request to start"),
-        (
-            Arrival,
-            lambda n, a: a._replace(used=False),
-            "was 0.090 s old or older when",
-        ),
+        (Arrival, lambda n, a: a._replace(used=False), "was 0.090 s old or older when"),
         # The start opens a new session: commands of older sessions do not count.
         (
             Arrival,

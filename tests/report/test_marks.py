@@ -21,7 +21,6 @@ from cloudrc.report.figures.style import RC, Subject, new_figure
 from tests.metrics.conftest import ONE_PIPE, Log, at, flown
 
 CALM = Direction(delay_ms=50.0)
-SHORT = Direction(delay_ms=9.0)
 TIMED = Direction(
     delay_ms=20.0,
     changes=(Change(at_s=2.0, delay_ms=90.0), Change(at_s=99.0, delay_ms=9.0)),
@@ -30,19 +29,11 @@ TIMED = Direction(
 
 
 def changed(
-    time: float,
-    direction: Direction,
-    cause: str,
-    age: float = 0.0,
-    *,
-    uplink: bool = True,
-    line: float | None = None,
+    time: float, direction: Direction, cause: str, age: float = 0.0, *, uplink: bool = True
 ) -> LinkChanged:
     conditions = json.dumps(direction.model_dump(mode="json", exclude_defaults=True))
-    origin = age if line is None else line
-    return LinkChanged(
-        at(time), uplink, "relay", cause, age, origin, 0.0, 0.0, 0.0, math.nan, conditions
-    )
+    measured = (0.0, 0.0, 0.0, math.nan)
+    return LinkChanged(at(time), uplink, "relay", cause, age, age, *measured, conditions)
 
 
 def subject_of(*changes: LinkChanged, uplink: Direction = CALM, log: Log | None = None) -> Subject:
@@ -114,15 +105,6 @@ def test_a_time_line_starts_at_its_change_and_ends_at_the_next() -> None:
     assert patches(marked(subject)) == [pytest.approx((2.0, 4.0))], "its blackout ends, too"
     said = "set in flight (1: profile timed, at 1.0 s; 2: profile calm, at 4.0 s)."
     assert said in legend(subject)
-
-
-def test_changing_one_value_keeps_the_time_line() -> None:
-    subject = subject_of(
-        changed(1.0, TIMED, "profile timed"),
-        changed(2.0, TIMED.model_copy(update={"jitter_ms": 5.0}), "jitter_ms=5", line=1.0),
-        changed(2.5, TIMED, "jitter_ms=0", line=math.nan),
-    )
-    assert low(subject, 2.2, 2.9, 3.1) == pytest.approx([0.015, 0.02, 0.09])
 
 
 def test_holds_blackouts_and_changes_are_marked() -> None:

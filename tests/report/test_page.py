@@ -59,9 +59,6 @@ def test_the_page_says_what_the_flight_did(folder: Path) -> None:
     for name, number in assess(recording, experiment, Run("virtual", "virtual")).numbers.items():
         assert f"<code>{name}</code>" in page
         assert number.meaning.split("'")[0] in page
-
-
-def test_figures_are_written_as_png_and_svg(folder: Path) -> None:
     for name in FIGURES:
         assert (folder / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         svg = ElementTree.parse(folder / "figures" / f"{name}.svg").getroot()
