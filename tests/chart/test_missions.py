@@ -69,11 +69,7 @@ def test_a_job_calls_the_releases_api() -> None:
 
 @pytest.mark.parametrize(
     ("values", "name"),
-    [
-        ({}, "pipes"),
-        ({"experiment": {"mission": "hover"}}, "hover"),
-        ({"mission": {"plan": "hover"}}, "hover"),
-    ],
+    [({"experiment": {"mission": "hover"}}, "hover"), ({"mission": {"plan": "hover"}}, "hover")],
 )
 def test_the_plan_defaults_to_the_experiments_mission(
     values: Object, name: str, tmp_path: Path

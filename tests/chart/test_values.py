@@ -7,8 +7,6 @@ from typing import Any
 
 import pytest
 
-from cloudrc.config.problems import leaves
-from cloudrc.config.schema import Experiment
 from tests.chart.conftest import CHART, SCHEMA, Object, render, values_of
 
 jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-validate, extra dev")
@@ -38,20 +36,11 @@ def test_the_schema_is_closed_at_every_level() -> None:
         assert extra is False or (isinstance(extra, dict) and extra.get("type")), path
 
 
-def test_every_value_has_a_description_and_a_number_its_unit() -> None:
-    definitions = SCHEMA["$defs"]
-    units = {"_m": "[m]", "_ms": "[ms]", "_s": "[s]", "_deg": "[deg]", "_kbit": "[kbit/s]"}
-    keys = {path[-1] for path, _ in leaves(Experiment)}
+def test_every_value_has_a_description() -> None:
     for path, part in parts(SCHEMA):
         for name, value in part.get("properties", {}).items():
-            reference = value.get("$ref", "").rpartition("/")[2]
-            text = value.get("description") or definitions.get(reference, {}).get("description")
-            assert text, (*path, name)
-            for end, unit in units.items():
-                assert name not in keys or not name.endswith(end) or unit in text, (*path, name)
-            if value.get("type") == "integer" and path[:2] != ("$defs", "Experiment"):
-                words = ("[", "port", "Number of", "Packets", "random")
-                assert any(word in text for word in words), (*path, name)
+            target = SCHEMA["$defs"].get(value.get("$ref", "").rpartition("/")[2], {})
+            assert value.get("description") or target.get("description"), (*path, name)
 
 
 def test_the_defaults_are_valid_and_written_out() -> None:

@@ -203,10 +203,7 @@ def test_the_local_run_is_the_default(running: FakeApi, capsys: Printed) -> None
 @pytest.mark.usefixtures("flies_here")
 @pytest.mark.parametrize(
     "words",
-    [
-        ["cloudrc", "mission", "list", "--release", "cloudrc"],
-        ["/usr/local/bin/kubectl-cloudrc", "mission", "list"],
-    ],
+    [["cloudrc", "mission", "list", "-n", "demo"], ["/bin/kubectl-cloudrc", "mission", "list"]],
 )
 def test_a_flag_or_the_plugin_of_kubectl_selects_the_cluster(
     running: FakeApi, capsys: Printed, monkeypatch: pytest.MonkeyPatch, words: list[str]

@@ -111,12 +111,7 @@ def test_rules(
             (world(GuardChange(at(5), state, "why")), "guard_intervened", f"{state.name}: why", 5.0)
             for state in (GuardState.LAND, GuardState.ESTOP, GuardState.GROUND)
         ),
-        (
-            world(SessionOpened(at(6), "world", 3, "world restarted")),
-            "world_restarted",
-            "a new session in flight: world restarted",
-            6.0,
-        ),
+        (world(SessionOpened(at(6), "world", 3, "why")), "world_restarted", "why", 6.0),
         (ended("timed_out"), "timed_out", "why", 10.0),
     ],
 )
