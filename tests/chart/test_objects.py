@@ -118,9 +118,8 @@ def test_the_notes_are_three_commands_for_this_release() -> None:
     options = build_parser([fly[1]]).parse_args(fly[1:])
     assert (fly[0], options.namespace, options.release) == ("cloudrc", "lab-7", "flight")
     name = next(w.partition("/")[2] for w in logs if w.startswith("deployment/"))
-    (thing,) = (t for t in deployments.values() if t["metadata"]["name"] == name)
-    links = [c["name"] for c in thing["spec"]["template"]["spec"]["initContainers"]]
-    assert logs[logs.index("--container") + 1] in links
+    assert name in {thing["metadata"]["name"] for thing in deployments.values()}
+    assert logs[logs.index("--container") + 1] == "link"
 
 
 SATELLITE = {"profile": "satellite"}

@@ -88,7 +88,6 @@ def test_the_wait_for_a_release_ends_with_the_cause(
 @pytest.mark.parametrize(
     ("said", "hint"),
     [
-        ("Kubernetes cluster unreachable: Get https://10.0.0.1: refused", "kubectl cluster-info"),
         ("chart requires >=1.29.0-0 which is incompatible with Kubernetes v1.28.3", "kind create"),
         ("secrets is forbidden: User me cannot list", "kubectl auth can-i"),
         ("values don't meet the specifications of the schema(s)\n- link: mdoe", "helm show values"),
