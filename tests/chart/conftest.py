@@ -24,8 +24,16 @@ EXAMPLES = sorted((CHART / "examples").glob("values-*.yaml"))
 
 Object = dict[str, Any]
 SCHEMA = json.loads((CHART / "values.schema.json").read_text())
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 Lookup = Callable[[str, str, str, str], Any]
+
+
+class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Loads YAML and refuses duplicate keys, as server-side apply does."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Object:
+        mapping: Object = super().construct_mapping(node, deep)
+        assert len(mapping) == len(node.value), [key.value for key, _ in node.value]
+        return mapping
 
 
 class Files:
@@ -128,7 +136,7 @@ def render(values: Object | None = None, **where: Any) -> list[Object]:
     objects = []
     for name, text in sorted(texts.items()):
         if not name.endswith("NOTES.txt"):
-            objects += [found for found in yaml.load_all(text, LOADER) if found]
+            objects += [found for found in yaml.load_all(text, Loader) if found]
     return objects
 
 
@@ -164,4 +172,4 @@ def containers(spec: Object) -> dict[str, Object]:
 
 
 def values_of(path: Path) -> Object:
-    return dict(yaml.load(path.read_text(), LOADER) or {})  # noqa: S506
+    return dict(yaml.load(path.read_text(), Loader) or {})  # noqa: S506

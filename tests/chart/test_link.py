@@ -36,7 +36,6 @@ def modes(lookup: Lookup, values: Object | None = None) -> set[str]:
         (a_namespace("baseline"), "relay"),
         (a_namespace("restricted"), "relay"),
     ],
-    ids=["unseen", "no label", "privileged", "baseline", "restricted"],
 )
 def test_auto_follows_the_label_of_the_namespace(lookup: Lookup, mode: str) -> None:
     assert modes(lookup) == {f"--mode={mode}"}
@@ -44,20 +43,10 @@ def test_auto_follows_the_label_of_the_namespace(lookup: Lookup, mode: str) -> N
         assert modes(lookup, {"link": {"mode": fixed}}) == {f"--mode={fixed}"}
 
 
-@pytest.mark.parametrize(
-    ("first", "later"),
-    [
-        # Helm creates the namespace (--create-namespace) after rendering: only an upgrade sees it.
-        (nothing, a_namespace()),
-        (a_namespace(), a_namespace()),
-        (a_namespace("restricted"), a_namespace("restricted")),
-    ],
-    ids=["made by helm", "no label", "restricted"],
-)
-def test_an_upgrade_keeps_the_mode(first: Lookup, later: Lookup) -> None:
-    """It keeps the key and the tokens, too."""
-    installed = render(lookup=first)
-    assert render(lookup=holding(installed, later)) == installed
+def test_an_upgrade_keeps_the_mode() -> None:
+    """Helm creates the namespace (--create-namespace) after rendering: only an upgrade sees it."""
+    installed = render(lookup=nothing)
+    assert render(lookup=holding(installed, a_namespace())) == installed
 
 
 def test_an_upgrade_obeys_a_new_label() -> None:

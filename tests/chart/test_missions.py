@@ -12,7 +12,7 @@ import cloudrc
 from cloudrc.config.load import load_mission
 from cloudrc.config.mission_check import check_mission
 from cloudrc.geometry.scene import load_scene
-from tests.chart.conftest import CHART, Object, containers, of_kind, pod_specs, render
+from tests.chart.conftest import CHART, Object, of_kind, pod_specs, render
 
 EXAMPLES = {
     name: list(yaml.safe_load_all((CHART / "examples" / f"{name}.yaml").read_text()))
@@ -69,11 +69,7 @@ def test_a_job_calls_the_releases_api() -> None:
 
 @pytest.mark.parametrize(
     ("values", "name"),
-    [
-        ({}, "pipes"),
-        ({"experiment": {"mission": "hover"}}, "hover"),
-        ({"mission": {"plan": "hover"}}, "hover"),
-    ],
+    [({"experiment": {"mission": "hover"}}, "hover"), ({"mission": {"plan": "hover"}}, "hover")],
 )
 def test_the_plan_defaults_to_the_experiments_mission(
     values: Object, name: str, tmp_path: Path
@@ -108,28 +104,4 @@ def test_an_example_fits_the_release_of_the_readme(name: str, tmp_path: Path) ->
     selected = policy["spec"]["podSelector"]["matchLabels"]
     assert selected.items() <= pod["metadata"]["labels"].items()
     (tmp_path / "mission.yaml").write_text(config["data"]["mission.yaml"])
-    mission = load_mission(tmp_path / "mission.yaml")
-    assert check_mission(mission, load_scene("pipes")) == []
-    if name == "mission-paper":
-        assert mission.waypoints == load_mission("pipes").waypoints
-
-
-def test_the_chart_makes_the_same_job_as_the_example() -> None:
-    """`cloudrc mission run` fills in the example."""
-    (job,) = jobs(ENABLED)
-    theirs, ours = (each["spec"]["template"] for each in (EXAMPLES["mission-job"][1], job))
-    same = {"app.kubernetes.io/name", "app.kubernetes.io/component"}
-    assert all(theirs["metadata"]["labels"][k] == ours["metadata"]["labels"][k] for k in same)
-    assert theirs["spec"]["securityContext"] == ours["spec"]["securityContext"]
-    (theirs,), (ours,) = (template["spec"]["containers"] for template in (theirs, ours))
-    for key in ("securityContext", "volumeMounts", "resources"):
-        assert theirs[key] == ours[key]
-
-
-def test_the_services_do_not_select_mission_pods() -> None:
-    objects = render(ENABLED)
-    templates = [job["spec"]["template"] for job in jobs(ENABLED)]
-    for service in of_kind(objects, "Service").values():
-        for template in [*templates, of_kind(objects, "Pod")["test"]]:
-            assert not service["spec"]["selector"].items() <= template["metadata"]["labels"].items()
-    assert containers(pod_specs(objects)["mission"]).keys() == {"mission"}
+    assert check_mission(load_mission(tmp_path / "mission.yaml"), load_scene("pipes")) == []

@@ -12,7 +12,6 @@ from tests.chart.conftest import (
     CHART,
     METADATA,
     Object,
-    component,
     containers,
     notes,
     of_kind,
@@ -50,10 +49,8 @@ def test_objects_have_the_labels_that_selectors_need() -> None:
     ("release", "values", "name"),
     [
         ("demo", {}, "demo-cloudrc-world"),
-        ("cloudrc", {}, "cloudrc-world"),
         ("my-cloudrc", {}, "my-cloudrc-world"),
         ("demo", {"fullnameOverride": "robot"}, "robot-world"),
-        ("1rel", {"fullnameOverride": "robot"}, "robot-world"),
         ("d" * 53, {}, "d" * 46 + "-world"),
     ],
 )
@@ -63,10 +60,9 @@ def test_names_follow_release_and_override(release: str, values: dict[str, str],
     assert max(len(thing["metadata"]["name"]) for thing in objects) <= 63
 
 
-@pytest.mark.parametrize("release", ["1rel", "my.rel"])
-def test_an_invalid_name_is_refused(release: str) -> None:
-    with pytest.raises(Exception, match=f"the name '{release}-cloudrc' .* set fullnameOverride"):
-        render(release=release)
+def test_an_invalid_name_is_refused() -> None:
+    with pytest.raises(Exception, match=r"the name 'my\.rel-cloudrc' .* set fullnameOverride"):
+        render(release="my.rel")
 
 
 def test_annotations_and_placement_of_the_user_are_used() -> None:
@@ -112,39 +108,18 @@ def test_each_pod_has_one_image() -> None:
     assert found["cloud"] == "ghcr.io/me/cloudrc/cloud:9.9.9"
 
 
-def test_the_tunnels_services_are_headless_and_early() -> None:
-    services = of_kind(render(), "Service")
-    for end in ("world", "cloud"):
-        spec = services[end]["spec"]
-        assert spec["clusterIP"] == "None"
-        assert spec["publishNotReadyAddresses"] is True
-        assert [(port["port"], port["protocol"]) for port in spec["ports"]] == [(7400, "UDP")]
-
-
-def test_the_link_set_role_may_change_one_configmap() -> None:
-    """The experiment's ConfigMap has the guard's limits."""
-    role = values_of(CHART / "examples" / "link-set-role.yaml")
-    (changing,) = (rule for rule in role["rules"] if set(rule["verbs"]) - {"get", "list", "create"})
-    assert changing["verbs"] == ["get", "patch"]
-    assert (changing["resources"], changing["resourceNames"]) == (["configmaps"], ["cloudrc-link"])
-    assert "cloudrc-link" in of_kind(render(release="cloudrc"), "ConfigMap")
-
-
 def test_the_notes_are_three_commands_for_this_release() -> None:
     text = notes(release="flight", namespace="lab-7")
     wait, fly, logs = (shlex.split(line) for line in text.splitlines() if line.startswith("  "))
     for words in (wait, fly, logs):
         assert words[words.index("--namespace") + 1] == "lab-7"
     deployments = of_kind(render(release="flight"), "Deployment")
-    key, value = wait[wait.index("--selector") + 1].split("=")
-    selected = [component(t) for t in deployments.values() if t["metadata"]["labels"][key] == value]
-    assert sorted(selected) == ["cloud", "world"]
+    assert wait[wait.index("--selector") + 1] == "app.kubernetes.io/instance=flight"
     options = build_parser([fly[1]]).parse_args(fly[1:])
     assert (fly[0], options.namespace, options.release) == ("cloudrc", "lab-7", "flight")
     name = next(w.partition("/")[2] for w in logs if w.startswith("deployment/"))
-    (thing,) = (t for t in deployments.values() if t["metadata"]["name"] == name)
-    links = [c["name"] for c in thing["spec"]["template"]["spec"]["initContainers"]]
-    assert logs[logs.index("--container") + 1] in links
+    assert name in {thing["metadata"]["name"] for thing in deployments.values()}
+    assert logs[logs.index("--container") + 1] == "link"
 
 
 SATELLITE = {"profile": "satellite"}
@@ -157,19 +132,10 @@ CLOSED = "No Prometheus may scrape"
     [
         ({}, SLOW, False),
         ({"link": SATELLITE}, SLOW, True),
-        (
-            {"link": SATELLITE, "experiment": {"guard": {"command_age_max_ms": 800}}},
-            SLOW,
-            False,
-        ),
         ({"experiment": {"link": SATELLITE}}, SLOW, False),
         ({}, CLOSED, True),
         ({"metrics": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]}}, CLOSED, False),
-        (
-            {"networkPolicy": {"enabled": False}},
-            "WARNING: networkPolicy.enabled is false",
-            True,
-        ),
+        ({"networkPolicy": {"enabled": False}}, "WARNING: networkPolicy.enabled is false", True),
     ],
 )
 def test_the_notes_warn_of_what_will_not_work(values: Object, words: str, warns: bool) -> None:

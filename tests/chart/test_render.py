@@ -9,7 +9,6 @@ import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -20,9 +19,7 @@ from tests.chart.conftest import (
     EXAMPLES,
     METADATA,
     Object,
-    laid_over,
     render,
-    render_texts,
     values_of,
 )
 
@@ -58,33 +55,6 @@ def test_the_objects_and_the_examples_are_valid(version: str) -> None:
             kubernetes_validate.validate(thing, version, strict=True)
 
 
-class Once(yaml.SafeLoader):
-    """Loads YAML and refuses duplicate keys."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        mapping = super().construct_mapping(node, deep)
-        assert len(mapping) == len(node.value), [key.value for key, _ in node.value]
-        return mapping
-
-
-@each_file
-def test_rendered_objects_have_no_duplicates(path: Path) -> None:
-    """Server-side apply refuses duplicate ports, names and keys."""
-    annotations = {"podAnnotations": {"prometheus.io/scrape": "false"}}
-    for name, text in render_texts(laid_over(values_of(path), {"cloud": annotations})).items():
-        if name.endswith("NOTES.txt"):
-            continue
-        for thing in filter(None, yaml.load_all(text, Once)):
-            spec = thing.get("spec", {}).get("template", thing).get("spec", {})
-            for container in (*spec.get("initContainers", ()), *spec.get("containers", ())):
-                names = [port["name"] for port in container.get("ports", ())]
-                assert len(names) == len(set(names))
-                assert all(port["protocol"] for port in container.get("ports", ()))
-                assert all(len(name) <= 15 for name in names)
-            mounts = [volume["name"] for volume in spec.get("volumes", ())]
-            assert len(mounts) == len(set(mounts))
-
-
 def helm(*arguments: str) -> subprocess.CompletedProcess[str]:
     if shutil.which("helm") is None:
         pytest.skip("no helm here")
@@ -106,25 +76,10 @@ def test_helm_renders_the_same_objects(path: Path) -> None:
     assert "WARNING" not in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (["--kube-version", "1.28.0"], f"requires kubeVersion: {METADATA['kubeVersion']}"),
-        (["--kube-version", OLDEST, "--set", "link.mod=netem"], "mod"),
-    ],
-)
-def test_helm_refuses_an_older_cluster_and_an_unknown_value(flags: list[str], words: str) -> None:
-    done = helm("template", "demo", str(CHART), *flags)
+def test_helm_refuses_an_older_cluster() -> None:
+    done = helm("template", "demo", str(CHART), "--kube-version", "1.28.0")
     assert done.returncode != 0
-    assert words in done.stderr
-
-
-def test_helm_keeps_a_large_seed() -> None:
-    """Helm writes numbers above a million as powers of ten, which are no integers."""
-    flags = ("--kube-version", OLDEST, "--set-json", 'experiment={"seed": 4503599627370495}')
-    shown = "templates/shared/experiment.yaml"
-    done = helm("template", "demo", str(CHART), "--show-only", shown, *flags)
-    assert "seed: 4503599627370495\n" in done.stdout + "\n"
+    assert f"requires kubeVersion: {METADATA['kubeVersion']}" in done.stderr
 
 
 def _comparable(objects: Iterable[Object]) -> dict[tuple[str, str], Object]:

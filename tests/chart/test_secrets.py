@@ -142,19 +142,3 @@ def test_a_container_mounts_only_what_it_needs(mode: str) -> None:
     for name in ("cloud", "teleop"):
         where = {m["mountPath"]: m["name"] for m in cloud[name]["volumeMounts"]}
         assert where[folder] == "teleop", "no folder above it, which a link may mount"
-
-
-def test_volumes_in_memory_are_small() -> None:
-    # The value of older releases is accepted.
-    objects = render({"world": {"epochs": {"storageClassName": "fast"}}})
-    assert set(of_kind(objects, "PersistentVolumeClaim")) == {"journal"}
-    memory = {
-        name: {v["name"]: v["emptyDir"] for v in pod.get("volumes", ()) if "emptyDir" in v}
-        for name, pod in pod_specs(objects).items()
-    }
-    run = {"medium": "Memory", "sizeLimit": "4Mi"}
-    for end in ("world", "cloud"):
-        assert memory[end].pop("data").keys() == {"sizeLimit"}
-    assert memory.pop("cloud") == {"run": run, "teleop": {"medium": "Memory", "sizeLimit": "1Mi"}}
-    assert memory.pop("world") == {"run": run}
-    assert not any(memory.values())

@@ -75,8 +75,7 @@ def test_netem_adds_one_capability_to_one_container(mode: str) -> None:
     pods = pod_specs(render({"link": {"mode": mode}}, lookup=a_namespace()))
     expected = ["link: root", "link: capabilities"]
     assert {name: breaches(pod) for name, pod in pods.items()} == {
-        "world": expected,
-        "cloud": expected,
+        **dict.fromkeys(("world", "cloud"), expected),
         "test": [],
         "test-link": [],
     }

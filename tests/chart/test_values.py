@@ -7,15 +7,7 @@ from typing import Any
 
 import pytest
 
-from cloudrc.config.problems import leaves
-from cloudrc.config.schema import Experiment
-from tests.chart.conftest import (
-    CHART,
-    SCHEMA,
-    Object,
-    render,
-    values_of,
-)
+from tests.chart.conftest import CHART, SCHEMA, Object, render, values_of
 
 jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-validate, extra dev")
 
@@ -44,20 +36,11 @@ def test_the_schema_is_closed_at_every_level() -> None:
         assert extra is False or (isinstance(extra, dict) and extra.get("type")), path
 
 
-def test_every_value_has_a_description_and_a_number_its_unit() -> None:
-    definitions = SCHEMA["$defs"]
-    units = {"_m": "[m]", "_ms": "[ms]", "_s": "[s]", "_deg": "[deg]", "_kbit": "[kbit/s]"}
-    keys = {path[-1] for path, _ in leaves(Experiment)}
+def test_every_value_has_a_description() -> None:
     for path, part in parts(SCHEMA):
         for name, value in part.get("properties", {}).items():
-            reference = value.get("$ref", "").rpartition("/")[2]
-            text = value.get("description") or definitions.get(reference, {}).get("description")
-            assert text, (*path, name)
-            for end, unit in units.items():
-                assert name not in keys or not name.endswith(end) or unit in text, (*path, name)
-            if value.get("type") == "integer" and path[:2] != ("$defs", "Experiment"):
-                words = ("[", "port", "Number of", "Packets", "random")
-                assert any(word in text for word in words), (*path, name)
+            target = SCHEMA["$defs"].get(value.get("$ref", "").rpartition("/")[2], {})
+            assert value.get("description") or target.get("description"), (*path, name)
 
 
 def test_the_defaults_are_valid_and_written_out() -> None:
@@ -70,30 +53,21 @@ def test_the_defaults_are_valid_and_written_out() -> None:
     [
         ({"lnk": {}}, "lnk"),
         ({"link": {"mod": "netem"}}, "mod"),
-        ({"link": {"mode": "tc"}}, "tc"),
         ({"link": {"profile": {"uplink": {"delay": 40}}}}, "delay"),
         ({"experiment": {"seeds": 4}}, "seeds"),
         ({"experiment": {"guard": {"command_age_max_ms": -1}}}, "-1"),
-        ({"experiment": {"world": {"low_level": {"gain_p": [1, 2]}}}}, "[1, 2]"),
-        ({"experiment": {"cloud": {"predictor": {"share": 1}}}}, "share"),
         ({"world": {"resources": {"limits": {"cpus": 1}}}}, "cpus"),
         ({"world": {"resources": {"limits": {"memory": "64MB"}}}}, "64MB"),
-        ({"world": {"resources": {"limits": {"cpu": -1}}}}, "-1"),
         ({"world": {"podLabels": {"app.kubernetes.io/name": "x"}}}, "app.kubernetes.io/name"),
         ({"link": {"traces": {"profile.yaml": ""}}}, "profile.yaml"),
-        ({"link": {"traces": {"change.json": ""}}}, "change.json"),
-        ({"link": {"traces": {"experiment.yaml": ""}}}, "experiment.yaml"),
         ({"link": {"traces": {"a b": ""}}}, "a b"),
         ({"experiment": {"seed": 2**53}}, "9007199254740992"),
         ({"fullnameOverride": "1abc"}, "1abc"),
         ({"experiment": None}, "experiment"),
-        ({"cloud": {"backgroundLoad": None}}, "backgroundLoad"),
         ({"metrics": {"allowFrom": [{"namespace": "x"}]}}, "namespace"),
         ({"metrics": {"allowFrom": "all"}}, "all"),
         ({"image": {"world": {"digest": "sha256:12"}}}, "sha256:12"),
-        ({"image": {"tag": "a b"}}, "a b"),
         ({"secret": {"existingSecret": "Lab Key"}}, "Lab Key"),
-        ({"cloud": {"backgroundLoad": {"workers": 0}}}, "0"),
         ({"teleop": {"service": {"port": 70_000}}}, "70000"),
     ],
 )

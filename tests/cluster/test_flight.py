@@ -11,7 +11,7 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cluster import flight, pods
-from cloudrc.cluster.client import ClusterError, Release, connect
+from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
 from cloudrc.record.merge import Mission, cut_to_last_mission, merge
@@ -139,64 +139,47 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(
     assert {"config.yaml", "mission.mcap", "report.json", "environment.json"} <= left
     assert {"world.mcap", "cloud.mcap", "world-link.metrics", "cloud-teleop.log"} <= left
     assert not (tmp_path / "runs").exists()
-    assert "upgrade --install cloudrc" in (tmp_path / "helm").read_text()
+    line = (tmp_path / "helm").read_text()
+    assert "upgrade --install cloudrc " in line
+    assert "--namespace=demo --create-namespace" in line
 
 
-@pytest.mark.parametrize("out", [[], ["--out", "out"]], ids=["runs", "out"])
-def test_a_refused_mission_leaves_no_run(
-    ready: FakeApi, tmp_path: Path, capsys: Printed, out: list[str]
-) -> None:
+def test_a_refused_mission_leaves_no_run(ready: FakeApi, tmp_path: Path, capsys: Printed) -> None:
     ends(ready, "Failed", 5, "mission m-1 is under way")
-    assert main([*LINE, *out]) == 5
+    assert main(LINE) == 5
     said = capsys.readouterr().err
     assert "did not fly its mission: mission m-1 is under way" in said
     assert "what was recorded" not in said
-    assert not (tmp_path / "out").exists()
     assert list((tmp_path / "runs").glob("*")) == []
 
 
-@pytest.mark.parametrize("left", [True, False], ids=["left", "nothing"])
 def test_the_recording_from_before_a_restart_is_copied(
-    ready: FakeApi, tmp_path: Path, capsys: Printed, left: bool
+    ready: FakeApi, tmp_path: Path, capsys: Printed
 ) -> None:
     (key,) = [key for key in ready.objects if key[0] == "pods" and "world" in key[1]]
     ready.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
-    if left:
-        (tmp_path / "left").write_text("before\n")
+    (tmp_path / "left").write_text("before\n")
     ends(ready)
     assert main(LINE) == 6
     out, said = tmp_path / "runs" / "latest", capsys.readouterr().err
     assert (out / "report.json").is_file()
     assert not (out / "cloud.before.mcap").exists()
-    assert (out / "world.before.mcap").exists() is left
     assert "world was restarted" in said
-    if left:
-        assert (out / "world.before.mcap").read_text() == "before\n"
+    assert (out / "world.before.mcap").read_text() == "before\n"
 
 
 def test_a_broken_port_forward_loses_metrics_but_no_report(
     ready: FakeApi, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calls: list[str] = []
-
     def broken(release: object, component: str) -> dict[str, str]:
         raise ClusterError("no way to the pod")
 
-    def hiccup(release: Release, component: str, target: Path) -> None:
-        calls.append(component)
-        if len(calls) == 1:
-            raise ClusterError("kubectl exec failed")
-        fetch_recording(release, component, target)
-
-    fetch_recording = pods.fetch_recording
     monkeypatch.setattr(pods, "fetch_metrics", broken)
-    monkeypatch.setattr(pods, "fetch_recording", hiccup)
     ends(ready)
     assert main([*LINE, "--out", "out"]) == 6
     captured = capsys.readouterr()
     assert json.loads(captured.out)["shaper"] == "unknown"
     assert "without the world pod's metrics: no way to the pod" in captured.err
-    assert "kubectl exec failed; trying again" in captured.err
     assert (tmp_path / "out" / "cloud-teleop.log").is_file()
 
 
@@ -211,9 +194,7 @@ def test_a_run_does_not_end_a_flight_in_progress(
     teleop.missions = [{"id": "m7", "state": "done"}]
     run_job(connect(), {}, name="first")
     assert main([*LINE, "--out", "out"]) == 5
-    said = capsys.readouterr().err
-    assert "Job 'first' is under way" in said
-    assert "cloudrc mission cancel first --namespace=demo --release=cloudrc" in said
+    assert "Job 'first' is under way" in capsys.readouterr().err
     assert not (tmp_path / "helm").exists()
     assert not (tmp_path / "out").exists()
 

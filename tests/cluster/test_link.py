@@ -35,14 +35,7 @@ def item(kind: str, name: str, component: str, **rest: Any) -> dict[str, Any]:
 
 
 class Cluster:
-    """A release behind a fake kubectl, with a record of its calls.
-
-    Attributes:
-        refused: Verb of kubectl -> error message.
-        broken: Pods whose link container cannot be reached.
-        deaf: Pods whose link container applies nothing.
-        cannot: Pod -> word in a profile that its link container refuses.
-    """
+    """A release behind a fake kubectl, with a record of its calls."""
 
     def __init__(self) -> None:
         running = {"status": {"phase": "Running"}}
@@ -58,9 +51,9 @@ class Cluster:
             pod: asdict(LinkState("netem", "", "auto", way, {}, "", 1, asked={"delay": 0.12}))
             for pod, way in (("world-1", "uplink"), ("cloud-1", "downlink"))
         }
-        self.refused: dict[str, str] = {}
-        self.broken, self.deaf = set[str](), set[str]()
-        self.cannot: dict[str, str] = {}
+        self.refused: dict[str, str] = {}  # verb of kubectl -> error message
+        self.broken, self.deaf = set[str](), set[str]()  # pods that are away, or apply nothing
+        self.cannot: dict[str, str] = {}  # pod -> word in a profile that it refuses
         self.asked: list[list[str]] = []
         self.handed: dict[str, dict[str, Any]] = {}
         self.kept: dict[str, str] = {}
@@ -128,11 +121,6 @@ def test_a_local_trace_is_stored_beside_the_profile(
     made, new = with_files({"profile.yaml": PROFILE}, None, setting)
     assert made.restart
     assert yaml.safe_load(new["profile.yaml"])["uplink"]["trace"] == "uplink-my_trace.csv"
-    # The profile now has the name of the file beside it.
-    again, newer = with_files({**new, "change.json": "{}"}, None, ["downlink.loss=0.1"])
-    assert again.values["uplink"]["trace"] == "uplink-my_trace.csv"
-    assert set(newer) == {"profile.yaml"}
-    assert not again.restart
     monkeypatch.setattr("cloudrc.cluster.link.SIZE_MAX", 50)
     with pytest.raises(BadInputError, match="a ConfigMap takes 50"):
         with_files({"profile.yaml": PROFILE}, None, setting)
@@ -148,14 +136,11 @@ def error(capsys: Printed) -> str:
     return line
 
 
-@pytest.mark.parametrize("gone", [["cloud-1"], ["world-1", "cloud-1"]])
-def test_an_unreachable_container_gets_the_change_later(
-    cluster: Cluster, capsys: Printed, gone: list[str]
-) -> None:
-    cluster.broken |= set(gone)
+def test_an_unreachable_container_gets_the_change_later(cluster: Cluster, capsys: Printed) -> None:
+    cluster.broken.add("cloud-1")
     assert main(LINE) == 5
     said = error(capsys)
-    assert said.count("the pod is gone") == len(gone)
+    assert said.count("the pod is gone") == 1
     assert said.endswith(LATER)
     assert cluster.kept
 
@@ -167,11 +152,6 @@ def test_a_change_that_cannot_be_kept_says_where_it_is(cluster: Cluster, capsys:
     assert "the ConfigMap is unchanged: 'kubectl patch' failed" in said
     for way in ("uplink", "downlink"):
         assert f"the {way} has the change until its pod is replaced" in said
-    cluster.refused["exec"] = FORBIDDEN
-    assert main(LINE) == 5
-    said = error(capsys)
-    assert said.count("this is forbidden") == 3
-    assert "has the change" not in said
 
 
 def test_a_change_that_one_direction_refuses_does_not_last(
@@ -204,9 +184,6 @@ def test_a_missing_release_or_pod_is_named(
     del cluster.items[2]
     assert main(LINE) == 5
     assert "the world pod of release 'cloudrc' does not run" in error(capsys)
-    running.objects.clear()
-    assert main(LINE) == 5
-    assert "no release 'cloudrc'" in error(capsys)
 
 
 # The script in the link container, with a real `sh`.
@@ -251,13 +228,6 @@ def test_the_script_hands_over_a_change_and_prints_the_state(
     assert sorted(os.listdir(tmp_path)) == [HANDED_FILE, STATE_FILE], "no draft is left"
 
 
-@pytest.mark.process
-def test_a_silent_sidecar_leaves_the_old_state(tmp_path: Path) -> None:
-    told = tell(tmp_path, change="a1")
-    out, _ = start(tmp_path).communicate(DOCUMENT, timeout=10 * APPLY_LIMIT)
-    assert out == told
-
-
 @pytest.mark.parametrize(
     ("folder", "given", "words"),
     [(".", DOCUMENT[:-1], "the change arrived incomplete"), ("none", "", "no link runs here")],
@@ -287,6 +257,8 @@ KUBECTL_NEEDS = {
 def test_the_role_allows_just_what_its_commands_need(cluster: Cluster) -> None:
     assert main(LINE) == 0
     rules = yaml.safe_load(ROLE.read_text())["rules"]
+    (changing,) = (rule for rule in rules if "patch" in rule["verbs"])
+    assert changing["resourceNames"] == ["cloudrc-link"], "another one has the guard's limits"
     allowed = {
         (what, verb) for rule in rules for what in rule["resources"] for verb in rule["verbs"]
     }

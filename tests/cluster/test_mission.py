@@ -81,6 +81,12 @@ def fly(api: FakeApi, capsys: Printed, code: int = 0) -> str:
 
 
 def test_list_status_and_logs_show_jobs(running: FakeApi, capsys: Printed) -> None:
+    assert main(["mission", "list"]) == 0
+    assert "; fly one: cloudrc mission run FILE\n" in capsys.readouterr().out
+    assert main(["mission", "logs"]) == 2
+    assert capsys.readouterr().err.startswith("cloudrc: error: no missions ")
+    assert main(["mission", "status", "nothing"]) == 5
+    assert re.match("cloudrc: error: .*nothing.*\n$", capsys.readouterr().err)
     first = fly(running, capsys, 1)
     job = fly(running, capsys)
     assert main(["mission", "list"]) == 0
@@ -97,34 +103,10 @@ def test_list_status_and_logs_show_jobs(running: FakeApi, capsys: Printed) -> No
     assert capsys.readouterr().out.splitlines()[-1] == VERDICT[1]
 
 
-def test_an_empty_list_says_how_to_fly(running: FakeApi, capsys: Printed) -> None:
-    assert main(["mission", "list"]) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith("no missions in namespace 'demo'")
-    assert printed.endswith("; fly one: cloudrc mission run FILE\n")
-    assert main(["mission", "logs"]) == 2
-    assert capsys.readouterr().err.startswith("cloudrc: error: no missions ")
-
-
-@pytest.mark.parametrize("verb", ["status", "cancel", "logs"])
-def test_a_missing_job_is_an_error_of_the_cluster(
-    running: FakeApi, capsys: Printed, verb: str
-) -> None:
-    assert main(["mission", verb, "nothing"]) == 5
-    assert re.match("cloudrc: error: .*nothing.*\n$", capsys.readouterr().err)
-
-
-def test_a_missing_release_is_reported_with_a_command(api: FakeApi, capsys: Printed) -> None:
-    assert main(["mission", "run", "one.yaml"]) == 5
-    assert re.match("cloudrc: error: no release.*helm install.*\n$", capsys.readouterr().err)
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         (f"time_limit_s: .nan\n{WAYPOINTS}", "time_limit_s: nan: must be finite"),
-        ("waypoints: []", "waypoints: none given; give at least one"),
-        ("waypoints: [{position: [0, 0, 1]}]", "did you mean position_m"),
         ("waypoints: [{position_m: [0, 0, 99]}]", "waypoints.0.position_m.*beyond the fence"),
     ],
 )
@@ -147,11 +129,9 @@ def test_a_mission_that_cannot_be_flown_makes_no_job(
         (WAYPOINTS, {"seed": 4, "link": {"profile": "lossy"}}, 60),
         (WAYPOINTS, None, 600),
     ],
-    ids=["the experiment's", "its own", "the default", "unreadable"],
 )
-@pytest.mark.parametrize("queue", [[], ["--queue"]], ids=["at once", "queued"])
 def test_a_jobs_deadline_follows_the_missions_time_limit(
-    lands: FakeApi, folder: Path, mission: str, given: Any, limit: int, queue: list[str]
+    lands: FakeApi, folder: Path, mission: str, given: Any, limit: int
 ) -> None:
     data = {"experiment.yaml": yaml.safe_dump(given)}
     metadata = {"name": "cloudrc-experiment", "labels": labels("experiment")}
@@ -159,12 +139,13 @@ def test_a_jobs_deadline_follows_the_missions_time_limit(
     if given is None:
         lands.refuse["GET", "configmaps"] = 403, "configmaps is forbidden"
     (folder / "one.yaml").write_text(mission)
-    assert main(["mission", "run", "one.yaml", *queue]) == 0
-    (job,) = made(lands)
-    deadline = job["spec"]["activeDeadlineSeconds"]
-    assert deadline >= limit + (600 if queue else 0) + 60
-    assert queue or given is None or deadline <= limit + 180
-    assert job["metadata"]["patience"] > deadline
+    for queue in ([], ["--queue"]):
+        assert main(["mission", "run", "one.yaml", *queue]) == 0
+        job = made(lands)[-1]
+        deadline = job["spec"]["activeDeadlineSeconds"]
+        assert deadline >= limit + (600 if queue else 0) + 60
+        assert queue or given is None or deadline <= limit + 180
+        assert job["metadata"]["patience"] > deadline
 
 
 def test_run_waits_until_the_release_is_ready(lands: FakeApi, capsys: Printed) -> None:
@@ -187,13 +168,6 @@ def test_run_waits_until_the_release_is_ready(lands: FakeApi, capsys: Printed) -
     assert json.loads(plan) == command.read_mission("pipes")
 
 
-def test_the_wait_for_a_release_has_a_timeout(running: FakeApi, capsys: Printed) -> None:
-    running.put("pods", pod("world-1", "world", ready=False))
-    assert main(["mission", "run", "one.yaml", "--timeout", "0.05"]) == 4
-    assert "container world is not ready yet" in capsys.readouterr().err
-    assert made(running) == []
-
-
 def test_an_interrupted_run_says_that_the_job_continues(
     running: FakeApi, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,10 +178,8 @@ def test_an_interrupted_run_says_that_the_job_continues(
     assert main(["mission", "run", "one.yaml"]) == 130
     (job,) = made(running)
     name = job["metadata"]["name"]
-    assert capsys.readouterr().err == (
-        f"Job {name} is still running; cancel it: "
-        f"cloudrc mission cancel {name} --namespace=demo --release=cloudrc\n"
-    )
+    said = capsys.readouterr().err
+    assert f"cloudrc mission cancel {name} --namespace=demo --release=cloudrc\n" in said
 
 
 @pytest.fixture
@@ -231,12 +203,7 @@ def test_the_local_run_is_the_default(running: FakeApi, capsys: Printed) -> None
 @pytest.mark.usefixtures("flies_here")
 @pytest.mark.parametrize(
     "words",
-    [
-        ["cloudrc", "mission", "list", "--release", "cloudrc"],
-        ["cloudrc", "mission", "list", "-n", "demo"],
-        ["cloudrc", "mission", "list", "--context", "here"],
-        ["/usr/local/bin/kubectl-cloudrc", "mission", "list"],
-    ],
+    [["cloudrc", "mission", "list", "-n", "demo"], ["/bin/kubectl-cloudrc", "mission", "list"]],
 )
 def test_a_flag_or_the_plugin_of_kubectl_selects_the_cluster(
     running: FakeApi, capsys: Printed, monkeypatch: pytest.MonkeyPatch, words: list[str]
@@ -246,17 +213,9 @@ def test_a_flag_or_the_plugin_of_kubectl_selects_the_cluster(
     assert "no missions in namespace 'demo'" in capsys.readouterr().out
 
 
-def test_a_killed_run_is_ignored(
-    running: FakeApi, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
+def test_neither_a_run_nor_a_cluster_is_reported(
+    tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with local.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
-        (file,) = local.places()[0].iterdir()
-        left = file.read_text()
-    file.write_text(left)
-    file.chmod(0o600)
-    assert main(["mission", "list"]) == 0
-    assert "no missions in namespace 'demo'" in capsys.readouterr().out
-    nowhere = str(tmp_path / "none")
-    monkeypatch.setattr(CONFIG_PLACE, nowhere)
+    monkeypatch.setattr(CONFIG_PLACE, str(tmp_path / "none"))
     assert main(["mission", "status"]) == 3
     assert re.match(".*no run flies here.*KUBECONFIG.*\n$", capsys.readouterr().err)

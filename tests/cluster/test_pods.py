@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import os
 import re
 from collections.abc import Callable
@@ -34,7 +33,6 @@ def unscheduled(message: str) -> list[dict[str, str]]:
     ("given", "expected"),
     [
         ({"state": waiting("ImagePullBackOff")}, "cloudrc/cloud:0.1.0.*make kind-load"),
-        ({"state": waiting("ErrImageNeverPull")}, "make kind-load"),
         (
             {"state": waiting("CreateContainerConfigError", 'secret "mine" not found')},
             'cannot be created: secret "mine" not found',
@@ -49,7 +47,6 @@ def unscheduled(message: str) -> list[dict[str, str]]:
         ({"restarts": 5}, "ends repeatedly$"),
         ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
         ({}, "^$"),
-        ({"state": waiting("ContainerCreating")}, "^$"),
         ({"conditions": unscheduled("pod has unbound immediate volume claims")}, "^$"),
         ({"restarts": 1}, "^$"),
     ],
@@ -70,8 +67,6 @@ REFUSED = {"type": "ReplicaFailure", "status": "True", "message": "violates PodS
     ("body", "error", "words"),
     [
         (deployment("cloud", updatedReplicas=0), TimedOutError, "its pod is being created"),
-        (deployment("cloud", replicas=2), TimedOutError, "its pod is being created"),
-        (deployment("cloud", observedGeneration=0), TimedOutError, "its pod is being created"),
         (deployment("cloud", conditions=[REFUSED]), ClusterError, "violates PodSecurity"),
         (pod("world-1", "world", ready=False), TimedOutError, "container world is not ready"),
         (
@@ -93,7 +88,6 @@ def test_the_wait_for_a_release_ends_with_the_cause(
 @pytest.mark.parametrize(
     ("said", "hint"),
     [
-        ("Kubernetes cluster unreachable: Get https://10.0.0.1: refused", "kubectl cluster-info"),
         ("chart requires >=1.29.0-0 which is incompatible with Kubernetes v1.28.3", "kind create"),
         ("secrets is forbidden: User me cannot list", "kubectl auth can-i"),
         ("values don't meet the specifications of the schema(s)\n- link: mdoe", "helm show values"),
@@ -108,18 +102,7 @@ def test_a_refusal_of_helm_has_a_hint(
     assert "\n" not in str(caught.value)
 
 
-def test_install_passes_values_to_helm_and_waits_for_pods(
-    running: FakeApi, release: Release, pretend: Pretend, tmp_path: Path
-) -> None:
-    pretend("helm", f'cat > {tmp_path}/values; echo "$@" > {tmp_path}/line')
-    install(release, {"experiment": {"seed": 7}}, 1.0, print)
-    assert json.loads((tmp_path / "values").read_text()) == {"experiment": {"seed": 7}}
-    line = (tmp_path / "line").read_text()
-    assert line.startswith("upgrade --install cloudrc ")
-    assert "--namespace=demo --create-namespace" in line
-
-
-@pytest.mark.parametrize("data", [{}, {"operator": "%%%"}, {"operator": "//4gc2VjcmV0"}])
+@pytest.mark.parametrize("data", [{}, {"operator": "//4gc2VjcmV0"}])
 def test_a_secret_without_a_token_is_named(
     running: FakeApi, release: Release, data: dict[str, str]
 ) -> None:
@@ -128,15 +111,8 @@ def test_a_secret_without_a_token_is_named(
     with pytest.raises(ClusterError, match=r"'cloudrc-tokens' .* has no token under") as refused:
         operator_token(release)
     assert base64.b64decode("c2VjcmV0").decode() + "'" not in str(refused.value)
-
-
-def test_unreadable_tokens_are_reported(running: FakeApi, release: Release) -> None:
     running.refuse["GET", "secrets"] = (403, "secrets is forbidden")
     with pytest.raises(ClusterError, match="can-i get secrets"):
-        operator_token(release)
-    template = {"spec": {"containers": [{"name": "cloud"}]}}
-    running.get("deployments", "cloudrc-cloud")["spec"]["template"] = template
-    with pytest.raises(ClusterError, match=r"mounts no tokens: .*another version"):
         operator_token(release)
 
 
@@ -158,39 +134,8 @@ def test_a_port_is_forwarded_while_the_block_runs(
     assert "--namespace=demo port-forward pod/world-1" in (tmp_path / "line").read_text()
 
 
-@pytest.mark.parametrize(
-    ("script", "error", "words"),
-    [
-        (
-            "echo 'error: unable to forward port: pod is gone' >&2; exit 1",
-            ClusterError,
-            "cannot forward ports of pod 'cloud-1'.*pod is gone",
-        ),
-        ("exec sleep 60", TimedOutError, "has not started within"),
-    ],
-)
-def test_a_failed_port_forward_is_reported(
-    release: Release,
-    pretend: Pretend,
-    monkeypatch: pytest.MonkeyPatch,
-    script: str,
-    error: type[CloudrcError],
-    words: str,
-) -> None:
-    monkeypatch.setattr(pods, "START_LIMIT", 0.1 if "sleep" in script else 10.0)
-    pretend("kubectl", script)
-    with pytest.raises(error, match=words), pods.forwarded(release, "cloud-1", [8080]):
+def test_a_failed_port_forward_is_reported(release: Release, pretend: Pretend) -> None:
+    pretend("kubectl", "echo 'error: unable to forward port: pod is gone' >&2; exit 1")
+    words = "cannot forward ports of pod 'cloud-1'.*pod is gone"
+    with pytest.raises(ClusterError, match=words), pods.forwarded(release, "cloud-1", [8080]):
         pytest.fail("there is no way")
-
-
-def test_a_recording_is_copied_unchanged(
-    api: FakeApi, release: Release, pretend: Pretend, tmp_path: Path
-) -> None:
-    api.put("pods", pod("world-1", "world"))
-    source, target = tmp_path / "source", tmp_path / "world.mcap"
-    source.write_bytes(bytes(range(256)) * 100)
-    pretend("kubectl", f"echo $@ > {tmp_path}/line; cat {source}")
-    pods.fetch_recording(release, "world", target)
-    assert target.read_bytes() == source.read_bytes()
-    line = (tmp_path / "line").read_text()
-    assert "exec world-1 --container=world -- cat /var/lib/cloudrc/world.mcap" in line

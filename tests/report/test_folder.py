@@ -111,9 +111,7 @@ OTHER = b"seed: 2\nmission: pipes\n"
             filtered(keep=lambda c, m: c.topic in ("/odometry", "/cmd_vel")),
             "it holds 0 of 401 on /telemetry, .* and 12 more",
         ),
-        (filtered(keep=lambda c, m: c.topic != "/guard"), "it holds 0 of 3 on /guard"),
         (filtered(keep=lambda c, m: m.log_time < at(5)), "it holds"),
-        (filtered(keep=lambda c, m: m.log_time > at(5)), "it holds"),
         (filtered(rename=lambda topic: f"/r1{topic}"), "does not record: /r1/cmd_vel, "),
         (filtered(metadata=False), "the metadata of cloudrc, which names the clock, is not there"),
         (cut, "cut short: .* but report.json is of the whole recording"),
@@ -121,8 +119,6 @@ OTHER = b"seed: 2\nmission: pipes\n"
         (recorded(more=40), "on /ground_truth that are not later than the row before"),
         (recorded(config=OTHER), "is the recording of an experiment with other values for: "),
         (lambda source, target: target.write_bytes(b"PK"), "is not an MCAP file"),
-        (lambda source, target: target.write_bytes(b""), "is empty"),
-        (lambda source, target: target.mkdir(), "Is a directory"),
     ],
 )
 def test_a_recording_that_carries_no_report_is_refused(
@@ -139,21 +135,12 @@ def test_a_recording_that_carries_no_report_is_refused(
     assert {path: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 
-@pytest.mark.parametrize(
-    ("topic", "said"),
-    [
-        ("/telemetry", "has 0 rows on /telemetry, but 401 on /odometry"),
-        ("/guard", "has rows on /command_applied, but none on /guard"),
-        ("/mission", "has rows on /pid, but none on /mission"),
-    ],
-)
-def test_a_killed_runs_topics_are_compared(
-    run: Path, monkeypatch: pytest.MonkeyPatch, topic: str, said: str
-) -> None:
+def test_a_killed_runs_topics_are_compared(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its writer has not counted its messages."""
+    said = "has 0 rows on /telemetry, but 401 on /odometry"
     monkeypatch.setattr(McapWriter, "close", McapWriter.flush)
     (run / "report.json").unlink()
-    for left_out in ("", topic):
+    for left_out in ("", "/telemetry"):
         with McapWriter(run / "mission.mcap", clock="world") as writer:
             for log_time_ns, row in merged(*good().ends()):
                 if row[0] != left_out:
