@@ -12,10 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.find_run import QUIET_LIMIT, new_folder
+from cloudrc.cli.find_run import QUIET_LIMIT
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
-from cloudrc.errors import BadInputError
 from tests.teleop.conftest import Running, running
 
 Printed = pytest.CaptureFixture[str]
@@ -174,25 +173,3 @@ def test_the_kubectl_plugin_never_uses_a_local_run(
     with local.announced(with_link(elsewhere / "runs" / "latest")):
         assert main() == 3
     assert "KUBECONFIG" in capsys.readouterr().err
-
-
-def test_folders_are_numbered_and_latest_is_the_newest(elsewhere: Path) -> None:
-    names = [new_folder(None, "paper-local-seed1").as_posix() for _ in range(3)]
-    assert names == [f"runs/paper-local-seed1-{n}" for n in (1, 2, 3)]
-    assert Path("runs/latest").resolve() == Path(names[-1]).resolve()
-    assert new_folder(elsewhere / "a" / "b", "x").is_dir()
-    assert new_folder(elsewhere / "a" / "b", "x").is_dir(), "an empty one"
-
-
-def test_existing_files_are_not_overwritten(elsewhere: Path) -> None:
-    (elsewhere / "full").mkdir()
-    for file in ("full/report.json", "file"):
-        (elsewhere / file).write_text("{}")
-    for name in ("full", "file"):
-        with pytest.raises(BadInputError, match=r"never overwritten"):
-            new_folder(elsewhere / name, "x")
-    Path("runs").write_text("a file")
-    with pytest.raises(BadInputError, match=r"^runs/ in the working folder: .*with --out$"):
-        new_folder(None, "x")
-    with pytest.raises(BadInputError, match=r"^--out runs/x: .*name another folder$"):
-        new_folder(Path("runs/x"), "x")

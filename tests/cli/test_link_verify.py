@@ -130,15 +130,6 @@ def test_a_fault_names_its_direction_and_the_shapers_word(
     assert ("it was told so" in text) is told_so
 
 
-def test_once_one_direction_is_off_the_wait_is_short(
-    release: Release, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(link_verify, "OFF_TIMEOUT", 0.0)
-    release.hears(world="off", cloud="open")
-    assert release.ask(limit=5.0)["verdict"] == "not believed"
-    assert release.looks <= 3, "once at the start, once it is off"
-
-
 def test_a_verdict_off_for_a_moment_does_not_end_the_wait(
     release: Release, monkeypatch: pytest.MonkeyPatch
 ) -> None:

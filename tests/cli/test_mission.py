@@ -17,7 +17,6 @@ from cloudrc.cli.main import main
 from cloudrc.cli.output import escape
 from cloudrc.cluster import jobs
 from cloudrc.cluster.jobs import JobStatus
-from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.teleop.store import SHOWN as EVENTS
 from cloudrc.teleop.store import Order
@@ -219,20 +218,6 @@ def test_list_status_and_logs(api: Running, mission: Command, capsys: Printed) -
         assert "mission started from the spawn" in capsys.readouterr().out
     assert mission("status", "m9") == 5
     assert "no mission 'm9'" in capsys.readouterr().err
-
-
-def test_the_local_run_is_found_and_needs_no_token(folder: Path, capsys: Printed) -> None:
-    with running(unix=True) as api:
-        with local.announced(folder / "runs" / "latest", api.url):
-            assert main(["mission", "status"]) == 0
-            assert "no mission is under way" in capsys.readouterr().out
-            api.post_local("/v1/missions", {"waypoints": [{"position_m": [0.5, -2.0, 1.0]}]})
-            assert main(["mission", "estop"]) == 0
-        said = capsys.readouterr().out
-        assert said.splitlines() == [
-            "emergency stop: sent, and repeated until the rotors have stopped",
-            "mission m1 has failed",
-        ]
 
 
 def test_emergency_stop_and_acknowledgement(

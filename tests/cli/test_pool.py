@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from cloudrc.cli.pool import BATCH_MAX, WorkerDiedError, map_in_order
+from cloudrc.cli.pool import WorkerDiedError, map_in_order
 
 KILLED = 5
 """The piece of work that kills its process."""
@@ -43,25 +43,6 @@ def test_results_keep_the_order_of_the_work(pieces: int, jobs: int, workers: int
     assert numbers == tuple(range(pieces))
     assert (os.getpid() in pids) is (workers == 0)
     assert list(map_in_order(_slow_first, [], 2)) == []
-
-
-class _CountingWork(list[int]):
-    """Work that counts how much of it has been taken."""
-
-    taken = 0
-
-    def __iter__(self) -> Iterator[int]:
-        for each in super().__iter__():
-            self.taken += 1
-            yield each
-
-
-def test_much_work_is_submitted_in_batches() -> None:
-    work = _CountingWork(range(1, 3 * BATCH_MAX))
-    done = map_in_order(_slow_first, work, 2)
-    next(done)
-    assert work.taken == BATCH_MAX
-    assert sum(1 for _ in done) == len(work) - 1
 
 
 def test_results_before_a_worker_was_killed_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,16 +22,13 @@ from cloudrc.cli.processes import (
     open_recorder,
     open_relay,
     read_address,
-    read_profiles,
     read_size,
     resolve_address,
-    show_address,
 )
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import summary
 from cloudrc.link.verify.monitor import Asked, LinkMonitor, Load
 from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
@@ -114,17 +111,6 @@ def test_an_unresolvable_name_is_reported_at_the_start(
         f"cloudrc: error: {flag} nowhere:7400: nowhere cannot be resolved (Name or service not"
         " known); name a host that has an IPv4 address, or the address itself\n"
     )
-
-
-@pytest.mark.parametrize(
-    ("text", "address"),
-    [("127.0.0.1:7400", ("127.0.0.1", 7400)), ("[::1]:7400", ("::1", 7400)), ("[::]:1", ("::", 1))],
-)
-def test_an_address_of_ipv6_is_in_brackets(text: str, address: tuple[str, int]) -> None:
-    assert read_address(text) == address
-    assert show_address(address) == text
-    with pytest.raises(argparse.ArgumentTypeError, match=r"put an IPv6 address in brackets"):
-        read_address("::1:7400")
 
 
 def test_without_ipv6_all_addresses_are_those_of_ipv4(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -285,15 +271,6 @@ def test_a_trace_named_by_the_link_is_read_within_bounds(
     profile["uplink"][key] = "/dev/null"  # an endless device would fill the memory
     with pytest.raises(BadInputError, match="not a file; give a CSV file"):
         load(profile)
-
-
-def test_the_requested_delay_of_a_relay_is_that_of_the_trace(tmp_path: Path) -> None:
-    (tmp_path / "t.csv").write_text("time_s,delay_ms\n0,40\n5,90\n")
-    mine = tmp_path / "mine.yaml"
-    mine.write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}\n")
-    first = read_profiles(load_experiment(str(mine)))
-    delays = {way: summary(loaded.direction)["delay"] for way, loaded in first.items()}
-    assert delays == {"uplink": 0.04, "downlink": 0.025}
 
 
 def test_a_side_of_a_relay_that_cannot_reach_its_end_is_refused() -> None:

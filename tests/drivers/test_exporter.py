@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 import socket
-import subprocess
 import threading
 import time
 import urllib.error
@@ -20,7 +18,6 @@ from cloudrc import __version__
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import exporter as exporters
 from cloudrc.drivers.exporter import Exporter, read_throttling
-from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.exposition.table import (
     BODIES,
     DIRECTIONS,
@@ -115,25 +112,10 @@ def test_a_flight_shows_the_metrics_of_its_role(role: str, flight: Flight) -> No
     assert text.count("cloudrc_link_info{") == (2 if role == "link" else 0)
 
 
-@pytest.mark.parametrize("role", ROLES)
-def test_promtool_finds_nothing_to_say(role: str, flight: Flight) -> None:
-    if shutil.which("promtool") is None:
-        pytest.skip("promtool is missing: apt-get install prometheus")
-    text, command = exporter(role, flight).text(), ["promtool", "check", "metrics"]
-    done = subprocess.run(command, input=text, capture_output=True, text=True)
-    assert (done.returncode, done.stdout + done.stderr) == (0, "")
-
-
 @pytest.mark.parametrize("pod", [("world", "link"), ("cloud", "teleop", "link")])
 def test_a_pod_has_less_than_200_series(pod: tuple[str, ...], flight: Flight) -> None:
     made = [exporter(role, flight, missions=role != "cloud") for role in pod]
     assert sum(len(series(one.text())) for one in made) < 200
-
-
-def test_a_cloud_whose_missions_are_teleops_tells_of_none(flight: Flight) -> None:
-    shown = {alone: exporter("cloud", flight, missions=alone).text() for alone in (True, False)}
-    assert ["cloudrc_mission_state" in text for text in shown.values()] == [True, False]
-    assert "cloudrc_rtt_seconds_count" in shown[False]
 
 
 @pytest.mark.promise("unknown-is-absent")
@@ -144,22 +126,6 @@ def test_the_sync_age_is_absent_until_it_is_known() -> None:
     world.recording(lambda: ages.pop(0))
     assert "sync_age" not in world.text()
     assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
-
-
-def test_unresolved_names_are_counted_and_are_no_sign_of_life() -> None:
-    link = Exporter("link")
-    link.unresolved(7)
-    assert "cloudrc_dns_errors_total 7.0" in link.text()
-    assert link._seen_at is None
-
-
-def test_the_build_is_named_once(flight: Flight) -> None:
-    world = exporter("world", flight)
-    for config in ("", "0123456789ab"):
-        lines = [line for line in series(world.text()) if "build_info" in line]
-        text = f'config="{config}",role="world",version="{__version__}"'
-        assert lines == [f"cloudrc_build_info{{{text}}} 1.0"]
-        world.runs("0123456789ab" + "f" * 52)
 
 
 @pytest.mark.full
@@ -275,17 +241,6 @@ def test_probes_of_both_address_families_are_answered() -> None:
     port = exporter.serve(("::", 0))
     assert {get(port, "/healthz", host)[0] for host in ("127.0.0.1", "[::1]")} == {200}
     exporter.close()
-
-
-def test_an_address_that_cannot_be_bound_is_told(served: tuple[Exporter, int]) -> None:
-    for address in ((HOST, served[1]), ("192.0.2.1", 9100)):
-        told = rf"cannot be served on {address[0]}:{address[1]}: .*--metrics$"
-        with pytest.raises(MissingPrerequisiteError, match=told):
-            Exporter("world").serve(address)
-    served[0].close()
-    other = Exporter("link")
-    assert other.serve((HOST, served[1])) == served[1], "the port is free again"
-    other.close()
 
 
 def test_a_burst_of_clients_that_hang_blocks_no_probe(served: tuple[Exporter, int]) -> None:

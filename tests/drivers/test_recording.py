@@ -11,10 +11,9 @@ import pytest
 
 from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread, WallClock
 from cloudrc.messages import GuardState
-from cloudrc.record.columns import Recording
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import GuardChange, Lateness, Record
-from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records
+from tests.record.conftest import Shelf, counted
 
 
 class Slow(Shelf):
@@ -33,19 +32,6 @@ class Slow(Shelf):
         self.begun.release()
         if len(self.began) == 3:
             self.release.wait(10.0)
-
-
-def test_the_thread_writes_everything_before_it_ends(tmp_path: Path) -> None:
-    path, records = tmp_path / "world.mcap", world_records(200)
-    recorder = Recorder(path, open_mcap)
-    thread = RecordingThread(recorder)
-    thread.start()
-    for record in records:
-        recorder.put([record])
-    assert thread.stop(timeout=10.0)
-    recording = Recording.read(path)
-    assert recording.complete
-    assert_equal(recording, Recording.from_records(records))
 
 
 def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path: Path) -> None:

@@ -128,15 +128,6 @@ def test_after_a_stall_cloud_forwards_stops_but_not_waypoints(peers, stalled):
     assert teleop.take_outputs() == words[:1]
 
 
-def test_what_is_no_message_is_dropped(peers):
-    one, other = peers
-    teleop = remote(one)
-    other.send(b"rubbish")
-    other.send(encode(POINT))
-    teleop.handle_deadline(0)
-    assert teleop.take_outputs() == [POINT]
-
-
 # Teleop's side
 
 
