@@ -1,9 +1,6 @@
 """`cloudrc faults`: what was flown before an interrupt is kept."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,10 +13,8 @@ from cloudrc.faults.schedule import Schedule
 from cloudrc.faults.trial import Finding
 
 
-def test_a_fault_search_with_a_killed_worker_keeps_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def flown(function: object, work: list[tuple[str, int]], jobs: int) -> Iterator[Finding]:
+def test_a_fault_search_with_a_killed_worker_keeps_results(tmp_path, monkeypatch, capsys):
+    def flown(function, work, jobs):
         for _, seed in work[:3]:
             yield Finding(Schedule(seed), ())
         raise WorkerDiedError("a worker was killed")
@@ -37,14 +32,8 @@ def test_a_fault_search_with_a_killed_worker_keeps_results(
 @pytest.mark.parametrize(
     ("error", "code"), [(WorkerDiedError("a worker was killed"), 6), (KeyboardInterrupt(), 130)]
 )
-def test_an_interrupted_fault_run_keeps_its_results(
-    error: BaseException,
-    code: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    def flown(function: object, work: list[tuple[str, int]], jobs: int) -> Iterator[Result]:
+def test_an_interrupted_fault_run_keeps_its_results(error, code, tmp_path, monkeypatch, capsys):
+    def flown(function, work, jobs):
         yield Result(find(work[0][0]), Outcome(), 0.0)
         raise error
 

@@ -1,10 +1,7 @@
 """`cloudrc link`: its actions, traces of runs and logs, pictures of profiles."""
 
-from __future__ import annotations
-
 import gzip
 import os
-from pathlib import Path
 
 import pytest
 
@@ -13,7 +10,6 @@ from cloudrc.cli.link import ACTIONS
 from cloudrc.cli.main import main
 from cloudrc.link.traces import read_table, read_trace
 
-Printed = pytest.CaptureFixture[str]
 PING = "\n".join(
     f"[{100 + n / 5 + 0.04:.6f}] 64 bytes from 192.0.2.1: icmp_seq={n} ttl=57 time={40 + n % 3} ms"
     for n in range(20)
@@ -21,7 +17,7 @@ PING = "\n".join(
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     """A flight of some seconds over a link with losses."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     line = f"run steps --mode virtual --set mission.steps.count=2 --out {folder} -o json"
@@ -32,12 +28,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_every_action_explains_itself_in_80_columns(capsys: Printed) -> None:
+def test_every_action_explains_itself_in_80_columns(capsys):
     for action in ACTIONS:
         with pytest.raises(SystemExit):
             main(["link", action, "--help"])
@@ -45,7 +41,7 @@ def test_every_action_explains_itself_in_80_columns(capsys: Printed) -> None:
         assert max(map(len, text.splitlines())) <= 80, action
 
 
-def test_a_run_gives_a_trace_per_direction(run: Path, here: Path, capsys: Printed) -> None:
+def test_a_run_gives_a_trace_per_direction(run, here, capsys):
     assert main(["link", "record", str(run), "-o", "trace.csv"]) == 0
     said = capsys.readouterr().out
     for way in ("uplink", "downlink"):
@@ -67,7 +63,7 @@ def test_a_run_gives_a_trace_per_direction(run: Path, here: Path, capsys: Printe
     assert 0.020 < sum(trace.delays) / len(trace.delays) < 0.035
 
 
-def test_a_ping_log_gives_a_trace_and_what_was_left_out(here: Path, capsys: Printed) -> None:
+def test_a_ping_log_gives_a_trace_and_what_was_left_out(here, capsys):
     (here / "ping.log").write_text(PING + "\nping: sendmsg: Operation not permitted\n")
     assert main(["link", "record", "ping.log", "-o", "t.csv"]) == 2
     assert "--halve-rtt" in capsys.readouterr().err
@@ -98,14 +94,7 @@ def test_a_ping_log_gives_a_trace_and_what_was_left_out(here: Path, capsys: Prin
         (".", None, "has no mission.mcap"),
     ],
 )
-def test_an_unusable_source_is_refused_in_one_line(
-    name: str,
-    data: bytes | None,
-    says: str,
-    here: Path,
-    capsys: Printed,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_unusable_source_is_refused_in_one_line(name, data, says, here, capsys, monkeypatch):
     monkeypatch.setattr(link_record, "UNPACKED_MAX", 1 << 20)
     if data is not None:
         (here / name).write_bytes(data)
@@ -137,15 +126,13 @@ def test_an_unusable_source_is_refused_in_one_line(
         ("verify lossy --shaper netem", "uplink: netem cannot do loss.delay_bad_ms"),
     ],
 )
-def test_a_wrong_line_is_refused(line: str, says: str, capsys: Printed) -> None:
+def test_a_wrong_line_is_refused(line, says, capsys):
     assert main(["link", *line.split()]) == 2
     assert says in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["png", "svg"])
-def test_a_profile_is_drawn_and_its_statistics_printed(
-    kind: str, here: Path, capsys: Printed
-) -> None:
+def test_a_profile_is_drawn_and_its_statistics_printed(kind, here, capsys):
     line = ["link", "show", "handover", "--seconds", "12", "-o", f"a.{kind}"]
     assert main(line) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -160,9 +147,7 @@ def test_a_profile_is_drawn_and_its_statistics_printed(
 
 
 @pytest.mark.parametrize(("rate", "overtaken"), [(50, 19.0), (200, 59.0)])
-def test_rate_and_number_of_packets_can_be_set(
-    rate: int, overtaken: float, here: Path, capsys: Printed
-) -> None:
+def test_rate_and_number_of_packets_can_be_set(rate, overtaken, here, capsys):
     (here / "mine.yaml").write_text("uplink: {delay_ms: 70, jitter_ms: 25}\ndownlink: {loss: 1}")
     line = f"link show ./mine.yaml --seconds 1 --packets 4000 --rate {rate}"
     assert main(line.split()) == 0
@@ -171,9 +156,7 @@ def test_rate_and_number_of_packets_can_be_set(
 
 
 @pytest.mark.parametrize("loop", ["", ", loop: true"])
-def test_a_trace_is_shown_row_by_row_whatever_its_span(
-    loop: str, here: Path, capsys: Printed
-) -> None:
+def test_a_trace_is_shown_row_by_row_whatever_its_span(loop, here, capsys):
     """Its time is Unix time; a row in a year would be 3 billion packets at 100 Hz."""
     rows = [f"{1_700_000_000 + n / 100},{40 + n % 7},{int(n % 10 == 0)}" for n in range(500)]
     (here / "t.csv").write_text("\n".join(["time_s,delay_ms,loss", *rows, "1731536000,90,0"]))

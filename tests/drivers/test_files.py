@@ -1,7 +1,5 @@
 """Foreign files are read completely or not at all, and never block."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -9,7 +7,7 @@ import pytest
 from cloudrc import files
 
 
-def test_what_is_beyond_the_limit_is_refused_and_not_cut(tmp_path: Path) -> None:
+def test_what_is_beyond_the_limit_is_refused_and_not_cut(tmp_path):
     """Files of /proc claim to be empty, and so does a file that grows during the read."""
     for size in (0, 1, 99, 100):
         (tmp_path / "a").write_bytes(bytes(size))

@@ -1,10 +1,7 @@
 """The recorder with its threads, what a pod records, and steps of the wall clock."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -12,29 +9,29 @@ import pytest
 from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread, WallClock
 from cloudrc.messages import GuardState
 from cloudrc.record.recorder import Recorder
-from cloudrc.records import GuardChange, Lateness, Record
+from cloudrc.records import GuardChange, Lateness
 from tests.record.conftest import Shelf, counted
 
 
 class Slow(Shelf):
     """A sink whose third sync hangs until it is released."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.release, self.begun = threading.Event(), threading.Semaphore(0)
         self.began, self.flushed = list[float](), threading.Semaphore(0)
 
-    def flush(self) -> None:
+    def flush(self):
         self.flushed.release()
 
-    def sync(self) -> None:
+    def sync(self):
         self.began.append(time.monotonic())
         self.begun.release()
         if len(self.began) == 3:
             self.release.wait(10.0)
 
 
-def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path: Path) -> None:
+def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path):
     """The loop goes on, and the operating system gets the data."""
     path, shelf = tmp_path / "w.mcap", Slow()
     path.touch()
@@ -57,11 +54,11 @@ def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path: Path) -> None:
     shelf.release.set()
 
 
-def test_a_hanging_disk_does_not_keep_the_process() -> None:
+def test_a_hanging_disk_does_not_keep_the_process():
     release = threading.Event()
 
     class Hanging(Shelf):
-        def write(self, records: Iterable[Record]) -> None:
+        def write(self, records):
             release.wait(10.0)
 
     recorder = Recorder(Path("x"), lambda path: Hanging(), capacity=5)
@@ -75,7 +72,7 @@ def test_a_hanging_disk_does_not_keep_the_process() -> None:
     assert thread.stop(timeout=10.0)
 
 
-def test_a_pod_records_flights_whole_and_events_between_them() -> None:
+def test_a_pod_records_flights_whole_and_events_between_them():
     now, kept = 0, {}
     choose = FlightsOnly(lambda: now in (100, 101, 102))
     for now in range(300):
@@ -90,9 +87,7 @@ def test_a_pod_records_flights_whole_and_events_between_them() -> None:
 
 
 @pytest.mark.parametrize("by", [3600.0, -1.0])
-def test_a_step_of_the_wall_clock_is_noticed_once(
-    by: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_of_the_wall_clock_is_noticed_once(by, monkeypatch):
     offset, true = [0.0], time.time
     monkeypatch.setattr(time, "time", lambda: true() + offset[0])
     thread = RecordingThread(Recorder(Path("x"), lambda path: Shelf()))
@@ -107,7 +102,7 @@ def test_a_step_of_the_wall_clock_is_noticed_once(
     assert thread.stop(10.0)
 
 
-def test_a_clock_that_drifts_has_not_been_set(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_that_drifts_has_not_been_set(monkeypatch):
     boot = [0.0]
     monkeypatch.setattr(time, "clock_gettime", lambda clock: boot[-1])
     monkeypatch.setattr(time, "time", lambda: 1.7e9 + boot[-1] * 1.0005)
@@ -118,13 +113,11 @@ def test_a_clock_that_drifts_has_not_been_set(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("stopped_before", [True, False])
-def test_nor_has_one_whose_reader_was_stopped_meanwhile(
-    stopped_before: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nor_has_one_whose_reader_was_stopped_meanwhile(stopped_before, monkeypatch):
     """A stop of a second between the reads of both clocks, by SIGSTOP or a CPU quota."""
     true, stops = [0.0], iter([False, True])
 
-    def look() -> float:
+    def look():
         stop = next(stops, False)
         true[0] += stop and stopped_before
         shown = 1.7e9 + true[0]
