@@ -24,16 +24,15 @@ def no_waiting():
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("words", ["recover"])
 @pytest.mark.parametrize("what", ["pipe", "/dev/null", "."])
 def test_a_pipe_device_or_folder_is_refused_at_once(
-    words, what, tmp_path, no_waiting, monkeypatch, capsys
+    what, tmp_path, no_waiting, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
-    assert main([*words.split(), what]) == 2
+    assert main(["recover", what]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"{what}: not a regular file; see 'cloudrc {words} --help'" in line
+    assert f"{what}: not a regular file; see 'cloudrc recover --help'" in line
     assert os.listdir() == ["pipe"]
 
 

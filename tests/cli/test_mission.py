@@ -152,8 +152,7 @@ def test_an_api_that_is_not_there_ends_with_4_or_5(capsys):
 
 
 @pytest.mark.parametrize(
-    "url",
-    ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://", "http://[::1", "http://h:x"],
+    "url", ["here", "unix:", "ftp://h:1", "http://me@h:1", "http://", "http://[::1", "http://h:x"]
 )
 def test_an_invalid_url_of_the_api_is_an_error(url, capsys):
     assert main(["mission", "status", "--api", url]) == 2

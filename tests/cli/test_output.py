@@ -113,11 +113,3 @@ def test_a_long_text_has_no_position_and_is_wrapped_on_a_terminal(length):
     assert len(line) <= max(FILE_COLUMNS, len(text) + 2)
     *lines, _ = terminal.getvalue().splitlines()  # the last one is the status line
     assert max(map(len, lines)) <= 80
-
-
-def test_a_closed_pipe_does_not_end_the_flight():
-    class Closed(Terminal):
-        def write(self, text):
-            raise BrokenPipeError
-
-    seen(Closed(), telemetry(0), CONTROL, REACHED).close()

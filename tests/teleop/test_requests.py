@@ -3,10 +3,7 @@
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, RequestSender
-from cloudrc.teleop.wire import (
-    ALARM,
-    RobotStatus,
-)
+from cloudrc.teleop.wire import ALARM, RobotStatus
 from cloudrc.tunnel.codec import NUMBER_MAX
 from tests.teleop.conftest import FROM_SPAWN, ID, A, Flight, flying
 
