@@ -21,12 +21,6 @@ EVIL = "x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run
 SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
 
 
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.fixture
 def printed(capsys):
     """Check the output and give it: it contains the escaped text and no control characters."""
@@ -55,24 +49,24 @@ def test_a_name_in_an_error(words, printed):
     assert line.startswith("cloudrc: error: ")
 
 
-def test_names_in_an_error_of_several_lines(here, printed):
-    (here / "a.yaml").write_text(yaml.safe_dump({EVIL: 1, "seed": EVIL}))
+def test_names_in_an_error_of_several_lines(folder, printed):
+    (folder / "a.yaml").write_text(yaml.safe_dump({EVIL: 1, "seed": EVIL}))
     assert main(["run", "./a.yaml"]) == 2
     head, *lines = printed().splitlines()
     assert head.endswith("a.yaml has 2 problems:")
     assert [line.startswith("  ./a.yaml:") for line in lines] == [True, True]
 
 
-def test_the_note_of_a_recording(here, printed):
-    with McapWriter(here / "a.mcap", clock="world") as writer:
+def test_the_note_of_a_recording(folder, printed):
+    with McapWriter(folder / "a.mcap", clock="world") as writer:
         writer.write(world_records(5))
         writer.note({MISSING: EVIL})
     assert main(["recover", "a.mcap"]) == 1
     assert f"lossy: {SHOWN}\n" in printed()
 
 
-def test_the_description_of_a_profile(here, printed):
-    (here / "a.yaml").write_text(yaml.safe_dump({"description": EVIL, "uplink": {"delay_ms": 1}}))
+def test_the_description_of_a_profile(folder, printed):
+    (folder / "a.yaml").write_text(yaml.safe_dump({"description": EVIL, "uplink": {"delay_ms": 1}}))
     assert main(["link", "show", "./a.yaml", "--packets", "10", "-o", "a.svg"]) == 0
     assert printed().startswith(f"a: {SHOWN}\n")
 

@@ -31,7 +31,6 @@ def test_what_was_flown_before_an_interrupt_is_kept(
         yield Finding(Schedule(seed), ()) if seed else Result(find(name), Outcome(), 0.0)
         raise error
 
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cloudrc.cli.faults.map_in_order", flown)
     assert main(["faults", *line.split(), "-o", "json"]) == code
     out, message = capsys.readouterr()

@@ -28,7 +28,6 @@ def no_waiting():
 def test_a_pipe_device_or_folder_is_refused_at_once(
     what, tmp_path, no_waiting, monkeypatch, capsys
 ):
-    monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
     assert main(["recover", what]) == 2
     (line,) = capsys.readouterr().err.splitlines()

@@ -126,7 +126,6 @@ def test_state_that_a_full_disk_refused_is_written_later(tmp_path, monkeypatch):
 
 @pytest.fixture
 def flight(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     found = Flight(tmp_path / "runs" / "latest")
     monkeypatch.setattr(link_set, "sleep", found.wait)
     with local.announced(tmp_path / "runs" / "latest"):

@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from cloudrc.cli.faults import SEED_MAX
+from cloudrc.cli.link import ACTIONS
 from cloudrc.cli.main import INTERNAL, main
 from cloudrc.cli.parser import COMMANDS
 from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError
@@ -41,10 +42,10 @@ def test_help_answers_within_150_ms():
     assert min(took) < 0.150
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS])
+@pytest.mark.parametrize("command", ["", *COMMANDS, *(f"link {action}" for action in ACTIONS)])
 def test_help_fits_80_columns(command, capsys):
     with pytest.raises(SystemExit) as end:
-        main([command, "--help"] if command else ["--help"])
+        main([*command.split(), "--help"])
     text = capsys.readouterr().out
     assert end.value.code == 0
     assert max(map(len, text.splitlines())) <= 80

@@ -14,7 +14,6 @@ from cloudrc.cli.output import escape
 from cloudrc.cluster import jobs
 from cloudrc.cluster.jobs import JobStatus
 from cloudrc.errors import BadInputError
-from cloudrc.teleop.store import SHOWN as EVENTS
 from cloudrc.teleop.store import Order
 from tests.teleop.conftest import PLAN, A, B, running
 
@@ -34,14 +33,12 @@ def api():
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def quick(folder, monkeypatch):
     monkeypatch.setattr(command, "POLL_PERIOD", 0.02)
     monkeypatch.setattr(command, "API_TIMEOUT", 0.5)
-    monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    (tmp_path / "two.yaml").write_text(FILE)
-    return tmp_path
+    monkeypatch.setenv("KUBECONFIG", str(folder / "none"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    (folder / "two.yaml").write_text(FILE)
 
 
 @pytest.fixture
@@ -363,16 +360,3 @@ def test_an_invalid_id_is_no_mission(verb, forged, capsys):
         assert line.isprintable()
         shown = {"a/b": "Not Found", "\udcff": "no mission '\ufffd'"}
         assert shown.get(given, f"no mission '{escape(given)}'") in line
-
-
-def test_left_out_events_are_counted(forged, capsys):
-    mission = forged.flight.teleop.book.find("m1")
-    for _ in range(EVENTS):
-        noted = forged.bridge.submit(lambda service, _: service.book.note(mission, "goto", "to"))
-        noted.result(10.0)
-    left_out = mission.happened.total() - EVENTS
-    for words in ("status", "logs"):
-        assert main(["mission", words, "m1", "--api", forged.url]) == 0
-        said = capsys.readouterr().out
-        assert f"m1  {left_out} earlier events are not shown\n" in said
-        assert said.count("\nm1 ") >= EVENTS

@@ -15,12 +15,6 @@ SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"
 FLY = ["run", "steps", "--mode", "virtual", *SHORT]
 
 
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.fixture
 def no_page(monkeypatch):
     """Leave out the figures, which take longer than the flight."""

@@ -45,7 +45,6 @@ def test_under_nohup_a_hang_up_is_ignored():
     ],
 )
 def test_flying_commands_treat_a_hang_up_as_ctrl_c(words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     assert main(words) == 2
     assert signal.getsignal(signal.SIGHUP) is _hung_up
 

@@ -22,12 +22,6 @@ SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"
 """Overrides of `steps` for one second of flight."""
 
 
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def report(seed, verdict="success", **numbers):
     found = {name: {"value": value, "unit": "m"} for name, value in numbers.items()}
     return {"seed": seed, "verdict": verdict, "failures": [], "numbers": found}

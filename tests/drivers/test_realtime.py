@@ -55,20 +55,6 @@ def write(path, text, moment_ns):
     os.utime(path, ns=(moment_ns, moment_ns))
 
 
-def test_a_route_is_read_when_it_changes(tmp_path):
-    path = tmp_path / "route"
-    route = Route(path)
-    assert route.look() is None
-    write(path, "127.0.0.1:7401\n", 1)
-    assert route.look() == HERE
-    with path.open("r+") as file:  # the same file, with the same size and time
-        file.write("127.0.0.1:7499\n")
-    os.utime(path, ns=(1, 1))
-    assert route.look() == HERE, "it is not read again"
-    write(path, "10.1.2.3:7400", 2)
-    assert route.look() == THERE
-
-
 @pytest.mark.parametrize(
     "make",
     [
