@@ -23,9 +23,7 @@ KILLED = WorkerDiedError("a worker was killed")
         ("run --all --junit f.xml", KeyboardInterrupt(), 130, "cloudrc: interrupted; 1 of "),
     ],
 )
-def test_what_was_flown_before_an_interrupt_is_kept(
-    line, error, code, said, tmp_path, monkeypatch, capsys
-):
+def test_what_was_flown_before_an_interrupt_is_kept(line, error, code, said, monkeypatch, capsys):
     def flown(function, work, jobs):
         name, seed = work[0] if "search" in line else (work[0][0], 0)
         yield Finding(Schedule(seed), ()) if seed else Result(find(name), Outcome(), 0.0)

@@ -25,9 +25,7 @@ def no_waiting():
 
 
 @pytest.mark.parametrize("what", ["pipe", "/dev/null", "."])
-def test_a_pipe_device_or_folder_is_refused_at_once(
-    what, tmp_path, no_waiting, monkeypatch, capsys
-):
+def test_a_pipe_device_or_folder_is_refused_at_once(what, no_waiting, capsys):
     os.mkfifo("pipe")
     assert main(["recover", what]) == 2
     (line,) = capsys.readouterr().err.splitlines()

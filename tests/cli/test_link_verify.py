@@ -195,7 +195,7 @@ def test_ends_that_do_not_answer_are_a_timeout(release):
 
 
 @pytest.mark.parametrize("key", ["seed: 7", "criteria: {}", "guard: {}", "tunnel: {}"])
-def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(key, tmp_path, monkeypatch):
+def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(key, tmp_path):
     (tmp_path / "mine.yaml").write_text(key + "\n")
     assert find_experiment("./mine.yaml", []).uplink == load_experiment("./mine.yaml").uplink
     (tmp_path / "mine.yaml").write_text("description: mine\nuplink: {delay_ms: 12}\n")

@@ -44,7 +44,7 @@ def test_under_nohup_a_hang_up_is_ignored():
         ["link", "verify", "none"],
     ],
 )
-def test_flying_commands_treat_a_hang_up_as_ctrl_c(words, tmp_path, monkeypatch):
+def test_flying_commands_treat_a_hang_up_as_ctrl_c(words):
     assert main(words) == 2
     assert signal.getsignal(signal.SIGHUP) is _hung_up
 
