@@ -18,13 +18,16 @@ from cloudrc.cli.processes import (
     open_recorder,
     open_relay,
     read_address,
+    read_profiles,
     read_size,
     resolve_address,
+    show_address,
 )
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.state import summary
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.record.columns import Recording
 from cloudrc.records import MissionEvent
@@ -255,6 +258,21 @@ def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch, 
     profile["uplink"][key] = "/dev/null"  # an endless device would fill the memory
     with pytest.raises(BadInputError, match="not a file; give a CSV file"):
         load(profile)
+
+
+def test_the_requested_delay_of_a_relay_is_that_of_the_trace(tmp_path):
+    (tmp_path / "t.csv").write_text("time_s,delay_ms\n0,40\n5,90\n")
+    (tmp_path / "mine.yaml").write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}")
+    first = read_profiles(load_experiment("./mine.yaml"))
+    delays = {way: summary(loaded.direction)["delay"] for way, loaded in first.items()}
+    assert delays == {"uplink": 0.04, "downlink": 0.025}
+
+
+@pytest.mark.parametrize("text", ["127.0.0.1:7400", "[::1]:7400", "[::]:1"])
+def test_an_address_of_ipv6_is_in_brackets(text):
+    assert show_address(read_address(text)) == text
+    with pytest.raises(argparse.ArgumentTypeError, match=r"put an IPv6 address in brackets"):
+        read_address("::1:7400")
 
 
 def test_a_side_of_a_relay_that_cannot_reach_its_end_is_refused():
