@@ -199,7 +199,9 @@ def test_list_status_and_logs(api, mission, capsys):
 
 
 def test_emergency_stop_and_acknowledgement(api, mission, capsys):
+    api.post("/v1/missions", {"waypoints": [{"position_m": B}]})
     assert mission("estop") == 0
+    assert capsys.readouterr().out.endswith("stopped\nmission m1 has failed\n")
     assert api.alarms
     api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
     assert mission("run", "two.yaml") == 5
