@@ -13,9 +13,7 @@ from cloudrc.cli.bench import measure_wire
 
 
 @pytest.mark.process
-def test_a_sealed_odometry_costs_an_eighth_of_a_pickled_one(
-    figure: Callable[..., None],
-) -> None:
+def test_a_sealed_odometry_costs_an_eighth_of_a_pickled_one(figure: Callable[..., None]) -> None:
     wire = measure_wire()
     figure(
         "seal, open and codec of an odometry over a pickled round trip", wire["ratio"], "<=", 0.12

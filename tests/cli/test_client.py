@@ -1,9 +1,6 @@
 """The client of the API, when another server answers."""
 
-from __future__ import annotations
-
 import threading
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
@@ -14,18 +11,18 @@ from cloudrc.cli.client import Api, ApiError
 class Handler(BaseHTTPRequestHandler):
     """Answer the status that the path names, with a body that is no API's."""
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         self.send_response(int(self.path[1:]))
         self.send_header("Content-Length", "2")
         self.end_headers()
         self.wfile.write(b"[]")
 
-    def log_message(self, *args: object) -> None:
+    def log_message(self, *args):
         """Say nothing."""
 
 
 @pytest.fixture
-def url() -> Iterator[str]:
+def url():
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
@@ -35,6 +32,6 @@ def url() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("status", [307, 404, 418, 503])
-def test_an_answer_of_another_server_is_shown_as_it_is(url: str, status: int) -> None:
+def test_an_answer_of_another_server_is_shown_as_it_is(url, status):
     with pytest.raises(ApiError, match=f"the API answered {status} "):
         Api(url).get(f"/{status}")

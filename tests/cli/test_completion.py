@@ -1,7 +1,5 @@
 """Completion: a script for each shell that knows commands, options and shipped names."""
 
-from __future__ import annotations
-
 import importlib.util
 import shutil
 import subprocess
@@ -10,11 +8,9 @@ import pytest
 
 from cloudrc.cli.main import main
 
-Printed = pytest.CaptureFixture[str]
-
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_knows_commands_and_options(shell: str, capsys: Printed) -> None:
+def test_the_script_knows_commands_and_options(shell, capsys):
     assert main(["completion", shell]) == 0
     script = capsys.readouterr().out
     for word in ("doctor", "seeds", "paper-verbatim", "satellite", "link.profile=lte"):
@@ -36,7 +32,7 @@ def test_the_script_knows_commands_and_options(shell: str, capsys: Printed) -> N
         (["run", "--set", "cloud.predictor", "=", "last"], ["last_sample"]),
     ],
 )
-def test_bash_completes_names(words: list[str], found: list[str], capsys: Printed) -> None:
+def test_bash_completes_names(words, found, capsys):
     main(["completion", "bash"])
     script = capsys.readouterr().out
     line = " ".join(["cloudrc", *words])
@@ -49,7 +45,7 @@ def test_bash_completes_names(words: list[str], found: list[str], capsys: Printe
     assert done.stdout.split() == found, done.stderr
 
 
-def test_an_error_names_the_missing_shtab(monkeypatch: pytest.MonkeyPatch, capsys: Printed) -> None:
+def test_an_error_names_the_missing_shtab(monkeypatch, capsys):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert main(["completion", "bash"]) == 3
     assert "pip install shtab" in capsys.readouterr().err

@@ -1,7 +1,5 @@
 """The doctor: every problem has a fix; only what the mode needs blocks it."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path
@@ -27,13 +25,7 @@ NO_UDP = Check("udp loopback", "missing", "refused", "allow UDP", ("local",))
         ("virtual", [GOOD, NO_UDP], 0),
     ],
 )
-def test_only_a_needed_check_gives_exit_code_3(
-    mode: str,
-    found: list[Check],
-    code: int,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, capsys):
     monkeypatch.setattr(doctor, "all_checks", lambda *given: iter(found))
     assert main(["doctor", "--mode", mode]) == code
     text = capsys.readouterr().out
@@ -43,13 +35,13 @@ def test_only_a_needed_check_gives_exit_code_3(
     assert json.loads(capsys.readouterr().out)["ready"] is (code == 0)
 
 
-def test_every_problem_says_how_to_fix_it() -> None:
+def test_every_problem_says_how_to_fix_it():
     for check in doctor.all_checks():
         assert check.state == "ok" or check.fix, check.name
         assert len(f"  missing  {check.name}  {check.found}") < 160
 
 
-def test_a_missing_package_is_reported_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_reported_with_its_extra(monkeypatch):
     monkeypatch.setitem(extras.EXTRAS, "world", ("no_such_module",))
     assert doctor.packages("world").fix == "pip install 'cloudrc[world]'"
     assert doctor.packages("world").modes == ("virtual", "local")
@@ -57,7 +49,7 @@ def test_a_missing_package_is_reported_with_its_extra(monkeypatch: pytest.Monkey
         extras.require("mode virtual", ["world", "record"])
 
 
-def test_the_extras_are_those_of_pyproject() -> None:
+def test_the_extras_are_those_of_pyproject():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     declared = project["optional-dependencies"]
     for extra, modules in extras.EXTRAS.items():

@@ -1,9 +1,6 @@
 """Text from files is escaped: it cannot control the terminal or fake a line of output."""
 
-from __future__ import annotations
-
 import io
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,21 +20,12 @@ from tests.record.conftest import world_records
 EVIL = "x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
 SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
 
-Printed = pytest.CaptureFixture[str]
-Printing = Callable[[], str]
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
 
 @pytest.fixture
-def printed(capsys: Printed) -> Printing:
+def printed(capsys):
     """Check the output and give it: it contains the escaped text and no control characters."""
 
-    def check() -> str:
+    def check():
         out, err = capsys.readouterr()
         assert_harmless(out + err)
         return out + err
@@ -45,7 +33,7 @@ def printed(capsys: Printed) -> Printing:
     return check
 
 
-def assert_harmless(text: str) -> None:
+def assert_harmless(text):
     assert SHOWN in text
     assert [c for c in text if not c.isprintable() and c != "\n"] == []
     assert [line for line in text.splitlines() if line.startswith("cloudrc: all")] == []
@@ -55,35 +43,35 @@ def assert_harmless(text: str) -> None:
     "words",
     [["run"], ["report"], ["recover"], ["link", "show"], ["link", "verify"], ["faults", "run"]],
 )
-def test_a_name_in_an_error(words: list[str], printed: Printing) -> None:
+def test_a_name_in_an_error(words, printed):
     assert main([*words, EVIL]) != 0
     (line,) = printed().splitlines()
     assert line.startswith("cloudrc: error: ")
 
 
-def test_names_in_an_error_of_several_lines(here: Path, printed: Printing) -> None:
-    (here / "a.yaml").write_text(yaml.safe_dump({EVIL: 1, "seed": EVIL}))
+def test_names_in_an_error_of_several_lines(folder, printed):
+    (folder / "a.yaml").write_text(yaml.safe_dump({EVIL: 1, "seed": EVIL}))
     assert main(["run", "./a.yaml"]) == 2
     head, *lines = printed().splitlines()
     assert head.endswith("a.yaml has 2 problems:")
     assert [line.startswith("  ./a.yaml:") for line in lines] == [True, True]
 
 
-def test_the_note_of_a_recording(here: Path, printed: Printing) -> None:
-    with McapWriter(here / "a.mcap", clock="world") as writer:
+def test_the_note_of_a_recording(folder, printed):
+    with McapWriter(folder / "a.mcap", clock="world") as writer:
         writer.write(world_records(5))
         writer.note({MISSING: EVIL})
     assert main(["recover", "a.mcap"]) == 1
     assert f"lossy: {SHOWN}\n" in printed()
 
 
-def test_the_description_of_a_profile(here: Path, printed: Printing) -> None:
-    (here / "a.yaml").write_text(yaml.safe_dump({"description": EVIL, "uplink": {"delay_ms": 1}}))
+def test_the_description_of_a_profile(folder, printed):
+    (folder / "a.yaml").write_text(yaml.safe_dump({"description": EVIL, "uplink": {"delay_ms": 1}}))
     assert main(["link", "show", "./a.yaml", "--packets", "10", "-o", "a.svg"]) == 0
     assert printed().startswith(f"a: {SHOWN}\n")
 
 
-def test_what_is_printed_of_a_flight(printed: Printing) -> None:
+def test_what_is_printed_of_a_flight(printed):
     failures = [{"code": "x", "text": EVIL}] * 2
     found = {"verdict": "failure", "failures": failures, "numbers": {}}
     print(report.summary(found, Path(EVIL)))
@@ -97,7 +85,7 @@ def test_what_is_printed_of_a_flight(printed: Printing) -> None:
     assert printed() == f"{SHOWN}\n"
 
 
-def test_the_state_of_a_link_container() -> None:
+def test_the_state_of_a_link_container():
     row = Row("mean", "s", 0.1, 0.1, 0.1, 0.1, 0.1, "off")
     known = Evidence("none", elsewhere=(EVIL,))
     ways, probes = {"uplink": Findings([row], known)}, {"uplink": EVIL}

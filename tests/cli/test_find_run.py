@@ -1,29 +1,23 @@
 """The run that `cloudrc mission` and `cloudrc link set` find on this machine."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
 import socket
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.find_run import QUIET_LIMIT, new_folder
+from cloudrc.cli.find_run import QUIET_LIMIT
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
-from cloudrc.errors import BadInputError
-from tests.teleop.conftest import Running, running
+from tests.teleop.conftest import running
 
-Printed = pytest.CaptureFixture[str]
 SET = ["link", "set", "uplink.loss=0.1"]
 
 
 @pytest.fixture(autouse=True)
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def elsewhere(tmp_path, monkeypatch):
     """A working folder without a run."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
@@ -35,14 +29,14 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @contextlib.contextmanager
-def flying(folder: Path) -> Iterator[Running]:
+def flying(folder):
     """A run that is flying in this folder."""
     folder.mkdir(parents=True)
     with running(unix=True) as api, local.announced(folder, api.url):
         yield api
 
 
-def test_an_emergency_stop_finds_the_run(tmp_path: Path, elsewhere: Path, capsys: Printed) -> None:
+def test_an_emergency_stop_finds_the_run(tmp_path, elsewhere, capsys):
     """First ./runs/latest, then the only other run; with several others one has to be named."""
     with flying(tmp_path / "a") as a:
         assert main(["mission", "estop"]) == 0
@@ -60,7 +54,7 @@ def test_an_emergency_stop_finds_the_run(tmp_path: Path, elsewhere: Path, capsys
                 assert capsys.readouterr().err == ""
 
 
-def test_runs_without_an_answering_api_are_ignored(tmp_path: Path, elsewhere: Path) -> None:
+def test_runs_without_an_answering_api_are_ignored(tmp_path, elsewhere):
     with flying(tmp_path / "out") as api:
         not_yet = f"unix:{tmp_path / 'api.sock'}"
         with (
@@ -72,9 +66,7 @@ def test_runs_without_an_answering_api_are_ignored(tmp_path: Path, elsewhere: Pa
 
 
 @pytest.mark.parametrize("folder", ["runs/latest", "foreign"])
-def test_no_request_goes_to_a_server_that_a_folder_names(
-    elsewhere: Path, capsys: Printed, folder: str
-) -> None:
+def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, capsys, folder):
     (elsewhere / folder).mkdir(parents=True)
     with socket.create_server(("127.0.0.1", 0)) as stranger:
         stranger.setblocking(False)
@@ -88,9 +80,7 @@ def test_no_request_goes_to_a_server_that_a_folder_names(
 
 
 @pytest.mark.parametrize("by", ["flag", "environment"])
-def test_a_local_run_gets_no_token(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str
-) -> None:
+def test_a_local_run_gets_no_token(tmp_path, monkeypatch, by):
     unread = str(tmp_path / "there is none")  # sending it would mean reading it
     words = ["--token-file", unread] if by == "flag" else []
     monkeypatch.setenv("CLOUDRC_TOKEN_FILE", unread)
@@ -110,13 +100,13 @@ def test_a_local_run_gets_no_token(
         ([*SET, "-n", "demo"], "the other flags a cluster; give one"),
     ],
 )
-def test_a_wrong_run_flag_gives_one_line(words: list[str], said: str, capsys: Printed) -> None:
+def test_a_wrong_run_flag_gives_one_line(words, said, capsys):
     assert main([*words, "--run", "nowhere"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
 
 
-def with_link(folder: Path, *, killed: bool = False) -> Path:
+def with_link(folder, *, killed=False):
     """The folder of a run whose relay is silent so far, or whose relay was killed."""
     link = folder / "link"
     link.mkdir(parents=True)
@@ -126,7 +116,7 @@ def with_link(folder: Path, *, killed: bool = False) -> Path:
     return folder
 
 
-def test_link_set_finds_the_only_run(tmp_path: Path, capsys: Printed) -> None:
+def test_link_set_finds_the_only_run(tmp_path, capsys):
     run = with_link(tmp_path / "a", killed=True)
     with local.announced(run), local.announced(tmp_path / "without a link"):
         assert main(SET) == 2
@@ -142,12 +132,8 @@ def test_link_set_finds_the_only_run(tmp_path: Path, capsys: Printed) -> None:
 
 @pytest.mark.parametrize("kubectl", ["perhaps there", "missing"])
 def test_link_set_takes_a_live_relay_and_ignores_a_killed_one(
-    tmp_path: Path,
-    elsewhere: Path,
-    capsys: Printed,
-    monkeypatch: pytest.MonkeyPatch,
-    kubectl: str,
-) -> None:
+    tmp_path, elsewhere, capsys, monkeypatch, kubectl
+):
     if kubectl == "missing":
         monkeypatch.setenv("PATH", str(elsewhere))
     fresh = with_link(elsewhere / "runs" / "latest")
@@ -167,32 +153,8 @@ def test_link_set_takes_a_live_relay_and_ignores_a_killed_one(
     assert f"{tmp_path / 'out'}: no link is up there" in capsys.readouterr().err
 
 
-def test_the_kubectl_plugin_never_uses_a_local_run(
-    elsewhere: Path, monkeypatch: pytest.MonkeyPatch, capsys: Printed
-) -> None:
+def test_the_kubectl_plugin_never_uses_a_local_run(elsewhere, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc", *SET])
     with local.announced(with_link(elsewhere / "runs" / "latest")):
         assert main() == 3
     assert "KUBECONFIG" in capsys.readouterr().err
-
-
-def test_folders_are_numbered_and_latest_is_the_newest(elsewhere: Path) -> None:
-    names = [new_folder(None, "paper-local-seed1").as_posix() for _ in range(3)]
-    assert names == [f"runs/paper-local-seed1-{n}" for n in (1, 2, 3)]
-    assert Path("runs/latest").resolve() == Path(names[-1]).resolve()
-    assert new_folder(elsewhere / "a" / "b", "x").is_dir()
-    assert new_folder(elsewhere / "a" / "b", "x").is_dir(), "an empty one"
-
-
-def test_existing_files_are_not_overwritten(elsewhere: Path) -> None:
-    (elsewhere / "full").mkdir()
-    for file in ("full/report.json", "file"):
-        (elsewhere / file).write_text("{}")
-    for name in ("full", "file"):
-        with pytest.raises(BadInputError, match=r"never overwritten"):
-            new_folder(elsewhere / name, "x")
-    Path("runs").write_text("a file")
-    with pytest.raises(BadInputError, match=r"^runs/ in the working folder: .*with --out$"):
-        new_folder(None, "x")
-    with pytest.raises(BadInputError, match=r"^--out runs/x: .*name another folder$"):
-        new_folder(Path("runs/x"), "x")

@@ -1,10 +1,7 @@
 """`cloudrc key`: make a key, rotate it, drop the old one."""
 
-from __future__ import annotations
-
 import os
 import stat
-from pathlib import Path
 
 import pytest
 
@@ -12,10 +9,8 @@ from cloudrc.cli.main import main
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile, read_keys
 from cloudrc.tunnel.keys import KeySet
 
-Captured = pytest.CaptureFixture[str]
 
-
-def test_a_key_is_made_rotated_and_dropped(tmp_path: Path, capsys: Captured) -> None:
+def test_a_key_is_made_rotated_and_dropped(tmp_path, capsys):
     path, link = tmp_path / "key", tmp_path / "link"
     os.umask(0o022)
     assert main(["key", "new", str(path)]) == 0
@@ -49,9 +44,7 @@ def test_a_key_is_made_rotated_and_dropped(tmp_path: Path, capsys: Captured) -> 
 
 
 @pytest.mark.parametrize("verb", ["new", "drop"])
-def test_a_file_that_is_no_key_is_refused_and_kept(
-    verb: str, tmp_path: Path, capsys: Captured
-) -> None:
+def test_a_file_that_is_no_key_is_refused_and_kept(verb, tmp_path, capsys):
     (tmp_path / "notes").write_text("my notes")
     assert main(["key", verb, str(tmp_path / "notes")]) == 2
     assert (tmp_path / "notes").read_text() == "my notes"

@@ -1,9 +1,6 @@
 """A lasting tc process answers like a new tc process, but sooner; here tc is a script."""
 
-from __future__ import annotations
-
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -35,7 +32,7 @@ SHOW = ("tc", "-s", "-j", "qdisc", "show", "dev", "eth0")
 
 
 @pytest.fixture
-def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Programs:
+def programs(tmp_path, monkeypatch):
     program = tmp_path / "tc"
     program.write_text(TC)
     program.chmod(0o755)
@@ -43,7 +40,7 @@ def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Programs:
     return Programs()
 
 
-def test_changes_and_listings_go_through_one_process(programs: Programs, tmp_path: Path) -> None:
+def test_changes_and_listings_go_through_one_process(programs, tmp_path):
     for _ in range(2):
         assert programs((*CHANGE, "delay", "1us")) == (0, "", "")
         assert programs(SHOW) == (0, '[{"kind":"netem"}]', "")
@@ -59,7 +56,7 @@ def test_changes_and_listings_go_through_one_process(programs: Programs, tmp_pat
     programs.close()
 
 
-def test_other_commands_run_in_their_own_processes(programs: Programs, tmp_path: Path) -> None:
+def test_other_commands_run_in_their_own_processes(programs, tmp_path):
     assert programs(("tc", "qdisc", "add", "dev", "eth0", "root", "prio")).code == 0
     assert programs(("tc", "qdisc", "add", "lacks")).code == 2
     assert programs(("no-such-program",)).code == 127

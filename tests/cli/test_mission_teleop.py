@@ -1,7 +1,5 @@
 """`cloudrc teleop`: each reason not to start is one sentence."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys
@@ -15,9 +13,7 @@ from cloudrc.cli.main import main
 WORDS = ["teleop", "--config", "hover", "--socket"]
 
 
-def test_without_fastapi_the_api_is_refused_and_the_extra_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_fastapi_the_api_is_refused_and_the_extra_named(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(extras.EXTRAS, "api", ("fastapi_is_not_here",))
     assert main([*WORDS, str(tmp_path), "--api", "127.0.0.1:0"]) == 3
     assert "pip install 'cloudrc[api]'" in capsys.readouterr().err

@@ -1,41 +1,38 @@
 """Work on several cores: order, number of processes, killed workers, Ctrl-C."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Iterator
 
 import pytest
 
-from cloudrc.cli.pool import BATCH_MAX, WorkerDiedError, map_in_order
+from cloudrc.cli.pool import WorkerDiedError, map_in_order
 
 KILLED = 5
 """The piece of work that kills its process."""
 
 
 @pytest.fixture(autouse=True)
-def two_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def two_cores(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     yield
     assert multiprocessing.active_children() == []
 
 
-def _slow_first(number: int) -> tuple[int, int]:
+def _slow_first(number):
     time.sleep(0.2 * (number == 0))
     return number, os.getpid()
 
 
-def _kill_at_five(number: int) -> int:
+def _kill_at_five(number):
     if number == KILLED:
         os.kill(os.getpid(), signal.SIGKILL)
     return number
 
 
 @pytest.mark.parametrize(("pieces", "jobs", "workers"), [(6, 100_000, 2), (1, 9, 0), (6, 1, 0)])
-def test_results_keep_the_order_of_the_work(pieces: int, jobs: int, workers: int) -> None:
+def test_results_keep_the_order_of_the_work(pieces, jobs, workers):
     done = map_in_order(_slow_first, range(pieces), jobs)
     first = next(done)
     assert len(multiprocessing.active_children()) == workers
@@ -45,35 +42,16 @@ def test_results_keep_the_order_of_the_work(pieces: int, jobs: int, workers: int
     assert list(map_in_order(_slow_first, [], 2)) == []
 
 
-class _CountingWork(list[int]):
-    """Work that counts how much of it has been taken."""
-
-    taken = 0
-
-    def __iter__(self) -> Iterator[int]:
-        for each in super().__iter__():
-            self.taken += 1
-            yield each
-
-
-def test_much_work_is_submitted_in_batches() -> None:
-    work = _CountingWork(range(1, 3 * BATCH_MAX))
-    done = map_in_order(_slow_first, work, 2)
-    next(done)
-    assert work.taken == BATCH_MAX
-    assert sum(1 for _ in done) == len(work) - 1
-
-
-def test_results_before_a_worker_was_killed_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_before_a_worker_was_killed_are_kept(monkeypatch):
     monkeypatch.setattr("cloudrc.cli.pool.BATCH_MAX", KILLED)
-    results: list[int] = []
+    results = []
     done = map_in_order(_kill_at_five, range(9), 2)
     with pytest.raises(WorkerDiedError, match=r"a worker was killed.*use fewer processes"):
         results.extend(each for each in done if time.sleep(0.1) is None)  # take them slowly
     assert results[:KILLED] == list(range(KILLED))
 
 
-def test_ctrl_c_ends_the_workers_at_once() -> None:
+def test_ctrl_c_ends_the_workers_at_once():
     started = time.monotonic()
     done = map_in_order(time.sleep, [0.0, 60.0, 60.0], 2)
     next(done)

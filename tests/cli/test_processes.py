@@ -1,14 +1,10 @@
 """World, cloud and relay as commands: flags, addresses, recordings, sizes, stopping at start."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import signal
 import socket
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NoReturn
 
 import pytest
 
@@ -32,9 +28,8 @@ from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import summary
-from cloudrc.link.verify.monitor import Asked, LinkMonitor, Load
+from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.record.columns import Recording
-from cloudrc.record.recorder import Recorder
 from cloudrc.records import MissionEvent
 from tests.record.conftest import MS, counted, world_records
 
@@ -43,18 +38,17 @@ ENDS = ("world", "cloud")
 END = ["--listen", FREE, "--peer", FREE]
 RELAY = ["--world-side", FREE, "--cloud-side", FREE, "--world", FREE, "--cloud", FREE]
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-Printed = pytest.CaptureFixture[str]
 
 
 @pytest.fixture
-def key(tmp_path: Path) -> list[str]:
+def key(tmp_path):
     (tmp_path / "key").write_bytes(b"k" * 32)
     (tmp_path / "key").chmod(0o600)
     return ["--key", str(tmp_path / "key")]
 
 
 @pytest.fixture
-def taken() -> Iterator[str]:
+def taken():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
         udp.bind(("127.0.0.1", 0))
         tcp.bind(udp.getsockname())
@@ -62,7 +56,7 @@ def taken() -> Iterator[str]:
         yield f"127.0.0.1:{udp.getsockname()[1]}"
 
 
-def run(command: str, key: list[str], *last: str) -> int:
+def run(command, key, *last):
     """Run a process with usable flags; the last flags replace earlier ones."""
     flags = RELAY if command == "relay" else [*END, *key]
     return main([command, "--config", "hover", *flags, *last])
@@ -70,7 +64,7 @@ def run(command: str, key: list[str], *last: str) -> int:
 
 @pytest.mark.parametrize("more", [[], ["--peer", FREE, "--route", "route"]])
 @pytest.mark.parametrize("end", ENDS)
-def test_an_end_has_a_peer_or_a_route(end: str, more: list[str], capsys: Printed) -> None:
+def test_an_end_has_a_peer_or_a_route(end, more, capsys):
     assert main([end, "--config", "hover", "--listen", FREE, "--key", "key", *more]) == 2
     assert "--peer" in capsys.readouterr().err
 
@@ -86,15 +80,13 @@ def test_an_end_has_a_peer_or_a_route(end: str, more: list[str], capsys: Printed
         ("world", "--metrics", 3, "metrics cannot be served on {}: Address already in use; end"),
     ],
 )
-def test_an_address_in_use_is_reported_with_its_flag(
-    command: str, flag: str, code: int, said: str, taken: str, key: list[str], capsys: Printed
-) -> None:
+def test_an_address_in_use_is_reported_with_its_flag(command, flag, code, said, taken, key, capsys):
     assert run(command, key, flag, taken) == code
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"cloudrc: error: {said.format(taken)}")
 
 
-def no_such_name(*asked: object) -> NoReturn:
+def no_such_name(*asked):
     raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
 
@@ -102,9 +94,7 @@ def no_such_name(*asked: object) -> NoReturn:
     ("command", "flag"),
     [("world", "--peer"), ("cloud", "--peer"), ("relay", "--world"), ("relay", "--cloud")],
 )
-def test_an_unresolvable_name_is_reported_at_the_start(
-    command: str, flag: str, key: list[str], monkeypatch: pytest.MonkeyPatch, capsys: Printed
-) -> None:
+def test_an_unresolvable_name_is_reported_at_the_start(command, flag, key, monkeypatch, capsys):
     look_up = socket.getaddrinfo
     monkeypatch.setattr(
         socket, "getaddrinfo", lambda *a: no_such_name() if a[0] == "nowhere" else look_up(*a)
@@ -116,27 +106,16 @@ def test_an_unresolvable_name_is_reported_at_the_start(
     )
 
 
-@pytest.mark.parametrize(
-    ("text", "address"),
-    [("127.0.0.1:7400", ("127.0.0.1", 7400)), ("[::1]:7400", ("::1", 7400)), ("[::]:1", ("::", 1))],
-)
-def test_an_address_of_ipv6_is_in_brackets(text: str, address: tuple[str, int]) -> None:
-    assert read_address(text) == address
-    assert show_address(address) == text
-    with pytest.raises(argparse.ArgumentTypeError, match=r"put an IPv6 address in brackets"):
-        read_address("::1:7400")
-
-
-def test_without_ipv6_all_addresses_are_those_of_ipv4(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*asked: object) -> None:
+def test_without_ipv6_all_addresses_are_those_of_ipv4(monkeypatch):
+    def refuse(*asked):
         raise OSError("Address family not supported by protocol")
 
     monkeypatch.setattr(socket, "socket", refuse)
     assert read_address("[::]:7400") == ("0.0.0.0", 7400)
 
 
-def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    def look_up(name: str, port: None, family: int, kind: int) -> list[tuple[Any, ...]]:
+def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
+    def look_up(name, port, family, kind):
         return [(family, kind, 17, "", ("::5", 0))] if family == socket.AF_INET6 else no_such_name()
 
     with monkeypatch.context() as patch:
@@ -148,11 +127,11 @@ def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch: pytest.MonkeyPatch) ->
         resolve_address("--peer", ("x" * 64 + ".test", 1))
 
 
-def test_the_peer_is_resolved_once_before_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_peer_is_resolved_once_before_the_loop(monkeypatch):
     """The control loop once asked a name server for every datagram, and waited for it."""
-    asked: list[object] = []
+    asked = []
 
-    def look_up(name: str, *rest: object) -> list[tuple[Any, ...]]:
+    def look_up(name, *rest):
         asked.append(name)
         return [(socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.9", 0))]
 
@@ -169,16 +148,12 @@ def test_the_peer_is_resolved_once_before_the_loop(monkeypatch: pytest.MonkeyPat
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("end", ENDS)
 def test_an_end_stopped_at_its_start_completes_its_recording(
-    end: str,
-    key: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: Printed,
-) -> None:
+    end, key, tmp_path, monkeypatch, capsys
+):
     """The first process of a container ignores signals without a handler."""
     build = getattr(assembly, f"build_{end}")
 
-    def stop_and_build(*arguments: Any) -> Any:
+    def stop_and_build(*arguments):
         os.kill(os.getpid(), signal.SIGTERM)
         return build(*arguments)
 
@@ -201,7 +176,7 @@ def test_an_end_stopped_at_its_start_completes_its_recording(
     [("1Gi", 2**30), ("500M", 5e8), ("1.5Ki", 1536), ("4096", 4096), ("2k", 2e3), ("1m", 1e-3)]
     + [(text, None) for text in ("", "1GB", "-1", "1 Gi", "nan")],
 )
-def test_sizes_are_read_as_in_kubernetes(text: str, bytes_: float | None) -> None:
+def test_sizes_are_read_as_in_kubernetes(text, bytes_):
     if bytes_ is not None:
         assert read_size(text) == bytes_
         return
@@ -210,7 +185,7 @@ def test_sizes_are_read_as_in_kubernetes(text: str, bytes_: float | None) -> Non
 
 
 @pytest.mark.parametrize("elsewhere", [None, Path("sockets")])
-def test_cloud_with_a_teleop_process_exports_no_mission_metrics(elsewhere: Path | None) -> None:
+def test_cloud_with_a_teleop_process_exports_no_mission_metrics(elsewhere):
     options = argparse.Namespace(metrics=("127.0.0.1", 0), teleop=elsewhere)
     exporter = open_exporter(options, "cloud")
     assert exporter is not None
@@ -219,12 +194,12 @@ def test_cloud_with_a_teleop_process_exports_no_mission_metrics(elsewhere: Path 
     exporter.close()
 
 
-def started(path: Path | None, size_max: float | None = None) -> Recorder:
+def started(path, size_max=None):
     options = argparse.Namespace(record=path, record_max=size_max)
     return open_recorder(options, "world", b"id")
 
 
-def record(recorder: Recorder, seconds: int = 1) -> Recorder:
+def record(recorder, seconds=1):
     for start in range(0, 1000 * seconds, 500):
         recorder.put(world_records(50, start * MS))
         while recorder.drain():
@@ -233,7 +208,7 @@ def record(recorder: Recorder, seconds: int = 1) -> Recorder:
     return recorder
 
 
-def test_a_restart_keeps_the_recording_of_a_crash(tmp_path: Path) -> None:
+def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):
     path, before = tmp_path / "world.mcap", tmp_path / "world.before.mcap"
     path.touch()  # an empty one is not kept
     killed = record(started(path))
@@ -252,7 +227,7 @@ def test_a_restart_keeps_the_recording_of_a_crash(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_both_recordings_together_stay_within_the_limit(tmp_path: Path) -> None:
+def test_both_recordings_together_stay_within_the_limit(tmp_path):
     path, limit = tmp_path / "world.mcap", 200_000
     for _ in range(3):
         recorder = record(started(path, limit), 30)
@@ -264,12 +239,10 @@ def test_both_recordings_together_stay_within_the_limit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["trace", "table"])
-def test_a_trace_named_by_the_link_is_read_within_bounds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str
-) -> None:
-    kept: list[Load] = []
+def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch, key):
+    kept = []
 
-    def begin(self: LinkMonitor, asked: Asked, path: Path | None, load: Load) -> None:
+    def begin(self, asked, path, load):
         kept.append(load)
 
     monkeypatch.setattr(LinkMonitor, "begin", begin)
@@ -287,16 +260,22 @@ def test_a_trace_named_by_the_link_is_read_within_bounds(
         load(profile)
 
 
-def test_the_requested_delay_of_a_relay_is_that_of_the_trace(tmp_path: Path) -> None:
+def test_the_requested_delay_of_a_relay_is_that_of_the_trace(tmp_path):
     (tmp_path / "t.csv").write_text("time_s,delay_ms\n0,40\n5,90\n")
-    mine = tmp_path / "mine.yaml"
-    mine.write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}\n")
-    first = read_profiles(load_experiment(str(mine)))
+    (tmp_path / "mine.yaml").write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}")
+    first = read_profiles(load_experiment("./mine.yaml"))
     delays = {way: summary(loaded.direction)["delay"] for way, loaded in first.items()}
     assert delays == {"uplink": 0.04, "downlink": 0.025}
 
 
-def test_a_side_of_a_relay_that_cannot_reach_its_end_is_refused() -> None:
+@pytest.mark.parametrize("text", ["127.0.0.1:7400", "[::1]:7400", "[::]:1"])
+def test_an_address_of_ipv6_is_in_brackets(text):
+    assert show_address(read_address(text)) == text
+    with pytest.raises(argparse.ArgumentTypeError, match=r"put an IPv6 address in brackets"):
+        read_address("::1:7400")
+
+
+def test_a_side_of_a_relay_that_cannot_reach_its_end_is_refused():
     here = dict.fromkeys(("world_side", "cloud_side"), ("127.0.0.1", 0))
     ends = {"world": ("198.51.100.7", 7400), "cloud": ("127.0.0.1", 7400)}
     links = [LinkDirection(DirectionProfile(), 1, uplink) for uplink in (True, False)]

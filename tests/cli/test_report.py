@@ -1,16 +1,13 @@
 """The summary of a run: verdict, main numbers, faults and exit code."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from cloudrc.cli.report import exit_code, summary
 
 
-def report(outcome: str, *failures: str, **numbers: tuple[float, str]) -> dict[str, Any]:
+def report(outcome, *failures, **numbers):
     return {
         "verdict": outcome,
         "failures": [{"code": "x", "text": text, "time": 3.25} for text in failures],
@@ -44,7 +41,7 @@ def report(outcome: str, *failures: str, **numbers: tuple[float, str]) -> dict[s
         (report("interrupted", "x"), 130, ["INTERRUPTED: x", "no numbers: nothing was flown"]),
     ],
 )
-def test_summary(found: dict[str, Any], code: int, lines: list[str]) -> None:
+def test_summary(found, code, lines):
     shown = summary(found, Path("runs/a")).splitlines()
     assert [" ".join(line.split()) for line in shown if line] == [*lines, "runs/a/report.html"]
     assert exit_code(found) == code

@@ -1,7 +1,5 @@
 """`cloudrc run` and `cloudrc report`: refused input, output, and the folder of a run."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -15,20 +13,13 @@ from cloudrc.errors import BadInputError
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
 """Overrides of `steps` for one second of flight."""
 FLY = ["run", "steps", "--mode", "virtual", *SHORT]
-Printed = pytest.CaptureFixture[str]
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 @pytest.fixture
-def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_page(monkeypatch):
     """Leave out the figures, which take longer than the flight."""
 
-    def write_page(folder: Path, *assessment: object) -> None:
+    def write_page(folder, *assessment):
         (folder / "report.html").write_text("drawn elsewhere")
 
     monkeypatch.setattr("cloudrc.report.write._write_page", write_page)
@@ -50,9 +41,7 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
         ("--set nonsense", "key=value"),
     ],
 )
-def test_bad_input_gives_one_line_and_writes_nothing(
-    line: str, words: str, folder: Path, capsys: Printed
-) -> None:
+def test_bad_input_gives_one_line_and_writes_nothing(line, words, folder, capsys):
     assert main(["run", *line.split()]) == 2
     out, err = capsys.readouterr()
     assert err.startswith("cloudrc: error: ")
@@ -61,9 +50,7 @@ def test_bad_input_gives_one_line_and_writes_nothing(
     assert list(folder.iterdir()) == []
 
 
-def test_the_last_line_is_the_report_and_the_folder_is_complete(
-    folder: Path, capsys: Printed
-) -> None:
+def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, capsys):
     assert main([*FLY, "--seed", "7"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("steps: mode virtual, seed 7, link paper-p3")
@@ -77,13 +64,13 @@ def test_the_last_line_is_the_report_and_the_folder_is_complete(
 
 
 @pytest.mark.usefixtures("no_page")
-def test_json_output_is_only_the_report(folder: Path, capsys: Printed) -> None:
+def test_json_output_is_only_the_report(folder, capsys):
     assert main([*FLY, "--out", "here", "-o", "json"]) == 0
     assert capsys.readouterr() == ((folder / "here/report.json").read_text(), "")
 
 
 @pytest.mark.usefixtures("no_page")
-def test_the_resolved_file_flies_the_same_run_again(folder: Path) -> None:
+def test_the_resolved_file_flies_the_same_run_again(folder):
     assert main([*FLY, "--seed", "3", "--out", "a"]) == 0
     assert main(["run", "a/config.yaml", "--mode", "virtual", "--out", "b"]) == 0
     hashes = [json.loads((folder / d / "report.json").read_text())["records_sha256"] for d in "ab"]
@@ -92,9 +79,7 @@ def test_the_resolved_file_flies_the_same_run_again(folder: Path) -> None:
 
 @pytest.mark.parametrize("output", ["table", "json"])
 @pytest.mark.usefixtures("no_page")
-def test_a_closed_pipe_does_not_end_the_run(
-    output: str, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_closed_pipe_does_not_end_the_run(output, folder, monkeypatch):
     """As in `cloudrc run | head -1`; the exit code still follows the verdict, here 1."""
     reader, writer = os.pipe()
     os.close(reader)
@@ -107,7 +92,7 @@ def test_a_closed_pipe_does_not_end_the_run(
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_report_is_written_again(folder: Path, capsys: Printed) -> None:
+def test_a_report_is_written_again(folder, capsys):
     assert main([*FLY, "--out", "run"]) == 0
     before = json.loads((folder / "run/report.json").read_text())
     for name in ("report.json", "report.html"):
@@ -122,7 +107,7 @@ def test_a_report_is_written_again(folder: Path, capsys: Printed) -> None:
         assert capsys.readouterr().err.startswith("cloudrc: error: ")
 
 
-def test_folders_are_numbered_and_latest_is_the_newest() -> None:
+def test_folders_are_numbered_and_latest_is_the_newest():
     names = [new_folder(None, "paper-local-seed1").as_posix() for _ in range(3)]
     assert names == [f"runs/paper-local-seed1-{n}" for n in (1, 2, 3)]
     assert Path("runs/latest").resolve() == Path(names[-1]).resolve()
@@ -139,7 +124,7 @@ def test_folders_are_numbered_and_latest_is_the_newest() -> None:
         (Path("full"), "never overwritten"),
     ],
 )
-def test_what_is_there_is_never_overwritten(out: Path | None, said: str) -> None:
+def test_what_is_there_is_never_overwritten(out, said):
     Path("runs").write_text("a file")
     Path("full").mkdir()
     Path("full/precious").write_text("data")

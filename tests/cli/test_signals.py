@@ -1,7 +1,5 @@
 """Signals: SIGHUP and SIGTERM act like Ctrl-C, except under `nohup`; workers end, too."""
 
-from __future__ import annotations
-
 import os
 import select
 import signal
@@ -18,12 +16,12 @@ from cloudrc.cli.pool import _hung_up, interrupt_on_signals
 
 
 @pytest.fixture(autouse=True)
-def not_ignored() -> None:
+def not_ignored():
     """Start with the default handler, as in a terminal; conftest.py restores the old one."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
-def test_only_the_first_hang_up_interrupts() -> None:
+def test_only_the_first_hang_up_interrupts():
     interrupt_on_signals()
     with pytest.raises(KeyboardInterrupt):
         os.kill(os.getpid(), signal.SIGHUP)
@@ -32,7 +30,7 @@ def test_only_the_first_hang_up_interrupts() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def test_under_nohup_a_hang_up_is_ignored() -> None:
+def test_under_nohup_a_hang_up_is_ignored():
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     interrupt_on_signals()
     os.kill(os.getpid(), signal.SIGHUP)
@@ -46,10 +44,7 @@ def test_under_nohup_a_hang_up_is_ignored() -> None:
         ["link", "verify", "none"],
     ],
 )
-def test_flying_commands_treat_a_hang_up_as_ctrl_c(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_flying_commands_treat_a_hang_up_as_ctrl_c(words):
     assert main(words) == 2
     assert signal.getsignal(signal.SIGHUP) is _hung_up
 

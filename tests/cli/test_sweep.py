@@ -1,7 +1,5 @@
 """`cloudrc run --seeds N`: one table of all seeds, or of the finished ones."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -10,9 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -26,24 +22,18 @@ SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"
 """Overrides of `steps` for one second of flight."""
 
 
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def report(seed: int, verdict: str = "success", **numbers: float) -> dict[str, Any]:
+def report(seed, verdict="success", **numbers):
     found = {name: {"value": value, "unit": "m"} for name, value in numbers.items()}
     return {"seed": seed, "verdict": verdict, "failures": [], "numbers": found}
 
 
-def written(folder: Path) -> tuple[dict[str, Any], int]:
+def written(folder):
     """Return the content of sweep.json, and the number of runs in sweep.csv."""
     document = json.loads((folder / "sweep/sweep.json").read_text())
     return document, len((folder / "sweep/sweep.csv").read_text().splitlines()) - 1
 
 
-def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_many_seeds_become_one_table(folder, capsys):
     assert main(["run", "steps", "--seeds", "2", *SHORT, "--out", "sweep"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "sweep/sweep.json"
@@ -63,15 +53,9 @@ def test_many_seeds_become_one_table(folder: Path, capsys: pytest.CaptureFixture
     ],
 )
 def test_an_interrupted_sweep_keeps_what_is_finished(
-    error: BaseException,
-    code: int,
-    word: str,
-    finished: int,
-    folder: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def reports(*arguments: object) -> Iterator[dict[str, Any]]:
+    error, code, word, finished, folder, capsys, monkeypatch
+):
+    def reports(*arguments):
         yield from (report(seed, duration=1.0) for seed in range(1, finished + 1))
         raise error
 
@@ -129,13 +113,11 @@ def test_a_signal_ends_a_sweep_at_once(how: int, folder: Path) -> None:
         (20, (6, 15)),  # 0.9586 in textbooks
     ],
 )
-def test_the_interval_has_the_bounds_computed_by_hand(
-    n: int, bounds: tuple[float, float] | None
-) -> None:
+def test_the_interval_has_the_bounds_computed_by_hand(n, bounds):
     assert interval([float(i) for i in range(n, 0, -1)]) == bounds
 
 
-def test_runs_may_lack_a_number() -> None:
+def test_runs_may_lack_a_number():
     runs = [report(1, x=1.0), report(2, "failure", y=2.0), report(3, x=3.0)]
     summary = summarise(runs)
     assert (summary["done"], summary["count"]) == (2, 3)

@@ -1,14 +1,11 @@
 """Fixtures: a pair of Unix sockets, this machine's speed, and a release of three processes."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,11 +17,10 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.errors import CloudrcError
 from cloudrc.messages import GuardState
-from cloudrc.record.columns import Recording
 
 
 @pytest.fixture
-def peers(tmp_path: Path) -> Iterator[tuple[UnixPeer, UnixPeer]]:
+def peers(tmp_path):
     """Make teleop's and cloud's socket, in the order that a test chooses."""
     paths = tmp_path / "a.sock", tmp_path / "b.sock"
     pair = UnixPeer(*paths), UnixPeer(*reversed(paths))
@@ -48,17 +44,12 @@ NOMINAL = 0.100
 0.21 s the same release cost 228m to 300m."""
 
 
-def slower(told: str) -> float:
-    """Return the slowdown against nominal from the time that WORK has printed; at least 1."""
-    return max(1.0, float(told) / NOMINAL)
+def here():
+    """Measure the slowdown of this machine's interpreter against nominal; at least 1."""
+    return max(1.0, float(subprocess.check_output([sys.executable, "-c", WORK])) / NOMINAL)
 
 
-def here() -> float:
-    """Measure the slowdown of this machine's interpreter."""
-    return slower(subprocess.check_output([sys.executable, "-c", WORK], text=True))
-
-
-def ages_at_hold(recording: Recording) -> list[float]:
+def ages_at_hold(recording):
     """Return the age [s] of the newest applied basis at each HOLD for want of fresh commands."""
     guard, applied = recording["/guard"], recording["/command_applied"]
     ages = []
@@ -96,7 +87,7 @@ waypoints:
 class Release:
     """A release without its link: three processes, a journal, an API; some ends record."""
 
-    def __init__(self, folder: Path, *recorded: str) -> None:
+    def __init__(self, folder, *recorded):
         self.folder, self.running, self.all = folder, {}, []
         self.recorded = recorded
         self.world, self.cloud = (f"127.0.0.1:{port}" for port in free_ports(2))
@@ -109,7 +100,7 @@ class Release:
             self.start(name)
         self.until(lambda: self.ask("/v1/state")["seen"] is not None)
 
-    def start(self, name: str) -> None:
+    def start(self, name):
         flags = {
             "world": ["--listen", self.world, "--peer", self.cloud, "--key", "key"],
             "cloud": ["--listen", self.cloud, "--peer", self.world, "--key", "key",
@@ -121,7 +112,7 @@ class Release:
         record = ["--record", f"{name}.mcap"] if name in self.recorded else []
         self.running[name] = self.run(name, "--config", "config.yaml", *flags[name], *record)
 
-    def run(self, *words: str) -> subprocess.Popen[str]:
+    def run(self, *words):
         command = [sys.executable, "-m", "cloudrc", *words]
         environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
         pipe = subprocess.PIPE
@@ -131,30 +122,30 @@ class Release:
         self.all.append(process)
         return process
 
-    def kill(self, *names: str) -> None:
+    def kill(self, *names):
         for name in names:
             self.running[name].kill()
             self.running[name].communicate()
 
-    def freeze(self, name: str, duration: float) -> None:
+    def freeze(self, name, duration):
         """Let a process stand still for `duration` [s]."""
         self.running[name].send_signal(signal.SIGSTOP)
         time.sleep(duration)
         self.running[name].send_signal(signal.SIGCONT)
 
-    def end(self) -> None:
+    def end(self):
         for process in self.all:
             process.kill()
             process.communicate()
 
-    def ask(self, path: str):
+    def ask(self, path):
         try:
             url = json.loads((self.folder / "api.json").read_text())["url"]
             return Api(url, lambda: TOKEN).get(path)
         except (OSError, ValueError, CloudrcError):
             return {"seen": None, "missions": []}
 
-    def post(self, path: str):
+    def post(self, path):
         url = json.loads((self.folder / "api.json").read_text())["url"]
         return Api(url, lambda: TOKEN).post(path)
 
@@ -163,13 +154,13 @@ class Release:
         missions = self.ask("/v1/missions")["missions"]
         return missions[-1] if missions else {"state": "away", "reached": []}
 
-    def until(self, condition) -> None:
+    def until(self, condition):
         limit = time.monotonic() + LIMIT
         while not condition():
             assert time.monotonic() < limit, "not in time"
             time.sleep(0.05)
 
-    def fly(self) -> subprocess.Popen[str]:
+    def fly(self):
         """Start the command of a Job and wait for its first waypoint."""
         url = json.loads((self.folder / "api.json").read_text())["url"]
         flags = ["--token-file", "operator", "--mission", "mission.yaml", "--key", "u"]
@@ -177,12 +168,12 @@ class Release:
         self.until(lambda: len(self.mission()["reached"]) == 1)
         return job
 
-    def post_mission(self) -> None:
+    def post_mission(self):
         url = json.loads((self.folder / "api.json").read_text())["url"]
         Api(url, lambda: TOKEN).post("/v1/missions", yaml.safe_load(
             (self.folder / "mission.yaml").read_text()))  # fmt: skip
 
-    def stop(self) -> dict[str, float]:
+    def stop(self):
         took = {}
         for name, process in self.running.items():
             began = time.monotonic()

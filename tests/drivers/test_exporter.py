@@ -1,17 +1,11 @@
 """The exporter: valid text in bounds, probes on one port, hostile clients, CPU throttling."""
 
-from __future__ import annotations
-
-import shutil
 import socket
-import subprocess
 import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -20,7 +14,6 @@ from cloudrc import __version__
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import exporter as exporters
 from cloudrc.drivers.exporter import Exporter, read_throttling
-from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.exposition.table import (
     BODIES,
     DIRECTIONS,
@@ -41,21 +34,19 @@ from cloudrc.records import (
     Lateness,
     LinkChecked,
     MissionEvent,
-    Record,
     TelemetrySent,
 )
 from tests.drivers.conftest import here
 from tests.flights.conftest import records
 
-Flight = dict[str, list[Record]]
 HOST = "127.0.0.1"
 
 
 @pytest.fixture(scope="module")
-def flight() -> Flight:
+def flight():
     """The records of a flight with real-time wakes, and those of the other roles."""
     both = records(load_experiment("hover", ["link.profile=paper-p3"]))
-    seen: Flight = {}
+    seen = {}
     for end, of_end in zip(ENDS, both, strict=True):
         seen[end] = []
         for record in of_end:
@@ -79,7 +70,7 @@ def flight() -> Flight:
     return seen
 
 
-def exporter(role: str, flight: Flight, *, missions: bool = True) -> Exporter:
+def exporter(role, flight, *, missions=True):
     made = Exporter(role, missions=missions)
     made.see(flight[role])
     if role in ENDS:
@@ -92,12 +83,12 @@ def exporter(role: str, flight: Flight, *, missions: bool = True) -> Exporter:
     return made
 
 
-def series(text: str) -> list[str]:
+def series(text):
     return [line for line in text.splitlines() if not line.startswith("#")]
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_a_flight_shows_the_metrics_of_its_role(role: str, flight: Flight) -> None:
+def test_a_flight_shows_the_metrics_of_its_role(role, flight):
     text = exporter(role, flight).text()
     found, optional = set(), {name for name in METRICS if "_cpu_" in name}  # the kernel may count
     for family in text_string_to_metric_families(text):
@@ -115,30 +106,15 @@ def test_a_flight_shows_the_metrics_of_its_role(role: str, flight: Flight) -> No
     assert text.count("cloudrc_link_info{") == (2 if role == "link" else 0)
 
 
-@pytest.mark.parametrize("role", ROLES)
-def test_promtool_finds_nothing_to_say(role: str, flight: Flight) -> None:
-    if shutil.which("promtool") is None:
-        pytest.skip("promtool is missing: apt-get install prometheus")
-    text, command = exporter(role, flight).text(), ["promtool", "check", "metrics"]
-    done = subprocess.run(command, input=text, capture_output=True, text=True)
-    assert (done.returncode, done.stdout + done.stderr) == (0, "")
-
-
 @pytest.mark.parametrize("pod", [("world", "link"), ("cloud", "teleop", "link")])
-def test_a_pod_has_less_than_200_series(pod: tuple[str, ...], flight: Flight) -> None:
+def test_a_pod_has_less_than_200_series(pod, flight):
     made = [exporter(role, flight, missions=role != "cloud") for role in pod]
     assert sum(len(series(one.text())) for one in made) < 200
 
 
-def test_a_cloud_whose_missions_are_teleops_tells_of_none(flight: Flight) -> None:
-    shown = {alone: exporter("cloud", flight, missions=alone).text() for alone in (True, False)}
-    assert ["cloudrc_mission_state" in text for text in shown.values()] == [True, False]
-    assert "cloudrc_rtt_seconds_count" in shown[False]
-
-
 @pytest.mark.promise("unknown-is-absent")
-def test_the_sync_age_is_absent_until_it_is_known() -> None:
-    ages: list[float | None] = [None, 0.25]
+def test_the_sync_age_is_absent_until_it_is_known():
+    ages = [None, 0.25]
     world = Exporter("world")
     assert "sync_age" not in world.text()
     world.recording(lambda: ages.pop(0))
@@ -146,25 +122,9 @@ def test_the_sync_age_is_absent_until_it_is_known() -> None:
     assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
 
 
-def test_unresolved_names_are_counted_and_are_no_sign_of_life() -> None:
-    link = Exporter("link")
-    link.unresolved(7)
-    assert "cloudrc_dns_errors_total 7.0" in link.text()
-    assert link._seen_at is None
-
-
-def test_the_build_is_named_once(flight: Flight) -> None:
-    world = exporter("world", flight)
-    for config in ("", "0123456789ab"):
-        lines = [line for line in series(world.text()) if "build_info" in line]
-        text = f'config="{config}",role="world",version="{__version__}"'
-        assert lines == [f"cloudrc_build_info{{{text}}} 1.0"]
-        world.runs("0123456789ab" + "f" * 52)
-
-
 @pytest.mark.full
 @pytest.mark.parametrize("end", ENDS)
-def test_a_record_costs_less_than_a_microsecond(end: str, flight: Flight) -> None:
+def test_a_record_costs_less_than_a_microsecond(end, flight):
     """The fastest of several repeats counts, since the machine may be busy."""
     chunks = [flight[end][i : i + 4] for i in range(0, len(flight[end]), 4)]
     least = float("inf")
@@ -190,9 +150,7 @@ def test_a_record_costs_less_than_a_microsecond(end: str, flight: Flight) -> Non
     ],
     ids=["limited", "version 1", "unlimited", "empty", "missing"],
 )  # fmt: skip
-def test_throttling_is_read_from_the_kernel(
-    file: str, text: str | None, counts: list[float], tmp_path: Path
-) -> None:
+def test_throttling_is_read_from_the_kernel(file, text, counts, tmp_path):
     if text is not None:
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).write_text(text)
@@ -201,14 +159,14 @@ def test_throttling_is_read_from_the_kernel(
 
 
 @pytest.fixture
-def served() -> Iterator[tuple[Exporter, int]]:
+def served():
     exporter = Exporter("link")
     port = exporter.serve((HOST, 0))
     yield exporter, port
     exporter.close()
 
 
-def get(port: int, path: str, host: str = HOST) -> tuple[int, str]:
+def get(port, path, host=HOST):
     try:
         with urllib.request.urlopen(f"http://{host}:{port}{path}", timeout=10) as answer:
             return answer.status, answer.read().decode()
@@ -217,9 +175,7 @@ def get(port: int, path: str, host: str = HOST) -> tuple[int, str]:
             return error.code, error.read().decode()
 
 
-def test_metrics_and_probes_are_on_one_port(
-    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_metrics_and_probes_are_on_one_port(served, monkeypatch):
     monkeypatch.setattr(exporters, "KEPT", 0.0)
     exporter, port = served
     assert get(port, "/healthz") == (200, "alive\n")
@@ -235,14 +191,12 @@ def test_metrics_and_probes_are_on_one_port(
     assert get(port, "/") == (404, "there are /metrics, /healthz, /readyz, /link.json\n")
 
 
-def test_scrapers_that_come_at_once_have_one_page_made(
-    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_scrapers_that_come_at_once_have_one_page_made(served, monkeypatch):
     exporter, port = served
     monkeypatch.setattr(exporters, "KEPT", 60.0)
     write, calls, all_wait = exporter.text, [], threading.Event()
 
-    def slowly() -> str:
+    def slowly():
         calls.append(1)
         assert all_wait.wait(10.0)
         return write()
@@ -257,9 +211,7 @@ def test_scrapers_that_come_at_once_have_one_page_made(
     assert (len(pages), len(calls)) == (1, 1)
 
 
-def test_a_loop_that_stands_still_is_not_alive(
-    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loop_that_stands_still_is_not_alive(served, monkeypatch):
     """Liveness does not depend on the other end, nor on the loop before its start."""
     exporter, port = served
     monkeypatch.setattr(exporters, "STILL_MAX", -1.0)
@@ -270,25 +222,14 @@ def test_a_loop_that_stands_still_is_not_alive(
     assert get(port, "/healthz") == (503, "the loop has stood still for 61 s\n")
 
 
-def test_probes_of_both_address_families_are_answered() -> None:
+def test_probes_of_both_address_families_are_answered():
     exporter = Exporter("link")
     port = exporter.serve(("::", 0))
     assert {get(port, "/healthz", host)[0] for host in ("127.0.0.1", "[::1]")} == {200}
     exporter.close()
 
 
-def test_an_address_that_cannot_be_bound_is_told(served: tuple[Exporter, int]) -> None:
-    for address in ((HOST, served[1]), ("192.0.2.1", 9100)):
-        told = rf"cannot be served on {address[0]}:{address[1]}: .*--metrics$"
-        with pytest.raises(MissingPrerequisiteError, match=told):
-            Exporter("world").serve(address)
-    served[0].close()
-    other = Exporter("link")
-    assert other.serve((HOST, served[1])) == served[1], "the port is free again"
-    other.close()
-
-
-def test_a_burst_of_clients_that_hang_blocks_no_probe(served: tuple[Exporter, int]) -> None:
+def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
     waiting = [socket.create_connection((HOST, served[1]), timeout=0.9) for _ in range(200)]
     for client in waiting[::2]:
         client.sendall(b"GET /metr")
@@ -297,9 +238,7 @@ def test_a_burst_of_clients_that_hang_blocks_no_probe(served: tuple[Exporter, in
         client.close()
 
 
-def test_a_client_that_hangs_is_cut(
-    served: tuple[Exporter, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_client_that_hangs_is_cut(served, monkeypatch):
     monkeypatch.setattr(exporters._Handler, "timeout", 0.05)
     with socket.create_connection((HOST, served[1]), timeout=10) as client:
         client.sendall(b"GET /metrics HT")

@@ -1,9 +1,6 @@
 """An end reads its key file at the start, and follows it in flight."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +13,7 @@ from cloudrc.tunnel.keys import Key, KeySet, write
 FIRST, SECOND = Key(b"1" * 32), Key(b"2" * 32)
 
 
-def put(path: Path, data: bytes) -> None:
+def put(path, data):
     """Replace a file atomically, as kubelet does."""
     draft = path.with_name("draft")
     draft.write_bytes(data)
@@ -24,19 +21,19 @@ def put(path: Path, data: bytes) -> None:
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     (tmp_path / "key").write_bytes(b"1" * 32)
     return tmp_path / "key"
 
 
 @pytest.fixture
-def keys(path: Path) -> KeyFile:
+def keys(path):
     keys = KeyFile(path, 0)
     assert keys.follow(0) == []
     return keys
 
 
-def test_a_file_that_stays_changes_nothing(path: Path, keys: KeyFile) -> None:
+def test_a_file_that_stays_changes_nothing(path, keys):
     before = keys.ring.keys
     put(path, write(KeySet(FIRST)).encode())  # the same key in other words
     assert [keys.follow(n * PERIOD_NS) for n in range(1, 5)] == [[]] * 4
@@ -45,7 +42,7 @@ def test_a_file_that_stays_changes_nothing(path: Path, keys: KeyFile) -> None:
     assert keys.ring.keys is before
 
 
-def test_a_file_is_followed_twice_a_second(path: Path, keys: KeyFile) -> None:
+def test_a_file_is_followed_twice_a_second(path, keys):
     now_ns = 0
     for new, said in (
         (KeySet(SECOND, FIRST), f"new key {SECOND.name}; {FIRST.name} is accepted, too"),
@@ -61,12 +58,10 @@ def test_a_file_is_followed_twice_a_second(path: Path, keys: KeyFile) -> None:
 
 
 @pytest.mark.parametrize("wrong", [b"", b"3" * 31, bytes(32), b"#" * 10_000_000, "pipe", "barred"])
-def test_a_wrong_file_leaves_the_keys_and_is_told_once(
-    wrong: bytes | str, path: Path, keys: KeyFile, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wrong_file_leaves_the_keys_and_is_told_once(wrong, path, keys, monkeypatch):
     """A reader of a pipe would stop the loop; permissions do not change a file's version."""
 
-    def forbid(*args: object) -> None:
+    def forbid(*args):
         raise PermissionError(13, "Permission denied")
 
     with monkeypatch.context() as patch:
@@ -98,9 +93,7 @@ def test_a_wrong_file_leaves_the_keys_and_is_told_once(
         (bytes(32), "an all-zero key is refused"),
     ],
 )
-def test_an_end_without_a_key_does_not_start(
-    end: str, data: bytes | None, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_end_without_a_key_does_not_start(end, data, said, tmp_path, capsys):
     key = tmp_path / "key"
     if data is not None:
         key.write_bytes(data)

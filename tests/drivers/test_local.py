@@ -1,7 +1,5 @@
 """Flight files, and the supervisor of a local run: feeds, sockets, deadlines, the key."""
 
-from __future__ import annotations
-
 import os
 import signal
 import stat
@@ -10,7 +8,6 @@ import sys
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,7 +16,7 @@ from cloudrc.drivers.local import Child, LocalRun, socket_folder
 from cloudrc.drivers.machine import Deadline
 from cloudrc.drivers.process import to_line
 from cloudrc.errors import BadInputError
-from cloudrc.records import MissionEvent, Record
+from cloudrc.records import MissionEvent
 
 KILLED = """
 import os, signal, sys
@@ -33,16 +30,14 @@ EVENT = MissionEvent(5, "reached", 1, "waypoint 2 of 7 reached")
 
 
 @pytest.fixture(autouse=True)
-def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+def places(tmp_path, monkeypatch):
     for name, folder in (("XDG_RUNTIME_DIR", "runtime"), ("XDG_STATE_HOME", "state")):
         (tmp_path / folder).mkdir()
         monkeypatch.setenv(name, str(tmp_path / folder))
     return local.places()
 
 
-def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(
-    tmp_path: Path, places: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(tmp_path, places, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with suppress(KeyboardInterrupt), local.announced(Path("runs/a")):
         monkeypatch.chdir("/")
@@ -70,9 +65,7 @@ def test_a_flight_that_is_killed_is_over_and_is_cleared_away(
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, None])
-def test_an_unsafe_or_unwritable_first_folder_gives_the_second(
-    tmp_path: Path, places: list[Path], mode: int | None
-) -> None:
+def test_an_unsafe_or_unwritable_first_folder_gives_the_second(tmp_path, places, mode):
     if mode is None:
         places[0].parents[1].joinpath("cloudrc").write_text("in the way")
     else:
@@ -85,9 +78,7 @@ def test_an_unsafe_or_unwritable_first_folder_gives_the_second(
         assert local.under_way() == {}
 
 
-def test_another_users_folder_is_neither_read_nor_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_users_folder_is_neither_read_nor_written(tmp_path, monkeypatch):
     with local.announced(tmp_path / "a"):
         monkeypatch.setattr(os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
         assert local.under_way() == {}
@@ -95,9 +86,7 @@ def test_another_users_folder_is_neither_read_nor_written(
             assert not told
 
 
-def test_without_a_home_there_is_no_folder_in_the_working_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_home_there_is_no_folder_in_the_working_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("XDG_STATE_HOME")
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)
@@ -108,11 +97,9 @@ def test_without_a_home_there_is_no_folder_in_the_working_folder(
 
 
 @pytest.mark.parametrize("api", [True, False])
-def test_an_unannounced_flight_names_the_flag_for_its_commands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, api: bool
-) -> None:
+def test_an_unannounced_flight_names_the_flag_for_its_commands(tmp_path, monkeypatch, api):
     monkeypatch.setattr(LocalRun, "_fly", lambda *_: None)
-    said: list[Record] = []
+    said = []
     LocalRun(tmp_path, said.extend, api=api).fly(1.0)
     assert said == []
     monkeypatch.setattr(local, "places", list)
@@ -120,8 +107,8 @@ def test_an_unannounced_flight_names_the_flag_for_its_commands(
     assert ["--api unix:/" in str(record) for record in said] == [True] * api
 
 
-def test_a_bad_feed_line_ends_no_flight(tmp_path: Path) -> None:
-    child: Any = Child("cloud", None, tmp_path / "cloud.log")  # type: ignore[arg-type]
+def test_a_bad_feed_line_ends_no_flight(tmp_path):
+    child = Child("cloud", None, tmp_path / "cloud.log")
     event = to_line(EVENT).encode()
     lines = [b"\xff", event, event + event, b"[" + event, event]
     assert child.take(b"\n".join(lines)) == [EVENT]
@@ -134,9 +121,7 @@ def test_a_bad_feed_line_ends_no_flight(tmp_path: Path) -> None:
     ("tmpdir", "runtime", "chosen"),
     [("short", "", "short"), ("x" * 90, "run", "run"), ("x" * 90, "y" * 90, "/tmp")],
 )
-def test_sockets_lie_in_a_folder_with_a_short_path(
-    tmpdir: str, runtime: str, chosen: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sockets_lie_in_a_folder_with_a_short_path(tmpdir, runtime, chosen, monkeypatch):
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="t") as root:
         places = {name: Path(root, name) for name in (tmpdir, runtime, chosen) if name}
         for place in places.values():
@@ -149,7 +134,7 @@ def test_sockets_lie_in_a_folder_with_a_short_path(
             socket_folder()
 
 
-def test_a_deadline_does_not_count_the_time_in_which_we_stood_still() -> None:
+def test_a_deadline_does_not_count_the_time_in_which_we_stood_still():
     now = 0.0
     deadline = Deadline(3.0, turn_max=1.0, clock=lambda: now)
     for step, passed in ((0.9, False), (7.0, False), (0.9, False), (1.0, False), (0.9, True)):
@@ -158,12 +143,10 @@ def test_a_deadline_does_not_count_the_time_in_which_we_stood_still() -> None:
     assert deadline.pause == 7.0
 
 
-def test_the_key_of_a_run_is_for_its_user_alone_and_goes_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[tuple[Path, int, int]] = []
+def test_the_key_of_a_run_is_for_its_user_alone_and_goes_with_it(tmp_path, monkeypatch):
+    seen = []
 
-    def look(run: LocalRun, limit: float, sockets: Path, url: str) -> None:
+    def look(run, limit, sockets, url):
         key = sockets / "key"
         seen.append((key, key.stat().st_mode, sockets.stat().st_mode))
 

@@ -1,40 +1,13 @@
 """Requests and the emergency stop: repeated until the robot has acted on them, and no others."""
 
-from itertools import pairwise
-
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, RequestSender
-from cloudrc.teleop.wire import (
-    ALARM,
-    RobotStatus,
-)
+from cloudrc.teleop.wire import ALARM, RobotStatus
 from cloudrc.tunnel.codec import NUMBER_MAX
-from tests.teleop.conftest import FROM_SPAWN, ID, PLAN, A, Flight, flying
+from tests.teleop.conftest import FROM_SPAWN, ID, A, Flight, flying
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-
-
-def test_a_request_repeats_at_10_hz_until_acknowledged():
-    flight = Flight()
-    flight.downlink = False
-    flight.step()
-    flight.operate("start", PLAN)
-    flight.step(seconds=1.0)
-    said = zip(flight.said_at, flight.said, strict=True)
-    times = [when for when, each in said if each in flight.requests]
-    assert len(times) == 10
-    assert all(later - earlier == REPEAT_NS for earlier, later in pairwise(times))
-    assert {request.number for request in flight.requests} == {PREDECESSORS}
-    flight.downlink, flight.uplink = True, False
-    flight.step(seconds=0.5)
-    assert flight.state == "STARTING", "its acknowledgement is lost"
-    flight.uplink = True
-    flight.step(seconds=0.05)
-    assert flight.state == "FLYING"
-    count = len(flight.requests)
-    flight.step(seconds=2.0)
-    assert len(flight.requests) == count
 
 
 def first_request(seen, now_ns):
@@ -69,20 +42,6 @@ def test_a_start_that_becomes_visible_later_is_ended():
     flight.step(seconds=0.1)
     assert flight.requests[-1].request is Request.END
     assert flight.guard is HOLD
-
-
-def test_progress_waits_for_what_is_asked():
-    sender = RequestSender()
-    seen = RobotStatus(1, A, TRACK, 4, mission_id=ID, reached=0)
-    sender.see(seen, 0)
-    sender.report(ID, 2)
-    sender.ask(Request.END)
-    assert sender.due(0).request is Request.END
-    assert sender.due(50_000_000) is None
-    sender.see(seen._replace(mission=4 + PREDECESSORS), 0)
-    assert sender.due(99_999_999) is None
-    told = OperatorRequest(0, Request.PROGRESS, Start.SPAWN, ID, 2, epoch=seen.epoch)
-    assert sender.due(100_000_000) == told
 
 
 def test_each_copy_of_a_setpoint_or_request_names_the_current_session():
