@@ -44,9 +44,14 @@ NOMINAL = 0.100
 0.21 s the same release cost 228m to 300m."""
 
 
+def slower(told):
+    """Compute the slowdown of an interpreter against nominal from what `WORK` told; at least 1."""
+    return max(1.0, float(told) / NOMINAL)
+
+
 def here():
-    """Measure the slowdown of this machine's interpreter against nominal; at least 1."""
-    return max(1.0, float(subprocess.check_output([sys.executable, "-c", WORK])) / NOMINAL)
+    """Measure the slowdown of this machine's interpreter."""
+    return slower(subprocess.check_output([sys.executable, "-c", WORK]))
 
 
 def ages_at_hold(recording):
