@@ -82,7 +82,7 @@ class ProfileFile:
         the next call reads again.
         """
         seen = version(self._path)
-        if seen is None or seen == self._seen:
+        if seen == self._seen:
             return None
         loaded, refusal = None, ""
         try:

@@ -262,9 +262,11 @@ def test_a_full_disk_ends_nothing_and_delays_the_state(
     monkeypatch.setattr(sidecar, "publish", write)
     bench.at(1.0, lambda: full.update({"is": True}))
     bench.at(1.1, lambda: bench.replace(0.5))
+    bench.at(2.5, lambda: bench.replace(9.0, Change("b2", "far")))
     bench.at(5.0, lambda: full.update({"is": False}))
     state = bench.run(until=7.0).told()
-    assert (state["changes"], state["profile"]) == (1, {"description": "0.5 s"})
+    assert (state["changes"], state["refused"]) == (1, "b2")
+    assert state["profile"] == {"description": "0.5 s"}
 
 
 RICH = DirectionProfile(
