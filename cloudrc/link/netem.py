@@ -65,6 +65,8 @@ _ETHERNET_BYTES = 14
 """Length of the Ethernet header, which netem counts and the model does not [bytes]."""
 _RATE_MIN = 8.0
 """Lowest rate [bit/s]: tc turns less than 1 byte/s into no limit, without a message."""
+_CHANCE_MIN = 2.0**-32
+"""Lowest probability above 0 [1]: tc turns less into 0, without a message."""
 _PACKET_BITS = 8 * 116
 """Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
 _PACKETS = 1_000
@@ -216,6 +218,10 @@ def check(profile: DirectionProfile) -> None:
         found = "rate_kbit with jitter_ms but without keep_order (overtaking behind a bottleneck)"
     if any(0.0 < (piece.rate or inf) < _RATE_MIN for piece in pieces):
         found = f"rate_kbit below {_RATE_MIN * 1e-3:g} (tc takes it for no limit)"
+    chances = [chance for piece in pieces for chance in _chances(piece.loss)]
+    chances += [profile.duplicate, profile.reorder, profile.corrupt]
+    if any(0.0 < chance < _CHANCE_MIN for chance in chances):
+        found = "a probability below 2**-32 (tc takes it for 0)"
     if (slowest := max(piece.delay_ns for piece in pieces)) > DELAY_MAX_NS:
         found = f"delay_ms above 274000 (its clock ends there, here {slowest * 1e-6:g} ms)"
     for one in profile.blackouts:
@@ -287,10 +293,15 @@ def limit(profile: DirectionProfile) -> int:
 
 
 def _loss(loss: Loss) -> list[str]:
+    kind = "gemodel" if isinstance(loss, GilbertElliott) else "random"
+    return [kind, *map(_percent, _chances(loss))]
+
+
+def _chances(loss: Loss) -> tuple[float, ...]:
+    """Return the probabilities of a loss [1], in the order of tc's arguments."""
     if isinstance(loss, GilbertElliott):
-        chances = (loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good)
-        return ["gemodel", *map(_percent, chances)]
-    return ["random", _percent(loss)]
+        return loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good
+    return (loss,)
 
 
 def _microseconds(duration_ns: float) -> str:

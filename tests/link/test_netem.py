@@ -181,6 +181,8 @@ def test_a_profile_is_put_into_tcs_words(profile: DirectionProfile, at: float, w
         (DirectionProfile(changes=(Change(1.0, loss=BURSTS),)), "loss.delay_bad_ms"),
         (DirectionProfile(rate=1e6, changes=(Change(1.0, jitter=0.1),)), "without keep_order"),
         (DirectionProfile(rate=4.0), "rate_kbit below 0.008"),
+        (DirectionProfile(loss=GilbertElliott(0.1, 1e-11)), "a probability below 2**-32"),
+        (DirectionProfile(reorder=1e-11), "a probability below 2**-32"),
         (DirectionProfile(blackouts=(Blackout(1.0, 0.004),)), "here 4 ms at 1 s"),
     ],
 )
