@@ -18,6 +18,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.state import LinkState
 
 TIMED = {
     "uplink": {"delay_ms": 40.0},
@@ -154,3 +155,11 @@ def test_a_relay_that_does_not_answer_is_an_error(flight, capsys, monkeypatch):
         "cloudrc: error: the uplink and downlink did not apply the change within 0 s; "
         f"see {Path('runs/latest/relay.log')}\n"
     )
+
+
+def test_the_table_names_all_settings():
+    own = {"corrupt": 0.1, "reorder": 0.05, "duplicate": 0.01, "correlation": 0.4,
+           "keep_order": True, "blackouts": [{}], "trace": "/a/t.csv"}  # fmt: skip
+    row = link_set._row(LinkState("relay", "", "relay", "uplink", {"uplink": own}, "", 1))
+    beside = "duplicate 1 %, reorder 5 %, corrupt 10 %, correlation 0.4, order kept"
+    assert row[-1] == f"1 blackouts, trace t.csv, {beside}"

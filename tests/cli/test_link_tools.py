@@ -8,6 +8,7 @@ import pytest
 from cloudrc.cli import link_record
 from cloudrc.cli.main import main
 from cloudrc.link.traces import read_table, read_trace
+from tests.record.conftest import world_records, write
 
 PING = "\n".join(
     f"[{100 + n / 5 + 0.04:.6f}] 64 bytes from 192.0.2.1: icmp_seq={n} ttl=57 time={40 + n % 3} ms"
@@ -46,6 +47,19 @@ def test_a_run_gives_a_trace_per_direction(run, folder, capsys):
     trace = read_trace(folder / "t.csv")
     assert trace.losses is None
     assert 0.020 < sum(trace.delays) / len(trace.delays) < 0.035
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ([], "no rows on /uplink_delay, so no uplink; give the run's folder"),
+        (["--halve-rtt"], "holds no round trip; give the folder of a run that flew"),
+    ],
+)
+def test_a_recording_of_the_world_alone_gives_no_trace(words, says, folder, capsys):
+    recording = write(folder / "world.mcap", world_records(5))
+    assert main(["link", "record", str(recording), "-o", "t.csv", *words]) == 2
+    assert f"world.mcap: {says}" in capsys.readouterr().err
 
 
 def test_a_ping_log_gives_a_trace_and_what_was_left_out(folder, capsys):
