@@ -42,8 +42,9 @@ LONGEST = 5.0
 """Longest plausible median delay [s]; values with a larger median are probably in another unit."""
 UNUSABLE_MAX = 0.01
 """Largest share of rows that may be left out [1]; above this share the log is refused."""
-GAP, GAP_MIN = 20, 1.0
-"""Shortest gap that a note reports, in median times between packets [1] and in [s]."""
+GAP, GAP_OF_PING, GAP_MIN = 20, 2, 1.0
+"""Shortest gap that a note reports, in median times between packets [1] and in [s]. ping sends
+regularly, and its lost packets have times, too."""
 STEPS_MAX = 3
 """Up to this number of jumps back in time, a jump is a step of the clock or a new session; more
 jumps mean that the rows are shuffled [1]."""
@@ -97,6 +98,7 @@ class Log:
         counts: What was left out, merged or changed -> how often.
         unusable: One reason for each row that cannot be used.
         clocks: What the user should do if the two clocks differ.
+        gap: Shortest gap, and shortest jump back, in median times between packets [1].
     """
 
     name: str
@@ -105,6 +107,7 @@ class Log:
     unusable: list[str] = field(default_factory=list)
     halved: bool = False
     clocks: str = _CLOCKS
+    gap: int = GAP
 
     def packets(self) -> Packets:
         """Check the packets, sort them by the time of sending, and note what was changed.
@@ -133,7 +136,7 @@ class Log:
         self.counts["left out, unreadable"] += len(self.unusable)
         notes = [f"{count} {what}" for what, count in self.counts.items() if count]
         sent, delays = zip(*sorted(unique.items(), key=itemgetter(0)), strict=True)
-        return Packets(sent, delays, (*notes, *_gaps(sent)), self.halved)
+        return Packets(sent, delays, (*notes, *self._gaps(sent)), self.halved)
 
     def refuse_early(self, least: float) -> None:
         """Refuse a log whose shortest delay, `least` [s], is negative."""
@@ -144,7 +147,7 @@ class Log:
     def _refuse_steps(self) -> None:
         """Refuse times that jump far back one to three times: sorting would mix two sessions."""
         steps = [after - before for (before, _), (after, _) in pairwise(self.entries)]
-        far = max(GAP_MIN, GAP * median([abs(step) for step in steps] or [0.0]))
+        far = max(GAP_MIN, self.gap * median([abs(step) for step in steps] or [0.0]))
         back = [row for row, step in enumerate(steps, 1) if step < -far]
         if 1 <= len(back) <= STEPS_MAX:
             raise BadInputError(
@@ -153,23 +156,22 @@ class Log:
                 "give the rows before or after it"
             )
 
+    def _gaps(self, times: Sequence[float]) -> list[str]:
+        """Report the longest time without a packet, if it is unusual for this log."""
+        steps = [after - before for before, after in pairwise(times)]
+        longest = max(steps, default=0.0)
+        if longest <= max(GAP_MIN, self.gap * median(steps or [0.0])):
+            return []
+        return [
+            f"nothing sent for {longest:.4g} s after packet {steps.index(longest) + 1}: a pause, "
+            "two sessions in one log, or a step of the clock"
+        ]
+
     def _refuse_beyond_limit(self, count: int, reason: str) -> None:
         rows = len(self.entries) + len(self.unusable)
         if count > UNUSABLE_MAX * rows:
             more = f" ({count} of {rows} rows cannot be used)" if count > 1 else ""
             raise BadInputError(reason + more)
-
-
-def _gaps(times: Sequence[float]) -> list[str]:
-    """Report the longest time without a packet, if it is unusual for this log."""
-    steps = [after - before for before, after in pairwise(times)]
-    longest = max(steps, default=0.0)
-    if longest <= max(GAP_MIN, GAP * median(steps or [0.0])):
-        return []
-    return [
-        f"nothing sent for {longest:.4g} s after packet {steps.index(longest) + 1}: a pause, two "
-        "sessions in one log, or a step of the clock"
-    ]
 
 
 def trace_of(packets: Packets) -> Trace:
@@ -511,7 +513,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     """
     if not halve:
         raise BadInputError(f"{name}: ping measures round trips; {HALVE}")
-    log = Log(name, halved=True)
+    log = Log(name, halved=True, gap=GAP_OF_PING)
     ping = _Ping(lines, log)
     if not ping.replies:
         nothing = f"{name}: has no replies; give the output of: ping -D -O HOST"
