@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -30,7 +31,14 @@ from cloudrc.config.shipped import names
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers
 from cloudrc.link.netem import STRETCH, Answer, Netem, table, write_tables
-from cloudrc.link.profile import Blackout, Change, DirectionProfile
+from cloudrc.link.profile import (
+    Blackout,
+    Change,
+    DirectionProfile,
+    GilbertElliott,
+    Loss,
+    Trace,
+)
 from cloudrc.tunnel.codec import Kind
 
 MINUTES = [
@@ -143,7 +151,7 @@ class Flow:
         self._thread = threading.Thread(target=self._receive, daemon=True)
         self._thread.start()
 
-    def send(self, count: int, period: float = 0.01, meanwhile: Callable[[], None] = int) -> None:
+    def send(self, count: int, period: float = 0.01, meanwhile: Callable[[], object] = int) -> None:
         """Send `count` datagrams, one per period; call `meanwhile` after each."""
         begin = time.monotonic()
         for index in range(count):
@@ -270,6 +278,22 @@ def test_jitter_is_distributed_as_asked(shaped: Netem, distribution: Distributio
     assert least(off, 0.006) < 0.006
 
 
+@pytest.mark.parametrize(
+    ("asked", "share", "burst"), [(0.2, 0.2, 1.25), (GilbertElliott(0.05, 0.25), 1 / 6, 4.0)]
+)
+def test_losses_are_as_many_as_asked_and_counted(
+    shaped: Netem, asked: Loss, share: float, burst: float
+) -> None:
+    shaped.follow_profile(DirectionProfile(loss=asked))
+    flow, counts = measure(2000, 0.002), shaped.counts()
+    lost = sorted(set(range(2000)) - set(flow.numbers()))
+    mean = len(lost) / (1 + sum(after - before > 1 for before, after in pairwise(lost)))
+    show("losses", asked=share, measured=len(lost) / 2000, burst=mean)
+    assert (counts["forwarded"], counts["lost"]) == (2000 - len(lost), len(lost))
+    assert len(lost) / 2000 == pytest.approx(share, abs=0.07 if burst > 2 else 0.045)
+    assert mean == pytest.approx(burst, rel=0.5)
+
+
 @pytest.mark.full
 @pytest.mark.parametrize(("name", "way"), MINUTES)
 def test_a_shipped_profile_for_a_minute(
@@ -348,10 +372,18 @@ def test_a_bottleneck_has_its_rate(shaped: Netem) -> None:
         return abs(measured / 400e3 - 1.0)
 
     assert least(off, 0.03) < 0.03
+    # 38 packets of 200 bytes are under way beside the queue's 100.
+    shaped.follow_profile(DirectionProfile(delay=0.3, rate=200e3, queue_packets=100))
+    for sent, least_arrived in ((130, 130), (800, 138)):
+        flow = Flow()
+        flow.send(sent, 0.0)
+        arrived = len(flow.settle(1.0).arrived)
+        show("at once", sent=sent, arrived=arrived)
+        assert least_arrived <= arrived <= min(sent, 799)
 
 
 def test_duplicates_order_and_packets_that_overtake(shaped: Netem) -> None:
-    for keep_order in (False, True):
+    for keep_order in (False, True, False):
         shaped.follow_profile(DirectionProfile(0.040, 0.030, keep_order=keep_order))
         numbers = measure(300, 0.003).numbers()
         assert (len(numbers), numbers == sorted(numbers)) == (300, keep_order)
@@ -384,9 +416,10 @@ def test_it_is_set_up_once_and_removed_without_a_trace(tables: Path) -> None:
     "words",
     [
         ("del", "dev", DEVICE, "root"),
+        ("del", "dev", DEVICE, "parent", "7400:4"),
         ("change", "dev", DEVICE, "parent", "7400:4", "handle", "7401:", "netem"),
     ],
-    ids=["removed", "changed"],
+    ids=["root", "leaf", "changed"],
 )
 def test_what_another_program_does_is_counted_once(tables: Path, words: tuple[str, ...]) -> None:
     shaped = real_netem(tables, DirectionProfile(delay=0.060))
@@ -415,21 +448,26 @@ def test_a_measured_distribution_is_applied(tables: Path, shaped: Netem) -> None
     assert delays.std() == pytest.approx(0.03, abs=0.004)
 
 
-def test_changes_and_blackouts_take_effect_when_they_are_due(tables: Path) -> None:
-    profile = DirectionProfile(
-        delay=0.02, changes=(Change(2.5, delay=0.1),), blackouts=(Blackout(3.5, 0.3),)
-    )
+def stepped(tables: Path, profile: DirectionProfile, count: int) -> tuple[Netem, Flow, Floats]:
+    """Follow a time line beside a flow of 50 Hz; also return the times of sending on it [s]."""
     origin_ns = time.monotonic_ns() + 5_000_000_000  # by then it is set up
     begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
     netem, flow = real_netem(tables, profile, origin_ns), Flow()
     netem.follow_peer(FAR_PEER)
-    sender = threading.Thread(target=flow.send, args=(480, 0.02))
+    sender = threading.Thread(target=flow.send, args=(count, 0.02))
     sender.start()
     while sender.is_alive():
         netem.step(0.1)
     flow.settle()
     netem.close()
-    since = (np.array(flow.sent_ns) - begun_ns) * 1e-9
+    return netem, flow, (np.array(flow.sent_ns) - begun_ns) * 1e-9
+
+
+def test_changes_and_blackouts_take_effect_when_they_are_due(tables: Path) -> None:
+    profile = DirectionProfile(
+        delay=0.02, changes=(Change(2.5, delay=0.1),), blackouts=(Blackout(3.5, 0.3),)
+    )
+    netem, flow, since = stepped(tables, profile, 480)
     counts = netem.steps.counts()
     assert (counts["steps"], counts["steps_passed_over"]) == (3, 0)
     arrived, delays = since[flow.numbers()], flow.delays()
@@ -439,6 +477,26 @@ def test_changes_and_blackouts_take_effect_when_they_are_due(tables: Path) -> No
     assert np.median(before) == pytest.approx(0.02, abs=0.005)
     assert np.median(after) == pytest.approx(0.1, abs=0.005)
     assert (lost.min(), lost.max()) == pytest.approx((3.5, 3.8), abs=LATE)
+
+
+def test_a_trace_is_followed(tables: Path) -> None:
+    """60 to 140 ms in waves of 4 s, one row per 20 ms; measured at the instants of sending."""
+    times = 0.02 * np.arange(400)
+    rows = 0.1 + 0.04 * np.sin(0.5 * np.pi * times)
+    profile = DirectionProfile(trace=Trace(tuple(times.tolist()), tuple(rows.tolist())))
+
+    def off() -> float:
+        netem, flow, since = stepped(tables, profile, 700)
+        assert len(flow.arrived) == 700, "steps lose nothing"
+        on = (since[flow.numbers()] > 0.0) & (since[flow.numbers()] < times[-1])
+        asked = rows[np.searchsorted(times, since[flow.numbers()][on], side="right") - 1]
+        correlation = float(np.corrcoef(asked, flow.delays()[on])[0, 1])
+        show(netem.steps.in_words(), correlation=correlation)
+        counts = netem.steps.counts()
+        assert counts["steps"] + counts["steps_passed_over"] == len(times) - 1
+        return 1.0 - correlation
+
+    assert least(off, 0.02) < 0.02
 
 
 def until(condition: Callable[[], bool]) -> None:
@@ -453,29 +511,70 @@ def median_off(asked: float) -> float:
     return least(lambda: float(abs(np.median(measure(50).delays()) - asked)), BESIDE)
 
 
+class Pod:
+    """A link container in the near namespace, as a context manager."""
+
+    def __init__(self, folder: Path, mode: str, *prefix: str) -> None:
+        self.route, self.state = folder / "route", folder / "link.json"
+        self.profile, self.log = folder / "profile.yaml", folder / "log"
+        self.profile.write_text("uplink: {delay_ms: 60}\n")
+        words = ["ip", "netns", "exec", NEAR, *prefix, sys.executable, "-m", "cloudrc", "link"]
+        words += ["run", "--config", "paper", "--profile", str(self.profile), "--mode", mode]
+        words += ["--direction", "uplink", "--peer", f"{FAR_HOST}:7400", "--route", str(self.route)]
+        with self.log.open("w") as file:
+            self.process = subprocess.Popen(words, cwd=ROOT, stderr=file)
+
+    def __enter__(self) -> Pod:
+        until(lambda: self.route.exists() or self.process.poll() is not None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def told(self) -> dict[str, object]:
+        found: dict[str, object] = json.loads(self.state.read_text())
+        return found
+
+    def end(self) -> None:
+        self.process.send_signal(signal.SIGTERM)
+        assert self.process.wait(PATIENCE) == 0, self.log.read_text()
+
+
+@pytest.mark.smoke
 def test_a_pod_takes_netem_follows_the_profile_and_leaves_nothing(
     tables: Path, tmp_path: Path
 ) -> None:
-    before, route, profile = qdiscs(), tmp_path / "route", tmp_path / "profile.yaml"
-    state, log = tmp_path / "link.json", tmp_path / "log"
-    profile.write_text("uplink: {delay_ms: 60}\n")
-    command = ["ip", "netns", "exec", NEAR, sys.executable, "-m", "cloudrc", "link", "run"]
-    command += ["--config", "paper", "--profile", str(profile), "--direction", "uplink"]
-    command += ["--mode", "auto", "--peer", f"{FAR_HOST}:7400", "--route", str(route)]
-    with log.open("w") as file, subprocess.Popen(command, cwd=ROOT, stderr=file) as process:
-        try:
-            until(lambda: route.exists() or process.poll() is not None)
-            told = json.loads(state.read_text())
-            assert (told["shaper"], told["mode"], told["direction"]) == ("netem", "auto", "uplink")
-            assert route.read_text() == f"{FAR_HOST}:7400\n"
-            assert median_off(0.060) < BESIDE
-            profile.write_text("uplink: {delay_ms: 120}\n")
-            until(lambda: "delay 120ms" in qdiscs())
-            assert median_off(0.120) < BESIDE
-            until(lambda: json.loads(state.read_text())["changes"] == 1)
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(PATIENCE) == 0, log.read_text()
-        finally:
-            process.kill()
-    assert qdiscs() == before
-    assert not route.exists()
+    before = qdiscs()
+    with Pod(tmp_path, "auto") as pod:
+        told = pod.told()
+        assert (told["shaper"], told["mode"], told["direction"]) == ("netem", "auto", "uplink")
+        assert pod.route.read_text() == f"{FAR_HOST}:7400\n"
+        assert median_off(0.060) < BESIDE
+        pod.profile.write_text("uplink: {delay_ms: 120}\n")
+        until(lambda: "delay 120ms" in qdiscs())
+        assert median_off(0.120) < BESIDE
+        until(lambda: pod.told()["changes"] == 1)
+        pod.end()
+        assert qdiscs() == before
+        assert not pod.route.exists()
+
+
+def test_a_qdisc_deleted_in_flight_is_an_error_in_the_log(tables: Path, tmp_path: Path) -> None:
+    with Pod(tmp_path, "netem") as pod:
+        sh("tc", "-n", NEAR, "qdisc", "del", "dev", DEVICE, "root")
+        until(lambda: f"error: the qdisc of {DEVICE} was removed by another" in pod.log.read_text())
+        assert "netem" not in qdiscs(), "it is not repaired"
+        pod.end()
+
+
+@pytest.mark.usefixtures("tables")
+def test_without_the_capability_auto_uses_relay_and_netem_fails(tmp_path: Path) -> None:
+    drop = ("setpriv", "--bounding-set", "-net_admin", "--inh-caps", "-net_admin")
+    with Pod(tmp_path, "auto", *drop) as pod:
+        reason = "netem does not work here: no uid 0 with NET_ADMIN"
+        assert (pod.told()["shaper"], pod.told()["reason"]) == ("relay", reason)
+        pod.end()
+    with Pod(tmp_path, "netem", *drop) as pod:
+        assert pod.process.wait(PATIENCE) == MissingPrerequisiteError.exit_code
+        assert "no uid 0 with NET_ADMIN; give this container both" in pod.log.read_text()
