@@ -35,7 +35,7 @@ class Process:
 
     def __init__(self, command: list[str], ways: list[Way]) -> None:
         """Start it and wait until it says that it is ready."""
-        self.ways, self._said = ways, ""
+        self.ways = ways
         self._process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
@@ -49,12 +49,7 @@ class Process:
     def stop(self) -> None:
         """End it."""
         self._process.send_signal(signal.SIGTERM)
-        _, self._said = self._process.communicate(timeout=10)
-
-    def counts(self) -> dict[str, float]:
-        """Read what our relay has counted, once it has ended."""
-        line = self._said.strip().splitlines()[-1].rpartition(": ")[2]
-        return {name: float(n) for name, n in (one.split() for one in line.split(", "))}
+        self._process.communicate(timeout=10)
 
 
 def ours(folder: Path, link: dict[str, object], *, fifo: bool = False) -> Process:
