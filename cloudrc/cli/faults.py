@@ -17,7 +17,7 @@ from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.faults.scenario import Result
+    from cloudrc.faults.scenario import Outcome, Result
 
 EPILOG = """\
 examples:
@@ -140,7 +140,7 @@ def print_faults(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run one fault, all, or those of a schedule's file."""
-    from cloudrc.faults.scenario import as_json, as_junit
+    from cloudrc.faults.scenario import Result, as_json, as_junit
     from cloudrc.faults.scenarios import SCENARIOS, find
 
     if isinstance(options.name, Path):
@@ -148,8 +148,8 @@ def run(options: argparse.Namespace) -> int:
     chosen = SCENARIOS if options.all else (find(options.name),)
     results: list[Result] = []
 
-    def take(result: Result) -> None:
-        results.append(result)
+    def take(done: tuple[Outcome, float, str]) -> None:
+        results.append(result := Result(chosen[len(results)], *done))
         if options.output == "table":
             _print_result(result, options.all)
 
@@ -169,18 +169,18 @@ def run(options: argparse.Namespace) -> int:
     return code or (FAILED if failed else 0)
 
 
-def _run(job: tuple[str, int]) -> Result:
-    """Run one fault, in this process or in a worker; an exception becomes a failed result."""
-    from cloudrc.faults.scenario import Outcome, Result
+def _run(job: tuple[str, int]) -> tuple[Outcome, float, str]:
+    """Run one fault, in this process or in a worker; return its outcome, time [s] and error."""
+    from cloudrc.faults.scenario import Outcome
     from cloudrc.faults.scenarios import find
 
-    name, seed = job
-    scenario, began = find(name), time.monotonic()
+    (name, seed), began = job, time.monotonic()
+    outcome, text = Outcome(), ""
     try:
-        return Result(scenario, scenario.run(seed), time.monotonic() - began)
+        outcome = find(name).run(seed)
     except Exception as error:  # this scenario fails, the others still run
         text = f"{type(error).__name__}: {error}"
-        return Result(scenario, Outcome(), time.monotonic() - began, text)
+    return outcome, time.monotonic() - began, text
 
 
 def _print_result(result: Result, briefly: bool) -> None:

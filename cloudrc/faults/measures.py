@@ -13,9 +13,17 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import CommandApplied, Fault, GuardChange, Record, SessionOpened
+from cloudrc.records import (
+    CommandApplied,
+    Fault,
+    GuardChange,
+    Record,
+    SessionOpened,
+    TelemetrySent,
+)
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
+from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD
 
 AGE_MAX = 0.252 + 1e-9
 """Largest age of a command's basis at a HOLD [s]: `command_age_max` and one tick."""
@@ -170,6 +178,38 @@ def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
     causes = [change.cause for change in after if change.state is GuardState.TRACK]
     right = bool(causes) and all("fresh commands within" in cause for cause in causes)
     outcome.true(f"{what}each TRACK after it tells of fresh commands", right)
+    sent = [r.telemetry for r in flight.of_world if isinstance(r, TelemetrySent)]
+    shown = {telemetry.cause for telemetry in sent if telemetry.guard is GuardState.HOLD}
+    right = Cause.SILENCE in shown <= {Cause.SILENCE, Cause.SESSION, Cause.ENDED}
+    outcome.true(f"{what}so does telemetry: {Cause.SILENCE.words}", right)
+
+
+def status(flight: Flight) -> dict[str, Any]:
+    """Return teleop's status at this instant, as its API shows it."""
+    assert flight.teleop.service is not None
+    return flight.teleop.service.state(flight.cloud.clock.at(flight.run.now_ns))
+
+
+def silence_told(
+    outcome: Outcome, flight: Flight, at: float, silent: float, what: str = "", *, cloud: bool
+) -> None:
+    """Schedule a check, `silent` [s] after `at` [s], that the status tells who is silent.
+
+    It is the robot alone if `cloud` is heard, else both; each text begins with `what`.
+    """
+
+    def check(now_ns: int) -> None:
+        shown = status(flight)
+        seen, wrong = shown["seen"], abs(shown["seen"]["age_s"] - silent)
+        outcome.most(f"{what}the status says for how long, off by", wrong, 0.2, "s")
+        outcome.true(f"{what}it shows the guard's state as past", seen["guard_for_s"] is None)
+        wrong = abs(shown["cloud_age_s"] - (0.0 if cloud else silent))
+        outcome.most(f"{what}it says when cloud was heard last, off by", wrong, 0.25, "s")
+        right = seen["next_step"] == (NOT_HEARD if cloud else NO_CLOUD)
+        who = "the robot, not cloud" if cloud else "cloud"
+        outcome.true(f"{what}its next step is to look after {who}", right)
+
+    flight.cloud.at(at + silent, check)
 
 
 # The path.

@@ -7,6 +7,7 @@ import operator
 import xml.etree.ElementTree as Xml
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from math import isfinite
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -114,13 +115,7 @@ def scenario(
     number: int, name: str, *, injects: str, expects: str, loses: str = "none", shows: str
 ) -> Callable[[Inject], Scenario]:
     """Make a `Scenario` of the function that injects the fault; the arguments are its fields."""
-
-    def make(inject: Inject) -> Scenario:
-        # A pool pickles a function by its name, and the scenario takes the place of the function.
-        inject.__qualname__ += ".inject"
-        return Scenario(number, name, injects, expects, loses, shows, inject)
-
-    return make
+    return partial(Scenario, number, name, injects, expects, loses, shows)
 
 
 class Result(NamedTuple):

@@ -7,8 +7,7 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cli.pool import WorkerDiedError
-from cloudrc.faults.scenario import Outcome, Result
-from cloudrc.faults.scenarios import find
+from cloudrc.faults.scenario import Outcome
 from cloudrc.faults.schedule import Schedule
 from cloudrc.faults.trial import Finding
 
@@ -25,8 +24,8 @@ KILLED = WorkerDiedError("a worker was killed")
 )
 def test_what_was_flown_before_an_interrupt_is_kept(line, error, code, said, monkeypatch, capsys):
     def flown(function, work, jobs):
-        name, seed = work[0] if "search" in line else (work[0][0], 0)
-        yield Finding(Schedule(seed), ()) if seed else Result(find(name), Outcome(), 0.0)
+        seed = work[0][1] if "search" in line else 0
+        yield Finding(Schedule(seed), ()) if seed else (Outcome(), 0.0, "")
         raise error
 
     monkeypatch.setattr("cloudrc.cli.faults.map_in_order", flown)

@@ -113,6 +113,18 @@ def test_it_stops_at_any_instant(k: int, kill: bool, figure: Figure) -> None:
             interrupt(figure, kill, at, calm=1.4)
 
 
+@pytest.mark.parametrize(
+    ("way", "at", "duration"),
+    [("uplink", 11.3, 0.3), ("uplink", 22.1, 5.0), ("downlink", 28.85, 20.0)],
+)
+def test_a_silence_of_one_direction_touches_nothing(way: str, at: float, duration: float) -> None:
+    """In pipe 1 at speed, at the second bend, and before the board."""
+    flight = cut_off(at, duration, "cloud.controller.speed_max=2", ways=(way,)).fly_mission(200.0)
+    is_flown(flight)
+    assert len(measures.held(flight)) == 1
+    assert measures.number(flight, "min_clearance") >= 0.12
+
+
 def test_a_silence_at_the_missions_end_lets_the_robot_hold() -> None:
     (done,) = undisturbed(*SLOW).events("done")
     flight = cut_off(done.stamp_ns * 1e-9 - 0.02, SILENT, *SLOW).fly_mission(200.0)

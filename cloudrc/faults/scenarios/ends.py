@@ -46,13 +46,14 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     "cloud-paused",
     injects="SIGSTOP of the cloud process for 5 s",
     expects="HOLD; of what it computed before nothing is applied",
-    shows="guard HOLD with its cause, cloudrc_guard_transitions_total, then "
-    "cloudrc_loop_missed_periods_total",
+    shows="guard HOLD with its cause; in the status: cloud not heard, nor the robot; "
+    "cloudrc_guard_transitions_total, then cloudrc_loop_missed_periods_total",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
     at, missed = measures.instant(seed), "loop_missed_periods_total"
     flight = Flight(seed=seed, separate=True)
     flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
+    measures.silence_told(outcome, flight, at, 4.0, cloud=False)
     flight.fly_mission()
     measures.safe_and_done(outcome, flight)
     measures.held_in_time(outcome, flight)

@@ -51,7 +51,8 @@ def _short_silence(outcome: Outcome, seed: int) -> None:
     injects="both directions silent for 0.5, 3 and 20 s",
     expects="HOLD at 252 ms, below 0.05 m/s in 1 s, drift <= 0.10 m, resumes <= 1 s after return",
     loses="samples in the gap",
-    shows="guard HOLD with its cause, cloudrc_guard_transitions_total",
+    shows="guard HOLD with its cause; in the status: robot not heard, cloud heard; "
+    "cloudrc_guard_transitions_total",
 )
 def _silence(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
@@ -59,6 +60,8 @@ def _silence(outcome: Outcome, seed: int) -> None:
         cut, back, what = silent(at, duration), at + duration, f"{duration:g} s of silence"
         slow = ("guard.speed_max_mps=1.5", "criteria.time_limit_s=150")
         flight = Flight(*slow, seed=seed, uplink=cut, downlink=cut, separate=True)
+        if duration >= 3.0:
+            measures.silence_told(outcome, flight, at, 0.9 * duration, f"{what}: ", cloud=True)
         flight.fly_mission(150.0)
         measures.safe_and_done(outcome, flight)
         began = next(iter(measures.changes_into(flight, GuardState.HOLD)), at)
@@ -79,7 +82,8 @@ def _silence(outcome: Outcome, seed: int) -> None:
     injects="both directions silent for 75 s, over the floor and amid the pipes",
     expects="HOLD, LAND after 60 s at 0.5 m/s, rotors stop on what lies below, latched",
     loses="the mission, which says so",
-    shows="guard LAND with its cause, cloudrc_guard_state",
+    shows="guard LAND with its cause; in the status: robot not heard, cloud heard; "
+    "cloudrc_guard_state",
 )
 def _long_silence(outcome: Outcome, seed: int) -> None:
     """Cut the link over the free floor, and anywhere on the way through the pipes."""
@@ -96,6 +100,7 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     """Cut the link at `at` [s] for long: the robot lands and stops its rotors."""
     cut = silent(at, 75.0)
     flight = Flight("criteria.time_limit_s=200", seed=seed, uplink=cut, downlink=cut, separate=True)
+    measures.silence_told(outcome, flight, at, 70.0, f"{where}: ", cloud=True)
     flight.fly(at + 80.0)
     measures.safe(outcome, flight)
     held = next(iter(measures.changes_into(flight, GuardState.HOLD)), nan)
@@ -113,6 +118,9 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     failed, verdict = flight.mission.state == "failed", str(flight.mission.verdict)
     text = f"guard went to LAND ({Cause.ALONE.words})"
     outcome.true(f"{where}: the mission says why it failed", failed and text in verdict)
+    seen, shown = measures.status(flight)["seen"], ("LAND", Cause.ALONE.words)
+    right = (seen["guard"], seen["cause"]) == shown
+    outcome.true(f"{where}: the status says so, too: {', '.join(shown)}", right)
     measures.moves(outcome, flight, "world", "guard_state", since=at)
     state = measures.reading(flight, "world", "guard_state")
     outcome.least(f"{where}: metric guard_state at the end", state, 3)

@@ -130,7 +130,11 @@ def _jitter(outcome: Outcome, seed: int) -> None:
     flight = Flight("link.profile=paper-p3", seed=seed).fly_mission()
     measures.safe_and_done(outcome, flight)
     outcome.same("jitter 40 ms: HOLDs", len(measures.held(flight)), 0)
-    older, old = (measures.above(flight, "world", AGE, age)[1] for age in (0.1, 0.15))
+    steady = conditions(jitter=0.0)
+    without = Flight("link.profile=paper-p3", seed=seed, uplink=steady, downlink=steady)
+    older, old = _above_100_and_150_ms(without.fly_mission())
+    outcome.most(f"no jitter: metric {AGE}: share outside 0.1 to 0.15 s", 1 - older + old, 0.01)
+    older, old = _above_100_and_150_ms(flight)
     outcome.most(f"jitter 40 ms: metric {AGE}: share above 0.1 s", older, 0.95)
     outcome.least(f"jitter 40 ms: metric {AGE}: share above 0.15 s", old, 0.05)
     wild = conditions(delay=0.15, jitter=0.15)
@@ -143,3 +147,9 @@ def _jitter(outcome: Outcome, seed: int) -> None:
     outcome.same(f"jitter 150 ms: metric {AGE}: share above 0.25 s", old, 0.0)
     busiest = measures.busiest_second(flight.changes)
     outcome.most("jitter 150 ms: changes of the guard in any second", busiest, 2)
+
+
+def _above_100_and_150_ms(flight: Flight) -> tuple[float, float]:
+    """Return the shares of commands [1] that were older than 0.1 and 0.15 s when in use."""
+    older, old = (measures.above(flight, "world", AGE, age)[1] for age in (0.1, 0.15))
+    return older, old
