@@ -54,6 +54,10 @@ what waits begins only with the disk: create 0.05 A queue full B C 3
   -> states=done,queued
 once it works: create 0.05 A queue full B C 3 free 1.5
   -> states=done,flying
+also if it is found full only then: create 0.05 queue cancelm1 full 3
+  -> states=cancelled,starting guard=HOLD asked=END,START
+and starts once it works: create 0.05 queue cancelm1 full 3 free 1.5
+  -> states=cancelled,flying
 a second mission waits: create 0.05 A !create queue queue B C A B C
   -> states=done,done,flying reached=0,1,2
 between two missions the robot is seen to hold: create 0.05 A queue mute B C 1.0
@@ -118,6 +122,8 @@ it continues before take-off: create 0.05 A GROUND mark restart see 0.3
   -> states=flying asked=START
 with a full disk the robot remembers: create 0.05 A full B 0.1 restart free away C 0.1
   -> states=done reached=0,1,2 failure=
+a flight never stored is not flown again: mute create full link 0.1 A B C 0.2 free restart mark 1
+  -> states=failed failure=end_lost asked=END guard=HOLD reached=
 it never flies back: create 0.05 A full B 0.1 mute restart free away
   -> states=flying waypoint=2
 a lost cancel is not flown again: create 0.05 A full cancel 0.3 free mark restart away 1.0
