@@ -2,6 +2,7 @@
 
 import re
 from argparse import Namespace
+from math import inf, nan
 from types import SimpleNamespace
 
 import pytest
@@ -424,8 +425,10 @@ def test_the_state_is_shown_with_cause_and_since_when_in_this_world():
     assert shown(flight)["age_s"] == pytest.approx(2.0)
     flight.uplink = True
     flight.restart_cloud()
-    flight.step()
+    flight.step(position=(nan, 0.0, inf))
     assert shown(flight)["guard_for_s"] == pytest.approx(2.51)
+    assert shown(flight)["position_m"] == [None, 0.0, None], "JSON has no such numbers"
+    assert (shown(flight)["touch_speed_mps"], shown(flight)["loop_delay_s"]) == (None, None)
     flight.restart()
     flight.guard = HOLD
     flight.step()
