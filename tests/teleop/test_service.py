@@ -125,6 +125,14 @@ with a full disk the robot remembers: create 0.05 A full B 0.1 restart free away
   -> states=done reached=0,1,2 failure=
 a flight never stored is not flown again: mute create full link 0.1 A B C 0.2 free restart mark 1
   -> states=failed failure=end_lost asked=END guard=HOLD reached=
+nor is an end that the robot knows lost: create 0.05 A full B C 0.3 restart free away 0.3
+  -> states=done reached=0,1,2 last=done
+nor does it fly before that: create 0.05 A full B C 0.3 mute restart free away 0.1
+  -> setpoint=away:-1
+nor is a held place left for it: create 0.05 A hold full resume B 0.3 restart free away 0.2
+  -> states=held setpoint=away:-1 reached=0,1
+nor a robot taken that flies another mission: create 0.05 A TRACK foreign mark restart 0.3
+  -> failure=taken_over asked=
 it never flies back: create 0.05 A full B 0.1 mute restart free away
   -> states=flying waypoint=2
 a lost cancel is not flown again: create 0.05 A full cancel 0.3 free mark restart away 1.0
@@ -161,6 +169,14 @@ a stop: create 0.05 A mark stop 0.05
   -> failure=emergency_stopped guard=ESTOP asked=ESTOP settled=True
 a stop of an idle robot: 0.01 stop 0.05
   -> states= guard=ESTOP asked=ESTOP settled=True
+nothing else is asked before it acts: create 0.05 A mute stop ack mark 0.5
+  -> asked=ESTOP settled=False
+the robot learns that it ended the mission: create 0.05 A stop 0.3
+  -> onboard=65535
+it precedes the end of a lost mission: restart stop foreign 0.3
+  -> asked=ESTOP
+an acknowledgement does as well: restart ack foreign mark 0.3
+  -> asked=ACKNOWLEDGE,END
 a stop on its way forbids to start: create 0.05 queue mute stop 0.2 !queue !goto link 0.3
   -> states=failed,queued guard=ESTOP
 until it is acknowledged: create 0.05 queue stop 0.3 !queue ack 0.5 !ack
