@@ -202,6 +202,9 @@ class MissionService:
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
         self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
+        if not self.book.kept:
+            text = f"{mission.id} is cancelled, but waits again if teleop restarts"
+            raise UnavailableError(f"{text}: {self.book.trouble}")
         return mission
 
     def hold(self, now_ns: int) -> Mission:

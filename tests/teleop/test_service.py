@@ -59,6 +59,8 @@ also if it is found full only then: create 0.05 queue cancelm1 full 3
   -> states=cancelled,starting guard=HOLD asked=END,START
 and starts once it works: create 0.05 queue cancelm1 full 3 free 1.5
   -> states=cancelled,flying
+a cancelled one might begin after a restart: create 0.05 A queue full !cancel B C 0.1
+  -> states=done,cancelled
 a second mission waits: create 0.05 A !create queue queue B C A B C
   -> states=done,done,flying reached=0,1,2
 between two missions the robot is seen to hold: create 0.05 A queue mute B C 1.0
