@@ -103,6 +103,8 @@ class Tokens:
             path = self._folder / role
             if role == OPERATOR or path.exists():
                 digest = hashlib.sha256(_read_token(path)).digest()
+                if digest in known:  # readers would command
+                    raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
                 known[digest] = Caller(role, f"{role}-{digest.hex()[:8]}")
         return known
 

@@ -124,6 +124,7 @@ class Teleop:
         self._expected: tuple[int, ...] = ()  # missions that may be on board; empty: any
         self._watch = LegWatch()
         self._setpoint: Setpoint | None = None
+        self._over = MISSION_OVER  # waypoints stored on board from which on the mission is over
         self._is_pending = False  # whether the mission's first setpoint has not been sent yet
         self._stays = False  # whether waypoints are ignored
 
@@ -141,9 +142,15 @@ class Teleop:
         outputs, self.outputs = self.outputs, []
         return outputs
 
-    def start(self, now_ns: int, plan: Plan, mission_id: int = 0) -> None:
-        """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0."""
+    def start(self, now_ns: int, plan: Plan, mission_id: int = 0, *, again: bool = False) -> None:
+        """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0.
+
+        With `again`, an earlier teleop may have flown it: if the robot reports the last waypoint,
+        the mission is over and does not begin at the spawn again.
+        """
         self._order(plan, mission_id, now_ns)
+        if again and plan.start is Start.SPAWN:
+            self._over = len(plan.legs)
         here = None if plan.start is Start.SPAWN else self._seen
         self._world = here.world if here else ANY_WORLD
         self._expected = (here.mission_id, mission_id) if here else ()
@@ -151,6 +158,8 @@ class Teleop:
         self.requests.ask(Request.START, plan.start, after=True)
         self._is_pending = True
         self._select_early()
+        if again and self._seen:
+            self.see(self._seen, now_ns)  # the mission may be over
 
     def continue_mission(self, now_ns: int, mission: Mission) -> None:
         """Take over a mission of an earlier teleop at its current waypoint; do not reset world."""
@@ -264,7 +273,7 @@ class Teleop:
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
             return "taken_over", "somebody else has started another mission"
-        if self._reached_on_board(seen) >= MISSION_OVER:
+        if self._reached_on_board(seen) >= self._over:
             return END_LOST
         if seen.guard > WORST_GUARD:
             return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
@@ -297,11 +306,12 @@ class Teleop:
         """Store a new mission: its plan, its number, and the start of its time [ns]."""
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
-        self._continued = self._was_held = False
+        self._continued, self._was_held, self._over = False, False, MISSION_OVER
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission after telemetry shows its start; start the times of mission and leg."""
         self.state, self._world, self._expected = FLYING, seen.world, (self._mission_id,)
+        self._over = MISSION_OVER
         self._watch.begin()
         if not self._continued:
             self._began_ns = now_ns

@@ -202,6 +202,9 @@ class MissionService:
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
         self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
+        if not self.book.kept:
+            text = f"{mission.id} is cancelled, but waits again if teleop restarts"
+            raise UnavailableError(f"{text}: {self.book.trouble}")
         return mission
 
     def hold(self, now_ns: int) -> Mission:
@@ -340,12 +343,13 @@ class MissionService:
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
         """Make the first open mission the current one; return the current mission, if any.
 
-        If the mission has begun, it continues. If it waits, it starts only with `queued`.
+        If the mission has begun, it continues. If it waits, it starts only with `queued`, and
+        once that is stored.
         """
         if self._current is None and (waiting := self.book.open()):
             if queued and waiting[0].state == QUEUED:
                 self._note(waiting[0], "starting", ASKED, now_ns)
-            if waiting[0].state != QUEUED:
+            if waiting[0].world or (waiting[0].state != QUEUED and self.book.kept):
                 self._take_over(waiting[0], now_ns)
         return self._current
 
@@ -353,7 +357,7 @@ class MissionService:
         """Fly a mission that this or an earlier teleop has begun."""
         self._current = mission
         if not mission.world:  # it has not started
-            self._teleop.start(now_ns, mission.order.plan, mission.number)
+            self._teleop.start(now_ns, mission.order.plan, mission.number, again=True)
         else:
             self._teleop.continue_mission(now_ns, mission)
             mission.witness = mission.witness.after_restart()

@@ -51,6 +51,16 @@ def test_all_that_systemd_lets_wait_is_taken_in_one_wake(peers, monkeypatch):
         assert len(peers[0].receive()) == 513
 
 
+def test_a_neighbour_that_is_away_or_new_is_no_error(peers, tmp_path):
+    one, other = peers
+    other.close()
+    assert not one.send(b"lost")
+    again = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
+    assert one.send(b"found")
+    assert again.receive() == [b"found"]
+    again.close()
+
+
 def test_a_path_that_is_too_long_is_named(tmp_path):
     with pytest.raises(BadInputError, match="longer than 107 bytes"):
         UnixPeer(tmp_path / ("x" * 120), tmp_path / "b")
@@ -74,7 +84,8 @@ def test_cloud_reports_each_silence_of_teleop_once(peers):
         teleop.handle_deadline(now_ns)
     (fault,) = teleop.take_outputs()
     assert (type(fault), fault.code) == (Fault, "teleop_silent")
-    other.send(encode(POINT))
+    for data in (b"rubbish", b'["Nobody", []]', encode(POINT)):  # what is no message is ignored
+        other.send(data)
     for now_ns in range(6 * SECOND, 9 * SECOND, PERIOD_NS):
         teleop.handle_deadline(now_ns)
     assert [type(output) for output in teleop.take_outputs()] == [Setpoint, Fault]

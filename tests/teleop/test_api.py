@@ -27,7 +27,8 @@ from cloudrc.teleop.store import UnavailableError
 from tests.teleop.conftest import DIRECT, OPERATOR, READER, A, B, C, connect, head, running
 
 LEG = {"dwell_s": 0.0, "tolerance_m": 0.3}
-MISSION = {"name": "round", "waypoints": [{"position_m": p, **LEG} for p in (A, B, C)]}
+NAME = "zum Brett, \N{RIGHTWARDS ARROW} 板"
+MISSION = {"name": NAME, "waypoints": [{"position_m": p, **LEG} for p in (A, B, C)]}
 A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 emergency_stop = pytest.mark.promise("emergency-stop-gets-through")
 
@@ -63,7 +64,8 @@ def test_a_mission_from_post_to_verdict(api):
     assert (status, view["id"], view["state"], view["waypoints"]) == (201, "m1", "starting", 3)
     api.until(lambda: api.state_of("m1") == "flying")
     finish(api, "m1")
-    assert api.get("/v1/missions/m1")["verdict"]["outcome"] == "success"
+    view = api.get("/v1/missions/m1")
+    assert (view["name"], view["verdict"]["outcome"]) == (NAME, "success")
     assert [mission["id"] for mission in api.get("/v1/missions")["missions"]] == ["m1"]
     status, again = api.post("/v1/missions", {**MISSION, "key": "uid"})
     assert (status, again["id"]) == (200, "m1")
@@ -105,7 +107,8 @@ def test_requests_and_refusals_become_metrics(api):
 
     def readings():
         live = LiveMetrics("teleop")
-        live.see([Counted(0, "teleop", name, count) for name, count in api.server.counts.items()])
+        counts = {**api.server.counts, "api_events_dropped": 3, "journal_repaired": 1}
+        live.see([Counted(0, "teleop", name, count) for name, count in counts.items()])
         return live.read()
 
     def refusals():
@@ -114,6 +117,8 @@ def test_requests_and_refusals_become_metrics(api):
     api.until(lambda: refusals() == {("invalid",): 3, ("conflict",): 1})  # counted after the answer
     api.until(lambda: readings()["cloudrc_api_requests_total"][()] >= 6)
     assert readings()["cloudrc_api_rejected_total"][("role",)] == 1
+    assert readings()["cloudrc_stream_dropped_events_total"] == {(): 3}
+    assert readings()["cloudrc_journal_repaired_total"] == {(): 1}
 
 
 # Events
@@ -403,6 +408,8 @@ def test_the_openapi_document_describes_everything(api):
     post = document["paths"]["/v1/missions"]["post"]
     content = post["requestBody"]["content"]["application/json"]
     models.MissionRequest.model_validate_json(json.dumps(content["example"]))
+    assert "[m]" in json.dumps(content["schema"]["properties"]["waypoints"])
+    assert "$ref" not in json.dumps(content["schema"])
     assert {"201", "200", "409", "413", "422", "503"} <= set(post["responses"])
     for path, verbs in document["paths"].items():
         for verb, operation in verbs.items():

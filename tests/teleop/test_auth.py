@@ -42,9 +42,11 @@ def idle():
     [
         ({}, "operator: No such file or directory; make one: "),
         ({"operator": "short"}, "operator: a token is 16 to 512 visible"),
+        ({"operator": "x" * 513}, "operator: a token is"),
         ({"operator": "two words and more"}, "operator: a token is"),
         ({"operator": "o" * 16 + "\n" * 4096}, "operator: longer than 4096 .*; make one"),
         ({"operator": "o" * 16, "reader": ""}, "reader: a token is"),
+        ({"operator": "o" * 16, "reader": "o" * 16 + "\n"}, "both roles have the same token"),
         ({"operator": None}, "operator: not a file; make one"),  # and is not awaited
     ],
 )
@@ -76,7 +78,8 @@ def test_a_token_file_that_others_can_read_is_warned_of(tmp_path, monkeypatch, m
     user = os.geteuid()
     monkeypatch.setattr(os, "geteuid", lambda: user + owner)
     warnings = []
-    Tokens(folder, warnings.append)
+    tokens = Tokens(folder, warnings.append)
+    assert OPERATOR not in repr(vars(tokens)), "only digests are held"
     path = folder / "reader"
     expected = [f"warning: {path} can be read by others: chmod 600 {path}"]
     assert warnings == (expected if told else [])

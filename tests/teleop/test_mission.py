@@ -47,6 +47,25 @@ def test_a_mission_flies_its_legs_in_order_and_ends_in_a_hold():
     assert (flight.state, flight.guard) == ("DONE", HOLD)
 
 
+@pytest.mark.parametrize("away", [(1.11, 0.0, 1.0), (1.07, 0.07, 1.07)])
+def test_dwell_starts_again_outside_of_the_tolerance(away):
+    flight = flying()
+    flight.step(position=A, seconds=0.45)
+    flight.step(position=away)
+    flight.step(position=A, seconds=0.45)
+    assert last_event(flight) == "started"
+    flight.step(position=A, seconds=0.06)
+    assert last_event(flight) == "reached"
+
+
+def test_legs_of_infinite_tolerance_last_their_dwell_time():
+    flight = flying(Plan(tuple(Leg(at, tolerance=float("inf"), dwell=0.4) for at in (A, B, C))))
+    flight.step(position=AWAY, seconds=1.3)
+    first, second, third = (e.stamp_ns for e in flight.events if e.event == "reached")
+    assert (second - first, third - second) == (400_000_000, 400_000_000)
+    assert flight.state == "DONE"
+
+
 def test_time_in_hold_or_unseen_is_no_dwell():
     flight = flying()
     flight.guard = HOLD
@@ -95,7 +114,7 @@ def test_no_robot_is_held_where_it_would_scrape_along_the_floor():
     flight.step(position=(0.2, 0.1, 0.12))
     for verb in ("hold", "cancel"):
         flight.operate(verb)
-        assert flight.setpoints[-1].position == (0.2, 0.1, HELD_LOWEST)
+        assert flight.setpoints[-1] == Setpoint((0.2, 0.1, HELD_LOWEST), 0.3, -1)
 
 
 # The first setpoint: an armed robot flies to it at once

@@ -60,6 +60,8 @@ def test_a_value_that_cannot_be_used_is_named(api, body, path, index, words):
     "body",
     [
         b"[" * 200_000,
+        b'{"waypoints":' + b"[" * 100_000,
+        b'{"waypoints": [' + b"0," * 100_000 + b"0]}",
         b'{"waypoints": [' + b'{"position_m": [0, 0, 1]},' * 9_000 + b"{}]}",
         b'{"name": "' + b"x" * 200_000 + b'"}',
         b'{"time_limit_s": 1' + b"0" * 200_000 + b"}",

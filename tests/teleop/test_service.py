@@ -2,6 +2,7 @@
 
 import re
 from argparse import Namespace
+from math import inf, nan
 from types import SimpleNamespace
 
 import pytest
@@ -54,6 +55,12 @@ what waits begins only with the disk: create 0.05 A queue full B C 3
   -> states=done,queued
 once it works: create 0.05 A queue full B C 3 free 1.5
   -> states=done,flying
+also if it is found full only then: create 0.05 queue cancelm1 full 3
+  -> states=cancelled,starting guard=HOLD asked=END,START
+and starts once it works: create 0.05 queue cancelm1 full 3 free 1.5
+  -> states=cancelled,flying
+a cancelled one might begin after a restart: create 0.05 A queue full !cancel B C 0.1
+  -> states=done,cancelled
 a second mission waits: create 0.05 A !create queue queue B C A B C
   -> states=done,done,flying reached=0,1,2
 between two missions the robot is seen to hold: create 0.05 A queue mute B C 1.0
@@ -118,6 +125,16 @@ it continues before take-off: create 0.05 A GROUND mark restart see 0.3
   -> states=flying asked=START
 with a full disk the robot remembers: create 0.05 A full B 0.1 restart free away C 0.1
   -> states=done reached=0,1,2 failure=
+a flight never stored is not flown again: mute create full link 0.1 A B C 0.2 free restart mark 1
+  -> states=failed failure=end_lost asked=END guard=HOLD reached=
+nor is an end that the robot knows lost: create 0.05 A full B C 0.3 restart free away 0.3
+  -> states=done reached=0,1,2 last=done
+nor does it fly before that: create 0.05 A full B C 0.3 mute restart free away 0.1
+  -> setpoint=away:-1
+nor is a held place left for it: create 0.05 A hold full resume B 0.3 restart free away 0.2
+  -> states=held setpoint=away:-1 reached=0,1
+nor a robot taken that flies another mission: create 0.05 A TRACK foreign mark restart 0.3
+  -> failure=taken_over asked=
 it never flies back: create 0.05 A full B 0.1 mute restart free away
   -> states=flying waypoint=2
 a lost cancel is not flown again: create 0.05 A full cancel 0.3 free mark restart away 1.0
@@ -154,6 +171,14 @@ a stop: create 0.05 A mark stop 0.05
   -> failure=emergency_stopped guard=ESTOP asked=ESTOP settled=True
 a stop of an idle robot: 0.01 stop 0.05
   -> states= guard=ESTOP asked=ESTOP settled=True
+nothing else is asked before it acts: create 0.05 A mute stop ack mark 0.5
+  -> asked=ESTOP settled=False
+the robot learns that it ended the mission: create 0.05 A stop 0.3
+  -> onboard=65535
+it precedes the end of a lost mission: restart stop foreign 0.3
+  -> asked=ESTOP
+an acknowledgement does as well: restart ack foreign mark 0.3
+  -> asked=ACKNOWLEDGE,END
 a stop on its way forbids to start: create 0.05 queue mute stop 0.2 !queue !goto link 0.3
   -> states=failed,queued guard=ESTOP
 until it is acknowledged: create 0.05 queue stop 0.3 !queue ack 0.5 !ack
@@ -418,8 +443,10 @@ def test_the_state_is_shown_with_cause_and_since_when_in_this_world():
     assert shown(flight)["age_s"] == pytest.approx(2.0)
     flight.uplink = True
     flight.restart_cloud()
-    flight.step()
+    flight.step(position=(nan, 0.0, inf))
     assert shown(flight)["guard_for_s"] == pytest.approx(2.51)
+    assert shown(flight)["position_m"] == [None, 0.0, None], "JSON has no such numbers"
+    assert (shown(flight)["touch_speed_mps"], shown(flight)["loop_delay_s"]) == (None, None)
     flight.restart()
     flight.guard = HOLD
     flight.step()
