@@ -23,6 +23,7 @@ from cloudrc.drivers.process import (
     _Sink,
     from_line,
     in_words,
+    to_line,
 )
 from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
 from cloudrc.link.relay import ReleaseErrors
@@ -119,6 +120,11 @@ def pipe():
     yield reader, writer
     os.close(reader)
     os.close(writer)
+
+
+@pytest.mark.parametrize("record", [sent(7), EVENT, GuardChange(1, GuardState.HOLD, "why")])
+def test_a_record_comes_back_as_it_was(record):
+    assert repr(from_line(to_line(record))) == repr(record)  # with the types of all values
 
 
 def test_events_are_all_told_and_samples_ten_times_a_second(pipe):
