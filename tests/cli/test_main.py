@@ -24,7 +24,7 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
 """
 
 
-@pytest.mark.parametrize("command", [[], ["link"]])
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
 def test_help_imports_nothing_heavy(command):
     words = [sys.executable, "-c", QUIET, *command, "--help"]
     done = subprocess.run(words, capture_output=True, text=True)
@@ -123,3 +123,8 @@ def test_a_closed_pipe_is_no_error():
     line = f"{sys.executable} -m cloudrc list -o json | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+def test_no_argument_prints_help(capsys):
+    assert main([]) == 0
+    assert "examples:" in capsys.readouterr().out
