@@ -123,8 +123,3 @@ def test_a_closed_pipe_is_no_error():
     line = f"{sys.executable} -m cloudrc list -o json | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("0\n", "")
-
-
-def test_no_argument_prints_help(capsys):
-    assert main([]) == 0
-    assert "examples:" in capsys.readouterr().out
