@@ -114,7 +114,7 @@ class Api:
     def _connection(self, limit: float) -> http.client.HTTPConnection:
         """Make a connection; use no proxy, because the API is on this machine or in the cluster."""
         if self.url.startswith(UNIX):
-            return _UnixConnection(self.url.removeprefix(UNIX), timeout=limit)
+            return _UnixConnection(self.url.removeprefix(UNIX), limit)
         parts = urlsplit(self.url)
         secure = parts.scheme == "https"
         kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
@@ -122,10 +122,14 @@ class Api:
 
 
 class _UnixConnection(http.client.HTTPConnection):
+    def __init__(self, path: str, limit: float) -> None:
+        super().__init__("localhost", timeout=limit)  # a path may be no valid name of a host
+        self._path = path
+
     def connect(self) -> None:
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self.sock.settimeout(self.timeout)
-        self.sock.connect(self.host)
+        self.sock.connect(self._path)
 
 
 def _is_http(url: str) -> bool:

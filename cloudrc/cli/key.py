@@ -54,7 +54,8 @@ def execute(options: argparse.Namespace) -> int:
         keys, said = old, " is the only key already"
     target = Path(os.path.realpath(path))  # of a symbolic link
     try:
-        write_atomically(target, write(keys).encode("ascii"), 0o600)
+        if keys != old:
+            write_atomically(target, write(keys).encode("ascii"), 0o600)
     except OSError as error:
         remedy = "name a file in an existing, writable folder"
         raise BadInputError(f"{path}: {error.strerror or error}; {remedy}") from None

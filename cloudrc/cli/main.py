@@ -8,9 +8,8 @@ from collections.abc import Sequence
 
 from cloudrc.cli.output import discard_output, escape
 from cloudrc.cli.parser import COMMANDS, build_parser, describe_unknown
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
-INTERRUPTED = 130
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
 REMEDIES = {
@@ -34,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _dispatch(given)
     except KeyboardInterrupt:
-        return INTERRUPTED
+        return InterruptedRunError.exit_code
     except BrokenPipeError:
         discard_output(sys.stdout)  # the reader (head, less) has closed the pipe
         return 0

@@ -23,7 +23,13 @@ from cloudrc.cli.find_run import api_url_of, find_local_run, no_run_error, run_a
 from cloudrc.cli.output import escape, format_document, output_argument, print_line, table
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.drivers.machine import Deadline
-from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
+from cloudrc.errors import (
+    BadInputError,
+    CloudrcError,
+    InterruptedRunError,
+    MissingPrerequisiteError,
+    TimedOutError,
+)
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
@@ -66,7 +72,6 @@ TERMINATION_LOG = Path("/dev/termination-log")
 """File in a pod; `kubectl describe` shows its text after the container has ended."""
 UNKNOWN_LIMIT = 600.0
 """Time limit of a mission if neither the mission nor the release's experiment has a limit [s]."""
-INTERRUPTED = 130
 
 _Answer = TypeVar("_Answer")
 Json = dict[str, Any]
@@ -234,7 +239,8 @@ def _fly(options: argparse.Namespace) -> int:
         if mission_id:
             with suppress(CloudrcError):
                 api.post(f"{mission_path(mission_id)}/cancel")
-        text, code = "INTERRUPTED: the Job was stopped, its mission is cancelled", INTERRUPTED
+        text = "INTERRUPTED: the Job was stopped, its mission is cancelled"
+        code = InterruptedRunError.exit_code
     except CloudrcError as error:
         _write_termination_message(str(error))
         raise
@@ -251,10 +257,8 @@ def _write_termination_message(text: str) -> None:
 
 
 def _run(options: argparse.Namespace, api: Api) -> int:
-    mission, follower = (
-        read_mission(options.mission, options.name),
-        MissionFollower(api, RUN_TIMEOUT),
-    )
+    mission = read_mission(options.mission, options.name)
+    follower = MissionFollower(api, RUN_TIMEOUT)
     mission_id = follower.post({**mission, "queue": options.queue})
     try:
         verdict = follower.follow(mission_id)

@@ -16,8 +16,7 @@ from itertools import islice
 from types import FrameType
 from typing import Any, TypeAlias, TypeVar
 
-from cloudrc.errors import InvalidRunError
-from cloudrc.metrics.verdict import EXIT_CODES
+from cloudrc.errors import InterruptedRunError, InvalidRunError
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
@@ -112,7 +111,7 @@ def take_each(results: Generator[Result, Any, None], take: Callable[[Result], No
             for result in results:
                 take(result)
     except KeyboardInterrupt:
-        return "interrupted", EXIT_CODES["interrupted"]
+        return "interrupted", InterruptedRunError.exit_code
     except WorkerDiedError as error:
         return str(error), error.exit_code
     return "", 0

@@ -286,6 +286,7 @@ def open_end(
     from cloudrc.drivers.keyfile import KeyFile
     from cloudrc.drivers.machine import clock_id
 
+    feed = Feed.on_stdout(watched=options.feed)  # before a plug-in is loaded, which may print
     exporter, path, clock = open_exporter(options, name), str(options.config), clock_id()
     given = read_experiment(path)
     # Only cloud loads the plug-ins, which fill in their default parameters.
@@ -304,8 +305,8 @@ def open_end(
             peer=open_peer(options),
             recorder=open_recorder(options, name, clock),  # renames an old recording
             keys=keys,
+            feed=feed,
             exporter=exporter,
-            watched=options.feed,
             flights_only=options.record_flights,
             link=_link_state(options),
             check=link_monitor(options, experiment, uplink=name == "cloud"),

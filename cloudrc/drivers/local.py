@@ -84,9 +84,9 @@ def announced(run: Path, api: str = "") -> Iterator[bool]:
                 place.mkdir(mode=0o700, parents=True, exist_ok=True)
                 if _is_private(place):
                     new = path.with_suffix(".new")  # renamed once it is locked
+                    file = stack.enter_context(new.open("xb", buffering=0))
                     for name in (path, new):
                         stack.callback(name.unlink, missing_ok=True)
-                    file = stack.enter_context(new.open("xb", buffering=0))
                     fcntl.flock(file, fcntl.LOCK_EX)
                     file.write(flight.encode())
                     new.rename(path)

@@ -266,8 +266,8 @@ class EndProcess:
         peer: Its socket.
         recorder: Writes its records.
         keys: Key file, which may get new keys.
+        feed: Tells its supervisor what happens.
         exporter: Turns the records into metrics; None for no metrics.
-        watched: Whether a supervisor reads the feed.
         flights_only: Whether only events are recorded while the robot does not fly.
         link: State file of the link, whose changes are recorded; None without one.
         check: Compares the link with its profile by the datagrams that this end receives.
@@ -277,8 +277,8 @@ class EndProcess:
     peer: Peer
     recorder: Recorder
     keys: KeyFile
+    feed: Feed
     exporter: Exporter | None = None
-    watched: bool = True
     flights_only: bool = False
     link: Path | None = None
     check: LinkMonitor | None = None
@@ -294,15 +294,15 @@ class EndProcess:
 
         `flies` tells whether the robot follows cloud; `slip_ns` is the lag of world's clock [ns].
         """
-        feed, thread = Feed.on_stdout(watched=self.watched), RecordingThread(self.recorder)
+        thread = RecordingThread(self.recorder)
         choose = FlightsOnly(flies) if self.flights_only else list
-        sink = _Sink(self, feed, choose, slip_ns, thread.take_steps)
+        sink = _Sink(self, choose, slip_ns, thread.take_steps)
         if self.exporter is not None:
             self.exporter.recording(thread.sync_age)
         thread.start()
-        feed.ready()
+        self.feed.ready()
         try:
-            ends = feed.alive_while(stop)
+            ends = self.feed.alive_while(stop)
             serve(endpoint, self.peer, end=self.end, sink=sink, stop=ends, slip_ns=slip_ns)
         finally:
             self.recorder.put([sink.count_losses(time.monotonic_ns() - slip_ns())])
@@ -315,12 +315,11 @@ class _Sink:
     def __init__(
         self,
         run: EndProcess,
-        feed: Feed,
         choose: Callable[[list[Record]], list[Record]],
         slip_ns: Callable[[], int],
         clock_steps: Callable[[], list[float]],
     ) -> None:
-        self._run, self._feed, self._choose = run, feed, choose
+        self._run, self._choose = run, choose
         self._slip_ns, self._clock_steps = slip_ns, clock_steps
         self._notes = LinkNotes(run.link, uplink=run.end == "world") if run.link else None
         self._trouble, self._dropped = "", 0
@@ -329,10 +328,10 @@ class _Sink:
         run, recorder = self._run, self._run.recorder
         records = records + self.look_around(records)
         recorder.put(self._choose(records))
-        self._feed.tell(records)
+        run.feed.tell(records)
         if records and recorder.error != self._trouble:
             self._trouble = recorder.error
-            self._feed.tell([Fault(records[-1].stamp_ns, "recorder", self._trouble)])
+            run.feed.tell([Fault(records[-1].stamp_ns, "recorder", self._trouble)])
         if run.exporter is not None:
             if records and recorder.dropped != self._dropped:
                 self._dropped = recorder.dropped

@@ -6,6 +6,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from cloudrc.cli.client import Api, ApiError
+from tests.teleop.conftest import running
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -35,3 +36,11 @@ def url():
 def test_an_answer_of_another_server_is_shown_as_it_is(url, status):
     with pytest.raises(ApiError, match=f"the API answered {status} "):
         Api(url).get(f"/{status}")
+
+
+@pytest.mark.parametrize("name", ["a b", "a:80", "a:b", "[::", "ü" * 8])
+def test_a_socket_may_have_any_path(name, tmp_path):
+    with running(unix=True) as api:
+        path = tmp_path / name
+        path.symlink_to(api.url.removeprefix("unix:"))
+        assert Api(f"unix:{path}").get("/v1/missions") == {"missions": []}

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from cloudrc.cli.find_run import QUIET_LIMIT
+from cloudrc.cli.find_run import QUIET_LIMIT, discard
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
 from tests.teleop.conftest import running
@@ -63,6 +63,14 @@ def test_runs_without_an_answering_api_are_ignored(tmp_path, elsewhere):
         ):
             assert main(["mission", "estop"]) == 0
         assert len(api.alarms) == 1
+
+
+def test_an_api_that_cannot_be_asked_is_reported_and_no_other_is_taken(tmp_path, elsewhere, capsys):
+    with flying(tmp_path / "out") as api:
+        with local.announced(elsewhere / "runs" / "latest", f"unix:/{'x' * 200}"):
+            assert main(["mission", "estop"]) == 5
+        assert "does not answer (AF_UNIX path too long)" in capsys.readouterr().err
+        assert api.alarms == []
 
 
 @pytest.mark.parametrize("folder", ["runs/latest", "foreign"])
@@ -151,6 +159,23 @@ def test_link_set_takes_a_live_relay_and_ignores_a_killed_one(
     with local.announced(with_link(tmp_path / "out")):
         assert main(SET) == 2
     assert f"{tmp_path / 'out'}: no link is up there" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("files", "left"),
+    [
+        ({"world.mcap": "", "config.yaml": "x"}, None),
+        ({"world.mcap": "recorded", "config.yaml": "x"}, ["config.yaml", "world.mcap"]),
+        ({"world.mcap": "", "config.yaml": "x", "notes": "mine"}, ["notes"]),
+    ],
+)
+def test_only_the_folder_of_a_run_that_recorded_nothing_is_removed(elsewhere, files, left):
+    run = elsewhere / "run"
+    run.mkdir()
+    for name, text in files.items():
+        (run / name).write_text(text)
+    assert discard(run) is (left is None)
+    assert (sorted(path.name for path in run.iterdir()) if run.exists() else None) == left
 
 
 def test_the_kubectl_plugin_never_uses_a_local_run(elsewhere, monkeypatch, capsys):

@@ -43,12 +43,28 @@ def test_a_key_is_made_rotated_and_dropped(tmp_path, capsys):
         assert read_keys(path).previous == before
 
 
-@pytest.mark.parametrize("verb", ["new", "drop"])
-def test_a_file_that_is_no_key_is_refused_and_kept(verb, tmp_path, capsys):
-    (tmp_path / "notes").write_text("my notes")
-    assert main(["key", verb, str(tmp_path / "notes")]) == 2
-    assert (tmp_path / "notes").read_text() == "my notes"
-    assert main(["key", verb, str(tmp_path / "none" / "key")]) == 2
-    first, second = capsys.readouterr().err.splitlines()
-    assert first.startswith(f"cloudrc: error: {tmp_path / 'notes'}: ")
-    assert "No such file" in second
+def test_drop_leaves_a_file_with_one_key_as_it_is(tmp_path):
+    (tmp_path / "key").write_bytes(b"1" * 32)
+    assert main(["key", "drop", str(tmp_path / "key")]) == 0
+    assert (tmp_path / "key").read_bytes() == b"1" * 32
+
+
+@pytest.mark.parametrize(
+    ("verb", "name", "data", "said"),
+    [
+        ("new", "no/key", None, "No such file or directory; name a file in an existing"),
+        ("new", "odd\x1b[31m", b"my thesis", "expected the line"),
+        ("new", "zeros", bytes(32), "an all-zero key is refused"),
+        ("drop", "none", None, "No such file"),
+        ("drop", "odd", b"my thesis", "expected the line"),
+    ],
+)
+def test_a_file_that_is_no_key_is_refused_and_kept(verb, name, data, said, tmp_path, capsys):
+    if data is not None:
+        (tmp_path / name).write_bytes(data)
+    assert main(["key", verb, str(tmp_path / name)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+    assert "--key" not in line
+    assert "\x1b" not in line
+    assert [each.read_bytes() for each in tmp_path.iterdir()] == ([data] if data else [])

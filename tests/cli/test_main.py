@@ -24,7 +24,7 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
 """
 
 
-@pytest.mark.parametrize("command", [[], ["link"]])
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
 def test_help_imports_nothing_heavy(command):
     words = [sys.executable, "-c", QUIET, *command, "--help"]
     done = subprocess.run(words, capture_output=True, text=True)

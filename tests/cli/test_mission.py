@@ -251,7 +251,7 @@ def test_the_token_file_comes_from_flag_or_environment(api, folder, monkeypatch,
 def test_without_run_and_cluster_both_remedies_are_named(capsys):
     assert main(["mission", "status"]) == 3
     error = capsys.readouterr().err
-    assert "no run flies here" in error
+    assert "no run flies here (start one: cloudrc run; or name one: --run, --api)" in error
     assert "KUBECONFIG" in error
     assert error.count("\n") == 1
 
@@ -337,12 +337,15 @@ def test_events_verdicts_and_pods_are_shown_without_effect(folder, monkeypatch, 
     failure = {"code": NAME, "text": NAME}
     verdict = {"outcome": NAME, "exit_code": 1, "failures": [failure]}
     posted = {"id": NAME, "state": NAME, "waypoints": 1}
+    answer = {"id": NAME, "events": [event], "events_left_out": 3, "verdict": verdict}
     monkeypatch.setattr(Api, "post", lambda api, path, body=None: posted)
-    monkeypatch.setattr(Api, "get", lambda api, path: {"events": [event], "verdict": verdict})
+    monkeypatch.setattr(Api, "get", lambda api, path: answer)
     assert main(["mission", "fly", "--mission", "pipes", "--api", "unix:there"]) == 1
     assert main(["mission", "run", "pipes", "--api", "unix:there"]) == 1
     assert main(["mission", "logs", "m1", "--api", "unix:there"]) == 0
-    for said, lines in ((capsys.readouterr().out, 7), (log.read_text(), 1)):
+    out = capsys.readouterr().out
+    assert "3 earlier events are not shown" in out
+    for said, lines in ((out, 8), (log.read_text(), 1)):
         assert (len(said.splitlines()), harmless(said)) == (lines, True)
     job = JobStatus("job-1", "uid", "failed", "now", 1, NAME)
     monkeypatch.setattr(command, "_release", lambda options: None)

@@ -1,5 +1,6 @@
 """The exporter: valid text in bounds, probes on one port, hostile clients, CPU throttling."""
 
+import select
 import socket
 import threading
 import time
@@ -122,6 +123,13 @@ def test_the_sync_age_is_absent_until_it_is_known():
     assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
 
 
+def test_the_build_names_the_configuration_that_runs():
+    world = Exporter("world")
+    world.runs("0123456789ab" + "f" * 52)
+    labels = f'config="0123456789ab",role="world",version="{__version__}"'
+    assert f"cloudrc_build_info{{{labels}}} 1.0" in world.text()
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("end", ENDS)
 def test_a_record_costs_less_than_a_microsecond(end, flight):
@@ -214,11 +222,14 @@ def test_scrapers_that_come_at_once_have_one_page_made(served, monkeypatch):
 def test_a_loop_that_stands_still_is_not_alive(served, monkeypatch):
     """Liveness does not depend on the other end, nor on the loop before its start."""
     exporter, port = served
-    monkeypatch.setattr(exporters, "STILL_MAX", -1.0)
-    assert get(port, "/healthz")[0] == 503
+    exporter.unresolved(7)  # another thread than the loop's calls this
+    assert "cloudrc_dns_errors_total 7.0" in exporter.text()
+    assert exporter._seen_at is None
+    assert get(port, "/healthz") == (200, "alive\n")
+    exporter.see([])
     monkeypatch.setattr(exporters, "STILL_MAX", 60.0)
     assert get(port, "/healthz") == (200, "alive\n")
-    exporter._seen_at = time.monotonic() - 61.0
+    exporter._seen_at -= 61.0
     assert get(port, "/healthz") == (503, "the loop has stood still for 61 s\n")
 
 
@@ -231,9 +242,12 @@ def test_probes_of_both_address_families_are_answered():
 
 def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
     waiting = [socket.create_connection((HOST, served[1]), timeout=0.9) for _ in range(200)]
-    for client in waiting[::2]:
+    for client in waiting[-2:]:
         client.sendall(b"GET /metr")
     assert get(served[1], "/healthz")[0] == 200
+    closed = select.select(waiting, [], [], 0)[0]  # the oldest ones
+    assert closed == waiting[: len(closed)]
+    assert len(closed) == len(waiting) + 1 - exporters.CONNECTIONS_MAX
     for client in waiting:
         client.close()
 

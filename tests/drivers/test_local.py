@@ -1,5 +1,6 @@
 """Flight files, and the supervisor of a local run: feeds, sockets, deadlines, the key."""
 
+import errno
 import os
 import signal
 import stat
@@ -13,7 +14,7 @@ import pytest
 
 from cloudrc.drivers import local
 from cloudrc.drivers.local import Child, LocalRun, socket_folder
-from cloudrc.drivers.machine import Deadline
+from cloudrc.drivers.machine import Deadline, clock_id
 from cloudrc.drivers.process import to_line
 from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
@@ -78,6 +79,19 @@ def test_an_unsafe_or_unwritable_first_folder_gives_the_second(tmp_path, places,
         assert local.under_way() == {}
 
 
+def test_a_read_only_file_system_ends_no_flight(tmp_path, places, monkeypatch):
+    for place in places:
+        place.mkdir(mode=0o700, parents=True)
+
+    def refuse(path, *given, **more):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with local.announced(tmp_path) as told:
+        assert not told
+
+
 def test_another_users_folder_is_neither_read_nor_written(tmp_path, monkeypatch):
     with local.announced(tmp_path / "a"):
         monkeypatch.setattr(os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
@@ -110,7 +124,8 @@ def test_an_unannounced_flight_names_the_flag_for_its_commands(tmp_path, monkeyp
 def test_a_bad_feed_line_ends_no_flight(tmp_path):
     child = Child("cloud", None, tmp_path / "cloud.log")
     event = to_line(EVENT).encode()
-    lines = [b"\xff", event, event + event, b"[" + event, event]
+    lines = [b"\xff", event, event + event, b"[" + event, b"", b"{}", b'["MissionEvent", [1]]']
+    lines += [b'["Nobody", []]', event]
     assert child.take(b"\n".join(lines)) == [EVENT]
     assert (child.ready, child.heard > 0.0) == (False, True)
     assert child.take(b"\nready\n") == [EVENT]
@@ -132,6 +147,11 @@ def test_sockets_lie_in_a_folder_with_a_short_path(tmpdir, runtime, chosen, monk
         monkeypatch.setattr(os, "access", lambda *asked: False)
         with pytest.raises(BadInputError, match=r"^TMPDIR .* is too long for a socket"):
             socket_folder()
+
+
+def test_processes_of_one_machine_share_their_clock():
+    assert clock_id() == clock_id()
+    assert len(clock_id()) == 16
 
 
 def test_a_deadline_does_not_count_the_time_in_which_we_stood_still():

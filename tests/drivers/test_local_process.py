@@ -153,6 +153,7 @@ PREDICTOR = '''
 """A predictor that is slow and talks."""
 import time
 from cloudrc.cloud.predictors import Predictor
+print("loaded")
 class Odd(Predictor):
     def predict(self, odometry, horizon):
         print("hello")
@@ -183,7 +184,9 @@ def test_a_late_link_a_slow_plug_in_and_no_fastapi_end_no_run(tmp_path):
     assert document["numbers"]["missed_periods"]["value"] > 100
     assert "a plug-in is slow" in output
     assert any("a plug-in is slow" in note for note in document["notes"])
-    assert "hello" in (tmp_path / "run" / "cloud.log").read_text()
+    log = (tmp_path / "run" / "cloud.log").read_text()
+    assert "loaded" in log
+    assert "hello" in log
     assert "no operator's API in this run" in errors
     assert "pip install 'cloudrc[api]'" in errors
 

@@ -23,6 +23,7 @@ from cloudrc.drivers.process import (
     _Sink,
     from_line,
     in_words,
+    to_line,
 )
 from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
 from cloudrc.link.relay import ReleaseErrors
@@ -119,6 +120,11 @@ def pipe():
     yield reader, writer
     os.close(reader)
     os.close(writer)
+
+
+@pytest.mark.parametrize("record", [sent(7), EVENT, GuardChange(1, GuardState.HOLD, "why")])
+def test_a_record_comes_back_as_it_was(record):
+    assert repr(from_line(to_line(record))) == repr(record)  # with the types of all values
 
 
 def test_events_are_all_told_and_samples_ten_times_a_second(pipe):
@@ -301,11 +307,12 @@ def test_an_end_tells_of_its_clock_and_of_its_recorders_trouble(pipe):
     recorder = SimpleNamespace(put=put.extend, error="", dropped=0)
     keys, exporter = SimpleNamespace(follow=lambda now_ns: []), Exporter("world")
     run = SimpleNamespace(
-        end="world", recorder=recorder, keys=keys, exporter=exporter, link=None, check=None
-    )
+        end="world", recorder=recorder, keys=keys, exporter=exporter, link=None, check=None,
+        feed=Feed(pipe[1], watched=False),
+    )  # fmt: skip
     steps = [[60.0, -1.0], [], []]
-    slip_ns, feed = 5_000_000_000, Feed(pipe[1], watched=False)
-    sink = _Sink(run, feed, list, lambda: slip_ns, lambda: steps.pop(0))
+    slip_ns = 5_000_000_000
+    sink = _Sink(run, list, lambda: slip_ns, lambda: steps.pop(0))
     began_ns = time.monotonic_ns() - slip_ns
     sink([])
     assert [record.code for record in put] == ["wall_clock", "wall_clock"]

@@ -73,6 +73,9 @@ def test_what_is_no_route_changes_nothing(tmp_path, make):
     path.unlink()
     make(path)
     assert [route.look(), route.look()] == [HERE, HERE]
+    path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
+    write(path, "10.1.2.3:7400", 2)
+    assert route.look() == THERE
 
 
 def test_a_peer_follows_its_route_twice_a_second(tmp_path):
