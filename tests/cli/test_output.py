@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 
 import pytest
 import yaml
@@ -100,6 +101,14 @@ def test_a_terminal_gets_a_status_line_that_is_erased():
     seen(stream, telemetry(0), CONTROL).close()
     assert "waypoint 3/7" in stream.getvalue()
     assert stream.getvalue().endswith("\x1b[2K")
+
+
+def test_a_narrow_terminal_cuts_off_the_status_line(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "20")
+    stream = Terminal()
+    seen(stream, telemetry(0), CONTROL)
+    drawn = re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", stream.getvalue()).strip()
+    assert drawn == "0.0 s  GROUND  wa"
 
 
 def test_a_file_gets_plain_lines_for_events_only():
