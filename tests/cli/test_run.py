@@ -78,6 +78,18 @@ def test_json_output_is_only_the_report(folder, capsys):
 
 
 @pytest.mark.usefixtures("no_page")
+def test_an_interrupt_while_the_report_is_written_names_the_remedy(monkeypatch, capsys):
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as changed:
+        changed.setattr("cloudrc.report.write.write_report", interrupt)
+        assert main([*FLY, "--out", "here"]) == 130
+    assert "'cloudrc report here' writes its report" in capsys.readouterr().err
+    assert main(["report", "here"]) == 0
+
+
+@pytest.mark.usefixtures("no_page")
 def test_the_resolved_file_flies_the_same_run_again(folder):
     assert main([*FLY, "--seed", "3", "--out", "a"]) == 0
     assert main(["run", "a/config.yaml", "--mode", "virtual", "--out", "b"]) == 0
