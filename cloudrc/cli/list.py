@@ -47,11 +47,12 @@ def describe_all(kind: str) -> dict[str, str]:
     """Return name -> description for all entries of a kind, sorted by name."""
     from cloudrc import plugins
     from cloudrc.config import shipped
-    from cloudrc.metrics import SHIPPED
 
     if kind in PLUGINS:
         lines = {name: plugins.describe(kind, name) for name in plugins.names(kind)}
         if kind == "metrics":
+            from cloudrc.metrics import SHIPPED
+
             lines |= {metric.name: metric.meaning for metric in SHIPPED.values()}
     else:
         one = kind.removesuffix("s")

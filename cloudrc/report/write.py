@@ -15,8 +15,6 @@ from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import Assessment, Run, environment_document, write_json
 
-__all__ = ["Assessment", "assess", "attachments", "write_report"]
-
 DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
 """Beginning of the note on an operator's verdict that differs."""
 RECORDING_NOTE = "The recording "

@@ -52,6 +52,11 @@ def test_help_fits_80_columns(command, capsys):
     assert all(name in text for name in COMMANDS) or command
 
 
+def test_no_argument_prints_help(capsys):
+    assert main([]) == 0
+    assert "examples:" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [

@@ -2,12 +2,14 @@
 
 import io
 import json
+import math
+import re
 
 import pytest
 import yaml
 
 from cloudrc.cli.main import main
-from cloudrc.cli.output import format_number, is_live, paint
+from cloudrc.cli.output import format_number, is_live, paint, table
 from cloudrc.cli.progress import FILE_COLUMNS, FlightView
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Control, Fault, GuardChange, MissionEvent, TelemetrySent
@@ -31,6 +33,12 @@ def plain_environment(monkeypatch):
     for name in ("CI", "NO_COLOR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("TERM", "xterm-256color")
+
+
+def test_columns_line_up_and_numbers_are_right_aligned():
+    assert table([("name", "value"), ("a", "1.5"), ("longer", "10.5")], right=[1]) == (
+        "name    value\na         1.5\nlonger   10.5"
+    )
 
 
 @pytest.mark.parametrize(
@@ -78,6 +86,10 @@ def test_the_status_line_shows_the_state_of_the_flight():
     guard = GuardChange(0, GuardState.TRACK, "mission started")
     flown = telemetry(SECOND), CONTROL, guard, telemetry(3 * SECOND)
     assert seen(io.StringIO()).line().plain == "   0.0 s  GROUND"
+    early = CONTROL._replace(horizon=0.0, rtt=math.nan, waypoint=-1)
+    assert seen(io.StringIO(), telemetry(0), early).line().plain == (
+        "   0.0 s  GROUND  (-1.00,  2.50, 0.00) m"
+    )
     # Two seconds of flight within one second of the clock above.
     assert seen(io.StringIO(), *flown).line().plain == (
         "   2.0 s  TRACK   waypoint 3/7  (-1.00,  2.50, 0.00) m  delay  96 ms  x2.00"
@@ -91,6 +103,14 @@ def test_a_terminal_gets_a_status_line_that_is_erased():
     assert stream.getvalue().endswith("\x1b[2K")
 
 
+def test_a_narrow_terminal_cuts_off_the_status_line(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "20")
+    stream = Terminal()
+    seen(stream, telemetry(0), CONTROL)
+    drawn = re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", stream.getvalue()).strip()
+    assert drawn == "0.0 s  GROUND  wa"
+
+
 def test_a_file_gets_plain_lines_for_events_only():
     stream = io.StringIO()
     hold = GuardChange(0, GuardState.HOLD, "command age 0.252 s above 0.250 s")
@@ -100,6 +120,14 @@ def test_a_file_gets_plain_lines_for_events_only():
         "waypoint 2 of 7 reached at 4.85 s (-1.00, 2.50, 0.00) m delay 96 ms",
         "HOLD: command age 0.252 s above 0.250 s (-1.00, 2.50, 0.00) m delay 96 ms",
     ]
+
+
+def test_a_closed_pipe_does_not_end_the_flight():
+    class Closed(Terminal):
+        def write(self, text):
+            raise BrokenPipeError
+
+    seen(Closed(), telemetry(0), CONTROL, REACHED).close()
 
 
 @pytest.mark.parametrize("length", [10, 44, 45, 60, 159])

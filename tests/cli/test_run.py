@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.cli import extras
 from cloudrc.cli.find_run import new_folder
 from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
@@ -38,6 +39,7 @@ def no_page(monkeypatch):
         ("--set cloud.predictor=kalmann", "last_sample"),
         ("--set link.uplink.loss=1.2", "loss"),
         ("--set report.metrics=./no.py", "no.py': there is no such file"),
+        ("--set report.metrics=duratoin", "did you mean duration?"),
         ("--set nonsense", "key=value"),
     ],
 )
@@ -48,6 +50,12 @@ def test_bad_input_gives_one_line_and_writes_nothing(line, words, folder, capsys
     assert (err.count("\n"), out) == (1, "")
     assert words in err
     assert list(folder.iterdir()) == []
+
+
+def test_a_missing_extra_ends_with_3(monkeypatch, capsys):
+    monkeypatch.setitem(extras.EXTRAS, "world", ("no_such_module",))
+    assert main(["run", "--mode", "virtual"]) == 3
+    assert "pip install 'cloudrc[world]'" in capsys.readouterr().err
 
 
 def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, capsys):
@@ -67,6 +75,18 @@ def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, capsys):
 def test_json_output_is_only_the_report(folder, capsys):
     assert main([*FLY, "--out", "here", "-o", "json"]) == 0
     assert capsys.readouterr() == ((folder / "here/report.json").read_text(), "")
+
+
+@pytest.mark.usefixtures("no_page")
+def test_an_interrupt_while_the_report_is_written_names_the_remedy(monkeypatch, capsys):
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as changed:
+        changed.setattr("cloudrc.report.write.write_report", interrupt)
+        assert main([*FLY, "--out", "here"]) == 130
+    assert "'cloudrc report here' writes its report" in capsys.readouterr().err
+    assert main(["report", "here"]) == 0
 
 
 @pytest.mark.usefixtures("no_page")

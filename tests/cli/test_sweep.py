@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from cloudrc.cli import sweep
 from cloudrc.cli.main import main
@@ -115,6 +117,15 @@ def test_a_signal_ends_a_sweep_at_once(how: int, folder: Path) -> None:
 )
 def test_the_interval_has_the_bounds_computed_by_hand(n, bounds):
     assert interval([float(i) for i in range(n, 0, -1)]) == bounds
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=6, max_size=40))
+@settings(max_examples=50, deadline=None)
+def test_the_interval_encloses_the_median(values):
+    bounds = interval(values)
+    median = summarise([report(i, x=v) for i, v in enumerate(values)])["numbers"]["x"]["median"]
+    assert bounds is not None
+    assert bounds[0] <= median <= bounds[1]
 
 
 def test_runs_may_lack_a_number():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,22 @@ def test_a_cluster_elsewhere_needs_neither_docker_nor_kind(
     assert doctor(capsys, 3, "--context", "x")["kubeconfig"]["state"] == "missing"
     programs.remove("helm")
     assert doctor(capsys, 3)["helm"]["state"] == "missing"
+
+
+@pytest.mark.parametrize(("script", "state"), [("exit 1", "warn"), ("echo 28.0.0", "ok")])
+def test_docker_without_a_daemon_is_not_ok(
+    api: FakeApi,
+    pretend: Callable[[str, str], Path],
+    capsys: Printed,
+    monkeypatch: pytest.MonkeyPatch,
+    script: str,
+    state: str,
+) -> None:
+    path = str(pretend("docker", script))
+    monkeypatch.setattr(shutil, "which", lambda name: path)
+    docker = doctor(capsys, 0)["docker"]
+    assert docker["state"] == state
+    assert ("daemon does not answer" in docker["found"]) is (state == "warn")
 
 
 def test_a_cluster_that_cannot_be_reached_blocks_the_mode(

@@ -26,8 +26,8 @@ from cloudrc.messages import (
 from cloudrc.record.columns import Recording
 from cloudrc.record.hash import RecordHash
 from cloudrc.records import Arrival, Counted, Fault, Record
-from cloudrc.report.document import Run
-from cloudrc.report.write import Assessment, assess
+from cloudrc.report.document import Assessment, Run
+from cloudrc.report.write import assess
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.handshake import ClientHandshake

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import hypot, isfinite
+from math import hypot, isfinite, nan
 
 import pytest
 
@@ -50,9 +50,17 @@ PROMISED = {
 def contact() -> Flight:
     log = flown()
     # Contacts of the floor, of a rotor, and later ones are not the tip's first touch.
-    log.world += [touch(6, "floor"), touch(7, tip=False), touch(8), touch(9), touch(3, "pipe_1")]
+    log.world += [touch(6, "floor"), touch(7, tip=False), touch(8), touch(9)]
+    log.world.append(touch(3, "pipe_1", tip=False))
     pressing(log, 8, lambda n: 0.1 if n % 2 else 0.3)
     return log.flight(ONE_PIPE, contact=True)
+
+
+def late_contact() -> Flight:
+    """The tip touches the board less than two seconds before the end."""
+    log = flown()
+    log.world.append(touch(9))
+    return log.flight(ONE_PIPE)
 
 
 def cancelled_contact() -> Flight:
@@ -98,6 +106,12 @@ def lost_and_duplicated() -> Flight:
     log.change(Arrival, lambda n, a: a._replace(delay=0.08, used=False) if n % 4 == 1 else a)
     log.change(Arrival, lambda n, a: None if n % 2 == 0 else a)
     log.cloud += [record for record in log.cloud if isinstance(record, Arrival)]
+    return log.flight()
+
+
+def without_a_shared_clock() -> Flight:
+    log = flown()
+    log.change(Arrival, lambda n, arrival: arrival._replace(delay=nan))
     return log.flight()
 
 
@@ -195,6 +209,7 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
         "steady_contact_force": approx(0.2, abs=3e-3),
         "pipe_contacts": 1.0,
     },
+    late_contact: {"contact_time": approx(9.0), "steady_contact_force": None},
     cancelled_contact: {"steady_contact_force": None},
     # Just before the pipe the robot's front is inside it, with the rotor at y = .21 + .1.
     beside_the_axis_before_the_pipe: {
@@ -217,7 +232,13 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
         "loss_uplink": approx(0.5, abs=6e-3),
         "uplink_delay_mean": approx(0.065, abs=1e-3),
     },
-    held: {"hold_count": 2.0, "hold_time": approx(2.0)},  # 1.5 s, and 0.5 s to the end
+    without_a_shared_clock: {
+        **{f"{way}_delay_mean": None for way in WAYS},
+        "age_of_information_mean": None,
+        "rtt_mean": approx(0.09),
+    },
+    # Time zero stays the first TRACK. The holds last 1.5 s, and 0.5 s to the end.
+    held: {"hold_count": 2.0, "hold_time": approx(2.0), "duration": 10.0},
     resting: {
         "steady_error_x": approx(0.03),
         "steady_error_y": approx(0.0),

@@ -72,6 +72,13 @@ def test_a_later_report_measures_a_file_only_if_named(folder: Path) -> None:
     assert report_of(run) == first
 
 
+def test_a_sweep_measures_a_file(folder: Path) -> None:
+    line = ["run", *SHORT, "--seeds", "2", "--out", "sweep"]
+    assert main([*line, "--set", "report.metrics=mine/overshoot.py"]) == 0
+    numbers = json.loads((folder / "sweep" / "sweep.json").read_text())["numbers"]
+    assert numbers["overshoot"]["count"] == 2
+
+
 def test_a_metric_that_fails_costs_only_its_own_number(folder: Path) -> None:
     numbers, notes = measure_all(straight_flight(), sorted(map(str, folder.glob("mine/*.py"))))
     assert {"duration", "overshoot"} <= set(numbers)
@@ -100,6 +107,7 @@ def test_an_invalid_metric_is_refused_in_one_line(
         (folder / names[0]).write_text(text)
     for line in (
         ["run", *SHORT, "--set", f"report.metrics={json.dumps(names)}"],
+        ["run", *SHORT, "--seeds", "2", "--set", f"report.metrics={json.dumps(names)}"],
         ["report", "mine", *(f"--metric={name}" for name in names)],
     ):
         assert main(line) == 2

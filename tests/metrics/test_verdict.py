@@ -219,6 +219,7 @@ LATE = Ending("timed_out", "mission not done within 60 s")
     [
         (Observations(touch_speed=0.12), {"contact": True}, "success", []),
         (Observations(touch_speed=0.25), {"contact": True}, "failure", ["contact_too_fast"]),
+        (Observations(touch_speed=9.0), {}, "success", []),  # the board need not be touched
         # 5 % of 30 s are 1.5 s.
         (Observations(slip_began_ns=7, slip_ns=1_490_000_007), {}, "success", []),
         (Observations(slip_began_ns=7, slip_ns=1_510_000_007), {}, "invalid", ["not_real_time"]),
@@ -237,6 +238,13 @@ def test_the_same_rules_judge_what_telemetry_shows(
     verdict = judge(seen.evidence(elapsed=30.0, **{"ending": DONE, **rules, **known}))
     assert (verdict.outcome, codes(verdict)) == (outcome, found)
     assert verdict.as_json()["exit_code"] == EXIT_CODES[outcome]
+
+
+def test_telemetry_names_neither_pipe_nor_waypoint() -> None:
+    rules = {"waypoints": 3, "contact_speed_max": 0.25, "contact": False, "reached": 1}
+    verdict = judge(Observations(pipe_touches=1).evidence(DONE, 30.0, **rules))
+    texts = [failure.text for failure in verdict.failures]
+    assert texts == ["1 of 3 waypoints reached", "the robot touched a pipe"]
 
 
 def test_only_what_telemetry_shows_during_the_mission_counts() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.record.columns import Recording
-from cloudrc.report.document import Run, clock_offset_document, environment_document
+from cloudrc.report.document import Run, clock_offset_document, environment_document, write_json
 from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import good, paper
 
@@ -67,6 +67,11 @@ def test_a_clock_offset_has_its_uncertainty(
     metadata: dict[str, str], expected: dict[str, Any] | None
 ) -> None:
     assert clock_offset_document(metadata) == expected
+
+
+def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_json(tmp_path / "report.json", {"value": float("nan")})
 
 
 def test_the_environment_names_software_but_no_user_or_host() -> None:

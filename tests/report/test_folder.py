@@ -135,12 +135,21 @@ def test_a_recording_that_carries_no_report_is_refused(
     assert {path: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 
-def test_a_killed_runs_topics_are_compared(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("topic", "said"),
+    [
+        ("/telemetry", "has 0 rows on /telemetry, but 401 on /odometry"),
+        ("/guard", "has rows on /command_applied, but none on /guard"),
+        ("/mission", "has rows on /pid, but none on /mission"),
+    ],
+)
+def test_a_killed_runs_topics_are_compared(
+    run: Path, monkeypatch: pytest.MonkeyPatch, topic: str, said: str
+) -> None:
     """Its writer has not counted its messages."""
-    said = "has 0 rows on /telemetry, but 401 on /odometry"
     monkeypatch.setattr(McapWriter, "close", McapWriter.flush)
     (run / "report.json").unlink()
-    for left_out in ("", "/telemetry"):
+    for left_out in ("", topic):
         with McapWriter(run / "mission.mcap", clock="world") as writer:
             for log_time_ns, row in merged(*good().ends()):
                 if row[0] != left_out:

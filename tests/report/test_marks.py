@@ -16,7 +16,7 @@ from cloudrc.config.schema import Blackout, Change, Direction
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, LinkChanged
 from cloudrc.report.figures import curves
-from cloudrc.report.figures.marks import LEGEND, bounds, legend, mark_events, set_in_flight
+from cloudrc.report.figures.marks import LEGEND, bounds, legend, mark_events, set_in_flight, spans
 from cloudrc.report.figures.style import RC, Subject, new_figure
 from tests.metrics.conftest import ONE_PIPE, Log, at, flown
 
@@ -29,11 +29,17 @@ TIMED = Direction(
 
 
 def changed(
-    time: float, direction: Direction, cause: str, age: float = 0.0, *, uplink: bool = True
+    time: float,
+    direction: Direction,
+    cause: str,
+    age: float = 0.0,
+    *,
+    time_line: float | None = None,
+    uplink: bool = True,
 ) -> LinkChanged:
     conditions = json.dumps(direction.model_dump(mode="json", exclude_defaults=True))
-    measured = (0.0, 0.0, 0.0, math.nan)
-    return LinkChanged(at(time), uplink, "relay", cause, age, age, *measured, conditions)
+    line, measured = age if time_line is None else time_line, (0.0, 0.0, 0.0, math.nan)
+    return LinkChanged(at(time), uplink, "relay", cause, age, line, *measured, conditions)
 
 
 def subject_of(*changes: LinkChanged, uplink: Direction = CALM, log: Log | None = None) -> Subject:
@@ -105,6 +111,34 @@ def test_a_time_line_starts_at_its_change_and_ends_at_the_next() -> None:
     assert patches(marked(subject)) == [pytest.approx((2.0, 4.0))], "its blackout ends, too"
     said = "set in flight (1: profile timed, at 1.0 s; 2: profile calm, at 4.0 s)."
     assert said in legend(subject)
+
+
+def test_changing_one_value_keeps_the_time_line() -> None:
+    noisy = TIMED.model_copy(update={"jitter_ms": 5.0})
+    subject = subject_of(
+        changed(1.0, TIMED, "profile timed"),
+        changed(2.0, noisy, "uplink.jitter_ms=5", time_line=1.0),
+        changed(2.5, TIMED, "uplink.jitter_ms=0", time_line=math.nan),
+    )
+    assert low(subject, 2.2, 2.9, 3.1) == pytest.approx([0.015, 0.02, 0.09])
+
+
+def test_repeated_records_are_no_changes() -> None:
+    fast = Direction(delay_ms=9.0)
+    subject = subject_of(
+        changed(-1.0, CALM, "", time_line=math.nan),  # the link started as configured
+        changed(3.0, fast, "by hand"),
+        changed(5.0, fast, "by hand", 2.0),  # a repeated record
+        changed(3.1, fast, "by hand", uplink=False),
+    )
+    assert len(spans(subject, uplink=True)) == 2
+    assert set_in_flight(subject) == [(pytest.approx(3.0), "by hand")]
+
+
+def test_a_change_before_the_mission_holds_from_its_start() -> None:
+    subject = subject_of(changed(-0.5, Direction(delay_ms=9.0), "by hand", 300.0))
+    assert low(subject, 0.0) == pytest.approx([0.009])
+    assert set_in_flight(subject) == []
 
 
 def test_holds_blackouts_and_changes_are_marked() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,6 +20,23 @@ from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import ONE_PIPE, flown, paper, touch
 
 
+class Reader(HTMLParser):
+    """Check that tags are closed, in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        if tag not in ("meta", "img", "br", "hr"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the complete report of the shipped experiment."""
@@ -32,6 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_page_fetches_nothing_and_describes_every_picture(folder: Path) -> None:
     page = (folder / "report.html").read_text(encoding="utf-8")
+    Reader(page)
     pictures = re.findall(r"<img\b[^>]*>", page)
     assert len(pictures) == len(FIGURES)
     for picture in pictures:
@@ -81,16 +100,20 @@ def test_failures_and_notes_are_escaped() -> None:
     assert "it hit, at 3.50 s, x 1.00, y -2.00, z 0.70 m <code>pipe_touched</code>" in page
     assert "<script>" not in page
     assert "metric &lt;b&gt; &amp;" in page
+    Reader(page)
 
 
 @pytest.mark.parametrize(
     ("name", "number", "expected"),
     [
         ("rtt_mean", Number(0.069325, "s", ""), ("69.33", "ms")),
+        ("min_clearance", Number(0.15179, "m", ""), ("0.152", "m")),
+        ("prediction_error_rms", Number(0.0199667, "m", ""), ("19.97", "mm")),
         ("distance_flown", Number(1234.56, "m", ""), ("1235", "m")),
         ("hold_count", Number(3.0, "1", ""), ("3", "")),
         ("loss_uplink", Number(0.0123, "1", ""), ("1.23", "%")),
         ("real_time_factor", Number(0.99876, "1", ""), ("0.9988", "")),
+        ("hold_time", Number(0.0, "s", ""), ("0", "s")),
     ],
 )
 def test_numbers_have_readable_units(name: str, number: Number, expected: tuple[str, str]) -> None:
