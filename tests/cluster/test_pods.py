@@ -88,6 +88,7 @@ def test_the_wait_for_a_release_ends_with_the_cause(
 @pytest.mark.parametrize(
     ("said", "hint"),
     [
+        ("Kubernetes cluster unreachable: Get https://10.0.0.1: refused", "kubectl cluster-info"),
         ("chart requires >=1.29.0-0 which is incompatible with Kubernetes v1.28.3", "kind create"),
         ("secrets is forbidden: User me cannot list", "kubectl auth can-i"),
         ("values don't meet the specifications of the schema(s)\n- link: mdoe", "helm show values"),
@@ -134,8 +135,27 @@ def test_a_port_is_forwarded_while_the_block_runs(
     assert "--namespace=demo port-forward pod/world-1" in (tmp_path / "line").read_text()
 
 
-def test_a_failed_port_forward_is_reported(release: Release, pretend: Pretend) -> None:
-    pretend("kubectl", "echo 'error: unable to forward port: pod is gone' >&2; exit 1")
-    words = "cannot forward ports of pod 'cloud-1'.*pod is gone"
-    with pytest.raises(ClusterError, match=words), pods.forwarded(release, "cloud-1", [8080]):
+@pytest.mark.parametrize(
+    ("script", "error", "words"),
+    [
+        (
+            "echo 'error: unable to forward port: pod is gone' >&2; exit 1",
+            ClusterError,
+            "cannot forward ports of pod 'cloud-1'.*pod is gone",
+        ),
+        ("exec sleep 60", TimedOutError, "has not started within 0.5 s"),
+    ],
+)
+def test_a_failed_port_forward_is_reported(
+    release: Release,
+    pretend: Pretend,
+    monkeypatch: pytest.MonkeyPatch,
+    script: str,
+    error: type[CloudrcError],
+    words: str,
+) -> None:
+    if error is TimedOutError:
+        monkeypatch.setattr(pods, "START_LIMIT", 0.5)
+    pretend("kubectl", script)
+    with pytest.raises(error, match=words), pods.forwarded(release, "cloud-1", [8080]):
         pytest.fail("there is no way")
