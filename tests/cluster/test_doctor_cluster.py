@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,20 @@ def test_a_cluster_elsewhere_needs_neither_docker_nor_kind(
     assert doctor(capsys, 3, "--context", "x")["kubeconfig"]["state"] == "missing"
     programs.remove("helm")
     assert doctor(capsys, 3)["helm"]["state"] == "missing"
+
+
+def test_docker_without_a_daemon_is_not_ok(
+    api: FakeApi,
+    pretend: Callable[[str, str], Path],
+    capsys: Printed,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    docker = pretend("docker", "echo 'Cannot connect to the Docker daemon' >&2; exit 1")
+    monkeypatch.setattr(shutil, "which", lambda name: str(docker))
+    found = doctor(capsys, 0)["docker"]
+    assert (found["state"], "daemon does not answer" in found["found"]) == ("warn", True)
+    pretend("docker", "echo 28.0.0")
+    assert doctor(capsys, 0)["docker"]["state"] == "ok"
 
 
 def test_a_cluster_that_cannot_be_reached_blocks_the_mode(

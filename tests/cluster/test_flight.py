@@ -98,7 +98,10 @@ def ready(
     monkeypatch.chdir(tmp_path)
     world, _ = flown()
     merged(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)
-    pretend("helm", f"echo $@ >> {tmp_path}/helm; test $1 = list && echo '[]' || cat > /dev/null")
+    pretend(
+        "helm",
+        f"echo $@ >> {tmp_path}/helm; test $1 = list && echo '[]' || cat > {tmp_path}/values",
+    )
     pretend(
         "kubectl",
         f'case "$*" in *exec*before*) cat {tmp_path}/left ;;'
@@ -139,6 +142,7 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(
     assert {"config.yaml", "mission.mcap", "report.json", "environment.json"} <= left
     assert {"world.mcap", "cloud.mcap", "world-link.metrics", "cloud-teleop.log"} <= left
     assert not (tmp_path / "runs").exists()
+    assert json.loads((tmp_path / "values").read_text())["experiment"]["name"] == NAME
     line = (tmp_path / "helm").read_text()
     assert "upgrade --install cloudrc " in line
     assert "--namespace=demo --create-namespace" in line

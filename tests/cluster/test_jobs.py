@@ -46,6 +46,9 @@ def test_a_job_posts_the_mission_to_its_release(running: FakeApi, release: Relea
     assert json.loads(plan["data"]["mission.yaml"]) == MISSION
     assert plan["metadata"]["ownerReferences"][0]["uid"] == status.uid
     pod = pod_of(running, "first")
+    job = running.get("jobs", "first")
+    for found in (job["metadata"], job["spec"]["template"]["metadata"], plan["metadata"]):
+        assert release.labels("mission").items() <= found["labels"].items(), "for NetworkPolicies"
     (container,) = pod["containers"]
     assert container["image"] == "cloudrc/cloud:0.1.0"
     assert "--api=http://cloudrc-api:8080" in container["args"]
@@ -62,6 +65,7 @@ def test_a_job_has_owner_nodes_and_rights_of_its_release(
 ) -> None:
     cloud = running.get("deployments", "cloudrc-cloud")
     where = {"nodeSelector": {"disk": "fast"}, "tolerations": [{"key": "lab"}]}
+    where["imagePullSecrets"] = [{"name": "registry"}]
     run_job(release, MISSION, name="first")
     cloud["spec"]["template"]["spec"] |= where
     run_job(release, MISSION, name="second")

@@ -156,6 +156,10 @@ def test_a_change_that_cannot_be_kept_says_where_it_is(cluster: Cluster, capsys:
     assert "the ConfigMap is unchanged: 'kubectl patch' failed" in said
     for way in ("uplink", "downlink"):
         assert f"the {way} has the change until its pod is replaced" in said
+    cluster.refused["exec"] = FORBIDDEN
+    assert main(LINE) == 5
+    said = error(capsys)
+    assert (said.count("this is forbidden"), "has the change" in said) == (3, False)
 
 
 def test_a_change_that_one_direction_refuses_does_not_last(
@@ -188,6 +192,10 @@ def test_a_missing_release_or_pod_is_named(
     del cluster.items[2]
     assert main(LINE) == 5
     assert "the world pod of release 'cloudrc' does not run" in error(capsys)
+    cluster.items.clear()
+    running.objects.clear()
+    assert main(LINE) == 5
+    assert "no release 'cloudrc'" in error(capsys)
 
 
 # The script in the link container, with a real `sh`.

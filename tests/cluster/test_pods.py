@@ -47,6 +47,7 @@ def unscheduled(message: str) -> list[dict[str, str]]:
         ({"restarts": 5}, "ends repeatedly$"),
         ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
         ({}, "^$"),
+        ({"state": waiting("ContainerCreating")}, "^$"),
         ({"conditions": unscheduled("pod has unbound immediate volume claims")}, "^$"),
         ({"restarts": 1}, "^$"),
     ],
@@ -67,6 +68,8 @@ REFUSED = {"type": "ReplicaFailure", "status": "True", "message": "violates PodS
     ("body", "error", "words"),
     [
         (deployment("cloud", updatedReplicas=0), TimedOutError, "its pod is being created"),
+        (deployment("cloud", replicas=2), TimedOutError, "its pod is being created"),
+        (deployment("cloud", observedGeneration=0), TimedOutError, "its pod is being created"),
         (deployment("cloud", conditions=[REFUSED]), ClusterError, "violates PodSecurity"),
         (pod("world-1", "world", ready=False), TimedOutError, "container world is not ready"),
         (
@@ -103,7 +106,7 @@ def test_a_refusal_of_helm_has_a_hint(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("data", [{}, {"operator": "//4gc2VjcmV0"}])
+@pytest.mark.parametrize("data", [{}, {"operator": "%%%"}, {"operator": "//4gc2VjcmV0"}])
 def test_a_secret_without_a_token_is_named(
     running: FakeApi, release: Release, data: dict[str, str]
 ) -> None:
@@ -114,6 +117,9 @@ def test_a_secret_without_a_token_is_named(
     assert base64.b64decode("c2VjcmV0").decode() + "'" not in str(refused.value)
     running.refuse["GET", "secrets"] = (403, "secrets is forbidden")
     with pytest.raises(ClusterError, match="can-i get secrets"):
+        operator_token(release)
+    running.get("deployments", "cloudrc-cloud")["spec"]["template"]["spec"]["volumes"] = []
+    with pytest.raises(ClusterError, match=r"mounts no tokens: .* upgrade it: helm upgrade"):
         operator_token(release)
 
 
