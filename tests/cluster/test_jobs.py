@@ -105,6 +105,8 @@ def test_follow_writes_each_line_once_and_returns_the_verdict(
 
     def land() -> None:
         start_pod(running, "first", state=terminated(1, "the\nverdict"))
+        statuses = running.get("pods", "first-x")["status"]["containerStatuses"]
+        statuses.append({**statuses[0], "name": "mesh", "state": terminated(0, "bye")})
         running.logs["first-x"] = "waypoint 1 of 2 reached\nwaypoint 2 of 2 reached\n"
         end(running, "first", "Failed")
 
