@@ -23,6 +23,10 @@ def test_base_dependencies_are_those_of_a_pod() -> None:
     assert names == {"numpy", "pyyaml", "pydantic", "cryptography", "prometheus-client", "rich"}
 
 
+def test_cloudrc_is_a_plugin_of_kubectl() -> None:
+    assert PROJECT["scripts"]["kubectl-cloudrc"] == PROJECT["scripts"]["cloudrc"]
+
+
 def test_all_files_name_the_same_version() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {cloudrc.__version__}\n" in citation

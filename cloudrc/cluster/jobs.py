@@ -106,9 +106,7 @@ def run_job(
     """
     # A Job's pod has a longer name than the Job; the limit is 63 characters.
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
-    plan, job = yaml.safe_load_all(
-        (chart_folder() / "examples/mission-job.yaml").read_text("utf-8")
-    )
+    plan, job = yaml.safe_load_all((chart_folder() / EXAMPLE).read_text("utf-8"))
     labels = {
         **release.labels(COMPONENT),  # the NetworkPolicies select by these
         "app.kubernetes.io/part-of": "cloudrc",

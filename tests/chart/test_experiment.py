@@ -107,6 +107,7 @@ UNKNOWN = "experiment.mission: no mission 'nonsense' .*pipe"
     ("values", "said"),
     [
         ({"link": {"profile": "wify"}}, "link.profile: no profile 'wify' ships.*choose one of 5g"),
+        ({"mission": {"enabled": True, "plan": "pipe"}}, "no mission 'pipe'.*one of hover, pipes"),
         (
             {"experiment": {"link": {"profile": "./mine.yaml"}}},
             "experiment.link.profile: no profile './mine.yaml'.*profile under link.profile",
@@ -114,6 +115,11 @@ UNKNOWN = "experiment.mission: no mission 'nonsense' .*pipe"
         ({"experiment": {"mission": "nonsense"}}, UNKNOWN),
         ({"experiment": {"mission": "./a.yaml"}}, "experiment.mission: .*write the mission there"),
         ({"experiment": {"cloud": {"predictor": "./my.py"}}}, r"cloud.predictor: '\./my.py' is a"),
+        ({"experiment": {"cloud": {"controller": {"name": "a/b.py"}}}}, "controller: 'a/b.py'"),
+        (
+            {"experiment": {"link": {"uplink": {"table": "/t.csv"}}}},
+            "experiment.link: uplink.table names '/t.csv', but link.traces has no",
+        ),
         (
             {"link": {"profile": {"downlink": {"table": "t.csv"}}}},
             "link.profile: downlink.table names 't.csv', but link.traces has no such",

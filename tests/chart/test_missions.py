@@ -104,4 +104,23 @@ def test_an_example_fits_the_release_of_the_readme(name: str, tmp_path: Path) ->
     selected = policy["spec"]["podSelector"]["matchLabels"]
     assert selected.items() <= pod["metadata"]["labels"].items()
     (tmp_path / "mission.yaml").write_text(config["data"]["mission.yaml"])
-    assert check_mission(load_mission(tmp_path / "mission.yaml"), load_scene("pipes")) == []
+    mission = load_mission(tmp_path / "mission.yaml")
+    assert check_mission(mission, load_scene("pipes")) == []
+    if name == "mission-paper":
+        assert mission.waypoints == load_mission("pipes").waypoints
+
+
+def test_the_chart_makes_the_job_of_the_examples() -> None:
+    """The example's is also that of `cloudrc mission run`."""
+    objects = of_kind(render(ENABLED, release="cloudrc"), "Job").values()
+    ours, theirs = (
+        job["spec"]["template"]["spec"] for job in (*objects, EXAMPLES["mission-job"][1])
+    )
+    for pod in (ours, theirs):
+        (container,) = pod["containers"]
+        (variable,) = container["env"]
+        key = variable.pop("name")
+        container["args"] = sorted(word.replace(key, "KEY") for word in container["args"])
+        pod["volumes"][0]["configMap"] = {}
+        pod.pop("serviceAccountName", None)
+    assert ours == theirs

@@ -42,6 +42,19 @@ def test_monitors_need_the_value_and_the_kind_or_force() -> None:
     assert asked == served
 
 
+@pytest.mark.parametrize("wanted", [True, False])
+def test_scrape_annotations_are_optional(wanted: bool) -> None:
+    for thing in of_kind(render({"metrics": {"annotations": wanted}}), "Deployment").values():
+        template = thing["spec"]["template"]
+        found = {k: v for k, v in template["metadata"]["annotations"].items() if "prometheus" in k}
+        assert bool(found) is wanted
+        served = [
+            str(p["containerPort"]) for c in template["spec"]["containers"] for p in c["ports"]
+        ]
+        assert not wanted or found["prometheus.io/scrape"] == "true"
+        assert not wanted or found["prometheus.io/port"] in served
+
+
 def test_the_rules_use_existing_metrics_and_name_a_runbook() -> None:
     groups = yaml.safe_load(RULES.read_text())["groups"]
     rules = [rule for group in groups for rule in group["rules"]]

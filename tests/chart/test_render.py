@@ -19,6 +19,8 @@ from tests.chart.conftest import (
     EXAMPLES,
     METADATA,
     Object,
+    containers,
+    pod_specs,
     render,
     values_of,
 )
@@ -50,6 +52,12 @@ def test_the_objects_and_the_examples_are_valid(version: str) -> None:
         assert len(objects) > 10
         for thing in objects:
             kubernetes_validate.validate(thing, version, strict=True)
+        for pod in pod_specs(objects).values():  # server-side apply refuses duplicates
+            parts = containers(pod).values()
+            named = [volume["name"] for volume in pod.get("volumes", ())]
+            for names in (named, *([p["name"] for p in part.get("ports", ())] for part in parts)):
+                assert len(names) == len(set(names))
+                assert max(map(len, names), default=0) <= 15
     for name in ("link-set-role", "mission-job", "mission-paper"):
         for thing in yaml.safe_load_all((CHART / "examples" / f"{name}.yaml").read_text()):
             kubernetes_validate.validate(thing, version, strict=True)
@@ -80,6 +88,13 @@ def test_helm_refuses_an_older_cluster() -> None:
     done = helm("template", "demo", str(CHART), "--kube-version", "1.28.0")
     assert done.returncode != 0
     assert f"requires kubeVersion: {METADATA['kubeVersion']}" in done.stderr
+
+
+def test_helm_keeps_a_large_seed() -> None:
+    """Helm writes numbers above a million as powers of ten, which are no integers."""
+    flags = ("--kube-version", OLDEST, "--set-json", 'experiment={"seed": 4503599627370495}')
+    shown = ("--show-only", "templates/shared/experiment.yaml")
+    assert "seed: 4503599627370495\n" in helm("template", "demo", str(CHART), *shown, *flags).stdout
 
 
 def _comparable(objects: Iterable[Object]) -> dict[tuple[str, str], Object]:

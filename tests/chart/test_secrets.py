@@ -130,13 +130,29 @@ def test_a_container_mounts_only_what_it_needs(mode: str) -> None:
         pod: {v["name"]: v["secret"] for v in spec.get("volumes", ()) if "secret" in v}
         for pod, spec in found.items()
     }
+    run = {"medium": "Memory", "sizeLimit": "4Mi"}
+    teleop = {"medium": "Memory", "sizeLimit": "1Mi"}
+    memory = {
+        pod: {v["name"]: v["emptyDir"] for v in spec.get("volumes", ()) if "emptyDir" in v}
+        for pod, spec in found.items()
+    }
+    assert all(memory[end].pop("data").keys() == {"sizeLimit"} for end in ("world", "cloud"))
+    wanted = {"world": {"run": run}, "cloud": {"run": run, "teleop": teleop}}
+    assert {pod: volumes for pod, volumes in memory.items() if volumes} == wanted
     for end in ("world", "cloud"):
         volumes = {volume["name"]: volume for volume in found[end]["volumes"]}
         link = containers(found[end])["link"]
         kinds = {m["name"]: set(volumes[m["name"]]) - {"name"} for m in link["volumeMounts"]}
         assert kinds == {"experiment": {"configMap"}, "link": {"configMap"}, "run": {"emptyDir"}}
         assert not found[end].get("shareProcessNamespace"), "/proc/PID/root is another way in"
+        (path,) = (
+            a.partition("=")[2] for a in containers(found[end])[end]["args"] if "--key=" in a
+        )
+        where = {m["mountPath"]: m["name"] for m in containers(found[end])[end]["volumeMounts"]}
+        assert where[path.removesuffix("/key")] == "secret"
     cloud = containers(found["cloud"])
+    assert "--tokens=/etc/cloudrc-tokens" in cloud["teleop"]["args"]
+    assert any(a.startswith("--audit=/var/lib/cloudrc-journal/") for a in cloud["teleop"]["args"])
     (folder,) = (a.split("=")[1] for a in cloud["cloud"]["args"] if a.startswith("--teleop="))
     assert f"--socket={folder}" in cloud["teleop"]["args"]
     for name in ("cloud", "teleop"):

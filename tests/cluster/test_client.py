@@ -163,6 +163,16 @@ def test_a_missing_program_is_named_with_its_page(monkeypatch: pytest.MonkeyPatc
         client.run("helm", ["version"], timeout=1.0)
 
 
+def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path: Path) -> None:
+    package = tmp_path / "cloudrc"
+    with pytest.raises(MissingPrerequisiteError, match="install cloudrc again"):
+        client.chart_folder(package)
+    for folder in (tmp_path / "charts" / "cloudrc", package / "_chart"):
+        folder.mkdir(parents=True)
+        (folder / "Chart.yaml").touch()
+        assert client.chart_folder(package) == folder
+
+
 @pytest.mark.parametrize(
     ("script", "kind", "expected"),
     [

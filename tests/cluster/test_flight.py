@@ -98,7 +98,10 @@ def ready(
     monkeypatch.chdir(tmp_path)
     world, _ = flown()
     merged(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)
-    pretend("helm", f"echo $@ >> {tmp_path}/helm; test $1 = list && echo '[]' || cat > /dev/null")
+    pretend(
+        "helm",
+        f"echo $@ >> {tmp_path}/helm; test $1 = list && echo '[]' || cat > {tmp_path}/values",
+    )
     pretend(
         "kubectl",
         f'case "$*" in *exec*before*) cat {tmp_path}/left ;;'
@@ -139,6 +142,7 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(
     assert {"config.yaml", "mission.mcap", "report.json", "environment.json"} <= left
     assert {"world.mcap", "cloud.mcap", "world-link.metrics", "cloud-teleop.log"} <= left
     assert not (tmp_path / "runs").exists()
+    assert json.loads((tmp_path / "values").read_text())["experiment"]["name"] == NAME
     line = (tmp_path / "helm").read_text()
     assert "upgrade --install cloudrc " in line
     assert "--namespace=demo --create-namespace" in line
@@ -153,33 +157,43 @@ def test_a_refused_mission_leaves_no_run(ready: FakeApi, tmp_path: Path, capsys:
     assert list((tmp_path / "runs").glob("*")) == []
 
 
+@pytest.mark.parametrize("left", [True, False])
 def test_the_recording_from_before_a_restart_is_copied(
-    ready: FakeApi, tmp_path: Path, capsys: Printed
+    ready: FakeApi, tmp_path: Path, capsys: Printed, left: bool
 ) -> None:
     (key,) = [key for key in ready.objects if key[0] == "pods" and "world" in key[1]]
     ready.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
-    (tmp_path / "left").write_text("before\n")
     ends(ready)
+    if left:
+        (tmp_path / "left").write_text("before\n")
     assert main(LINE) == 6
     out, said = tmp_path / "runs" / "latest", capsys.readouterr().err
     assert (out / "report.json").is_file()
     assert not (out / "cloud.before.mcap").exists()
     assert "world was restarted" in said
-    assert (out / "world.before.mcap").read_text() == "before\n"
+    before = out / "world.before.mcap"
+    assert before.read_text() == "before\n" if left else not before.exists()
 
 
 def test_a_broken_port_forward_loses_metrics_but_no_report(
     ready: FakeApi, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(release: object, component: str) -> dict[str, str]:
+    def broken(*arguments: object) -> dict[str, str]:
         raise ClusterError("no way to the pod")
 
+    def once_broken(*arguments: object) -> None:
+        monkeypatch.setattr(pods, "fetch_recording", fetch_recording)
+        raise ClusterError("kubectl exec failed")
+
+    fetch_recording = pods.fetch_recording
     monkeypatch.setattr(pods, "fetch_metrics", broken)
+    monkeypatch.setattr(pods, "fetch_recording", once_broken)
     ends(ready)
     assert main([*LINE, "--out", "out"]) == 6
     captured = capsys.readouterr()
     assert json.loads(captured.out)["shaper"] == "unknown"
     assert "without the world pod's metrics: no way to the pod" in captured.err
+    assert "kubectl exec failed; trying again" in captured.err
     assert (tmp_path / "out" / "cloud-teleop.log").is_file()
 
 
@@ -194,7 +208,9 @@ def test_a_run_does_not_end_a_flight_in_progress(
     teleop.missions = [{"id": "m7", "state": "done"}]
     run_job(connect(), {}, name="first")
     assert main([*LINE, "--out", "out"]) == 5
-    assert "Job 'first' is under way" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "Job 'first' is under way" in said
+    assert "cloudrc mission cancel first --namespace=demo --release=cloudrc" in said
     assert not (tmp_path / "helm").exists()
     assert not (tmp_path / "out").exists()
 

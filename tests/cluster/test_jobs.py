@@ -46,6 +46,9 @@ def test_a_job_posts_the_mission_to_its_release(running: FakeApi, release: Relea
     assert json.loads(plan["data"]["mission.yaml"]) == MISSION
     assert plan["metadata"]["ownerReferences"][0]["uid"] == status.uid
     pod = pod_of(running, "first")
+    job = running.get("jobs", "first")
+    for found in (job["metadata"], job["spec"]["template"]["metadata"], plan["metadata"]):
+        assert release.labels("mission").items() <= found["labels"].items(), "for NetworkPolicies"
     (container,) = pod["containers"]
     assert container["image"] == "cloudrc/cloud:0.1.0"
     assert "--api=http://cloudrc-api:8080" in container["args"]
@@ -62,6 +65,7 @@ def test_a_job_has_owner_nodes_and_rights_of_its_release(
 ) -> None:
     cloud = running.get("deployments", "cloudrc-cloud")
     where = {"nodeSelector": {"disk": "fast"}, "tolerations": [{"key": "lab"}]}
+    where["imagePullSecrets"] = [{"name": "registry"}]
     run_job(release, MISSION, name="first")
     cloud["spec"]["template"]["spec"] |= where
     run_job(release, MISSION, name="second")
@@ -73,6 +77,13 @@ def test_a_job_has_owner_nodes_and_rights_of_its_release(
     assert pod["containers"][0]["securityContext"] == TELEOP["securityContext"]
     assert not pod.keys() & where.keys()
     assert pod["automountServiceAccountToken"] is False
+    del cloud["spec"]["template"]["spec"]["securityContext"]  # as a chart for OpenShift
+    (teleop,) = (c for c in cloud["spec"]["template"]["spec"]["containers"] if len(c) > 1)
+    cloud["spec"]["template"]["spec"]["containers"] = [
+        {key: value for key, value in teleop.items() if key != "securityContext"}
+    ]
+    run_job(release, MISSION, name="third")
+    assert "securityContext" not in str(pod_of(running, "third"))
 
 
 def test_a_job_has_an_unused_and_short_name(running: FakeApi, release: Release) -> None:
@@ -94,6 +105,8 @@ def test_follow_writes_each_line_once_and_returns_the_verdict(
 
     def land() -> None:
         start_pod(running, "first", state=terminated(1, "the\nverdict"))
+        statuses = running.get("pods", "first-x")["status"]["containerStatuses"]
+        statuses.append({**statuses[0], "name": "mesh", "state": terminated(0, "bye")})
         running.logs["first-x"] = "waypoint 1 of 2 reached\nwaypoint 2 of 2 reached\n"
         end(running, "first", "Failed")
 
@@ -160,6 +173,9 @@ def test_the_mission_of_a_job_is_cancelled_by_its_key(teleop: FakeTeleop, releas
     assert cancel(release, "first") == "mission m2 (up) of Job 'first' is cancelled"
     assert teleop.posted == ["/v1/missions/m2/cancel"]
     assert teleop.tokens == {f"Bearer {TOKEN}"}
+    teleop.tokens.clear()
+    cancel(release, "first", "a-token-of-mine-alone")
+    assert teleop.tokens == {"Bearer a-token-of-mine-alone"}
     teleop.refuses = True
     with pytest.raises(ClusterError, match="it is over"):
         cancel(release, "first")
@@ -168,6 +184,9 @@ def test_the_mission_of_a_job_is_cancelled_by_its_key(teleop: FakeTeleop, releas
 def test_a_job_that_has_not_posted_is_deleted(
     running: FakeApi, teleop: FakeTeleop, release: Release
 ) -> None:
+    run_job(release, MISSION, name="first")
+    assert cancel(release, "first") == "Job 'first' is deleted; it had not posted its mission"
+    assert (teleop.posted, made(running)) == ([], [])
     run_job(release, MISSION, name="first")
     running.get("pods", "cloud-1")["status"]["phase"] = "Pending"
     said = cancel(release, "first")

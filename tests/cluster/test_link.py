@@ -121,6 +121,10 @@ def test_a_local_trace_is_stored_beside_the_profile(
     made, new = with_files({"profile.yaml": PROFILE}, None, setting)
     assert made.restart
     assert yaml.safe_load(new["profile.yaml"])["uplink"]["trace"] == "uplink-my_trace.csv"
+    again, newer = with_files({**new, "change.json": "{}"}, None, ["downlink.loss=0.1"])
+    assert again.values["uplink"]["trace"] == "uplink-my_trace.csv", "it names the file beside it"
+    assert set(newer) == {"profile.yaml"}
+    assert not again.restart
     monkeypatch.setattr("cloudrc.cluster.link.SIZE_MAX", 50)
     with pytest.raises(BadInputError, match="a ConfigMap takes 50"):
         with_files({"profile.yaml": PROFILE}, None, setting)
@@ -152,6 +156,10 @@ def test_a_change_that_cannot_be_kept_says_where_it_is(cluster: Cluster, capsys:
     assert "the ConfigMap is unchanged: 'kubectl patch' failed" in said
     for way in ("uplink", "downlink"):
         assert f"the {way} has the change until its pod is replaced" in said
+    cluster.refused["exec"] = FORBIDDEN
+    assert main(LINE) == 5
+    said = error(capsys)
+    assert (said.count("this is forbidden"), "has the change" in said) == (3, False)
 
 
 def test_a_change_that_one_direction_refuses_does_not_last(
@@ -184,6 +192,10 @@ def test_a_missing_release_or_pod_is_named(
     del cluster.items[2]
     assert main(LINE) == 5
     assert "the world pod of release 'cloudrc' does not run" in error(capsys)
+    cluster.items.clear()
+    running.objects.clear()
+    assert main(LINE) == 5
+    assert "no release 'cloudrc'" in error(capsys)
 
 
 # The script in the link container, with a real `sh`.
@@ -193,9 +205,9 @@ LONG = "time_s,delay_ms\n" + "0,40\n" * 20_000
 DOCUMENT = write_handed(Handed(NOTE, {"profile.yaml": "uplink: {trace: t.csv}\n", "t": LONG}))
 
 
-def start(folder: Path) -> subprocess.Popen[str]:
+def start(folder: Path, script: str = APPLY_SCRIPT) -> subprocess.Popen[str]:
     length = str(len(DOCUMENT.encode()))
-    command = ["sh", "-c", APPLY_SCRIPT, "sh", str(folder), "b2", length]
+    command = ["sh", "-c", script, "sh", str(folder), "b2", length]
     pipe = subprocess.PIPE
     return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
 
@@ -226,6 +238,14 @@ def test_the_script_hands_over_a_change_and_prints_the_state(
     assert (running.returncode, out, err) == (0, decided[0], "")
     assert read_handed((tmp_path / HANDED_FILE).read_text()).change == NOTE
     assert sorted(os.listdir(tmp_path)) == [HANDED_FILE, STATE_FILE], "no draft is left"
+
+
+def test_a_silent_sidecar_leaves_the_old_state(tmp_path: Path) -> None:
+    told = tell(tmp_path, change="a1")
+    quick = APPLY_SCRIPT.replace("seq 250", "seq 3")
+    assert quick != APPLY_SCRIPT
+    out, _ = start(tmp_path, quick).communicate(DOCUMENT, timeout=APPLY_LIMIT)
+    assert out == told
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,7 @@ def unscheduled(message: str) -> list[dict[str, str]]:
         ({"restarts": 5}, "ends repeatedly$"),
         ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
         ({}, "^$"),
+        ({"state": waiting("ContainerCreating")}, "^$"),
         ({"conditions": unscheduled("pod has unbound immediate volume claims")}, "^$"),
         ({"restarts": 1}, "^$"),
     ],
@@ -67,6 +68,8 @@ REFUSED = {"type": "ReplicaFailure", "status": "True", "message": "violates PodS
     ("body", "error", "words"),
     [
         (deployment("cloud", updatedReplicas=0), TimedOutError, "its pod is being created"),
+        (deployment("cloud", replicas=2), TimedOutError, "its pod is being created"),
+        (deployment("cloud", observedGeneration=0), TimedOutError, "its pod is being created"),
         (deployment("cloud", conditions=[REFUSED]), ClusterError, "violates PodSecurity"),
         (pod("world-1", "world", ready=False), TimedOutError, "container world is not ready"),
         (
@@ -88,6 +91,7 @@ def test_the_wait_for_a_release_ends_with_the_cause(
 @pytest.mark.parametrize(
     ("said", "hint"),
     [
+        ("Kubernetes cluster unreachable: Get https://10.0.0.1: refused", "kubectl cluster-info"),
         ("chart requires >=1.29.0-0 which is incompatible with Kubernetes v1.28.3", "kind create"),
         ("secrets is forbidden: User me cannot list", "kubectl auth can-i"),
         ("values don't meet the specifications of the schema(s)\n- link: mdoe", "helm show values"),
@@ -102,7 +106,7 @@ def test_a_refusal_of_helm_has_a_hint(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("data", [{}, {"operator": "//4gc2VjcmV0"}])
+@pytest.mark.parametrize("data", [{}, {"operator": "%%%"}, {"operator": "//4gc2VjcmV0"}])
 def test_a_secret_without_a_token_is_named(
     running: FakeApi, release: Release, data: dict[str, str]
 ) -> None:
@@ -113,6 +117,9 @@ def test_a_secret_without_a_token_is_named(
     assert base64.b64decode("c2VjcmV0").decode() + "'" not in str(refused.value)
     running.refuse["GET", "secrets"] = (403, "secrets is forbidden")
     with pytest.raises(ClusterError, match="can-i get secrets"):
+        operator_token(release)
+    running.get("deployments", "cloudrc-cloud")["spec"]["template"]["spec"]["volumes"] = []
+    with pytest.raises(ClusterError, match=r"mounts no tokens: .* upgrade it: helm upgrade"):
         operator_token(release)
 
 
@@ -134,8 +141,27 @@ def test_a_port_is_forwarded_while_the_block_runs(
     assert "--namespace=demo port-forward pod/world-1" in (tmp_path / "line").read_text()
 
 
-def test_a_failed_port_forward_is_reported(release: Release, pretend: Pretend) -> None:
-    pretend("kubectl", "echo 'error: unable to forward port: pod is gone' >&2; exit 1")
-    words = "cannot forward ports of pod 'cloud-1'.*pod is gone"
-    with pytest.raises(ClusterError, match=words), pods.forwarded(release, "cloud-1", [8080]):
+@pytest.mark.parametrize(
+    ("script", "error", "words"),
+    [
+        (
+            "echo 'error: unable to forward port: pod is gone' >&2; exit 1",
+            ClusterError,
+            "cannot forward ports of pod 'cloud-1'.*pod is gone",
+        ),
+        ("exec sleep 60", TimedOutError, "has not started within 0.5 s"),
+    ],
+)
+def test_a_failed_port_forward_is_reported(
+    release: Release,
+    pretend: Pretend,
+    monkeypatch: pytest.MonkeyPatch,
+    script: str,
+    error: type[CloudrcError],
+    words: str,
+) -> None:
+    if error is TimedOutError:
+        monkeypatch.setattr(pods, "START_LIMIT", 0.5)
+    pretend("kubectl", script)
+    with pytest.raises(error, match=words), pods.forwarded(release, "cloud-1", [8080]):
         pytest.fail("there is no way")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -110,6 +111,15 @@ def test_make_names_a_missing_program(target: str, program: str, tmp_path: Path)
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, env=path)
     assert f"make {target} needs {program}: https://" in done.stderr
     assert "Error 3" in done.stderr
+
+
+def test_e2e_names_the_missing_programs(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pytest", "-m", "e2e", "tests/e2e/test_7_end.py", "-q"]
+    environ = {**os.environ, "PATH": str(tmp_path), "KUBECONFIG": str(tmp_path / "none")}
+    done = subprocess.run(command, cwd=ROOT, env=environ, capture_output=True, text=True)
+    assert done.returncode == 3
+    for tool in ("docker", "kind", "helm", "kubectl"):
+        assert f"{tool}: https://" in done.stdout + done.stderr
 
 
 def test_kind_makes_one_cluster_named_cloudrc() -> None:
