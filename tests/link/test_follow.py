@@ -156,6 +156,7 @@ def test_a_late_config_map_does_not_bring_an_older_change_back(pod: Pod) -> None
     for delay_ms, number in ((120.0, "a1"), (20.0, "b2")):
         pod.put(delay_ms, number)
         assert pod.poll() is None
+    pod.hand(9.0, "refused by netem")
     pod.start()  # a container that restarts takes the ConfigMap
     assert pod.first() == 0.02
     assert pod.poll() is None

@@ -342,6 +342,7 @@ def test_what_is_under_way_has_room_until_it_has_left() -> None:
     for _ in range(2):
         shaper.step(1.0)
     assert f"limit {limit(small)} " in kernel.said[-1]
+    assert shaper.counts()["restored"] == 0, "its own changes are nobody else's"
 
 
 @pytest.mark.parametrize("delay", [300.0, 0.1])

@@ -135,8 +135,10 @@ class Bench:
 
 
 def test_relay_touches_no_netem_and_leaves_no_route(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, "relay", refuses=AssertionError("touched")).run(5.05)
-    assert bench.routes == ["127.0.0.1:7401\n"]
+    bench = Bench(tmp_path, "relay", refuses=AssertionError("touched"))
+    bench.at(3.0, lambda: bench.routes.append((tmp_path / "link.released").read_text()))
+    bench.run(5.05)
+    assert bench.routes == ['{"released": 1, "overflow": 0}', "127.0.0.1:7401\n"]
     assert bench.did == ["relay 10.244.0.7", "metric relay", "relay closes"]
     assert bench.log == ["relay shapes the uplink (link.mode=relay)"]
     assert [path.name for path in tmp_path.iterdir()] == ["link.json"]
@@ -221,7 +223,9 @@ def test_a_new_profile_is_followed_within_a_step(tmp_path: Path) -> None:
     assert state["profile"] == {"description": "0.5 s"}
     assert state["asked"] == {"delay": 0.5, "jitter": 0.0, "loss": 0.0, "rate": None}
     assert 1.0e9 <= state["since_ns"] <= 1.2e9
+    assert state["origin_ns"] == 0, "the time line goes on"
     assert bench.told()["cause"] == "the profile's file changed"
+    assert 2.0e9 <= bench.told()["origin_ns"] <= 2.2e9
 
 
 @pytest.mark.parametrize(("mode", "left"), [("netem", "netem"), ("auto", "relay")])
@@ -233,6 +237,8 @@ def test_a_profile_netem_cannot_do_is_refused_or_relayed(
     assert bench.run().did[-1] == f"{left} closes"
     assert any("netem cannot do delay_ms" in line for line in bench.log)
     assert bench.told()["shaper"] == left
+    if mode == "auto":
+        assert 1.0e9 <= bench.told()["origin_ns"] <= 1.2e9, "the relay begins the time line anew"
     if mode == "netem":
         assert (bench.told()["changes"], bench.told()["refused"]) == (0, "b2")
         assert "netem cannot do delay_ms" in bench.told()["refusal"]
