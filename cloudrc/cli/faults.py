@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,11 +88,12 @@ def _minutes(text: str) -> float:
     return minutes
 
 
-def _output_path(text: str) -> Path:
-    """Parse the path of an output; refuse one that cannot be made."""
+def _output_path(text: str, *, is_folder: bool = False) -> Path:
+    """Parse the path of an output file or folder; refuse one that cannot be made."""
     path = Path(text)
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
-    if not ((existing.is_dir() or existing == path) and os.access(existing, os.W_OK)):
+    fits = existing.is_dir() is (is_folder or existing != path)
+    if not (fits and os.access(existing, os.W_OK)):
         raise argparse.ArgumentTypeError(f"{text}: cannot be written")
     return path
 
@@ -108,7 +110,7 @@ OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
         "--minutes": (_minutes, 1.0, "M", "duration (default: 1)"),
         "--first": (_seed, 1, "SEED", "first seed (default: 1)"),
         "--jobs": JOBS,
-        "--store": (_output_path, STORE, "DIR", STORED),
+        "--store": (partial(_output_path, is_folder=True), STORE, "DIR", STORED),
     },
 }
 """Options of each action: how a value is read, the default, its name in the help, the help."""

@@ -154,6 +154,7 @@ def test_the_list_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
         ("run F13 --seed -1", "'-1' is not a whole number"),
         ("run F1 --seed 9007199254740992", "argument --seed: '9007199254740992' is not a whole"),
         ("run F13 --junit /dev/null/x.xml", "/dev/null/x.xml: cannot be written"),
+        ("run F13 --junit /dev", "/dev: cannot be written"),
         ("run none.yaml", "none.yaml: "),
         ("run /dev/null", "/dev/null: not a regular file"),
         ("run F99", "no fault 'F99'; there are: F1 short-blackout, F2 "),
@@ -162,6 +163,7 @@ def test_the_list_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
         ("search --minutes 0", "'0' is not a number of minutes"),
         ("search --minutes nan", "'nan' is not a number of minutes"),
         ("search --store /dev/null/found", "cannot be written"),
+        ("search --store /dev/null", "/dev/null: cannot be written"),
     ],
 )
 def test_bad_input_is_told_in_one_line(

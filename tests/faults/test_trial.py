@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from cloudrc.faults import invariants
-from cloudrc.faults.adversary import POLICIES, choose
+from cloudrc.faults.adversary import POLICIES, choose, dishonesty
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import OrderInvariant, checked_in, fly
-from cloudrc.messages import ZERO, Command, GuardState
+from cloudrc.messages import ZERO, Command, GuardState, Request, Start
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
@@ -46,6 +46,15 @@ def test_random_faults_break_no_invariant(seed: int) -> None:
 def test_a_hostile_cloud_causes_no_breach(policy: str) -> None:
     seed = next(seed for seed in range(1, 30) if choose(seed).policy == policy)
     assert fly(replace(choose(seed), duration=8.0)).breaches == ()
+
+
+def test_a_hostile_cloud_makes_every_request() -> None:
+    _, words = dishonesty(Schedule(27, policy="operators-voice"))
+    assert words is not None
+    seen: list[Any] = [SimpleNamespace(guard=each, position=(1.0, 1.0, 1.0)) for each in GuardState]
+    said = [words(n * 10_000 * MS, robot) for n, robot in enumerate(seen * 300)]
+    made = {(request.request, request.start) for request in said if request is not None}
+    assert made == {(each, Start.SPAWN) for each in Request} | {(Request.START, Start.HERE)}
 
 
 @pytest.mark.promise("stays-inside-the-fence")

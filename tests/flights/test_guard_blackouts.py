@@ -174,6 +174,16 @@ def test_a_start_without_commands(
     assert ends.world.robot.guard.state.name == states[-1]
 
 
+def test_a_lost_downlink_lands_the_robot_and_ends_the_run() -> None:
+    lost = "link.downlink.blackouts=[{start_s: 3, duration_s: 1000}]"
+    ends, of_world, _ = fly_records(lost, "guard.hold_max_s=1")
+    changes = [r for r in of_world if isinstance(r, GuardChange)]
+    assert [r.state.name for r in changes[-3:]] == ["HOLD", "LAND", "LAND"]
+    assert changes[-1].cause == "touched down, rotors stopped"
+    assert ends.cloud.teleop.outcome.code == "guard_stopped"
+    assert ends.run.now_ns < 30e9
+
+
 def test_a_flight_without_faults_never_meets_the_fence() -> None:
     ends, _, _ = fly_records()
     assert dict(ends.world.robot.guard.counts) == {}

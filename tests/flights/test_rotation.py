@@ -64,6 +64,16 @@ def test_a_rotation_costs_one_short_hold_at_most(first: str, second: str, apart:
     assert flight.count("tag") <= 12 * apart / 60 + 2, "no alert"
 
 
+@pytest.mark.parametrize(("first", "second"), [ENDS, ENDS[::-1]])
+def test_an_end_that_starts_amid_a_rotation_uses_both_keys(first: str, second: str) -> None:
+    flight = Flight(*HOVER)
+    flight.replace_key(first, NEW)
+    assert key(flight.fly(5.0)) == SECRET.current
+    assert held(flight) == []
+    flight.replace_key(second, NEW)
+    assert key(flight.fly(5.7)) == NEW.current
+
+
 @pytest.mark.promise("old-keys-end")
 @pytest.mark.parametrize("first", ENDS)
 def test_a_dropped_key_ends_its_session_at_once(first: str) -> None:

@@ -15,6 +15,7 @@ import pytest
 from cloudrc.cli import processes
 from cloudrc.cli.link_verify import find_experiment
 from cloudrc.cli.main import main
+from cloudrc.cli.pool import map_in_order
 from cloudrc.cluster.link import APPLY_SCRIPT
 from cloudrc.config.load import dump, read_experiment
 from cloudrc.config.schema import PlugIn
@@ -130,16 +131,17 @@ def test_a_new_process_imports_nothing_from_the_working_folder(
     assert "-P" not in interpreter("-m", "cloudrc"), "this process uses that path, too"
 
 
-def test_a_sweep_worker_imports_nothing_from_there_either(
+def test_a_worker_imports_nothing_from_there_either(
     run: Path, trace: Path, spy: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It imports the pool's modules before it gets its parent's path."""
     (run / "pickle.py").write_text(spy)
     monkeypatch.chdir(run)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
-    assert main(["run", "hover", "--seeds", "1", "--out", "sweep"]) == 0
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert list(map_in_order(abs, [-1, -2], 2)) == [1, 2]
     assert not trace.exists()
-    assert "PYTHONSAFEPATH" not in os.environ
+    assert not os.environ.get("PYTHONSAFEPATH")
 
 
 def test_every_process_is_started_by_the_safe_function() -> None:

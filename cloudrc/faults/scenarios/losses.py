@@ -73,6 +73,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
             drift = measures.drift(flight, began + 2.0, back)
             outcome.most(f"{what}: drift", drift, 0.10, "m")
         measures.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
+        measures.moves(outcome, flight, "cloud", "commands_frozen_total", since=at)
         outcome.most(f"{what}: resumed after", measures.resumed_after(flight, back), 1.0, "s")
 
 
