@@ -15,7 +15,7 @@ from cloudrc.messages import Cause, GuardState, Request, Setpoint, Start
 from cloudrc.teleop import wire
 from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, SILENCE, next_step
-from cloudrc.teleop.store import ENDED, STATES, ConflictError, Order
+from cloudrc.teleop.store import ENDED, STATES, ConflictError, Order, UnavailableError
 from cloudrc.teleop.wire import Leg, Plan
 from tests.teleop.conftest import (
     FROM_SPAWN,
@@ -268,6 +268,56 @@ def test_what_follows_from_a_script(name, script, expected):
     for each in expected.split():
         key, _, value = each.partition("=")
         assert ",".join(found[key]) == value, key
+
+
+@pytest.mark.parametrize(
+    ("script", "action", "said"),
+    [
+        ("create 0.05 A", "create", "m1 is flying; cancel it first, or queue the new one"),
+        ("create 0.05 A", "goto", "m1 is flying; hold or cancel it first"),
+        ("create 0.05 A", "ack", "m1 is flying; there is nothing to acknowledge"),
+        ("create 0.05 A", "resume", "resume: the mission is FLYING; it must be held"),
+        ("create 0.05 cancel", "cancelm1", "mission m1 has ended: cancelled"),
+        ("", "hold", "no mission is under way"),
+        ("mute stop", "create", "an emergency stop is on its way to the robot; find the cause"),
+        ("stop 0.1", "create", "the guard is in ESTOP (emergency stop) and lets nothing fly; find"),
+        ("pause", "create", "teleop ends; repeat this when teleop runs again"),
+        ("create queue full", "cancelm2", "m2 is cancelled, but waits again if teleop restarts"),
+    ],
+)
+def test_a_refusal_says_why(script, action, said):
+    flight = ServiceFlight()
+    flight.step()
+    play(flight, script)
+    with pytest.raises((ConflictError, UnavailableError), match=re.escape(said)):
+        play(flight, action)
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("cancel", "mission cancelled"),
+        ("stop", "emergency stop on the way to waypoint 2 of 3"),
+        ("world 0.05", "world restarted on the way to waypoint 2 of 3"),
+        ("LAND 0.05", "guard went to LAND (fresh command) on the way to waypoint 2 of 3"),
+        ("foreign 0.05", "somebody else has started another mission on the way to waypoint 2 of 3"),
+        ("60", "mission not done within 60 s: on the way to waypoint 2 of 3"),
+        ("cancel 0.1 mute create 60", "the robot has not started within 60 s; is the link up?"),
+        ("pause", "paused by shutdown on the way to waypoint 2 of 3"),
+        ("full B 0.1 restart free 0.1", "waypoint 2 of 3 reached, as the robot reports, at"),
+        (
+            "cloud 1",
+            "has a new session, as after a restart; the mission goes on to waypoint 2 of 3",
+        ),
+        ("hold cloud 1", "the mission is held on the way to waypoint 2 of 3"),
+        ("queue cancelm2", "mission cancelled before it began"),
+    ],
+)
+def test_an_event_says_what_happened_once(script, said):
+    flight, _ = service_flying()
+    play(flight, script)
+    events = flight.teleop.book.events_after(0)
+    assert [said in event["text"] for event in events].count(True) == 1
 
 
 def test_every_end_of_a_mission_is_counted_under_its_own_name():

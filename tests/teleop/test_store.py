@@ -267,7 +267,9 @@ def test_what_is_over_and_what_was_stopped_is_known():
     assert store.stopped() is None
     store.note(first, "started", "")
     store.note(first, "emergency_stopped", "")
-    assert store.stopped() is first, "those after it have not begun"
+    for _ in range(SHOWN):
+        store.note(first, "new_session", "")
+    assert store.stopped() is first, "those after it have not begun, and its event is not kept"
     assert [mission.id for mission in store.open()] == ["m2"]
     ended = [store.has_ended(mission.number) for mission in (first, second, third)]
     assert ended == [True, False, True]
