@@ -396,13 +396,15 @@ def _run_relay(options: argparse.Namespace) -> int:
         refused = ask_for_fifo()
         _log(f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO")
     relay = open_relay(options, *links.values())
+    should_stop: Callable[[], bool] = stop
     if exporter is not None:
+        should_stop = _counting(stop, relay, exporter)
         for way, loaded in read_profiles(experiment).items():
             exporter.shaped("relay", way, "relay")
             exporter.asked(way, summary(loaded.direction)["delay"] or 0.0)
         exporter.runs(fingerprint(experiment))
         exporter.ready(True)
-    feed, should_stop = Feed.on_stdout(watched=options.feed), _counting(stop, relay, exporter)
+    feed = Feed.on_stdout(watched=options.feed)
     if options.link:
         asked = exporter.asked if exporter else lambda way, delay: None
         control = RelayControl(options.link, links, read_profiles(experiment), asked, relay)
@@ -455,15 +457,13 @@ def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
     return {way: Loaded(link_profile(direction), values) for way, direction in ways.items()}
 
 
-def _counting(
-    stop: Callable[[], bool], relay: Relay, exporter: Exporter | None
-) -> Callable[[], bool]:
+def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
     """Make a function that returns `stop()` and, once a second, exports the relay's counts."""
     due = 0.0
 
     def ask() -> bool:
         nonlocal due
-        if exporter is not None and time.monotonic() >= due:
+        if time.monotonic() >= due:
             due = time.monotonic() + PERIOD
             counts = relay.outcomes() | relay.recent()
             exporter.see([Counted(0, "link", name, n) for name, n in counts.items()])

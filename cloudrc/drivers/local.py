@@ -153,7 +153,7 @@ class Child:
         for line in lines:
             self.heard = time.monotonic()
             self.ready |= line == READY.encode()
-            with contextlib.suppress(ValueError):  # a sign of life
+            with contextlib.suppress(ValueError):  # a sign of life, or no record
                 records.append(from_line(line.decode()))
         return records
 

@@ -289,10 +289,10 @@ NEW = {**SEEN, "age_s": 0.02, "guard_for_s": 4.5, "next_step": "the robot flies"
     ids=["not heard", "heard", "never heard"],
 )  # fmt: skip
 def test_old_values_of_the_robot_are_marked_as_old(seen, cloud_age, lines, monkeypatch, capsys):
-    state = {"mission": None, "queue": [], "seen": seen, "cloud_age_s": cloud_age}
+    state = {"mission": None, "queue": ["m2", "m3"], "seen": seen, "cloud_age_s": cloud_age}
     monkeypatch.setattr(Api, "get", lambda api, path: state)
     assert main(["mission", "status", "--api", "unix:there"]) == 0
-    assert capsys.readouterr().out.splitlines()[1:] == lines
+    assert capsys.readouterr().out.splitlines()[1:] == ["waiting: m2, m3", *lines]
 
 
 NAME = "far\x1b[2J\nm9  forged\r\x9b31m\x7f\u202e"

@@ -129,6 +129,7 @@ def test_a_bad_feed_line_ends_no_flight(tmp_path):
     assert child.take(b"\n".join(lines)) == [EVENT]
     assert (child.ready, child.heard > 0.0) == (False, True)
     assert child.take(b"\nready\n") == [EVENT]
+    assert child.take(event + b"\n") == [EVENT]
     assert child.ready
 
 
