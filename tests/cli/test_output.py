@@ -39,6 +39,7 @@ def test_columns_line_up_and_numbers_are_right_aligned():
     assert table([("name", "value"), ("a", "1.5"), ("longer", "10.5")], right=[1]) == (
         "name    value\na         1.5\nlonger   10.5"
     )
+    assert table([("a", "short"), ("b", "much longer")]) == "a  short\nb  much longer"
 
 
 @pytest.mark.parametrize(
