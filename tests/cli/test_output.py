@@ -39,6 +39,7 @@ def test_columns_line_up_and_numbers_are_right_aligned():
     assert table([("name", "value"), ("a", "1.5"), ("longer", "10.5")], right=[1]) == (
         "name    value\na         1.5\nlonger   10.5"
     )
+    assert table([("a", "short"), ("b", "much longer")]) == "a  short\nb  much longer"
 
 
 @pytest.mark.parametrize(
@@ -115,10 +116,12 @@ def test_a_file_gets_plain_lines_for_events_only():
     stream = io.StringIO()
     hold = GuardChange(0, GuardState.HOLD, "command age 0.252 s above 0.250 s")
     track = GuardChange(0, GuardState.TRACK, "fresh commands")
-    seen(stream, telemetry(0), CONTROL, REACHED, hold, track).close()
+    done = REACHED._replace(event="done", text="mission done")
+    seen(stream, telemetry(0), CONTROL, REACHED, hold, track, done, hold).close()
     assert [" ".join(line.split()) for line in stream.getvalue().splitlines()] == [
         "waypoint 2 of 7 reached at 4.85 s (-1.00, 2.50, 0.00) m delay 96 ms",
         "HOLD: command age 0.252 s above 0.250 s (-1.00, 2.50, 0.00) m delay 96 ms",
+        "mission done (-1.00, 2.50, 0.00) m delay 96 ms",  # then the robot always holds
     ]
 
 

@@ -72,6 +72,12 @@ def test_an_interrupted_sweep_keeps_what_is_finished(
     assert document["interrupted"]
 
 
+def test_a_failed_run_sets_the_exit_code(folder, monkeypatch):
+    reports = [report(1), report(2, "failure"), report(3)]
+    monkeypatch.setattr(sweep, "map_in_order", lambda *given: (each for each in reports))
+    assert main(["run", "steps", "--seeds", "3", "--out", "sweep"]) == 1
+
+
 @pytest.mark.process
 @pytest.mark.parametrize(
     "how", [signal.SIGTERM, signal.SIGKILL, *nightly(signal.SIGINT, signal.SIGHUP)]

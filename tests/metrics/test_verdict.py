@@ -108,10 +108,21 @@ def test_rules(
     [
         (world(touch(4, "pipe_1"), touch(3, "pipe_1")), "pipe_touched", "pipe_1 (2 times)", 3.0),
         *(
-            (world(GuardChange(at(5), state, "why")), "guard_intervened", f"{state.name}: why", 5.0)
+            (
+                # A touch-down repeats LAND.
+                world(GuardChange(at(5), state, "why"), GuardChange(at(6), state, "down")),
+                "guard_intervened",
+                f"{state.name}: why",
+                5.0,
+            )
             for state in (GuardState.LAND, GuardState.ESTOP, GuardState.GROUND)
         ),
-        (world(SessionOpened(at(6), "world", 3, "why")), "world_restarted", "why", 6.0),
+        (
+            world(*(SessionOpened(at(6), end, 3, "why") for end in ("world", "cloud"))),
+            "world_restarted",
+            "why",
+            6.0,
+        ),
         (ended("timed_out"), "timed_out", "why", 10.0),
     ],
 )

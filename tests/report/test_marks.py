@@ -128,7 +128,7 @@ def test_repeated_records_are_no_changes() -> None:
     subject = subject_of(
         changed(-1.0, CALM, "", time_line=math.nan),  # the link started as configured
         changed(3.0, fast, "by hand"),
-        changed(5.0, fast, "by hand", 2.0),  # a repeated record
+        changed(5.0, fast, "by hand", 1.98),  # a repeated record
         changed(3.1, fast, "by hand", uplink=False),
     )
     assert len(spans(subject, uplink=True)) == 2
