@@ -159,6 +159,14 @@ def test_every_datagram_is_counted_once(
     until(lambda: pair.relay.outcomes() == {**dict.fromkeys(LINK_OUTCOMES, 0), **counts})
 
 
+def test_a_datagram_is_damaged_as_the_model_says(bench: Callable[..., Bench]) -> None:
+    profile = DirectionProfile(corrupt=1.0)
+    pair = bench(profile)
+    pair.up(packet(5))
+    damaged = LinkDirection(profile, 1, True).corrupted(1, 3, 5, packet(5))
+    assert pair.cloud.recv(100) == damaged != packet(5)
+
+
 def test_a_flood_is_counted_and_over_in_a_second(bench: Callable[..., Bench]) -> None:
     pair = bench(PLAIN, DirectionProfile(0.02))
     for n in range(20_000):
