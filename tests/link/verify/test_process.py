@@ -56,7 +56,6 @@ def test_an_honest_link_is_believed_unless_the_machine_delays_it() -> None:
 
 
 @pytest.mark.process
-@pytest.mark.full
 def test_a_fault_is_named_on_the_command_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
