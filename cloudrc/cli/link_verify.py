@@ -31,6 +31,7 @@ from cloudrc.cli.link import VERIFY_DEFAULT
 from cloudrc.cli.link_run import Programs, inspect_network
 from cloudrc.cli.output import escape, format_document, paint, table
 from cloudrc.cli.pool import interrupt_on_signals
+from cloudrc.cluster.client import end_process
 from cloudrc.cluster.pods import METRICS, NO_PROXY
 from cloudrc.config import shipped
 from cloudrc.config.document import write_yaml
@@ -68,8 +69,8 @@ from cloudrc.tunnel.codec import SIZES, Kind
 
 RELEASE_TIMEOUT = 270.0
 """Default time limit for the verdict on a release [s]."""
-START_LIMIT, STOP_LIMIT = 90.0, 2.0
-"""Longest time for both processes to start, which a slow disk needs, and to stop [s]."""
+START_LIMIT = 90.0
+"""Longest time for both processes to start, which a slow disk needs [s]."""
 COUNTS_WAIT = 1.3
 """Time until the processes have counted the last probe [s]; they do so once a second."""
 POLL_PERIOD, OFF_TIMEOUT, HTTP_TIMEOUT = 2.0, 30.0, 3.0
@@ -262,7 +263,7 @@ def run_link(
             way.folder = folder / name
             way.folder.mkdir()
             way.process = _start(name, way, shaper)
-            stack.callback(_stop, way.process)
+            stack.callback(end_process, way.process)
         deadline = time.monotonic() + START_LIMIT
         while not all((way.folder / "route").exists() for way in ways.values()):
             for name, way in ways.items():
@@ -303,15 +304,6 @@ def _ended(name: str, code: int, log: str) -> CloudrcError:
     if code in known:
         return known[code](f"the {name} is not shaped: {words}")
     return InvalidRunError(f"the {name} is not shaped: its process ended with {code}: {words}")
-
-
-def _stop(process: subprocess.Popen[bytes]) -> None:
-    process.terminate()
-    try:
-        process.wait(STOP_LIMIT)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 @contextlib.contextmanager

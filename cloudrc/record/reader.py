@@ -55,6 +55,8 @@ UNPACKED_MAX = 64
 1 MiB counts as 1 MiB. Recordings of flights need a factor of 10, recordings of an idle robot 30."""
 MESSAGE_COST = 128
 """Memory of a message's Python objects, in addition to the message's bytes [bytes]."""
+CHANNELS_MAX = 65_535
+"""Limit of the number of channels plus schemas in a file; MCAP numbers both with 16 bits."""
 LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
 LOSSY_SHARE_MAX = 0.999
@@ -385,6 +387,7 @@ class _Copy:
         self._schemas: dict[int, tuple[Schema, int]] = {}  # old number -> its new number
         self._channels: dict[int, tuple[Channel, int]] = {}
         self._kept = {"messages": 0, "attachments": 0, "metadata": 0}
+        self._defined = 0  # channels and schemas in the new file
         self._homeless = 0  # messages of no channel
         self._told = ""  # what the recording itself says is missing
         for number, record in enumerate(records):
@@ -445,6 +448,12 @@ class _Copy:
         """Register a schema or channel; register each definition of its number only once."""
         if record.id in known and known[record.id][0] == record:
             return
+        self._defined += 1
+        if self._defined > CHANNELS_MAX:
+            raise BadInputError(
+                f"{self._records.path}: defines more than {CHANNELS_MAX} channels and schemas;"
+                " use another file"
+            )
         if isinstance(record, Schema):
             number = self._writer.register_schema(record.name, record.encoding, record.data)
         else:

@@ -58,6 +58,7 @@ _POSE_AND_TWIST = (
     Field("velocity", "vector", "m/s", "of the base, world frame"),
     Field("angular_velocity_body", "vector", "rad/s", "of the base, body frame"),
 )
+_WAY = Field("uplink", "bool", "", "true for the uplink, false for the downlink")
 _EPOCH = Field("epoch", "int", "", "epoch of its session")
 _COUNTER = Field("counter", "int", "", "counter in the datagram's header")
 _BASIS = Field("basis_stamp_ns", "int", "ns", "stamp of the odometry used, world's clock")
@@ -185,7 +186,7 @@ _TABLE = (
     Topic("/link", "cloudrc_msgs/msg/LinkChanged", rec.LinkChanged, "either",
         "The emulated link of this end was first seen, has changed or is repeated, in real time"
         " only, clock of its end", (
-        Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
+        _WAY,
         Field("shaper", "string", "", "relay or netem"),
         Field("cause", "string", "", "why it changed; empty before the first change"),
         Field("age", "float", "s", "time since these conditions took effect"),
@@ -197,9 +198,8 @@ _TABLE = (
         Field("conditions", "string", "", "the profile as JSON"))),
     Topic("/link_check", "cloudrc_msgs/msg/LinkChecked", rec.LinkChecked, "either",
         "A measured quantity of the link to the end that writes this, and whether it is as asked;"
-        " only in `local` and `cluster` mode, clock of"
-        " its end", (
-        Field("uplink", "bool", "", "true for the uplink, false for the downlink"),
+        " only in `local` and `cluster` mode, clock of its end", (
+        _WAY,
         Field("quantity", "string", "", "mean, deviation, round_trip, loss..."),
         Field("asked", "float", "s or 1", "expected from the profile: a delay or a share"),
         Field("measured", "float", "s or 1", "measured: a delay or a share"),

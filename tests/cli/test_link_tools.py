@@ -105,6 +105,13 @@ def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, cap
     assert not (folder / "t.csv").exists()
 
 
+def test_a_recording_without_round_trips_has_no_halves(folder, capsys):
+    write(folder / "world.mcap", world_records(5))
+    assert main(["link", "record", "world.mcap", "-o", "t.csv", "--halve-rtt"]) == 2
+    said = "world.mcap: holds no round trip; give the folder of a run that flew\n"
+    assert capsys.readouterr().err.endswith(said)
+
+
 @pytest.mark.parametrize(
     ("line", "says"),
     [
@@ -122,7 +129,7 @@ def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, cap
         ("verify nonsense", "no profile or experiment named 'nonsense'"),
         ("verify no/such.yaml", "no such file"),
         ("verify --ends world,", "--ends world,: give two hosts, WORLD,CLOUD"),
-        ("verify lossy --shaper netem", "uplink: netem cannot do loss.delay_bad_ms"),
+        ("verify lossy --shaper netem", "lasts); use --shaper relay, which can, or leave it out"),
     ],
 )
 def test_a_wrong_line_is_refused(line, says, capsys):

@@ -78,6 +78,7 @@ def test_at_most_fifty_problems_are_listed(mine: Path) -> None:
         ("\n".join(["a0: &a0 [1]"] + [f"a{n}: &a{n} [{f'*a{n - 1}, ' * 10}]" for n in range(1, 8)]),
          "more than 300000 values"),
         ("a: " + "9" * 5000, "not readable"),
+        (r'name: "a\0b"', "mine.yaml:1: text with the character NUL"),
         ("world: 3", "mine.yaml:1: world: 3: must be a mapping"),
         ("mission: 3", "mine.yaml:1: mission: 3: must be text or a mapping"),
         ("link: {uplink: 3}", "link.uplink: 3: must be a mapping"),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
+from cloudrc.exposition.ends import LinkVerdict
 from cloudrc.exposition.live import ONE_SHAPER, LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.messages import ZERO, GuardState
@@ -18,6 +20,7 @@ from cloudrc.records import (
     Counted,
     GuardChange,
     Lateness,
+    LinkChecked,
     MissionEvent,
     Record,
     SessionOpened,
@@ -255,3 +258,14 @@ def test_mission_metrics_follow_the_events() -> None:
     assert value(live, "cloudrc_missions_total", "leg_timed_out") == 1
     # A cloud beside which teleop runs has no missions.
     assert not any("mission" in name for name in LiveMetrics("cloud").read())
+
+
+def test_the_newest_verdict_on_the_link_is_exposed() -> None:
+    check = LinkVerdict("uplink")
+    for stamp_ns, verdict, believed in ((1, "open", None), (2, "ok", 1.0), (2, "off", 0.0)):
+        check.see(LinkChecked(stamp_ns, True, "mean", 0.04, math.nan, 0.03, 0.05, verdict, 900))
+        found = {("uplink",): believed}
+        assert check.read() == ({} if believed is None else {"cloudrc_link_believed": found})
+    document = json.loads(check.text())
+    assert (document["verdict"], len(document["rows"])) == ("off", 2)
+    assert "measured" not in document["rows"][0], "an unknown value is left out"

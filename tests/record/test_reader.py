@@ -93,13 +93,26 @@ def test_a_cut_file_is_read_to_its_last_whole_chunk(path: Path) -> None:
         assert (recording.complete, recording.lacking) == (False, "")
 
 
+def copied(data: bytes) -> list[str]:
+    """Return all that a recovery keeps: a file's contents without its numbers of channels."""
+    reader = make_reader(io.BytesIO(data), validate_crcs=True)
+    found: list[object] = [*reader.iter_attachments(), *reader.iter_metadata()]
+    for schema, channel, message in reader.iter_messages():
+        assert schema is not None
+        what = (schema.name, schema.data, channel.topic, channel.message_encoding)
+        found.append((*what, channel.metadata, message))
+    return sorted(re.sub("channel_id=[0-9]+", "", repr(each)) for each in found)
+
+
 @pytest.mark.parametrize("cut", [0, 1, 8, 30])
 def test_a_lost_index_loses_nothing(path: Path, cut: int) -> None:
     path.write_bytes(WHOLE[: len(WHOLE) - cut])
     recording = Recording.read(path)
     assert (recording.complete, recording.note) == (True, "")
     assert [remark[:16] for remark in recording.remarks] == ["had a torn index"] * (cut > 0)
-    assert recover(path, path.with_name("new.mcap")).complete
+    recovery = recover(path, new := path.with_name("new.mcap"))
+    assert (recovery.complete, recovery.index_is_new) == (True, cut > 0)
+    assert copied(new.read_bytes()) == copied(WHOLE)
 
 
 def test_reading_stops_at_the_first_damage(path: Path) -> None:
@@ -317,6 +330,18 @@ def test_messages_without_a_channel_are_counted(path: Path, tmp_path: Path) -> N
     assert recovery.dropped["messages"] > 0
     assert f"{recovery.dropped['messages']} messages are lost" in recovery.notes
     assert "messages are of no topic" in Recording.read(path).lacking
+
+
+def test_nothing_is_offered_of_what_cannot_be_copied(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    new = path.with_name("new.mcap")
+    with pytest.raises(BadInputError, match="holds no readable message: none is in it; nothing"):
+        recover(write(path, []), new)
+    monkeypatch.setattr("cloudrc.record.reader.CHANNELS_MAX", 5)
+    with pytest.raises(BadInputError, match="defines more than 5 channels and schemas"):
+        recover(write(path, world_records(5)), new)
+    assert not new.exists()
 
 
 def test_the_command_says_what_is_kept_and_lost(

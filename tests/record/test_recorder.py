@@ -21,7 +21,7 @@ from cloudrc.record.reader import recover
 from cloudrc.record.recorder import Recorder
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted, Record
-from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records
+from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records, write
 
 
 class Disk(io.BytesIO):
@@ -95,6 +95,17 @@ def test_on_a_full_disk_all_is_kept_or_counted(tmp_path: Path, room: int) -> Non
     assert kept < len(records)
 
 
+def test_without_room_for_the_index_all_chunks_are_kept(tmp_path: Path) -> None:
+    path, records = tmp_path / "w.mcap", counted(20)
+    disk = Disk(write(path, records).stat().st_size - 100)
+    recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
+    recorder.put(records)
+    recorder.close()
+    path.write_bytes(disk.getvalue())
+    assert "disk full" in recorder.error
+    assert (len(Recording.read(path)["/count"]), recorder.dropped) == (20, 0)
+
+
 def failing(step: str, code: int) -> Shelf:
     """Make a sink whose `step` fails."""
 
@@ -109,7 +120,13 @@ def failing(step: str, code: int) -> Shelf:
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
 @pytest.mark.parametrize("step", ["flush", "sync", "close"])
 @pytest.mark.parametrize(
-    ("code", "words"), [(errno.ENOSPC, "disk full"), (errno.EIO, "Input/output error")]
+    ("code", "words"),
+    [
+        (errno.ENOSPC, "disk full"),
+        (errno.EROFS, "disk is read-only"),
+        (errno.EDQUOT, "disk quota used up"),
+        (errno.EIO, "Input/output error"),
+    ],
 )
 def test_disk_errors_are_told_and_never_raised(step: str, code: int, words: str) -> None:
     shelf = failing(step, code)
@@ -164,6 +181,16 @@ def test_a_sync_by_another_thread_reports_its_error_later(tmp_path: Path, works:
     assert not shelf.closed
     recorder.flush(sync=False)
     assert (shelf.closed, recorder.error == "") == (not works, works)
+
+
+def test_a_sync_of_a_closed_file_is_nothing(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "w.mcap", open_mcap)
+    recorder.put(counted(1))
+    recorder.drain()
+    assert recorder._sink is not None
+    recorder._sink.close()
+    assert not recorder.sync()
+    assert recorder.error == ""
 
 
 FLIGHT = """

@@ -75,6 +75,8 @@ def test_a_definition_stands_on_its_own(ros_type: str) -> None:
     store.register(get_types_from_msg(text, ros_type))
     assert store.hash_rihs01(ros_type) == type_hash(ros_type)
     assert is_known(ros_type, text)
+    own, _, _ = text.partition("=" * 80)
+    assert "cloudrc" not in ros_type or all("#" in line for line in own.splitlines())
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import threading
@@ -55,7 +56,6 @@ def test_an_honest_link_is_believed_unless_the_machine_delays_it() -> None:
 
 
 @pytest.mark.process
-@pytest.mark.full
 def test_a_fault_is_named_on_the_command_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -135,6 +135,16 @@ def test_a_seeded_fault_is_named(fault: str) -> None:
     # A machine that does other things, too, may delay the shapers.
     found = codes(probe(experiment, applied=make(experiment)))
     assert {fault} <= found <= {fault, "throttled"}
+
+
+def test_netem_without_root_is_a_missing_prerequisite(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert main(["link", "verify", "ideal", "--shaper", "netem"]) == 3
+    said = capsys.readouterr().err.strip()
+    assert "needs root" in said
+    assert "\n" not in said
 
 
 @pytest.mark.parametrize(
