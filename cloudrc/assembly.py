@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.config import schema
@@ -26,9 +26,10 @@ from cloudrc.link.traces import SIZE_MAX, read_table, read_trace
 from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
-    from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
+    from cloudrc.world.endpoint import WorldEndpoint
 
 MS_TO_NS = 1_000_000
 CRUISE_SPEED = 1.0
@@ -45,7 +46,7 @@ FENCE_SPAN = dist(fence.LOW, fence.HIGH)
 
 def build_world(
     experiment: ResolvedExperiment,
-    identity: WorldIdentity,
+    identity: Identity,
     clock: Callable[[], int] = lambda: 0,
 ) -> WorldEndpoint:
     """Build world's end: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
@@ -87,7 +88,7 @@ def build_world(
 
 def build_cloud(
     experiment: ResolvedExperiment,
-    identity: CloudIdentity,
+    identity: Identity,
     clock: Callable[[], int] = lambda: 0,
     teleop: Operator | None = None,
     *,

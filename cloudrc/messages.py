@@ -125,7 +125,8 @@ class Telemetry(NamedTuple):
         touch_speed: Speed of the tip at its first contact with the board in this mission [m/s]; NaN
             before the first contact.
         mission_id: Mission that was started last, as in `OperatorRequest`; 0 if none.
-        reached: Number of waypoints of that mission reached, as far as world knows.
+        reached: Number of waypoints of that mission reached, as far as world knows, or
+            `MISSION_OVER`.
         cause: Why the guard is in its state; after touch-down in LAND, why the robot landed.
     """
 

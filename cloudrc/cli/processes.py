@@ -240,12 +240,12 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
 def _run_world(options: argparse.Namespace) -> int:
     stop = StopSignal()
     from cloudrc import assembly
-    from cloudrc.world.endpoint import WorldIdentity
+    from cloudrc.tunnel.end import Identity
 
     if options.epochs:
         print("cloudrc: --epochs is ignored: cloud keeps the session number", file=sys.stderr)
     experiment, clock, end = open_end(options, "world")
-    identity = WorldIdentity(clock, os.urandom(16), end.keys.ring)
+    identity = Identity(clock, os.urandom(16), end.keys.ring)
     world = assembly.build_world(experiment, identity, time.monotonic_ns)
     end.run(world, stop, lambda: world.robot.guard.armed, lambda: world.slip_ns)
     return 0
@@ -254,13 +254,13 @@ def _run_world(options: argparse.Namespace) -> int:
 def _run_cloud(options: argparse.Namespace) -> int:
     stop: Callable[[], bool] = StopSignal()
     from cloudrc import assembly
-    from cloudrc.cloud.endpoint import CloudIdentity
     from cloudrc.drivers.teleop import LastWord, RemoteTeleop, UnixPeer
     from cloudrc.messages import GuardState
     from cloudrc.teleop import wire
+    from cloudrc.tunnel.end import Identity
 
     experiment, clock, end = open_end(options, "cloud")
-    identity, teleop = CloudIdentity(clock, os.urandom(16), end.keys.ring), None
+    identity, teleop = Identity(clock, os.urandom(16), end.keys.ring), None
     if options.teleop:
         peer = UnixPeer(options.teleop / "cloud.sock", options.teleop / "teleop.sock")
         teleop = RemoteTeleop(peer, wire.encode, wire.decode, time.monotonic_ns())

@@ -228,12 +228,11 @@ def assemble(
 ) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
     """Assemble both ends and their run in virtual time."""
     from cloudrc import assembly
-    from cloudrc.cloud.endpoint import CloudIdentity
     from cloudrc.drivers.virtual import VirtualRun
-    from cloudrc.world.endpoint import WorldIdentity
+    from cloudrc.tunnel.end import Identity
 
-    world = assembly.build_world(experiment, WorldIdentity(CLOCK, b"world".ljust(16)))
-    cloud = assembly.build_cloud(experiment, CloudIdentity(CLOCK, b"cloud".ljust(16)))
+    world = assembly.build_world(experiment, Identity(CLOCK, b"world".ljust(16)))
+    cloud = assembly.build_cloud(experiment, Identity(CLOCK, b"cloud".ljust(16)))
     return world, cloud, VirtualRun(world, cloud, *assembly.build_links(experiment))
 
 

@@ -30,8 +30,6 @@ from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
 from cloudrc.tunnel.keys import Key
 from cloudrc.tunnel.session import NO_EPOCH
 
-CloudIdentity = Identity
-"""The identity of cloud's end."""
 MISSED_MAX = 50
 """Number of missed periods, not yet forgiven, from which on cloud reports a fault [periods]. Every
 machine misses a few periods."""
@@ -97,7 +95,7 @@ class CloudEndpoint(TunnelEnd):
         self,
         loop: ControlLoop,
         teleop: Operator,
-        identity: CloudIdentity,
+        identity: Identity,
         *,
         newest_wins: bool,
         start_ns: int = 0,

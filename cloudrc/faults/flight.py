@@ -12,7 +12,7 @@ from functools import partial
 from typing import TypeAlias
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.config.load import load_experiment
@@ -35,8 +35,9 @@ from cloudrc.messages import GuardState
 from cloudrc.record.hash import RecordHash
 from cloudrc.records import Counted, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.teleop.store import Mission, Order
+from cloudrc.tunnel.end import Identity
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
+from cloudrc.world.endpoint import WorldEndpoint
 from cloudrc.world.robot import Robot
 
 Shape: TypeAlias = Callable[[DirectionProfile], DirectionProfile]
@@ -184,14 +185,14 @@ class Flight:
         return self.robot.guard.state, self.robot.guard.cause.words
 
     def _build_world(self, start_ns: int) -> WorldEndpoint:
-        identity = WorldIdentity(SHARED, *self._begin("world"))
+        identity = Identity(SHARED, *self._begin("world"))
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self.watch.attach(world.robot, start_ns, honest=self._honest)
         self.world_starts_ns.append(start_ns)
         return world
 
     def _build_cloud(self, start_ns: int) -> Endpoint:
-        identity = CloudIdentity(self._clock_id, *self._begin("cloud"))
+        identity = Identity(self._clock_id, *self._begin("cloud"))
         teleop: Operator = self.teleop.join(start_ns)
         if self._words is not None:
             teleop = HostileOperator(teleop, self._words)
@@ -208,7 +209,7 @@ class Flight:
         """Build another cloud with the same key, which wants to fly the same mission."""
         teleop = InProcessTeleop(self.experiment.criteria.contact_speed_max_mps, name=b"rival")
         teleop.order(Order(assembly.build_plan(self.experiment)), start_ns)
-        identity = CloudIdentity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
+        identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
 
     def _make_link(self, shape: Shape, *, up: bool) -> LinkDirection:

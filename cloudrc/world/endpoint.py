@@ -158,8 +158,6 @@ class PaceMonitor:
         return [Fault(now_ns, "late", text)] if is_news else []
 
 
-WorldIdentity = Identity
-"""The identity of world's end."""
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
 CATCH_UP_NS = 50_000_000
@@ -177,7 +175,7 @@ class WorldEndpoint(TunnelEnd):
         self,
         robot: Robot,
         sensors: Sensors,
-        identity: WorldIdentity,
+        identity: Identity,
         *,
         newest_wins: bool,
         command_age_max_ns: int,

@@ -72,6 +72,7 @@ def test_a_plugin_is_built_and_documented_as_the_contract_says(module, kind):
         assert f"    {name}: " in inspect.getdoc(module.build)
     assert issubclass(signature.return_annotation, kind)
     assert type(module.build()) is signature.return_annotation
+    assert module.build() is not module.build()
     assert "Source:" in module.__doc__
     assert inspect.getdoc(signature.return_annotation)
 

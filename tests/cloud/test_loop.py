@@ -173,13 +173,14 @@ def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
 
 
 ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
+VECTORS = ("velocity", "proportional", "integral", "derivative")
 WRONG = ((0.1, 0.2), (0.1, 0.2, 0.3, 0.4), "abc", None, (None,) * 3)
 
 
 @pytest.mark.parametrize(
     "output",
     [
-        *(ANY._replace(**{field: w}) for w in WRONG for field in ("velocity", "derivative")),
+        *(ANY._replace(**{field: w}) for w in WRONG for field in VECTORS),
         SimpleNamespace(velocity=(0.1, 0.2, 0.3), yaw_rate=0.0),  # without its terms
     ],
 )

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from unittest.mock import Mock
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudEndpoint, CloudIdentity
+from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import (
@@ -30,10 +30,11 @@ from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
+from cloudrc.tunnel.end import Identity
 from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import Session
-from cloudrc.world.endpoint import WorldEndpoint, WorldIdentity
+from cloudrc.world.endpoint import WorldEndpoint
 
 MS = 1_000_000
 CLOCK = bytes(16)
@@ -55,7 +56,7 @@ def bare_world(
     nonce: bytes = b"w", ring: KeyRing | None = None, start_ns: int = 0
 ) -> WorldEndpoint:
     """Make world's end, sealed if it gets keys."""
-    identity = WorldIdentity(CLOCK, nonce.ljust(16), ring)
+    identity = Identity(CLOCK, nonce.ljust(16), ring)
     return WorldEndpoint(
         bare_robot(),
         SimpleNamespace(measure=lambda truth: truth),
@@ -88,7 +89,7 @@ def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
         see=lambda seen, now_ns: None, handle_deadline=lambda now_ns: None,
     )  # fmt: skip
     teleop.take_outputs = lambda: [teleop.outputs.pop(0) for _ in teleop.outputs[:]]
-    identity = CloudIdentity(CLOCK, nonce.ljust(16), keys)
+    identity = Identity(CLOCK, nonce.ljust(16), keys)
     loop: Any = NoLoop()
     return CloudEndpoint(loop, teleop, identity, newest_wins=True, start_ns=start_ns)
 
@@ -205,9 +206,9 @@ class Ends(NamedTuple):
 def join(experiment: ResolvedExperiment, *, offset_ns: int = 0) -> Ends:
     """Assemble an experiment; with an offset the two ends have different clocks."""
     world_clock = b"another clock..." if offset_ns else SHARED_CLOCK
-    world = assembly.build_world(experiment, WorldIdentity(world_clock, b"world".ljust(16)))
+    world = assembly.build_world(experiment, Identity(world_clock, b"world".ljust(16)))
     cloud = assembly.build_cloud(
-        experiment, CloudIdentity(SHARED_CLOCK, b"cloud".ljust(16)), lambda: offset_ns
+        experiment, Identity(SHARED_CLOCK, b"cloud".ljust(16)), lambda: offset_ns
     )
     links = assembly.build_links(experiment)
     return Ends(world, cloud, VirtualRun(world, cloud, *links, cloud_clock_offset_ns=offset_ns))
@@ -261,7 +262,7 @@ class Talk:
     """A sealed world with clouds that the test controls; `cloud` is the one that speaks."""
 
     def __init__(self, nonce: bytes = b"world") -> None:
-        identity = WorldIdentity(CLOCK, nonce.ljust(16), ring())
+        identity = Identity(CLOCK, nonce.ljust(16), ring())
         self.world = assembly.build_world(HOVER, identity)
         self.now_ns, self.records = 0, []
         self.clouds: dict[bytes, BareCloud] = {}

@@ -7,15 +7,14 @@ from collections.abc import Callable
 import pytest
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.faults.flight import Flight
 from cloudrc.record.hash import RecordHash
 from cloudrc.records import Arrival, CommandApplied, SessionOpened
 from cloudrc.tunnel.codec import Kind, peek
+from cloudrc.tunnel.end import Identity
 from cloudrc.tunnel.handshake import COOKIE_NS
-from cloudrc.world.endpoint import WorldIdentity
 from tests.flights.conftest import SHARED_CLOCK, fly_on, ring
 
 HOVER = (
@@ -130,8 +129,8 @@ def test_sealed_and_unsealed_flights_are_the_same_flight() -> None:
     """Flights in virtual time are unsealed; nothing else may differ."""
     experiment, digests = load_experiment("hover", ["mission.waypoints.0.dwell_s=1"]), set()
     for keys in (None, ring()):
-        world = assembly.build_world(experiment, WorldIdentity(SHARED_CLOCK, b"w" * 16, ring=keys))
-        cloud = assembly.build_cloud(experiment, CloudIdentity(SHARED_CLOCK, b"c" * 16, keys))
+        world = assembly.build_world(experiment, Identity(SHARED_CLOCK, b"w" * 16, ring=keys))
+        cloud = assembly.build_cloud(experiment, Identity(SHARED_CLOCK, b"c" * 16, keys))
         run = VirtualRun(world, cloud, *assembly.build_links(experiment))
         digest = RecordHash()
         for each in fly_on(run, 8_000_000_000):

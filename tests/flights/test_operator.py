@@ -5,13 +5,12 @@ from __future__ import annotations
 import pytest
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudIdentity
 from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import GuardChange
 from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
-from cloudrc.world.endpoint import WorldIdentity
+from cloudrc.tunnel.end import Identity
 from tests.flights.conftest import SHARED_CLOCK, Ends, fly_on, join
 
 HOVER = load_experiment("hover", ["link.profile=ideal"])
@@ -77,14 +76,14 @@ def test_used_up_numbers_last_until_the_next_session(ends: Ends) -> None:
     assert say(ends, said._replace(number=NUMBER_MAX + 1), ALARM) == []
     fly_on(ends.run, 5 * S)
     assert ends.cloud._counts["words_dropped"] > 2
-    identity = WorldIdentity(SHARED_CLOCK, b"another".ljust(16))
+    identity = Identity(SHARED_CLOCK, b"another".ljust(16))
     world = ends.run._world = assembly.build_world(HOVER, identity, lambda: ends.run.now_ns)
     fly_on(ends.run, 7 * S)
     assert world.robot.guard.state is ESTOP
 
 
 def test_without_a_session_only_an_alarm_waits() -> None:
-    cloud = assembly.build_cloud(HOVER, CloudIdentity(SHARED_CLOCK, b"cloud".ljust(16)))
+    cloud = assembly.build_cloud(HOVER, Identity(SHARED_CLOCK, b"cloud".ljust(16)))
     cloud.teleop.outputs += [OperatorRequest(3, Request.START), ALARM]
     for now_ns in range(0, S, 10_000_000):
         cloud.handle_deadline(now_ns)

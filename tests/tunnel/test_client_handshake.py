@@ -63,7 +63,9 @@ def test_repeated_challenges_get_a_limited_number_of_answers(cloud: Asking) -> N
     cloud.hello()
     old = [b"%013d" % n for n in range(REPLIES_MAX)]
     assert [answer(cookie) for cookie in 100 * old] == 300 * [None], "old ones use up no answers"
+    assert answer(b"%013d" % 49), "one that got no answer is new"
     assert answer(b"1" * 13)
+    assert [answer(cookie) for cookie in old] == REPLIES_MAX * [None]
     assert cloud.hello().cookie == b"1" * 13
 
 

@@ -30,5 +30,6 @@ def test_seconds_in_which_the_clock_slips_are_reported(
         slip_ns += round(slip * 1e9)
         for fault in pace.check(start_ns + (n + 1) * 1_000_000_000, slip_ns):
             assert fault.code == "late"
+            assert fault.text.endswith("give world more processor time")
             said[n] = fault.text.removeprefix("real-time factor ").partition(": ")[0]
     assert said == reports

@@ -127,6 +127,7 @@ def test_a_velocity_is_followed(scene_at, limit, reference, duration, velocity, 
     simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))
     fly(simulator, LowLevel(integral_limit_xy=limit), reference, duration)
     assert simulator.readings.velocity == pytest.approx(velocity, abs=slack)
+    assert simulator.readings.orientation_wxyz == pytest.approx(UPRIGHT, abs=0.02)
 
 
 def test_reset_gives_the_same_flight_again():

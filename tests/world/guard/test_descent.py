@@ -6,7 +6,7 @@ from math import nan
 import pytest
 
 from cloudrc.geometry import fence
-from cloudrc.messages import ZERO, GuardState
+from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.hold import LAND_SPEED
 from cloudrc.world.simulator import Simulator
 from tests.world.guard.conftest import HERE, LIMITS, MS, SECOND, Flight, command, feed, landing, run
@@ -30,6 +30,7 @@ def test_a_landing_acknowledged_too_low_goes_on_to_touch_down(position, velocity
     stood = run(guard, 3 * SECOND + 300 * MS, 5 * SECOND, position)
     assert set(stood[stood.index(None) :]) == {None}
     assert guard.take_changes()[-1][1:] == (GROUND, DOWN)
+    assert guard.cause is Cause.DOWN
     assert not guard.armed
     guard.start_mission(5 * SECOND)
     feed(guard, 5 * SECOND, 1, position=position)
