@@ -4,6 +4,7 @@ import argparse
 import os
 import signal
 import socket
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -49,11 +50,15 @@ def key(tmp_path):
 
 @pytest.fixture
 def taken():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
-        udp.bind(("127.0.0.1", 0))
-        tcp.bind(udp.getsockname())
-        tcp.listen()
-        yield f"127.0.0.1:{udp.getsockname()[1]}"
+    """Yield an address with a UDP and a TCP socket; the port is free for both only at times."""
+    for _ in range(20):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
+            tcp.bind(("127.0.0.1", 0))
+            with suppress(OSError):
+                udp.bind(tcp.getsockname())
+                tcp.listen()
+                yield f"127.0.0.1:{tcp.getsockname()[1]}"
+                return
 
 
 def run(command, key, *last):
