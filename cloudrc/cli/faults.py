@@ -7,7 +7,6 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ EPILOG = """\
 examples:
   cloudrc faults list
   cloudrc faults run cloud-killed            or by its number: F13
-  cloudrc faults run --all --seed 2 --junit faults.xml
+  cloudrc faults run --all --seed 2 -o json
   cloudrc faults search --minutes 10         random combinations of faults
   cloudrc faults search --minutes 5 --adversarial
   cloudrc faults search --first 201          continue an earlier search
@@ -88,12 +87,11 @@ def _minutes(text: str) -> float:
     return minutes
 
 
-def _output_path(text: str, *, is_folder: bool = False) -> Path:
-    """Parse the path of an output file or folder; refuse one that cannot be made."""
+def _folder(text: str) -> Path:
+    """Parse the path of an output folder; refuse one that cannot be made."""
     path = Path(text)
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
-    fits = existing.is_dir() is (is_folder or existing != path)
-    if not (fits and os.access(existing, os.W_OK)):
+    if not (existing.is_dir() and os.access(existing, os.W_OK)):
         raise argparse.ArgumentTypeError(f"{text}: cannot be written")
     return path
 
@@ -104,13 +102,12 @@ OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
     "run": {
         "--seed": (_seed, 1, "N", "seed (default: 1)"),
         "--jobs": JOBS,
-        "--junit": (_output_path, None, "FILE", "write the results as JUnit XML"),
     },
     "search": {
         "--minutes": (_minutes, 1.0, "M", "duration (default: 1)"),
         "--first": (_seed, 1, "SEED", "first seed (default: 1)"),
         "--jobs": JOBS,
-        "--store": (partial(_output_path, is_folder=True), STORE, "DIR", STORED),
+        "--store": (_folder, STORE, "DIR", STORED),
     },
 }
 """Options of each action: how a value is read, the default, its name in the help, the help."""
@@ -142,7 +139,7 @@ def print_faults(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run one fault, all, or those of a schedule's file."""
-    from cloudrc.faults.scenario import Result, as_json, as_junit
+    from cloudrc.faults.scenario import Result, as_json
     from cloudrc.faults.scenarios import SCENARIOS, find
 
     if isinstance(options.name, Path):
@@ -157,9 +154,6 @@ def run(options: argparse.Namespace) -> int:
 
     jobs = [(each.name, options.seed) for each in chosen]
     cause, code = take_each(map_in_order(_run, jobs, options.jobs), take)
-    if options.junit is not None:
-        options.junit.parent.mkdir(parents=True, exist_ok=True)
-        options.junit.write_text(as_junit(results, options.seed), encoding="utf-8")
     count, failed = len(results), sum(not result.passed for result in results)
     if options.output != "table":
         print(format_document(as_json(results, options.seed), options.output))
@@ -202,8 +196,8 @@ def fly_file(options: argparse.Namespace) -> int:
     from cloudrc.faults.schedule import load
     from cloudrc.faults.trial import fly
 
-    if options.junit is not None or options.seed != 1:
-        raise BadInputError("--junit and --seed belong to named faults, not to a schedule's file")
+    if options.seed != 1:
+        raise BadInputError("--seed belongs to named faults, not to a schedule's file")
     schedule = load(options.name)
     try:
         finding = fly(schedule, keep=True)

@@ -95,12 +95,6 @@ def _end_arguments(parser: argparse.ArgumentParser) -> None:
     _add(target, "--route", "FILE", route)
 
 
-def _world_arguments(parser: argparse.ArgumentParser) -> None:
-    _end_arguments(parser)
-    epochs = "ignored: cloud keeps the session number"
-    parser.add_argument("--epochs", metavar="FILE", help=epochs)
-
-
 def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
     _end_arguments(parser)
     teleop = "take missions from 'cloudrc teleop --socket DIR' (default: fly the experiment's)"
@@ -242,8 +236,6 @@ def _run_world(options: argparse.Namespace) -> int:
     from cloudrc import assembly
     from cloudrc.tunnel.end import Identity
 
-    if options.epochs:
-        print("cloudrc: --epochs is ignored: cloud keeps the session number", file=sys.stderr)
     experiment, clock, end = open_end(options, "world")
     identity = Identity(clock, os.urandom(16), end.keys.ring)
     world = assembly.build_world(experiment, identity, time.monotonic_ns)
@@ -571,6 +563,6 @@ def _log(line: str) -> None:
     print_line(f"cloudrc relay: {line}", sys.stderr)
 
 
-world = Command(_world_arguments, _run_world)
+world = Command(_end_arguments, _run_world)
 cloud = Command(_cloud_arguments, _run_cloud)
 relay = Command(_relay_arguments, _run_relay)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import operator
-import xml.etree.ElementTree as Xml
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -155,19 +154,3 @@ def as_json(results: Sequence[Result], seed: int) -> dict[str, Any]:
     """Return the results of scenarios as plain values."""
     passed, faults = all(each.passed for each in results), [each.as_json() for each in results]
     return {"schemaVersion": 1, "seed": seed, "passed": passed, "faults": faults}
-
-
-def as_junit(results: Sequence[Result], seed: int) -> str:
-    """Return the results of scenarios as JUnit XML, one test case per fault."""
-    failures = str(sum(not result.passed for result in results))
-    counts = {"tests": str(len(results)), "failures": failures, "skipped": "0"}
-    suite = Xml.Element("testsuite", {"name": f"cloudrc faults, seed {seed}", **counts})
-    for result in results:
-        name, seconds = f"{result.scenario.id} {result.scenario.name}", f"{result.seconds:.3f}"
-        case = Xml.SubElement(suite, "testcase", classname="faults", name=name, time=seconds)
-        if not result.passed:
-            lines = [check.show() for check in result.outcome.checks if not check.passed]
-            lines = [*filter(None, [result.error]), *lines] or ["it checked nothing"]
-            Xml.SubElement(case, "failure", message=lines[0]).text = "\n".join(lines)
-    Xml.indent(suite)
-    return Xml.tostring(suite, encoding="unicode", xml_declaration=True) + "\n"

@@ -33,13 +33,6 @@ def test_a_pipe_device_or_folder_is_refused_at_once(what, no_waiting, capsys):
     assert os.listdir() == ["pipe"]
 
 
-def test_a_file_of_epochs_is_ignored_with_one_line(capsys):
-    words = "world --config none --listen 127.0.0.1:9 --peer 127.0.0.1:9 --key none --epochs none"
-    assert main(words.split()) == 2
-    line, _ = capsys.readouterr().err.splitlines()
-    assert line == "cloudrc: --epochs is ignored: cloud keeps the session number"
-
-
 def test_a_redirected_file_is_read(tmp_path):
     """As with `/dev/stdin` and '<'."""
     run = write(tmp_path / "run.mcap", world_records(50))
