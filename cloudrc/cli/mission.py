@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
     from cloudrc.cluster.jobs import JobStatus
     from cloudrc.config.document import Document
-    from cloudrc.config.schema import Experiment
 
 EPILOG = """\
 where:
@@ -70,8 +69,9 @@ TURN_MAX = 30.0
 suspended."""
 TERMINATION_LOG = Path("/dev/termination-log")
 """File in a pod; `kubectl describe` shows its text after the container has ended."""
-UNKNOWN_LIMIT = 600.0
-"""Time limit of a mission if neither the mission nor the release's experiment has a limit [s]."""
+LIMIT_MAX = 86_400.0
+"""Time limit of the Job of a mission that has no limit [s]; teleop ends such a mission at the limit
+of the release's experiment."""
 
 _Answer = TypeVar("_Answer")
 Json = dict[str, Any]
@@ -426,51 +426,25 @@ def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
         yield Api(url, token_reader(path) if path else lambda: token)
 
 
-def _check(name: str, mission: Json, experiment: Experiment | None) -> float:
-    """Check a mission as the API does, before its Job is created; return its time limit [s].
+def _time_limit(name: str, mission: Json) -> float:
+    """Check the format of a mission before its Job is created; return its time limit [s].
+
+    The API checks the rest, for example whether the waypoints are inside the fence.
 
     Raises:
         BadInputError: If the mission is invalid; the text lists all problems.
     """
     from pydantic import ValidationError
 
-    from cloudrc.config.mission_check import check_mission
-    from cloudrc.config.problems import Problem, from_pydantic, raise_problems
-    from cloudrc.config.schema import Mission
-    from cloudrc.geometry.scene import load_scene
+    from cloudrc.config.problems import from_pydantic, raise_problems
     from cloudrc.teleop.models import MissionRequest
 
-    problems, limit = [], UNKNOWN_LIMIT
     try:
         request = MissionRequest.model_validate_json(json.dumps(mission))
     except ValidationError as error:
         raise_problems(_read(name), from_pydantic(error, MissionRequest), name)
         raise  # if no problem was listed
-    if not request.waypoints:
-        problems = [Problem(("waypoints",), "", "none given; give at least one")]
-    elif experiment is not None:
-        limit = experiment.criteria.time_limit_s
-        plan = Mission(start=request.start, waypoints=request.waypoints)
-        problems = check_mission(plan, load_scene(experiment.world.scene))
-    raise_problems(_read(name), problems, name)
-    return request.time_limit_s or limit
-
-
-def _experiment(release: Release) -> Experiment | None:
-    """Read the experiment of a release; None if this user's rights or this version prevent it."""
-    from pydantic import ValidationError
-
-    from cloudrc.cluster.client import FILE, ClusterError, experiment_text
-    from cloudrc.config.document import parse_yaml
-    from cloudrc.config.schema import Experiment
-    from cloudrc.config.shipped import check_name
-
-    with suppress(ClusterError, BadInputError, ValidationError):
-        tree, _ = parse_yaml(experiment_text(release), FILE)
-        experiment = Experiment.model_validate_json(json.dumps(tree or {}))
-        check_name("scene", experiment.world.scene)
-        return experiment
-    return None
+    return request.time_limit_s or LIMIT_MAX
 
 
 def _run_job(options: argparse.Namespace) -> int:
@@ -480,7 +454,7 @@ def _run_job(options: argparse.Namespace) -> int:
     from cloudrc.cluster.pods import find_deployment
 
     find_deployment(release, "cloud")
-    limit = _check(options.mission, mission, _experiment(release))
+    limit = _time_limit(options.mission, mission)
     # After 'helm install' without --wait this takes some seconds: the link starts last.
     wait_ready(release, timeout=options.timeout, tell=print_line)
     job = run_job(release, mission, limit=limit, queue=options.queue)

@@ -26,7 +26,6 @@ from cloudrc.drivers.realtime import Address
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.config.schema import Mission
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.geometry.scene import Scene
     from cloudrc.records import Record
@@ -43,7 +42,7 @@ PAUSE_LIMIT_NS = 500_000_000
 """Longest time that teleop, before it ends, waits for the robot to hold [ns]."""
 EPILOG = """\
 teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
---start or --mission it ends after that mission; otherwise on SIGTERM, on Ctrl-C
+--start it ends after that mission; otherwise on SIGTERM, on Ctrl-C
 and when its parent process has ended. A flying robot then holds; a new teleop
 with the same --journal resumes the mission.
 
@@ -70,11 +69,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     ):
         required = flag == "--socket"
         parser.add_argument(flag, type=kind, metavar=metavar, required=required, help=text)
-    first = parser.add_mutually_exclusive_group()
-    first.add_argument("--mission", metavar="FILE", help="fly this mission, then exit")
-    first.add_argument(
-        "--start", action="store_true", help="fly the experiment's mission, then exit"
-    )
+    start = "fly the experiment's mission, then exit"
+    parser.add_argument("--start", action="store_true", help=start)
 
 
 def api_address(text: str) -> Address | Path:
@@ -240,36 +236,22 @@ def _open_store(
 def _start(
     options: argparse.Namespace, experiment: ResolvedExperiment, service: MissionService
 ) -> bool:
-    """Start the mission of the command line, if any; return whether teleop flies it."""
+    """Start the experiment's mission if `--start` is given; return whether teleop flies it."""
     from cloudrc import assembly
     from cloudrc.teleop.store import ConflictError, Order
 
-    if not (options.start or options.mission):
+    if not options.start:
         return False
-    criteria, mission, name = experiment.criteria, experiment.mission, experiment.name
-    if options.mission:
-        mission, name = _load_mission(options.mission, experiment), Path(options.mission).stem
-    plan = assembly.mission_plan(mission, criteria.time_limit_s, experiment.seed)
+    criteria = experiment.criteria
+    plan = assembly.mission_plan(experiment.mission, criteria.time_limit_s, experiment.seed)
     if any(each.order.plan == plan for each in service.book.open()):
         return True  # the previous process started it with the same options: it resumes
     try:
-        service.create(Order(plan, name, contact=criteria.contact), time.monotonic_ns())
+        order = Order(plan, experiment.name, contact=criteria.contact)
+        service.create(order, time.monotonic_ns())
     except ConflictError as error:
         if not options.api:
             raise
         log_line(str(error))
         return False  # the operator can solve the conflict through the API
     return True
-
-
-def _load_mission(name: str, experiment: ResolvedExperiment) -> Mission:
-    from cloudrc.config.load import load_mission
-    from cloudrc.config.mission_check import check_mission
-    from cloudrc.errors import BadInputError
-    from cloudrc.geometry.scene import load_scene
-
-    mission = load_mission(name)
-    problems = check_mission(mission, load_scene(experiment.world.scene))
-    if problems:
-        raise BadInputError("\n  ".join([f"{name} cannot be flown:", *map(str, problems)]))
-    return mission

@@ -6,7 +6,6 @@ Errors of the cluster and of the programs become one sentence.
 from __future__ import annotations
 
 import json
-import logging
 import re
 import shutil
 import subprocess
@@ -35,8 +34,6 @@ STOP_LIMIT = 2.0
 """Time from SIGTERM to SIGKILL in which a program can end [s]."""
 OLDEST = (1, 29)
 """Oldest Kubernetes version that the chart supports, as kubeVersion in Chart.yaml."""
-FILE = "experiment.yaml"
-"""Key of the experiment in the ConfigMap of a release."""
 WHERE_TO_GET = {
     "kubectl": "https://kubernetes.io/docs/tasks/tools/",
     "helm": "https://helm.sh/docs/intro/install/",
@@ -115,7 +112,7 @@ class Release:
         from kubernetes import client, config
 
         configuration = client.Configuration()
-        with explain_errors("read the kubeconfig", self.where), _login_errors(self.where):
+        with explain_errors("read the kubeconfig", self.where):
             load: Any = config.load_kube_config  # not annotated
             load(context=self.context, client_configuration=configuration)
         configuration.retries = False  # callers repeat a request themselves, with a message
@@ -149,32 +146,6 @@ class Release:
         selector = ",".join(f"{name}={value}" for name, value in self.labels(component).items())
         found: list[Any] = self.request("list", kind, label_selector=selector)
         return found
-
-
-@contextmanager
-def _login_errors(where: str) -> Iterator[None]:
-    """Raise an error if the kubeconfig's login program fails, which the client only logs."""
-    messages: list[str] = []
-
-    class Listener(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            messages.append(" ".join(record.getMessage().split()))
-
-    # The client logs to the root logger, which prints when it has no handler. The NullHandler
-    # stays, because the client logs again after a token has expired.
-    root, listener = logging.getLogger(), Listener(logging.ERROR)
-    if not any(isinstance(handler, logging.NullHandler) for handler in root.handlers):
-        root.addHandler(logging.NullHandler())
-    root.addHandler(listener)
-    try:
-        yield
-    finally:
-        root.removeHandler(listener)
-    if messages:
-        raise MissingPrerequisiteError(
-            f"cannot log in to the cluster {where}: the kubeconfig's login program failed: "
-            f"{messages[0]}; install it, or run it by hand to see why"
-        )
 
 
 def connect(
@@ -218,12 +189,6 @@ def server_version(release: Release) -> tuple[int, int]:
     # The minor version of some vendors has a suffix: "29+".
     major, minor = (int(re.sub(r"\D.*", "", text) or 0) for text in (code.major, code.minor))
     return major, minor
-
-
-def experiment_text(release: Release) -> str:
-    """Read the experiment of a release as YAML; "" if its ConfigMap is missing."""
-    found = release.find("configmaps", "experiment")
-    return next((str((each.data or {}).get(FILE, "")) for each in found), "")
 
 
 @contextmanager

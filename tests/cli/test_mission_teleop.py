@@ -33,7 +33,6 @@ def test_a_missing_resource_is_named(tmp_path: Path) -> None:
             ("x" * 200,): "longer than 107 bytes",
             (str(tmp_path), "--api=nowhere"): "nowhere' is not HOST:PORT",
             (str(tmp_path), "--journal=/proc/journal"): "/proc/journal",
-            (str(tmp_path), "--mission=none"): "none",
         }
         for words, said in cases.items():
             command = [sys.executable, "-m", "cloudrc", *WORDS, *words]

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from cloudrc.cluster import client
 from cloudrc.cluster.client import ClusterError, Release, UnavailableError, connect
@@ -23,7 +19,6 @@ from tests.cluster.conftest import (
     MISSION,
     FakeApi,
     end,
-    kubeconfig,
     pod,
     start_pod,
     terminated,
@@ -55,29 +50,6 @@ def test_a_missing_kubeconfig_is_reported_with_a_remedy(
     with pytest.raises(MissingPrerequisiteError, match="kind create cluster") as caught:
         connect()
     assert "\n" not in str(caught.value)
-
-
-def test_a_failing_login_program_is_named_in_one_line(tmp_path: Path) -> None:
-    """Runs in its own process, because pytest captures log records."""
-    program = tmp_path / "login-to-nowhere"
-    program.write_text("#!/bin/sh\necho no token >&2; exit 7\n")
-    program.chmod(0o755)
-    config = yaml.safe_load(kubeconfig("http://127.0.0.1:9"))
-    version = "client.authentication.k8s.io/v1"
-    login = {"apiVersion": version, "command": str(program), "interactiveMode": "Never"}
-    config["users"][0]["user"] = {"exec": login}
-    (tmp_path / "config").write_text(yaml.safe_dump(config))
-    done = subprocess.run(
-        [sys.executable, "-m", "cloudrc", "mission", "list", "-n", "demo"],
-        env={**os.environ, "KUBECONFIG": str(tmp_path / "config"), "PYTHONPATH": str(ROOT)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 3, done.stderr
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("cloudrc: error: cannot log in to the cluster in namespace 'demo'")
-    assert "returned 7" in line
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from cloudrc.cli import mission as command
 from cloudrc.cli.main import main
@@ -23,7 +22,6 @@ from tests.cluster.conftest import (
     FakeApi,
     at_look,
     end,
-    labels,
     made,
     pod,
     start_pod,
@@ -103,48 +101,26 @@ def test_list_status_and_logs_show_jobs(running: FakeApi, capsys: Printed) -> No
     assert capsys.readouterr().out.splitlines()[-1] == VERDICT[1]
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (f"time_limit_s: .nan\n{WAYPOINTS}", "time_limit_s: nan: must be finite"),
-        ("waypoints: [{position_m: [0, 0, 99]}]", "waypoints.0.position_m.*beyond the fence"),
-    ],
-)
-def test_a_mission_that_cannot_be_flown_makes_no_job(
-    running: FakeApi, folder: Path, capsys: Printed, text: str, words: str
-) -> None:
-    (folder / "wrong.yaml").write_text(text)
+def test_a_mission_of_the_wrong_format_makes_no_job(running, folder, capsys):
+    (folder / "wrong.yaml").write_text(f"time_limit_s: .nan\n{WAYPOINTS}")
     assert main(["mission", "run", "wrong.yaml"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("cloudrc: error: wrong.yaml")
-    assert re.search(words, said)
+    assert "time_limit_s: nan: must be finite" in said
     assert made(running) == []
 
 
 @pytest.mark.parametrize(
-    ("mission", "given", "limit"),
-    [
-        (WAYPOINTS, {"criteria": {"time_limit_s": 300.0}}, 300),
-        (f"time_limit_s: 20\n{WAYPOINTS}", {"criteria": {"time_limit_s": 300.0}}, 20),
-        (WAYPOINTS, {"seed": 4, "link": {"profile": "lossy"}}, 60),
-        (WAYPOINTS, None, 600),
-    ],
+    ("mission", "limit"), [(f"time_limit_s: 20\n{WAYPOINTS}", 20), (WAYPOINTS, 86_400)]
 )
-def test_a_jobs_deadline_follows_the_missions_time_limit(
-    lands: FakeApi, folder: Path, mission: str, given: Any, limit: int
-) -> None:
-    data = {"experiment.yaml": yaml.safe_dump(given)}
-    metadata = {"name": "cloudrc-experiment", "labels": labels("experiment")}
-    lands.put("configmaps", {"metadata": metadata, "data": data})
-    if given is None:
-        lands.refuse["GET", "configmaps"] = 403, "configmaps is forbidden"
+def test_a_jobs_deadline_follows_the_missions_time_limit(lands, folder, mission, limit):
     (folder / "one.yaml").write_text(mission)
     for queue in ([], ["--queue"]):
         assert main(["mission", "run", "one.yaml", *queue]) == 0
         job = made(lands)[-1]
         deadline = job["spec"]["activeDeadlineSeconds"]
         assert deadline >= limit + (600 if queue else 0) + 60
-        assert queue or given is None or deadline <= limit + 180
+        assert queue or deadline <= limit + 180
         assert job["metadata"]["patience"] > deadline
 
 
