@@ -1,7 +1,7 @@
 """Run `cloudrc mission`: fly and steer missions, in a local run or in a cluster.
 
-Verbs go to teleop's API. In a cluster a mission is a Kubernetes Job, and the verbs about Jobs go to
-Kubernetes. A command that follows a mission exits with the code of the verdict.
+Verbs go to teleop's API. In a cluster `run` makes a Kubernetes Job, whose pod posts the mission to
+that API. A command that follows a mission exits with the code of the verdict.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -33,7 +32,6 @@ from cloudrc.errors import (
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
-    from cloudrc.cluster.jobs import JobStatus
     from cloudrc.config.document import Document
 
 EPILOG = """\
@@ -106,7 +104,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     output_argument(add("list", "list all missions"))
     status = add("status", "show the robot's state, or the state of a mission")
     output_argument(status)
-    status.add_argument("id", nargs="?", metavar="ID", help="mission (in a cluster: name of a Job)")
+    status.add_argument("id", nargs="?", metavar="ID", help="mission (default: the robot)")
     cancel = add("cancel", "cancel a mission; the robot holds its position")
     cancel.add_argument("id", nargs="?", metavar="ID", help="mission (default: the current one)")
     logs = add("logs", "show the events of missions")
@@ -137,8 +135,8 @@ def execute(options: argparse.Namespace) -> int:
         return API_VERBS[verb](options, Api(options.api, token_reader(token_file(options))))
     if (url := find_local_run(options, api_url_of, NO_API)) is not None:
         return API_VERBS[verb](options, Api(url))  # a local run asks for no token, so send none
-    if verb in ("run", "list", "logs") or (verb in ("status", "cancel") and options.id):
-        return JOB_VERBS[verb](options)
+    if verb == "run":
+        return _run_job(options)
     with _forwarded_api(options) as forwarded:
         return API_VERBS[verb](options, forwarded)
 
@@ -462,60 +460,9 @@ def _run_job(options: argparse.Namespace) -> int:
     try:
         ended = follow(release, job.name, print_line, timeout=follow_limit(limit, options.queue))
     except KeyboardInterrupt:
-        command = f"cloudrc mission cancel {job.name} {' '.join(release.cloudrc_flags)}"
-        print(f"Job {job.name} is still running; cancel it: {command}", file=sys.stderr)
+        command = f"kubectl {' '.join(release.flags)} delete job {job.name}"
+        print(f"Job {job.name} is still running; cancel its mission: {command}", file=sys.stderr)
         raise
     if ended.exit_code is None:
         print_line(ended.message)
     return 1 if ended.exit_code is None else ended.exit_code
-
-
-def _show_jobs(options: argparse.Namespace) -> int:
-    """List all Jobs, or show one."""
-    release = _release(options)
-    from cloudrc.cluster.jobs import list_jobs, read_job
-
-    shows_all = options.verb == "list"
-    jobs: list[JobStatus] = list_jobs(release) if shows_all else [read_job(release, options.id)]
-    if options.output != "table":
-        return _print({"jobs": [asdict(job) for job in jobs]}, options.output)
-    if not jobs:
-        print(f"no missions {release.where}; fly one: cloudrc mission run FILE")
-        return 0
-    heads = [("JOB", "STATE", "CREATED", "VERDICT")] if shows_all else []
-    print(table([*heads, *((job.name, job.state, job.created, job.message) for job in jobs)]))
-    return 0
-
-
-def _cancel_job(options: argparse.Namespace) -> int:
-    release, path = _release(options), token_file(options)
-    from cloudrc.cluster.jobs import cancel
-
-    print_line(cancel(release, options.id, token_reader(path)() if path else None))
-    return 0
-
-
-def _job_logs(options: argparse.Namespace) -> int:
-    release, job = _release(options), options.id
-    from cloudrc.cluster.jobs import follow, list_jobs, logs
-
-    if job is None:
-        jobs = list_jobs(release)
-        if not jobs:
-            raise BadInputError(f"no missions {release.where}")
-        job = jobs[-1].name
-    if options.follow:
-        follow(release, job, print_line, timeout=86_400.0)
-    else:
-        for line in logs(release, job):
-            print_line(line)
-    return 0
-
-
-JOB_VERBS: dict[str, Callable[[argparse.Namespace], int]] = {
-    "run": _run_job,
-    "list": _show_jobs,
-    "status": _show_jobs,
-    "cancel": _cancel_job,
-    "logs": _job_logs,
-}

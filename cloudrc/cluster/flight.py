@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, retry, run
-from cloudrc.cluster.jobs import cancel, current_mission, follow, follow_limit, run_job
+from cloudrc.cluster.jobs import delete_job, follow, follow_limit, job_under_way, run_job
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
@@ -150,12 +150,11 @@ def fly_in_cluster(
     """
     from cloudrc.config.load import dump
 
-    found, job = current_mission(release)
-    if found:  # an install would replace both pods
-        end = " ".join(["cloudrc mission cancel", *filter(None, [job]), *release.cloudrc_flags])
+    if job := job_under_way(release):  # an install would replace both pods
         raise ClusterError(
-            f"{found} is under way on release '{release.name}' {release.where}; wait for it, "
-            f"end it: {end}, or fly on a release of your own: --release NAME"
+            f"Job '{job}' is under way on release '{release.name}' {release.where}; wait for it, "
+            f"end it: kubectl {' '.join(release.flags)} delete job {job}, or fly on a release of "
+            "your own: --release NAME"
         )
     began = time.monotonic()
     install(release, chart_values(experiment, current_values(release)), timeout, tell)
@@ -221,8 +220,9 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
     try:
         ended = follow(release, job.name, tell, timeout=follow_limit(limit, False))
     except KeyboardInterrupt:
+        tell("cancelling the mission")
         try:
-            tell(cancel(release, job.name))
+            delete_job(release, job.name)
         except CloudrcError as error:
             tell(f"cannot cancel: {error}")
         raise

@@ -1,4 +1,4 @@
-"""Fly missions as Kubernetes Jobs: create, list, follow, cancel and delete them.
+"""Fly missions as Kubernetes Jobs: create, follow and delete them.
 
 The container of a Job posts the mission to the release's API, follows the mission, and ends with
 the exit code of the mission's verdict. The objects are those of the chart's
@@ -10,8 +10,6 @@ from __future__ import annotations
 import json
 import secrets
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,18 +20,15 @@ import yaml
 
 from cloudrc.cluster.client import ClusterError, Release, chart_folder, retry
 from cloudrc.cluster.pods import (
-    NO_PROXY,
-    api_url,
     container_statuses,
     find_deployment,
     list_pods,
     one_line,
-    operator_token,
     pod_failure,
     pod_log,
     tokens_secret,
 )
-from cloudrc.errors import TimedOutError
+from cloudrc.errors import CloudrcError, TimedOutError
 
 EXAMPLE = "examples/mission-job.yaml"
 """The objects of a mission in the chart, for the names of no release."""
@@ -58,8 +53,8 @@ KEEP_FINISHED = 3600
 """How long Kubernetes keeps a finished Job [s]."""
 LOOK_PERIOD = 0.5
 """Time between two looks at a Job [s]."""
-API_TIMEOUT = 10.0
-"""Time limit for the release's API to answer [s]."""
+DELETE_LIMIT = 40.0
+"""Time limit for a deleted Job to end [s]; Kubernetes gives its pod 30 s."""
 ENDED = ("complete", "failed")
 
 
@@ -69,17 +64,13 @@ class JobStatus:
 
     Attributes:
         name: Name of the Job.
-        uid: UID of the Job, and key of the mission in the API.
         state: "pending", "flying", "complete" or "failed".
-        created: Time of creation on the cluster's clock (RFC 3339).
         exit_code: Exit code of the container; None until the container has ended.
         message: Verdict in words; "" until the verdict is known.
     """
 
     name: str
-    uid: str
     state: str
-    created: str
     exit_code: int | None
     message: str
 
@@ -126,7 +117,7 @@ def run_job(
     try:
         release.request("create", "configmaps", body=plan)
     except BaseException:  # Ctrl-C too: without its mission the Job would wait forever
-        with suppress(ClusterError):
+        with suppress(CloudrcError):
             delete_job(release, name)
         raise
     return _status(created, None)
@@ -180,25 +171,23 @@ def follow_limit(limit: float, queue: bool) -> float:
     return deadline_of(limit, queue) + END_ALLOWANCE
 
 
-def list_jobs(release: Release) -> list[JobStatus]:
-    """List the Jobs of a release's missions, the oldest first."""
-    jobs = release.find("jobs", COMPONENT)
-    pods = {_uid(pod): pod for pod in list_pods(release, COMPONENT)}
-    found = [_status(job, pods.get(job.metadata.uid)) for job in jobs]
-    return sorted(found, key=lambda status: status.created)
-
-
-def read_job(release: Release, name: str) -> JobStatus:
-    """Read the state of one Job."""
-    return _read(release, name)[0]
+def job_under_way(release: Release) -> str | None:
+    """Return the name of a Job of this release that flies a mission, or waits to; else None."""
+    jobs = [_status(job, None) for job in release.find("jobs", COMPONENT)]
+    return next((job.name for job in jobs if job.state not in ENDED), None)
 
 
 def delete_job(release: Release, name: str) -> None:
-    """Delete a Job with its pod and ConfigMap; a mission that was already posted continues."""
-    release.request("delete", "jobs", name=name, propagation_policy="Background")
+    """Delete a Job with its pod and ConfigMap; the pod cancels its mission before it ends."""
+    release.request("delete", "jobs", name=name, propagation_policy="Foreground")
+    until = time.monotonic() + DELETE_LIMIT
+    while any(job.metadata.name == name for job in release.find("jobs", COMPONENT)):
+        if time.monotonic() > until:
+            raise TimedOutError(f"Job '{name}' has not ended {DELETE_LIMIT:g} s after its deletion")
+        time.sleep(LOOK_PERIOD)
 
 
-def _read(release: Release, name: str) -> tuple[JobStatus, Any]:
+def read_job(release: Release, name: str) -> tuple[JobStatus, Any]:
     """Read a Job's state and its pod; None without a pod."""
     job = release.request("get", "jobs", name=name)
     pods = list_pods(release, COMPONENT)
@@ -223,9 +212,7 @@ def _status(job: Any, pod: Any) -> JobStatus:
             state = "complete"
         elif condition.status == "True" and condition.type == "Failed":
             state, message = "failed", message or _failure(condition)
-    created = job.metadata.creation_timestamp
-    stamp = created.isoformat() if created else ""
-    return JobStatus(job.metadata.name, job.metadata.uid, state, stamp, exit_code, message)
+    return JobStatus(job.metadata.name, state, exit_code, message)
 
 
 def _failure(condition: Any) -> str:
@@ -255,14 +242,9 @@ def follow(
         if time.monotonic() > until:
             raise TimedOutError(
                 f"Job '{name}' has not ended within {timeout:g} s; it continues; "
-                f"see: cloudrc mission status {name} {' '.join(release.cloudrc_flags)}"
+                f"see: kubectl {' '.join(release.flags)} describe job {name}"
             )
         time.sleep(LOOK_PERIOD)
-
-
-def logs(release: Release, name: str) -> list[str]:
-    """Read the log of a Job, as lines."""
-    return _log(release, _read(release, name)[1])
 
 
 def _log(release: Release, pod: Any) -> list[str]:
@@ -273,7 +255,7 @@ def _log(release: Release, pod: Any) -> list[str]:
 
 def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
     """Read a Job's state and log; raise a ClusterError if its pod will never run."""
-    status, pod = _read(release, name)
+    status, pod = read_job(release, name)
     if status.state != "pending":
         return status, _log(release, pod)
     if pod is not None:
@@ -288,65 +270,3 @@ def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
             f"kubectl {' '.join(release.flags)} delete job {name}"
         )
     return status, []
-
-
-def cancel(release: Release, name: str, token: str | None = None) -> str:
-    """Cancel the mission of a Job; delete a Job that has not posted its mission yet.
-
-    Args:
-        release: Release that flies the mission.
-        name: Name of the Job.
-        token: Token of an operator; None to read the token from the release's Secret.
-
-    Returns:
-        The result in words.
-    """
-    status = read_job(release, name)
-    if status.state in ENDED:
-        return f"Job '{name}' has ended already: {status.message or status.state}"
-    if all(pod.status.phase != "Running" for pod in list_pods(release, "cloud")):
-        delete_job(release, name)
-        command = f"cloudrc mission cancel {' '.join(release.cloudrc_flags)}"
-        return (
-            f"Job '{name}' is deleted; no cloud pod runs: a mission that it has posted continues "
-            f"when one runs; cancel it then: {command}"
-        )
-    token = token or operator_token(release)
-    with api_url(release) as api:
-        missions = _ask(f"{api}/v1/missions", token)["missions"]
-        found = next((m for m in missions if m["key"] == status.uid), None)
-        if found is not None:
-            _ask(f"{api}/v1/missions/{found['id']}/cancel", token, method="POST")
-            return f"mission {found['id']} ({found['name']}) of Job '{name}' is cancelled"
-    delete_job(release, name)
-    return f"Job '{name}' is deleted; it had not posted its mission"
-
-
-def current_mission(release: Release) -> tuple[str, str]:
-    """Find the mission that flies, or will fly next, on a release; the release need not exist.
-
-    Returns:
-        The mission in words, and the name of its Job; "" for what is unknown.
-    """
-    for job in list_jobs(release):
-        if job.state not in ENDED:
-            return f"Job '{job.name}'", job.name
-    # An error leaves the answer unknown: a broken release must not prevent its own repair.
-    with suppress(ClusterError, TimedOutError), api_url(release) as api:
-        for mission in _ask(f"{api}/v1/missions", operator_token(release))["missions"]:
-            if mission["state"] not in ("done", "failed", "cancelled"):
-                return f"mission {mission['id']}", ""
-    return "", ""
-
-
-def _ask(url: str, token: str, *, method: str = "GET") -> Any:
-    headers = {"Authorization": f"Bearer {token}"}
-    request = urllib.request.Request(url, headers=headers, method=method)
-    try:
-        with NO_PROXY.open(request, timeout=API_TIMEOUT) as answer:
-            return json.loads(answer.read() or b"null")
-    except urllib.error.HTTPError as error:
-        text = error.read().decode(errors="replace")
-        raise ClusterError(f"the API refuses ({error.code}): {text}") from error
-    except (OSError, ValueError) as error:
-        raise ClusterError(f"the API does not answer: {error}") from error

@@ -197,20 +197,29 @@ def test_a_broken_port_forward_loses_metrics_but_no_report(
     assert (tmp_path / "out" / "cloud-teleop.log").is_file()
 
 
-def test_a_run_does_not_end_a_flight_in_progress(
-    ready: FakeApi, teleop: FakeTeleop, tmp_path: Path, capsys: Printed
+def test_an_interrupted_flight_cancels_its_mission_and_is_reported(
+    ready: FakeApi, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    teleop.missions = [{"id": "m7", "state": "held"}]
-    assert main([*LINE, "--out", "out"]) == 5
-    said = capsys.readouterr().err
-    assert "mission m7 is under way on release 'cloudrc'" in said
-    assert "end it: cloudrc mission cancel --namespace=demo --release=cloudrc, or" in said
-    teleop.missions = [{"id": "m7", "state": "done"}]
+    def interrupted(*arguments: object, **more: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(flight, "follow", interrupted)
+    # The fixture's recording was made in virtual time, which the verdict says first.
+    assert main([*LINE, "--out", "out"]) == 6
+    captured = capsys.readouterr()
+    assert "cancelling the mission" in captured.err
+    assert "DELETE jobs/" in " ".join(ready.seen)
+    assert json.loads(captured.out)["mode"] == "cluster"
+
+
+def test_a_run_does_not_end_a_flight_in_progress(
+    ready: FakeApi, tmp_path: Path, capsys: Printed
+) -> None:
     run_job(connect(), {}, name="first")
     assert main([*LINE, "--out", "out"]) == 5
     said = capsys.readouterr().err
     assert "Job 'first' is under way" in said
-    assert "cloudrc mission cancel first --namespace=demo --release=cloudrc" in said
+    assert "end it: kubectl --namespace=demo delete job first, or" in said
     assert not (tmp_path / "helm").exists()
     assert not (tmp_path / "out").exists()
 

@@ -1,4 +1,4 @@
-"""Jobs of missions on the fake API server: created, followed, listed, cancelled, deleted."""
+"""Jobs of missions on the fake API server: created, followed, deleted."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Any
 
 import pytest
 
+from cloudrc.cluster import jobs
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.cluster.jobs import (
-    cancel,
     delete_job,
     follow,
     follow_limit,
-    list_jobs,
-    logs,
+    job_under_way,
     read_job,
     run_job,
 )
@@ -26,7 +25,6 @@ from tests.cluster.conftest import (
     TELEOP,
     TOKEN,
     FakeApi,
-    FakeTeleop,
     at_look,
     end,
     made,
@@ -44,7 +42,7 @@ def test_a_job_posts_the_mission_to_its_release(running: FakeApi, release: Relea
     assert status.state == "pending"
     plan = running.get("configmaps", "first")
     assert json.loads(plan["data"]["mission.yaml"]) == MISSION
-    assert plan["metadata"]["ownerReferences"][0]["uid"] == status.uid
+    assert plan["metadata"]["ownerReferences"][0]["uid"] == made(running)[0]["metadata"]["uid"]
     pod = pod_of(running, "first")
     job = running.get("jobs", "first")
     for found in (job["metadata"], job["spec"]["template"]["metadata"], plan["metadata"]):
@@ -140,21 +138,8 @@ def test_follow_ends_when_the_pod_cannot_run(running: FakeApi, release: Release)
 def test_a_deadline_is_named_and_bounded(running: FakeApi, release: Release) -> None:
     run_job(release, MISSION, name="first")
     end(running, "first", "Failed", reason="DeadlineExceeded", message="...")
-    assert "activeDeadlineSeconds" in read_job(release, "first").message
+    assert "activeDeadlineSeconds" in read_job(release, "first")[0].message
     assert follow_limit(1e300, queue=True) < 2**31 + 100
-
-
-def test_jobs_are_listed_with_their_state_oldest_first(running: FakeApi, release: Release) -> None:
-    for name in ("one", "two", "three"):
-        run_job(release, MISSION, name=name)
-    end(running, "one", "Complete")
-    start_pod(running, "two")
-    found = [(status.name, status.state) for status in list_jobs(release)]
-    assert found == [("one", "complete"), ("two", "flying"), ("three", "pending")]
-    assert "has ended already" in cancel(release, "one")
-    delete_job(release, "one")
-    with pytest.raises(ClusterError, match='"one" not found'):
-        logs(release, "one")
 
 
 def test_a_job_that_cannot_be_made_leaves_nothing(running: FakeApi, release: Release) -> None:
@@ -167,29 +152,23 @@ def test_a_job_that_cannot_be_made_leaves_nothing(running: FakeApi, release: Rel
     assert made(running) == []
 
 
-def test_the_mission_of_a_job_is_cancelled_by_its_key(teleop: FakeTeleop, release: Release) -> None:
-    job = run_job(release, MISSION, name="first")
-    teleop.missions = [{"id": "m1", "key": "another"}, {"id": "m2", "key": job.uid, "name": "up"}]
-    assert cancel(release, "first") == "mission m2 (up) of Job 'first' is cancelled"
-    assert teleop.posted == ["/v1/missions/m2/cancel"]
-    assert teleop.tokens == {f"Bearer {TOKEN}"}
-    teleop.tokens.clear()
-    cancel(release, "first", "a-token-of-mine-alone")
-    assert teleop.tokens == {"Bearer a-token-of-mine-alone"}
-    teleop.refuses = True
-    with pytest.raises(ClusterError, match="it is over"):
-        cancel(release, "first")
+def test_a_job_is_under_way_until_it_has_ended_or_is_deleted(running, release):
+    for name in ("one", "two"):
+        run_job(release, MISSION, name=name)
+    end(running, "one", "Complete")
+    assert job_under_way(release) == "two"
+    delete_job(release, "two")
+    assert job_under_way(release) is None
+    with pytest.raises(ClusterError, match='"two" not found'):
+        delete_job(release, "two")
 
 
-def test_a_job_that_has_not_posted_is_deleted(
-    running: FakeApi, teleop: FakeTeleop, release: Release
-) -> None:
+def test_a_job_whose_pod_does_not_end_is_named(running, release, monkeypatch):
     run_job(release, MISSION, name="first")
-    assert cancel(release, "first") == "Job 'first' is deleted; it had not posted its mission"
-    assert (teleop.posted, made(running)) == ([], [])
-    run_job(release, MISSION, name="first")
-    running.get("pods", "cloud-1")["status"]["phase"] = "Pending"
-    said = cancel(release, "first")
-    assert "'first' is deleted" in said
-    assert "cloudrc mission cancel --namespace=demo --release=cloudrc" in said
-    assert (teleop.posted, made(running)) == ([], [])
+    monkeypatch.setattr(jobs, "DELETE_LIMIT", 0.05)
+    answer = running.answer
+    running.answer = lambda method, *rest: (
+        (200, {}) if method == "DELETE" else answer(method, *rest)
+    )
+    with pytest.raises(TimedOutError, match="'first' has not ended"):
+        delete_job(release, "first")

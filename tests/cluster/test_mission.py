@@ -19,7 +19,9 @@ from cloudrc.cluster.client import Release
 from cloudrc.drivers import local
 from tests.cluster.conftest import (
     CONFIG_PLACE,
+    TOKEN,
     FakeApi,
+    FakeTeleop,
     at_look,
     end,
     made,
@@ -56,49 +58,31 @@ def lands(running: FakeApi, monkeypatch: pytest.MonkeyPatch) -> FakeApi:
     return running
 
 
-def fly(api: FakeApi, capsys: Printed, code: int = 0) -> str:
-    """Call `mission run`, whose Job ends with this code; return the Job's name."""
+@pytest.mark.parametrize("code", [0, 1])
+def test_run_prints_the_log_of_its_job_and_ends_with_the_verdict(running, capsys, code):
+    def land():
+        ((_, job),) = (key for key in running.objects if key[0] == "jobs")
+        start_pod(running, job, state=terminated(code, VERDICT[code]))
+        running.logs[f"{job}-x"] = f"waypoint 1 of 1 reached\n{VERDICT[code]}\n"
+        end(running, job, "Failed" if code else "Complete")
 
-    def land() -> None:
-        *_, (_, job) = (key for key in api.objects if key[0] == "jobs")
-        start_pod(api, job, state=terminated(code, VERDICT[code]))
-        api.logs[f"{job}-x"] = f"waypoint 1 of 1 reached\n{VERDICT[code]}\n"
-        end(api, job, "Failed" if code else "Complete")
-
-    answer = api.answer
-    at_look(api, 3, land)
-    try:
-        assert main(["mission", "run", "one.yaml"]) == code
-    finally:
-        api.answer = answer  # type: ignore[method-assign]
+    at_look(running, 3, land)
+    assert main(["mission", "run", "one.yaml"]) == code
     head, *lines = capsys.readouterr().out.splitlines()
     assert head.startswith("Job ")
     assert head.endswith(" in namespace 'demo'")
     assert lines == ["waypoint 1 of 1 reached", VERDICT[code]]
-    return head.split()[1]
 
 
-def test_list_status_and_logs_show_jobs(running: FakeApi, capsys: Printed) -> None:
-    assert main(["mission", "list"]) == 0
-    assert "; fly one: cloudrc mission run FILE\n" in capsys.readouterr().out
-    assert main(["mission", "logs"]) == 2
-    assert capsys.readouterr().err.startswith("cloudrc: error: no missions ")
-    assert main(["mission", "status", "nothing"]) == 5
-    assert re.match("cloudrc: error: .*nothing.*\n$", capsys.readouterr().err)
-    first = fly(running, capsys, 1)
-    job = fly(running, capsys)
-    assert main(["mission", "list"]) == 0
-    head, *rows = capsys.readouterr().out.splitlines()
-    assert head.split() == ["JOB", "STATE", "CREATED", "VERDICT"]
-    assert [row.split()[:2] for row in rows] == [[first, "failed"], [job, "complete"]]
-    assert VERDICT[0] in rows[1]
-    assert main(["mission", "status", job, "-o", "json"]) == 0
-    (found,) = json.loads(capsys.readouterr().out)["jobs"]
-    assert (found["name"], found["state"], found["exit_code"]) == (job, "complete", 0)
-    assert main(["mission", "logs"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == VERDICT[0]
-    assert main(["mission", "logs", first, "--follow"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == VERDICT[1]
+def test_the_other_verbs_go_to_the_api_of_the_release(running, teleop, capsys):
+    assert main(["mission", "list", "-o", "json"]) == 0
+    assert json.loads(capsys.readouterr().out)["missions"] == []
+    assert main(["mission", "acknowledge"]) == 0
+    assert teleop.posted == ["/v1/acknowledge"]
+    assert teleop.tokens == {f"Bearer {TOKEN}"}
+    running.objects.pop(("secrets", "cloudrc-tokens"))
+    assert main(["mission", "list"]) == 5
+    assert re.match("cloudrc: error: .*secrets.*\n$", capsys.readouterr().err)
 
 
 def test_a_mission_of_the_wrong_format_makes_no_job(running, folder, capsys):
@@ -155,7 +139,7 @@ def test_an_interrupted_run_says_that_the_job_continues(
     (job,) = made(running)
     name = job["metadata"]["name"]
     said = capsys.readouterr().err
-    assert f"cloudrc mission cancel {name} --namespace=demo --release=cloudrc\n" in said
+    assert f"kubectl --namespace=demo delete job {name}\n" in said
 
 
 @pytest.fixture
@@ -182,11 +166,15 @@ def test_the_local_run_is_the_default(running: FakeApi, capsys: Printed) -> None
     [["cloudrc", "mission", "list", "-n", "demo"], ["/bin/kubectl-cloudrc", "mission", "list"]],
 )
 def test_a_flag_or_the_plugin_of_kubectl_selects_the_cluster(
-    running: FakeApi, capsys: Printed, monkeypatch: pytest.MonkeyPatch, words: list[str]
+    running: FakeApi,
+    teleop: FakeTeleop,
+    capsys: Printed,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
 ) -> None:
     monkeypatch.setattr(sys, "argv", words)
     assert main() == 0
-    assert "no missions in namespace 'demo'" in capsys.readouterr().out
+    assert capsys.readouterr().out == "no missions yet\n"
 
 
 def test_neither_a_run_nor_a_cluster_is_reported(

@@ -86,7 +86,7 @@ def flight(installed: None) -> Iterator[None]:
     yield
     assert read("job", "long")["status"].get("active") == 1, "it flies still"
     assert identity() == before, "a profile's change must not restart anything"
-    in_release("mission", "cancel", "long")
+    in_release("mission", "cancel")
     end, _ = job_end("long", 30.0)
     assert (end.state, end.exit_code) == ("failed", INTERRUPTED), end
 
