@@ -1,4 +1,4 @@
-"""The optional dependencies, and how to install those that are missing."""
+"""The optional dependencies, the modes that need them, and how to install them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,12 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "api": ("fastapi", "uvicorn"),
 }
 """Extra of pyproject.toml -> its modules; the distributions have the same names."""
+MODES: dict[str, tuple[str, ...]] = {
+    "local": ("world", "record", "report"),
+    "virtual": ("world", "record", "report"),
+    "cluster": ("kube", "record", "report"),
+}
+"""Mode of a run -> the extras that it needs."""
 
 
 def missing(extra: str) -> list[str]:

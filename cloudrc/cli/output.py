@@ -68,16 +68,10 @@ def paint(text: str, colour: str, stream: TextIO | None = None) -> str:
 
 def console(stream: TextIO) -> Console:
     """Make a rich console that writes to a stream, in plain text if the stream is no terminal."""
-    from rich.console import Console as RichConsole
-
-    class Quiet(RichConsole):
-        """A console that continues without error if its reader, such as `head`, closes the pipe."""
-
-        def on_broken_pipe(self) -> None:
-            discard_output(stream)
+    from rich.console import Console
 
     live = is_live(stream)
-    return Quiet(
+    return Console(
         file=stream,
         force_terminal=live,
         color_system="standard" if live else None,

@@ -41,8 +41,9 @@ GROUPS: dict[str, dict[str, str]] = {
 PROCESSES = ("world", "cloud", "relay")
 """Commands whose module is `cloudrc/cli/processes.py` instead."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
-COUNT_MAX = 100_000
-"""Largest number of repeats that a flag accepts."""
+COUNT_MAX = 10_000
+"""Largest number of repeats that a flag accepts. Before Python 3.11.6, a pool of processes hangs if
+it gets more than 16,384 tasks (cpython issue 105829)."""
 
 ABOUT = "Fly a simulated drone from a simulated cloud, over an emulated network."
 EXAMPLES = """\

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import extras
-from cloudrc.cli.find_run import new_folder
 from cloudrc.cli.main import main
+from cloudrc.cli.run import new_folder
 from cloudrc.errors import BadInputError
 
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
@@ -30,7 +30,7 @@ def no_page(monkeypatch):
     ("line", "words"),
     [
         ("--mode local --seeds 3", "virtual time"),
-        ("--seeds 0", "'0' is not a whole number from 1 to 100000"),
+        ("--seeds 0", "'0' is not a whole number from 1 to 10000"),
         ("--seed -1", "--seed"),
         ("--seed 1 --seeds 2", "not allowed with"),
         ("papper", "paper"),

@@ -107,7 +107,7 @@ def test_only_cloud_imports_plug_ins(
 
 def test_only_flying_code_loads_an_experiment_with_plug_ins() -> None:
     """All other code uses `read_experiment`, which imports none."""
-    flies = {"cli/run.py", "cli/sweep.py", "cli/processes.py", "cli/bench.py"}
+    flies = {"cli/run.py", "cli/processes.py", "cli/bench.py"}
     flies |= {"faults/flight.py"}
     imports = {
         path.relative_to(PACKAGE).as_posix()
