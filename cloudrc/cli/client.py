@@ -49,14 +49,9 @@ class Api:
     """Call teleop's API at one address."""
 
     def __init__(self, url: str, token: Callable[[], str] = lambda: "") -> None:
-        """Check and store the address.
+        """Check and store the address, "http://HOST:PORT" or "unix:PATH".
 
-        Args:
-            url: "http://HOST:PORT" or "unix:PATH".
-            token: Returns the current token; called for each request; "" for no token.
-
-        Raises:
-            BadInputError: If the address is invalid.
+        `token` is called for each request; it returns the current token, or "" for none.
         """
         self.url, self._token = url.rstrip("/"), token
         try:
@@ -72,21 +67,15 @@ class Api:
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
         """Send a POST request.
 
-        Raises:
-            UnreachableError: If there is no answer, if teleop is not ready yet, or if it is busy.
-            BadInputError: If a value is invalid.
-            ApiError: If the API refuses the request.
+        An UnreachableError says that there is no answer, or that teleop is not ready or busy; a
+        BadInputError that a value is invalid; another ApiError that the API refuses the request.
         """
         data = b"" if body is None else json.dumps(body).encode()
         with self._answer("POST", path, data, REQUEST_TIMEOUT) as answer:
             return json.loads(answer.read())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
-        """Yield the events after number `after` as they happen, until teleop ends.
-
-        Raises:
-            UnreachableError: If the connection breaks.
-        """
+        """Yield the events after number `after` as they happen, until teleop ends."""
         with self._answer("GET", f"/v1/events?after={after}", None, STREAM_TIMEOUT) as stream:
             for line in stream:
                 if line.startswith(b"data: "):

@@ -158,25 +158,26 @@ def execute(options: argparse.Namespace) -> int:
     """Print all checks; exit 3 if the wanted mode cannot run."""
     mode, checks = options.mode, list(all_checks(options.mode, options.context))
     blocking = [check.name for check in checks if check.state == "missing" and mode in check.modes]
+    code = MissingPrerequisiteError.exit_code if blocking else 0
     if options.output != "table":
         document = {"schemaVersion": 1, "mode": mode, "ready": not blocking}
         found = [check._asdict() for check in checks]
         print(format_document({**document, "checks": found}, options.output))
+        return code
+    for title, needed in ((f"Needed for mode {mode}:", True), ("Good to know:", False)):
+        if block := [check for check in checks if (mode in check.modes) is needed]:
+            print(f"{title}\n{_block(block)}\n")
+    if blocking:
+        print(paint(f"Mode {mode} cannot run: {', '.join(blocking)}.", "red"))
     else:
-        for title, needed in ((f"Needed for mode {mode}:", True), ("Good to know:", False)):
-            if block := [check for check in checks if (mode in check.modes) is needed]:
-                print(f"{title}\n{_block(block)}\n")
-        if blocking:
-            print(paint(f"Mode {mode} cannot run: {', '.join(blocking)}.", "red"))
-        else:
-            print(paint(f"Mode {mode} can run.", "green"))
-    return MissingPrerequisiteError.exit_code if blocking else 0
+        print(paint(f"Mode {mode} can run.", "green"))
+    return code
 
 
 def _block(checks: list[Check]) -> str:
-    rows = [(check.state, check.name, check.found) for check in checks]
     lines = []
-    for check, line in zip(checks, table(rows).splitlines(), strict=True):
+    shown = table([(check.state, check.name, check.found) for check in checks])
+    for check, line in zip(checks, shown.splitlines(), strict=True):
         lines.append("  " + line.replace(check.state, paint(check.state, COLOURS[check.state]), 1))
         if check.fix:
             lines.append(f"           -> {check.fix}")

@@ -29,11 +29,7 @@ def missing(extra: str) -> list[str]:
 
 
 def require(purpose: str, extras: Iterable[str]) -> None:
-    """Check that extras are installed, for a purpose such as "mode virtual".
-
-    Raises:
-        MissingPrerequisiteError: If a module is missing; the text says how to install it.
-    """
+    """Check that extras are installed, for a purpose such as "mode virtual"."""
     absent = {extra: found for extra in extras if (found := missing(extra))}
     if absent:
         modules = ", ".join(module for names in absent.values() for module in names)

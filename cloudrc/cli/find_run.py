@@ -33,17 +33,9 @@ def find_local_run(
 ) -> _Found | None:
     """Find the API or the link of the run of `--run`, of ./runs/latest, or of the only other run.
 
-    Args:
-        options: The parsed flags of `run_argument` and of `cluster_flags`.
-        look: Returns the API or the link of the run in a folder; None if no run is flying there.
-        nobody: Error text if no run is flying in the folder of `--run`.
-
-    Returns:
-        The result of `look`; None if the flags name a cluster, or if no run is flying.
-
-    Raises:
-        BadInputError: If no run is flying in the folder of `--run`, if the flags also name a
-            cluster, or if several runs are flying and none is named.
+    `look` returns the API or the link of the run in a folder, or None if no run is flying there;
+    `nobody` is the error text if that folder is the one of `--run`. The result is None if the flags
+    name a cluster, or if no run is flying.
     """
     from cloudrc.drivers.local import under_way
 

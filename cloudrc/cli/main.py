@@ -14,11 +14,7 @@ INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command line, by default that of this process.
-
-    Returns:
-        The exit code; `cloudrc --help` lists the codes.
-    """
+    """Run one command line, by default that of this process; return the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(given)

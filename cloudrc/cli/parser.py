@@ -100,12 +100,9 @@ def input_file(text: str) -> Path:
 
 
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
-    """Build the parser.
+    """Build the parser; import the `wanted` commands, and know the names of the others.
 
-    Args:
-        wanted: Commands to import; for the others the parser knows only the names.
-        for_completion: Whether argparse lists the commands. Otherwise the help lists them in
-            groups.
+    The help lists the commands in groups; for completion, argparse lists them itself.
     """
     common, about = Parser(add_help=False), "show the traceback of an error"
     common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)

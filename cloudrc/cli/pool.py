@@ -75,16 +75,9 @@ def map_in_order(
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    Ctrl-C or closing the generator ends the running calls and drops the others.
-
-    Args:
-        function: A function at module level, because worker processes call it. If `jobs` is 1, the
-            present process calls it.
-        work: Arguments of the function, one for each call.
-        jobs: Number of processes; limited to the number of cores and to the length of `work`.
-
-    Raises:
-        WorkerDiedError: If one of the processes was killed.
+    At most `jobs` processes work, and at most one for each core; a single job runs in the present
+    process. The function is at module level, because worker processes call it. Ctrl-C or closing
+    the generator ends the running calls and drops the others.
     """
     workers = min(jobs, len(work), os.cpu_count() or 1)
     if workers <= 1:

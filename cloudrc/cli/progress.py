@@ -30,12 +30,7 @@ class FlightView:
     """Show a flight on a stream, as a status line and one line per event."""
 
     def __init__(self, stream: TextIO, waypoints: int) -> None:
-        """Start without writing anything.
-
-        Args:
-            stream: Where to write; never stdout if that carries JSON or YAML.
-            waypoints: Number of the mission's waypoints.
-        """
+        """Prepare the view of a mission with `waypoints` waypoints; write nothing yet."""
         self._stream, self._waypoints = stream, waypoints
         self._first_ns = self._now_ns = NEVER_NS
         self._began = monotonic()

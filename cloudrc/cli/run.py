@@ -23,7 +23,7 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import read_count
 from cloudrc.cli.pool import interrupt_on_signals
-from cloudrc.cli.report import exit_code, summary
+from cloudrc.cli.report import summary
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
@@ -112,6 +112,8 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
 
 
 def _fly_once(options: argparse.Namespace, mode: str) -> int:
+    from cloudrc.metrics.verdict import EXIT_CODES
+
     experiment = load(options.experiment, options.set, options.seed)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
@@ -145,19 +147,14 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     print_or_drop(
         format_document(report, options.output) if for_programs else summary(report, folder)
     )
-    return exit_code(report)
+    return EXIT_CODES[report["verdict"]]
 
 
 def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
-    """Make the folder of a run; no later run overwrites it.
+    """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
-    Args:
-        out: The folder that the user wants; None for the next free `runs/<name>-<n>`.
-        name: Experiment, mode and seed, joined.
-        latest: Whether `runs/latest` points to the new folder from now on.
-
-    Raises:
-        BadInputError: If `out` exists and is not an empty folder, or if the folder cannot be made.
+    With `latest`, `runs/latest` points to the new folder from now on. A BadInputError says that
+    `out` exists and is not an empty folder, or that the folder cannot be made.
     """
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise BadInputError(
@@ -238,21 +235,11 @@ def fly(
     *,
     page: bool = True,
 ) -> dict[str, Any]:
-    """Fly a checked experiment in mode "virtual" or "local", and fill its empty run folder.
+    """Fly in mode "virtual" or "local", fill the empty run folder, and return the report.
 
-    Args:
-        experiment: The experiment.
-        mode: Where to fly.
-        folder: Receives configuration, recording and report.
-        see: Called with records during the flight: with all in virtual mode, with a selection in
-            local mode.
-        page: Whether to write the HTML page with figures; the numbers are always written.
-
-    Returns:
-        The content of report.json.
-
-    Raises:
-        CloudrcError: If the flight broke off. The recording stays; its report says "interrupted".
+    During the flight `see` gets records: all in virtual mode, a selection in local mode. If the
+    flight breaks off, the recording stays, and its report says "interrupted". Without `page` the
+    report has numbers only, no HTML page.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report

@@ -28,12 +28,9 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
 
     The k-th smallest and the k-th largest of n values enclose the median with probability
     1 - 2 · sum_{i<k} C(n, i) / 2^n. k is the largest number for which the probability is at least
-    95 %.
+    95 %. The result is None for fewer than 6 values, which cannot reach 95 %.
 
     Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, section 7.1.
-
-    Returns:
-        Lower and upper bound; None for fewer than 6 values, which cannot reach 95 %.
     """
     ordered, n = sorted(values), len(values)
     outside, k = 0.0, 0

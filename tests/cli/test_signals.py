@@ -54,7 +54,7 @@ def test_flying_commands_treat_a_hang_up_as_ctrl_c(words):
     "words",
     [["faults", "search", "--minutes", "9", "--jobs", "2"], ["run", "steps", "--seeds", "9"]],
 )
-def test_workers_end_if_their_parent_is_killed(words: list[str], tmp_path: Path) -> None:
+def test_workers_end_if_their_parent_is_killed(words, tmp_path):
     command = [sys.executable, "-m", "cloudrc", *words]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) as first:
         assert first.stdout is not None
