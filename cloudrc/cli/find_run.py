@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -17,9 +16,6 @@ _Found = TypeVar("_Found")
 RUNS = Path("runs")
 KUBECTL_PLUGIN = "kubectl-cloudrc"
 """Name of this program when kubectl starts it as a plugin."""
-QUIET_LIMIT = 5.0
-"""Longest silence of a relay whose run is not listed as under way [s]. After a longer time without
-a write to its folder, the relay counts as gone."""
 
 
 def run_argument(parser: argparse.ArgumentParser) -> None:
@@ -81,11 +77,7 @@ def link_folder_of(run: Path) -> Path | None:
     from cloudrc.drivers.local import LINK_FOLDER, under_way
 
     folder = run / LINK_FOLDER
-    try:
-        quiet_time = time.time() - folder.stat().st_mtime
-    except OSError:
-        return None
-    return folder if run.resolve() in under_way() or quiet_time < QUIET_LIMIT else None
+    return folder if folder.is_dir() and _real(run) in under_way() else None
 
 
 def api_url_of(run: Path) -> str | None:
@@ -96,4 +88,8 @@ def api_url_of(run: Path) -> str | None:
     """
     from cloudrc.drivers.local import under_way
 
-    return under_way().get(Path(os.path.realpath(run))) or None
+    return under_way().get(_real(run)) or None
+
+
+def _real(run: Path) -> Path:
+    return Path(os.path.realpath(run))

@@ -6,7 +6,6 @@ import argparse
 import difflib
 import importlib
 import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -58,20 +57,18 @@ exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
   3 missing prerequisite, 4 timeout, 5 cluster or API error,
   6 run invalid (not real time), 70 internal error, 130 interrupted"""
 
-_CHOICE = re.compile(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)\)")
-
 
 class Parser(argparse.ArgumentParser):
     """Parse a command line; raise errors of argparse as one line, which `main` prints."""
 
     def error(self, message: str) -> NoReturn:
         """Raise the error; name the help page that explains it."""
-        choice = _CHOICE.fullmatch(message)
-        if choice:
-            argument, given, valid = choice.groups()
-            names = [name.strip(" '") for name in valid.split(",")]
-            message = f"{argument}: {describe_unknown(given, names)}"
         raise BadInputError(f"{message}; see '{self.prog} --help'")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Suggest the most similar choice; argparse itself lists them all."""
+        if action.choices is not None and value not in action.choices:
+            raise argparse.ArgumentError(action, describe_unknown(value, action.choices))
 
 
 def describe_unknown(given: str, names: Iterable[str]) -> str:

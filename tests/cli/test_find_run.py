@@ -2,13 +2,11 @@
 
 import contextlib
 import json
-import os
 import socket
 import sys
 
 import pytest
 
-from cloudrc.cli.find_run import QUIET_LIMIT
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
 from tests.teleop.conftest import running
@@ -112,10 +110,10 @@ def with_link(folder):
     return folder
 
 
-def test_link_set_finds_the_only_run(tmp_path, capsys):
-    run = with_link(tmp_path / "a")
-    old = (run / "link").stat().st_mtime - QUIET_LIMIT
-    os.utime(run / "link", (old, old))
+def test_link_set_finds_the_only_run_and_ignores_a_killed_one(
+    tmp_path, elsewhere, capsys, monkeypatch
+):
+    run, killed = with_link(tmp_path / "a"), with_link(elsewhere / "runs" / "latest")
     with local.announced(run), local.announced(tmp_path / "without a link"):
         assert main(SET) == 2
         said = capsys.readouterr().err
@@ -126,17 +124,12 @@ def test_link_set_finds_the_only_run(tmp_path, capsys):
         (line,) = capsys.readouterr().err.splitlines()
         for name in "ab":
             assert f"--run {tmp_path / name}" in line
-    # Nobody has announced it, and its relay is quiet: it was killed.
-    assert main([*SET, "--run", str(run)]) == 2
-    assert f"--run {run}: no run flies there" in capsys.readouterr().err
-
-
-def test_link_set_takes_a_live_relay_that_nobody_has_announced(elsewhere, capsys, monkeypatch):
-    monkeypatch.setenv("PATH", str(elsewhere))  # without kubectl
-    with_link(elsewhere / "runs" / "latest")
-    assert main(SET) == 2
+    with local.announced(killed.resolve()):
+        assert main(SET) == 2
     assert "runs/latest: no link is up there (yet)" in capsys.readouterr().err
-    os.utime(elsewhere / "runs" / "latest" / "link", (0, 0))
+    assert main([*SET, "--run", str(killed)]) == 2
+    assert f"--run {killed}: no run flies there" in capsys.readouterr().err
+    monkeypatch.setenv("PATH", str(elsewhere))  # without kubectl
     assert main(SET) == 3
     said = "no run flies here (start one: cloudrc run; or name one: --run)"
     assert said in capsys.readouterr().err

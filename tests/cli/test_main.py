@@ -115,13 +115,6 @@ def test_an_error_prints_one_line_and_sets_its_exit_code(error, code, words, mon
         main(["list", "--debug"])
 
 
-def test_a_file_of_epochs_is_ignored_with_one_line(capsys):
-    words = "world --config none --listen 127.0.0.1:9 --peer 127.0.0.1:9 --key none --epochs none"
-    assert main(words.split()) == 2
-    line, _ = capsys.readouterr().err.splitlines()
-    assert line == "cloudrc: --epochs is ignored: cloud keeps the session number"
-
-
 def test_a_closed_pipe_is_no_error():
     line = f"{sys.executable} -m cloudrc list -o json | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
