@@ -33,7 +33,7 @@ class FlightView:
         """Prepare the view of a mission with `waypoints` waypoints; write nothing yet."""
         self._stream, self._waypoints = stream, waypoints
         self._first_ns = self._now_ns = NEVER_NS
-        self._began = monotonic()
+        self._began = self._seen = monotonic()
         self._position: Vector = (math.nan, math.nan, math.nan)
         self._delay, self._waypoint = math.nan, -1
         self._guard, self._ended = GuardState.GROUND, False
@@ -51,7 +51,7 @@ class FlightView:
                 case TelemetrySent():
                     if self._first_ns == NEVER_NS:
                         self._first_ns, self._began = record.stamp_ns, monotonic()
-                    self._now_ns = record.stamp_ns
+                    self._now_ns, self._seen = record.stamp_ns, monotonic()
                     self._position = record.telemetry.odometry.position
                 case Control():
                     # The horizon is 0 and meaningless before the first round trip.
@@ -70,13 +70,14 @@ class FlightView:
 
     def line(self) -> Text:
         """Return the status line; a narrow terminal cuts off its end, the least important part."""
-        elapsed, flown = monotonic() - self._began, (self._now_ns - self._first_ns) * 1e-9
+        elapsed, flown = self._seen - self._began, (self._now_ns - self._first_ns) * 1e-9
         number = self._waypoint + 1
         cells = (
             f"{flown:6.1f} s",
             f"{self._guard.name:<6}",
             f"waypoint {number}/{self._waypoints}" if number else "",
-            *self._place(),
+            self._place(),
+            "" if math.isnan(self._delay) else f"delay {self._delay * 1e3:3.0f} ms",
             f"x{flown / elapsed:.2f}" if elapsed > 0 and flown > 0 else "",
         )
         line = Text(_joined(cells), no_wrap=True, overflow="crop")
@@ -84,15 +85,14 @@ class FlightView:
         line.highlight_words([self._guard.name], colour)
         return line
 
-    def _place(self) -> tuple[str, str]:
-        """Return position and delay estimate, each empty until it is known."""
+    def _place(self) -> str:
+        """Return the robot's position; "" until it is known."""
         # Round first, then add 0.0: that turns a negative zero into a positive one.
         x, y, z = (round(coordinate, 2) + 0.0 for coordinate in self._position)
-        position = "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
-        return position, "" if math.isnan(self._delay) else f"delay {self._delay * 1e3:3.0f} ms"
+        return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
 
     def _event(self, text: str) -> None:
-        line = _joined((f"  {escape(text):<44}", *self._place()))
+        line = _joined((f"  {escape(text):<44}", self._place()))
         if self._status:
             self._status.console.print(Text(line))
         else:

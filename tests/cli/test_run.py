@@ -72,9 +72,26 @@ def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, capsys):
 
 
 @pytest.mark.usefixtures("no_page")
-def test_json_output_is_only_the_report(folder, capsys):
-    assert main([*FLY, "--out", "here", "-o", "json"]) == 0
-    assert capsys.readouterr() == ((folder / "here/report.json").read_text(), "")
+def test_a_run_and_its_report_can_be_repeated(folder, capsys):
+    assert main([*FLY, "--seed", "3", "--out", "a", "-o", "json"]) == 0
+    written = (folder / "a/report.json").read_text()
+    assert capsys.readouterr() == (written, ""), "only the report"
+    assert main(["run", "a/config.yaml", "--mode", "virtual", "--out", "b", "-o", "json"]) == 0
+    first, again = json.loads(written), json.loads(capsys.readouterr().out)
+    assert first["records_sha256"] == again["records_sha256"]
+    for name in ("report.json", "report.html"):
+        (folder / "a" / name).unlink()
+    assert main(["report", "a"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "a/report.html"
+    assert (folder / "a/report.html").is_file()
+    assert json.loads((folder / "a/report.json").read_text())["numbers"] == first["numbers"]
+
+
+@pytest.mark.parametrize("name", ["missing", "empty"])
+def test_a_report_needs_a_run(name, capsys):
+    Path("empty").mkdir()
+    assert main(["report", name]) == 2
+    assert capsys.readouterr().err.startswith("cloudrc: error: ")
 
 
 @pytest.mark.usefixtures("no_page")
@@ -89,14 +106,6 @@ def test_an_interrupt_while_the_report_is_written_names_the_remedy(monkeypatch, 
     assert main(["report", "here"]) == 0
 
 
-@pytest.mark.usefixtures("no_page")
-def test_the_resolved_file_flies_the_same_run_again(folder):
-    assert main([*FLY, "--seed", "3", "--out", "a"]) == 0
-    assert main(["run", "a/config.yaml", "--mode", "virtual", "--out", "b"]) == 0
-    hashes = [json.loads((folder / d / "report.json").read_text())["records_sha256"] for d in "ab"]
-    assert hashes[0] == hashes[1]
-
-
 @pytest.mark.parametrize("output", ["table", "json"])
 @pytest.mark.usefixtures("no_page")
 def test_a_closed_pipe_does_not_end_the_run(output, folder, monkeypatch):
@@ -109,22 +118,6 @@ def test_a_closed_pipe_does_not_end_the_run(output, folder, monkeypatch):
         assert main(line) == 1
     left = {path.name for path in (folder / "here").iterdir()}
     assert {"mission.mcap", "report.json", "config.yaml"} <= left
-
-
-@pytest.mark.usefixtures("no_page")
-def test_a_report_is_written_again(folder, capsys):
-    assert main([*FLY, "--out", "run"]) == 0
-    before = json.loads((folder / "run/report.json").read_text())
-    for name in ("report.json", "report.html"):
-        (folder / "run" / name).unlink()
-    assert main(["report", "run"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "run/report.html"
-    assert (folder / "run/report.html").is_file()
-    assert json.loads((folder / "run/report.json").read_text())["numbers"] == before["numbers"]
-    (folder / "empty").mkdir()
-    for name in ("missing", "empty"):
-        assert main(["report", name]) == 2
-        assert capsys.readouterr().err.startswith("cloudrc: error: ")
 
 
 def test_folders_are_numbered_and_latest_is_the_newest():
