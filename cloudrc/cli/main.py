@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from cloudrc.cli.output import discard_output, escape
-from cloudrc.cli.parser import COMMANDS, build_parser, describe_unknown
+from cloudrc.cli.parser import build_parser
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
@@ -35,10 +35,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _dispatch(given: Sequence[str]) -> int:
     name = next((word for word in given if not word.startswith("-")), None)
-    if name is not None and name not in COMMANDS:
-        raise BadInputError(
-            f"unknown command: {describe_unknown(name, COMMANDS)}; see 'cloudrc --help'"
-        )
     parser = build_parser([name] if name else [])
     if not given:
         parser.print_help()

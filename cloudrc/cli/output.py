@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 UNLIMITED = 10_000
 """Width of output that is not for a terminal [columns]."""
-_CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
+_CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
 
 def output_argument(parser: argparse.ArgumentParser, what: str = "output format") -> None:
@@ -59,9 +59,9 @@ def discard_output(stream: TextIO) -> None:
         os.close(null)
 
 
-def paint(text: str, colour: str, stream: TextIO | None = None) -> str:
-    """Colour a text if the stream (default: stdout) is a terminal with colour."""
-    if os.environ.get("NO_COLOR") or not is_live(stream or sys.stdout):
+def paint(text: str, colour: str) -> str:
+    """Colour a text if stdout is a terminal with colour."""
+    if os.environ.get("NO_COLOR") or not is_live(sys.stdout):
         return text
     return f"\x1b[{_CODES[colour]}m{text}\x1b[0m"
 

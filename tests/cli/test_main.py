@@ -87,11 +87,7 @@ def test_a_wrong_command_line_is_one_line_of_error(line, words, capsys):
         (BadInputError("key x"), 2, "key x"),
         (MissingPrerequisiteError("no mujoco"), 3, "no mujoco"),
         (InvalidRunError("fell behind"), 6, "fell behind"),
-        (
-            PermissionError(13, "Permission denied", "/x"),
-            2,
-            "/x: Permission denied; check the path",
-        ),
+        (PermissionError(13, "Not allowed", "/x"), 2, "/x: Not allowed; check the path"),
         (OSError(28, "No space left on device"), 2, "No space left on device; free some space"),
         (OSError("no errno"), 2, "no errno; check the path"),
         (ZeroDivisionError("two\nlines"), INTERNAL, "ZeroDivisionError: two lines"),

@@ -51,12 +51,13 @@ def test_numbers_have_four_digits(value, text):
 
 
 def test_colour_and_a_status_line_are_for_terminals(monkeypatch):
-    assert paint("x", "red", Terminal()) == "\x1b[31mx\x1b[0m"
+    monkeypatch.setattr("sys.stdout", Terminal())
+    assert paint("x", "red") == "\x1b[31mx\x1b[0m"
     assert (is_live(Terminal()), is_live(io.StringIO())) == (True, False)
     for variable, value in (("NO_COLOR", "1"), ("CI", "1"), ("TERM", "dumb")):
         with monkeypatch.context() as changed:
             changed.setenv(variable, value)
-            assert paint("x", "red", Terminal()) == "x"
+            assert paint("x", "red") == "x"
             assert is_live(Terminal()) is (variable == "NO_COLOR")
 
 
