@@ -67,8 +67,8 @@ class Api:
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
         """Send a POST request.
 
-        An UnreachableError says that there is no answer, or that teleop is not ready or busy; a
-        BadInputError that a value is invalid; another ApiError that the API refuses the request.
+        An UnreachableError says that there is no answer, or that teleop is not ready or busy. A
+        BadInputError says that a value is invalid, an ApiError that the API refuses the request.
         """
         data = b"" if body is None else json.dumps(body).encode()
         with self._answer("POST", path, data, REQUEST_TIMEOUT) as answer:

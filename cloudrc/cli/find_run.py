@@ -29,9 +29,9 @@ def find_local_run(
 ) -> _Found | None:
     """Find the API or the link of the run of `--run`, of ./runs/latest, or of the only other run.
 
-    `look` returns the API or the link of the run in a folder, or None if no run is flying there;
-    `nobody` is the error text if that folder is the one of `--run`. The result is None if the flags
-    name a cluster, or if no run is flying.
+    `look` returns the API or the link of the run in a folder, or None if no run is flying there.
+    `nobody` is the error text if no run is flying in the folder of `--run`. The result is None if
+    the flags name a cluster, or if no run is flying.
     """
     from cloudrc.drivers.local import under_way
 

@@ -48,6 +48,7 @@ def describe_all(kind: str) -> dict[str, str]:
     from cloudrc import plugins
     from cloudrc.config import shipped
 
+    one = kind.removesuffix("s")
     if kind in PLUGINS:
         lines = {name: plugins.describe(kind, name) for name in plugins.names(kind)}
         if kind == "metrics":
@@ -55,13 +56,12 @@ def describe_all(kind: str) -> dict[str, str]:
 
             lines |= {metric.name: metric.meaning for metric in SHIPPED.values()}
     else:
-        one = kind.removesuffix("s")
         describe = shipped.describe if kind in YAML else _comment
         lines = {name: describe(one, name) for name in shipped.names(one)}
     # A docstring such as "Predictor: trusts a share of the velocity." repeats the heading.
-    prefix = re.compile(rf"(.* )?{kind.removesuffix('s')}s?: ", re.IGNORECASE)
-    lines = {name: prefix.sub("", line, count=1).rstrip(".") for name, line in lines.items()}
-    return {name: line[:1].upper() + line[1:] for name, line in sorted(lines.items())}
+    prefix = re.compile(rf"^[^:]*\b{one}: ", re.IGNORECASE)
+    found = {name: prefix.split(line, maxsplit=1)[-1] for name, line in sorted(lines.items())}
+    return {name: line[:1].upper() + line[1:].rstrip(".") for name, line in found.items()}
 
 
 def _comment(kind: str, name: str) -> str:

@@ -97,9 +97,9 @@ def input_file(text: str) -> Path:
 
 
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
-    """Build the parser; import the `wanted` commands, and know the names of the others.
+    """Build the parser with the arguments of the `wanted` commands, and the names of the others.
 
-    The help lists the commands in groups; for completion, argparse lists them itself.
+    The help lists the commands in groups. For completion, argparse itself lists them.
     """
     common, about = Parser(add_help=False), "show the traceback of an error"
     common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)

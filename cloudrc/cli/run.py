@@ -251,9 +251,7 @@ def fly(
         return write_report(folder, recording, experiment, run, own=own, page=page)
 
 
-def assemble(
-    experiment: ResolvedExperiment,
-) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
+def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
     """Assemble both ends and their run in virtual time."""
     from cloudrc import assembly
     from cloudrc.drivers.virtual import VirtualRun

@@ -4,15 +4,7 @@ import pytest
 
 from cloudrc.cli.link_verify import RELEASE_TIMEOUT
 from cloudrc.cli.parser import build_parser
-from tests.chart.conftest import (
-    a_namespace,
-    containers,
-    notes,
-    nothing,
-    of_kind,
-    pod_specs,
-    render,
-)
+from tests.chart.conftest import a_namespace, containers, notes, nothing, of_kind, pod_specs, render
 
 
 def modes(lookup, values=None):

@@ -8,15 +8,7 @@ import pytest
 import yaml
 
 from cloudrc.exposition.table import METRICS, Kind
-from tests.chart.conftest import (
-    CHART,
-    OPERATOR,
-    ROOT,
-    metrics_ports,
-    of_kind,
-    pod_specs,
-    render,
-)
+from tests.chart.conftest import CHART, OPERATOR, ROOT, metrics_ports, of_kind, pod_specs, render
 
 KINDS = {"PodMonitor", "PrometheusRule"}
 RULES = CHART / "files" / "rules.yaml"

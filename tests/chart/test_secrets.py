@@ -4,15 +4,7 @@ import base64
 
 import pytest
 
-from tests.chart.conftest import (
-    a_namespace,
-    containers,
-    notes,
-    nothing,
-    of_kind,
-    pod_specs,
-    render,
-)
+from tests.chart.conftest import a_namespace, containers, notes, nothing, of_kind, pod_specs, render
 
 OURS = {
     "secret": {"existingSecret": "lab-key"},
