@@ -120,8 +120,9 @@ def timer(rounds: int = 100) -> Check:
 
 
 def _cores() -> Check:
-    """Compare the machine's load with its number of cores."""
-    count, load = os.cpu_count() or 1, os.getloadavg()[0]
+    """Compare the machine's load with the number of cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
+    count, load = len(affinity(0)) if affinity else os.cpu_count() or 1, os.getloadavg()[0]
     fix = "real time needs two cores without other load: close programs, or use --mode virtual"
     return _check("cores", 2 <= count >= load, f"{count}, load {load:.1f}", fix)
 

@@ -132,7 +132,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
         print_or_drop(escape(f"{experiment.name}: {facts}, {waypoints}"))
     try:
         report = flight(folder)
-    except (CloudrcError, OSError, KeyboardInterrupt) as error:
+    except (CloudrcError, KeyboardInterrupt) as error:
         if in_cluster:  # the folder stays empty until the mission has flown
             with contextlib.suppress(OSError):
                 folder.rmdir()
@@ -244,11 +244,15 @@ def fly(
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
 
-    (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     record = _record_virtual if mode == "virtual" else _record_local
-    with record(experiment, folder, see) as (recording, run):
-        own = experiment.report.metrics
-        return write_report(folder, recording, experiment, run, own=own, page=page)
+    own = experiment.report.metrics
+    try:
+        (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+        with record(experiment, folder, see) as (recording, run):
+            return write_report(folder, recording, experiment, run, own=own, page=page)
+    except OSError as error:
+        where, remedy = error.filename or folder, "free some space or choose another folder: --out"
+        raise CloudrcError(f"{where}: {error.strerror or error}; {remedy}") from error
 
 
 def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
