@@ -1,12 +1,9 @@
 """The import rules of the package and the sizes of its files and functions."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -90,11 +87,11 @@ ASKED_AS = {
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__"}
 
 
-def place_of(path: Path) -> str:
+def place_of(path):
     return path.relative_to(PACKAGE).as_posix()
 
 
-def imports(tree: ast.AST) -> Iterator[str]:
+def imports(tree):
     """Yield the full dotted names of all imports, anywhere in the file."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -104,7 +101,7 @@ def imports(tree: ast.AST) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def violations(place: str, tree: ast.AST) -> list[str]:
+def violations(place, tree):
     """Return the forbidden imports and calls of a file at `place`, a path below cloudrc/."""
     part = place.split("/")[0].removesuffix(".py")
     allowed = MAY_IMPORT[part] | ALWAYS | {part}
@@ -121,7 +118,7 @@ def violations(place: str, tree: ast.AST) -> list[str]:
     return found + [f"calls {f.id}" for f in calls if isinstance(f, ast.Name) and f.id in forbidden]
 
 
-def test_a_file_imports_only_allowed_modules() -> None:
+def test_a_file_imports_only_allowed_modules():
     found = {place_of(path): violations(place_of(path), tree) for path, tree in TREES.items()}
     assert {place: breaches for place, breaches in found.items() if breaches} == {}
 
@@ -137,17 +134,17 @@ def test_a_file_imports_only_allowed_modules() -> None:
         ("metrics/rtt.py", "print('x')"),
     ],
 )
-def test_a_forbidden_import_is_found(place: str, code: str) -> None:
+def test_a_forbidden_import_is_found(place, code):
     assert violations(place, ast.parse(code))
 
 
-def foreign(trees: Iterable[ast.AST]) -> set[str]:
+def foreign(trees):
     """Return the imported external packages by their names in pyproject.toml."""
     found = {name.partition(".")[0] for tree in trees for name in imports(tree)}
     return {ASKED_AS.get(name, name) for name in found - sys.stdlib_module_names - {"cloudrc"}}
 
 
-def test_imported_and_declared_packages_are_the_same() -> None:
+def test_imported_and_declared_packages_are_the_same():
     """Check that no package of a similar name is installed by mistake."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [lines for name, lines in project["optional-dependencies"].items() if name != "dev"]
@@ -157,7 +154,7 @@ def test_imported_and_declared_packages_are_the_same() -> None:
     assert foreign([ast.parse("def f():\n    from polaris.client import get")]) == {"polaris"}
 
 
-def test_no_file_and_no_function_is_too_long() -> None:
+def test_no_file_and_no_function_is_too_long():
     files = [*FILES, *(ROOT / "tests").rglob("*.py")]
     long = {str(path.relative_to(ROOT)) for path in files if path.read_text().count("\n") > 700}
     for path, tree in TREES.items():
@@ -173,7 +170,7 @@ def test_no_file_and_no_function_is_too_long() -> None:
     assert long == set()
 
 
-def test_numpy_s_global_random_state_is_not_used() -> None:
+def test_numpy_s_global_random_state_is_not_used():
     """Allow `numpy.random.default_rng(seed)` and the like; everything else is global state."""
     allowed = {"default_rng", "Generator", "Philox", "PCG64", "SeedSequence"}
     used = re.compile(r"\b(?:np|numpy)\.random\.(\w+)")

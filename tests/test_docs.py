@@ -1,10 +1,7 @@
 """Generated files are current; links, named files and cited sources lead somewhere."""
 
-from __future__ import annotations
-
 import ast
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -29,24 +26,24 @@ PUBLIC = re.compile(
 )
 
 
-def anchors(page: Path) -> set[str]:
+def anchors(page):
     """The anchors that GitHub gives to the headings of a page."""
     heads = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
 @pytest.mark.parametrize("path", OUTPUTS, ids=lambda path: path.name)
-def test_a_generated_file_is_current(path: Path) -> None:
+def test_a_generated_file_is_current(path):
     assert path.read_text() == OUTPUTS[path], "run: make docs"
 
 
-def test_no_generated_file_is_left_over() -> None:
+def test_no_generated_file_is_left_over():
     assert docs.leftovers() == [], "run: make docs"
     assert SAMPLING.keys() == TOPICS.keys()
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_every_link_leads_somewhere(page: Path) -> None:
+def test_every_link_leads_somewhere(page):
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     for path, anchor in LINK.findall(text):
         target = page.parent / path if path else page
@@ -54,14 +51,14 @@ def test_every_link_leads_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{path}#{anchor}"
 
 
-def test_every_file_in_the_architecture_exists() -> None:
+def test_every_file_in_the_architecture_exists():
     named = FILE.findall((ROOT / "docs" / "architecture.md").read_text())
     assert named
     for name in named:
         assert any(ROOT.glob(name)) or any(ROOT.glob(f"cloudrc/{name}")), name
 
 
-def test_the_list_of_pages_names_every_page() -> None:
+def test_the_list_of_pages_names_every_page():
     listed = {path for path, _ in LINK.findall((ROOT / "docs" / "README.md").read_text())}
     pages = {path.relative_to(ROOT / "docs").as_posix() for path in ROOT.glob("docs/**/*.md")}
     assert pages - {"README.md"} <= listed
@@ -70,7 +67,7 @@ def test_the_list_of_pages_names_every_page() -> None:
 # Sources in docstrings and comments
 
 
-def entries(text: str, suffix: str) -> Iterator[str]:
+def entries(text, suffix):
     """Yield the sources in the docstrings and comments of a file, each on one line."""
     if "Source:" not in text:
         return
@@ -85,7 +82,7 @@ def entries(text: str, suffix: str) -> Iterator[str]:
         yield from (" ".join(entry.split()) for entry in ENTRY.findall(block))
 
 
-def unresolved(entry: str) -> list[str]:
+def unresolved(entry):
     """Return the parts of an entry that cannot be resolved."""
     found, pages = VAGUE.findall(entry), PAGE.findall(entry)
     for name, quoted in pages:
@@ -99,7 +96,7 @@ def unresolved(entry: str) -> list[str]:
     return found if pages or PUBLIC.search(entry) else [*found, entry]
 
 
-def test_every_source_resolves() -> None:
+def test_every_source_resolves():
     paths = (path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.*")))
     files = [path for path in paths if path.suffix in {".py", ".yaml", ".xml"}]
     cited = [(path, entry) for path in files for entry in entries(path.read_text(), path.suffix)]
@@ -118,5 +115,5 @@ def test_every_source_resolves() -> None:
         ('# Source: docs/reference/faults.md, "F5"; RFC 791. Deviation: DESIGN', []),
     ],
 )
-def test_a_source_that_leads_nowhere_is_found(text: str, found: list[str]) -> None:
+def test_a_source_that_leads_nowhere_is_found(text, found):
     assert [part for entry in entries(text, ".py") for part in unresolved(entry)] == found

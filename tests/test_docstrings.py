@@ -5,11 +5,8 @@ A share "in [0, 1]", a unit vector and a unit quaternion have no unit. A functio
 unit says "any unit".
 """
 
-from __future__ import annotations
-
 import ast
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,29 +22,14 @@ ENTRY = re.compile(r"^    (\w+): ", re.MULTILINE)
 RECORDS = {"dataclass", "NamedTuple"}
 QUANTITIES = {"float", "Vector", "Quaternion", "Array"}
 
-# Function or class -> why its floats have no fixed unit.
-EXCEPTIONS = {
-    "Number": "its `unit` is a field of its own",
-}
+EXCEPTIONS = {"Number"}
+"""Classes whose floats have no fixed unit: a Number has a field `unit`."""
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def is_quantity(annotation: ast.expr | None) -> bool:
-    """Tell whether an annotation is a float, vector or array, or None besides."""
-    return annotation is not None and (
-        ast.unparse(annotation).removesuffix(" | None") in QUANTITIES
-    )
-
-
-def is_record(node: ast.ClassDef) -> bool:
-    """Tell whether the attributes of a class are its fields."""
-    marks = [ast.unparse(mark) for mark in (*node.decorator_list, *node.bases)]
-    return any(mark.partition("(")[0] in RECORDS for mark in marks)
-
-
-def public(tree: ast.Module) -> Iterator[Function | ast.ClassDef]:
-    """Yield the public classes with their methods, and all functions."""
+def public(tree):
+    """Yield the public classes with their methods, and the public functions."""
     for node in tree.body:
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             yield node
@@ -56,23 +38,23 @@ def public(tree: ast.Module) -> Iterator[Function | ast.ClassDef]:
             yield node
 
 
-def quantities(node: Function | ast.ClassDef) -> list[str]:
-    """Return the names of the arguments or fields that need a unit."""
+def quantities(node, lines):
+    """Yield the arguments or fields that need a unit, with the comments beside the fields."""
     if isinstance(node, ast.ClassDef):
-        fields = [field for field in node.body if isinstance(field, ast.AnnAssign)]
-        named = [(ast.unparse(field.target), field.annotation) for field in fields]
-        return [name for name, kind in named if is_record(node) and is_quantity(kind)]
-    arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
-    return [argument.arg for argument in arguments if is_quantity(argument.annotation)]
+        marks = [ast.unparse(mark) for mark in (*node.decorator_list, *node.bases)]
+        is_record = any(mark.partition("(")[0] in RECORDS for mark in marks)
+        found = [each for each in node.body if is_record and isinstance(each, ast.AnnAssign)]
+    else:
+        found = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+    for each in found:
+        kind = ast.unparse(each.annotation) if each.annotation else ""
+        if kind.removesuffix(" | None") in QUANTITIES:
+            is_field = isinstance(each, ast.AnnAssign)
+            beside = lines[each.lineno - 1].partition("  # ")[2] if is_field else ""
+            yield ast.unparse(each.target) if is_field else each.arg, beside
 
 
-def comments(node: Function | ast.ClassDef, lines: list[str]) -> dict[str, str]:
-    """Return the comments beside the fields of a class."""
-    fields = [field for field in node.body if isinstance(field, ast.AnnAssign)]
-    return {ast.unparse(f.target): lines[f.lineno - 1].partition("  # ")[2] for f in fields}
-
-
-def without_unit(source: str) -> list[str]:
+def without_unit(source):
     """Return the quantities without a unit, as "function: argument"."""
     found, lines = [], source.splitlines()
     for node in public(ast.parse(source)):
@@ -81,17 +63,15 @@ def without_unit(source: str) -> list[str]:
             continue
         pieces = ENTRY.split(said)[1:]
         entries = dict(zip(pieces[::2], pieces[1::2], strict=True))
-        beside = comments(node, lines) if isinstance(node, ast.ClassDef) else {}
-        for name in quantities(node):
+        for name, beside in quantities(node, lines):
             # A quantity without an entry has its unit in the sentence: "after `seconds` [s]".
             told = re.search(rf"\b{name.replace('_', '[_ ]')}\b", said)
-            text = entries.get(name, said if told else "") + beside.get(name, "")
-            if not UNIT.search(text):
+            if not UNIT.search(entries.get(name, said if told else "") + beside):
                 found.append(f"{node.name}: {name}")
     return found
 
 
-def test_every_quantity_has_its_unit() -> None:
+def test_every_quantity_has_its_unit():
     found = {str(path.relative_to(PACKAGE)): without_unit(path.read_text()) for path in FILES}
     assert {path: missing for path, missing in found.items() if missing} == {}
 
@@ -110,5 +90,5 @@ def test_every_quantity_has_its_unit() -> None:
         ('class A:\n    """A."""\n    x: float', []),
     ],
 )
-def test_a_missing_unit_is_found(code: str, missing: list[str]) -> None:
+def test_a_missing_unit_is_found(code, missing):
     assert without_unit(code) == missing

@@ -1,11 +1,7 @@
 """A number beyond its limit fails its test; the nightly page shows the worst of each number."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 
@@ -25,16 +21,12 @@ from tools import evidence
         (None, "<=", 1.0, "number: nan s, asked <= 1 s"),
     ],
 )
-def test_a_number_beyond_its_limit_fails_its_test(
-    figure: Callable[..., None], measured: float | None, relation: str, asked: float, said: str
-) -> None:
+def test_a_number_beyond_its_limit_fails_its_test(figure, measured, relation, asked, said):
     with pytest.raises(AssertionError, match=said) if said else nullcontext():
         figure("number", measured, relation, asked, "s")
 
 
-def test_the_nightly_page_shows_the_worst_of_each_number(
-    figure: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_nightly_page_shows_the_worst_of_each_number(figure, tmp_path, monkeypatch):
     monkeypatch.setenv("CLOUDRC_EVIDENCE", str(tmp_path))
     figure("clearance", 0.2, ">=", 0.12, "m", count=10)
     figure("clearance", 0.13, ">=", 0.12, "m", count=20)
@@ -52,9 +44,7 @@ def test_the_nightly_page_shows_the_worst_of_each_number(
     ]
 
 
-def test_the_nightly_page_shows_all_kinds_of_results(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_nightly_page_shows_all_kinds_of_results(tmp_path, capsys):
     for name, words in (
         ("faults", "faults run F17"),
         ("search-random", "faults search --minutes 0.001"),

@@ -1,7 +1,5 @@
 """The package: dependencies, version, licence and the files of the wheel."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -18,21 +16,21 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 SHIPPED = {".py", ".yaml", ".xml", ".typed", ".csv", ".html", ".css", ".js", ".mplstyle"}
 
 
-def test_base_dependencies_are_those_of_a_pod() -> None:
+def test_base_dependencies_are_those_of_a_pod():
     names = {re.split(r"[<>=\[; ]", line)[0] for line in PROJECT["dependencies"]}
     assert names == {"numpy", "pyyaml", "pydantic", "cryptography", "prometheus-client", "rich"}
 
 
-def test_cloudrc_is_a_plugin_of_kubectl() -> None:
+def test_cloudrc_is_a_plugin_of_kubectl():
     assert PROJECT["scripts"]["kubectl-cloudrc"] == PROJECT["scripts"]["cloudrc"]
 
 
-def test_all_files_name_the_same_version() -> None:
+def test_all_files_name_the_same_version():
     citation = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {cloudrc.__version__}\n" in citation
 
 
-def test_the_wheel_holds_every_file_of_the_package(tmp_path: Path) -> None:
+def test_the_wheel_holds_every_file_of_the_package(tmp_path):
     pytest.importorskip("hatchling", reason="the build backend comes with the extra dev")
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],

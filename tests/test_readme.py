@@ -1,7 +1,5 @@
 """The commands and the files in README.md, docs/experiment.md and docs/plugins.md work."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -31,7 +29,7 @@ SETUP = ". .venv/bin/activate"
 COMMANDS = [line for line in LINES if line and line != SETUP]
 
 
-def is_slow(command: str) -> bool:
+def is_slow(command):
     """Tell whether a command runs in real time or flies many times."""
     return command.startswith("make") or "--mode local" in command or "--seeds" in command
 
@@ -44,7 +42,7 @@ NIGHTLY = [*(command for command in SLOW if command.startswith("make")), *SWEEPS
 FLIGHTS = [command for command in QUICK if command.startswith("cloudrc run")]
 
 
-def execute(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+def execute(command, folder):
     words = shlex.split(command)
     if words[0] == "cloudrc":
         words = [sys.executable, "-m", *words]
@@ -56,7 +54,7 @@ def execute(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Make a working folder with the files that the pages describe."""
     path = tmp_path_factory.mktemp("readme")
     for name, body in FILES.items():
@@ -65,7 +63,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("command", [c for c in QUICK if c not in FLIGHTS[1:]])
-def test_a_command_works(command: str, folder: Path) -> None:
+def test_a_command_works(command, folder):
     done = execute(command, folder)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stderr == ""
@@ -76,7 +74,7 @@ def test_a_command_works(command: str, folder: Path) -> None:
 
 @pytest.mark.process
 @pytest.mark.parametrize("command", [*(c for c in SLOW if c not in NIGHTLY), *nightly(*NIGHTLY)])
-def test_a_slow_command_works(command: str, folder: Path) -> None:
+def test_a_slow_command_works(command, folder):
     done = execute(command, folder)
     assert done.returncode == 0, done.stdout + done.stderr
     where = ROOT if command.startswith("make") else folder
@@ -84,7 +82,7 @@ def test_a_slow_command_works(command: str, folder: Path) -> None:
 
 
 @pytest.fixture
-def numbers_only(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def numbers_only(folder, monkeypatch):
     """Fly in this process and without figures, which is fast."""
     monkeypatch.chdir(folder)
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
@@ -92,7 +90,7 @@ def numbers_only(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("numbers_only")
 @pytest.mark.parametrize("command", FLIGHTS[1:])
-def test_another_flight_works(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_flight_works(command, capsys):
     assert main(shlex.split(command)[1:]) == 0
     captured = capsys.readouterr()
     assert captured.err == ""
@@ -102,7 +100,7 @@ def test_another_flight_works(command: str, capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_readme_s_way_to_read_a_recording_works(folder: Path) -> None:
+def test_the_readme_s_way_to_read_a_recording_works(folder):
     assert main("run hover --mode virtual --set mission.waypoints.0.dwell_s=1".split()) == 0
     done = execute(f"{sys.executable} read_recording.py", folder)
     assert done.returncode == 0, done.stderr
@@ -110,7 +108,7 @@ def test_the_readme_s_way_to_read_a_recording_works(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_readme_s_predictor_works(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_readme_s_predictor_works(capsys):
     """Check that a share of 1 is `constant_velocity`, and that a share of 0.5 predicts worse."""
     errors = []
     for share in ("0.5", "1.0"):
@@ -124,9 +122,7 @@ def test_the_readme_s_predictor_works(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_metric_is_measured_by_a_run_and_by_a_report(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_metric_is_measured_by_a_run_and_by_a_report(capsys):
     line = "run steps --mode virtual -o json --set mission.steps.count=3"
     values = []
     for command in (

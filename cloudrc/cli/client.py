@@ -32,9 +32,7 @@ RETRY_STATUSES = (408, 429, 502, 503, 504)
 """HTTP status codes that mean: a later attempt may succeed."""
 UNIX = "unix:"
 VARIABLE = "CLOUDRC_TOKEN_FILE"
-SIZE_MAX = 4096
-"""Largest token file [bytes], including white space at its end."""
-_TOKEN = re.compile(r"[!-~]{16,512}")
+_TOKEN = re.compile(rb"[!-~]{16,512}")
 
 
 class ApiError(CloudrcError):
@@ -51,18 +49,15 @@ class Api:
     """Call teleop's API at one address."""
 
     def __init__(self, url: str, token: Callable[[], str] = lambda: "") -> None:
-        """Check and store the address.
+        """Check and store the address, "http://HOST:PORT" or "unix:PATH".
 
-        Args:
-            url: "http://HOST:PORT" or "unix:PATH".
-            token: Returns the current token; called for each request; "" for no token.
-
-        Raises:
-            BadInputError: If the address is invalid.
+        `token` is called for each request; it returns the current token, or "" for none.
         """
         self.url, self._token = url.rstrip("/"), token
-        if not (_is_http(self.url) or (url.startswith(UNIX) and len(url) > len(UNIX))):
-            raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH")
+        try:
+            self._connection(REQUEST_TIMEOUT)
+        except (ValueError, KeyError, http.client.InvalidURL):
+            raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH") from None
 
     def get(self, path: str) -> Any:
         """Send a GET request; raise the same errors as `post`."""
@@ -72,21 +67,15 @@ class Api:
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
         """Send a POST request.
 
-        Raises:
-            UnreachableError: If there is no answer, if teleop is not ready yet, or if it is busy.
-            BadInputError: If a value is invalid.
-            ApiError: If the API refuses the request.
+        An UnreachableError says that there is no answer, or that teleop is not ready or busy. A
+        BadInputError says that a value is invalid, an ApiError that the API refuses the request.
         """
         data = b"" if body is None else json.dumps(body).encode()
         with self._answer("POST", path, data, REQUEST_TIMEOUT) as answer:
             return json.loads(answer.read())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
-        """Yield the events after number `after` as they happen, until teleop ends.
-
-        Raises:
-            UnreachableError: If the connection breaks.
-        """
+        """Yield the events after number `after` as they happen, until teleop ends."""
         with self._answer("GET", f"/v1/events?after={after}", None, STREAM_TIMEOUT) as stream:
             for line in stream:
                 if line.startswith(b"data: "):
@@ -116,29 +105,26 @@ class Api:
         if self.url.startswith(UNIX):
             return _UnixConnection(self.url.removeprefix(UNIX), limit)
         parts = urlsplit(self.url)
-        secure = parts.scheme == "https"
-        kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
-        return kind(parts.hostname or "", parts.port, timeout=limit)
+        kinds: dict[str, type[http.client.HTTPConnection]] = {
+            "http": http.client.HTTPConnection,
+            "https": http.client.HTTPSConnection,
+        }
+        if not parts.hostname or parts.port == 0 or parts.username:
+            raise ValueError(self.url)
+        return kinds[parts.scheme](parts.hostname, parts.port, timeout=limit)
 
 
 class _UnixConnection(http.client.HTTPConnection):
     def __init__(self, path: str, limit: float) -> None:
-        super().__init__("localhost", timeout=limit)  # a path may be no valid name of a host
+        super().__init__("localhost", timeout=limit)
+        if not path:
+            raise ValueError(path)
         self._path = path
 
     def connect(self) -> None:
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self.sock.settimeout(self.timeout)
         self.sock.connect(self._path)
-
-
-def _is_http(url: str) -> bool:
-    try:
-        parts = urlsplit(url)
-        named = bool(parts.hostname) and parts.port != 0 and not parts.username
-    except ValueError:  # an address without its bracket, or a port that is no number
-        return False
-    return named and parts.scheme in ("http", "https")
 
 
 def mission_path(mission_id: str) -> str:
@@ -151,8 +137,8 @@ def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcEr
     with suppress(OSError, ValueError, http.client.HTTPException):
         body = json.loads(answer.read())
     body = body if isinstance(body, dict) else {}  # it may be another server that answers
-    detail = body.get("detail") or f"the API answered {answer.status} {answer.reason}"
-    detail, problems = escape(str(detail)), body.get("problems") or []
+    detail = escape(str(body.get("detail") or f"the API answered {answer.status} {answer.reason}"))
+    problems = body.get("problems") or []
     if len(problems) > 1:
         parts = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
         lines = [escape(": ".join(words)) for words in parts]
@@ -191,11 +177,11 @@ def token_reader(path: Path | None) -> Callable[[], str]:
 
 def _read(path: Path) -> str:
     try:
-        token = read(path, SIZE_MAX).decode("ascii").strip()
+        token = read(path).strip()
     except OSError as error:
         raise BadInputError(f"--token-file {path}: {error.strerror}; name a file") from None
-    except ValueError:
-        token = ""
+    except ValueError:  # a pipe, or a file that is too long
+        token = b""
     if not _TOKEN.fullmatch(token):
         raise BadInputError(f"--token-file {path}: holds no token; name another file")
-    return token
+    return token.decode("ascii")

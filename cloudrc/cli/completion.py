@@ -19,7 +19,7 @@ installation:
   cloudrc completion fish > ~/.config/fish/completions/cloudrc.fish"""
 
 JOINED = """\
-# Bash splits words at "=": join KEY=VALUE again before completing, and return what follows "=".
+# Bash splits words at "=": join KEY=VALUE before completing, and return what follows "=".
 _cloudrc_joined() {
   local word joined=()
   for word in "${COMP_WORDS[@]:0:COMP_CWORD+1}"; do
@@ -56,18 +56,17 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.config import shipped
 
     keys = list(_settings())
+    of_link = [key.removeprefix("link.") for key in keys if key.startswith("link.")]
     candidates = {
         "EXPERIMENT": _candidates("experiment", shipped.names("experiment"), files=True),
         "PROFILE": _candidates("profile", shipped.names("profile"), files=True),
-        "KEY=VALUE": _candidates("key", keys),
+        "KEY=VALUE of --set": _candidates("key", keys),
+        "KEY=VALUE": _candidates("link", of_link),  # the arguments of `link set`
     }
-    links = [key.removeprefix("link.") for key in keys if key.startswith("link.")]
-    of_link_set = _candidates("link", links)
     parser = build_parser(COMMANDS, for_completion=True)
     for action in _actions(parser):
-        if action.metavar in candidates:
-            is_option = action.option_strings or action.metavar != "KEY=VALUE"
-            found = candidates[str(action.metavar)] if is_option else of_link_set
+        name = " of ".join([str(action.metavar), *action.option_strings])
+        if found := candidates.get(name) or candidates.get(str(action.metavar)):
             action.complete = found  # type: ignore[attr-defined]
     print(shtab.complete(parser, options.shell))
     if options.shell == "bash":
@@ -106,12 +105,14 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 def _candidates(name: str, words: Sequence[str], *, files: bool = False) -> dict[str, Any]:
     """Write completion candidates for shtab, in the syntax of each shell."""
     function, joined = f"_cloudrc_{name}", " ".join(words)
-    bash = "; compgen -f -- $1" if files else ""
-    zsh = "; _files -g '*.yaml'" if files else ""
+    bash = zsh = fish = ""
+    if files:
+        bash, zsh = "; compgen -f -- $1", "; _files -g '*.yaml'"
+        fish = " (__fish_complete_suffix .yaml)"
     return {
         "bash": function,
         "zsh": function,
-        "fish": f"{joined} (__fish_complete_suffix .yaml)" if files else joined,
+        "fish": joined + fish,
         "preamble": {
             "bash": f"{function}() {{ compgen -W '{joined}' -- $1{bash}; }}\n",
             "zsh": f"{function}() {{ compadd -S '' -- {joined}{zsh} }}\n",

@@ -1,4 +1,4 @@
-"""The optional dependencies, and how to install those that are missing."""
+"""The optional dependencies, the modes that need them, and how to install them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,12 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "api": ("fastapi", "uvicorn"),
 }
 """Extra of pyproject.toml -> its modules; the distributions have the same names."""
+MODES: dict[str, tuple[str, ...]] = {
+    "local": ("world", "record", "report"),
+    "virtual": ("world", "record", "report"),
+    "cluster": ("kube", "record", "report"),
+}
+"""Mode of a run -> the extras that it needs."""
 
 
 def missing(extra: str) -> list[str]:
@@ -23,11 +29,7 @@ def missing(extra: str) -> list[str]:
 
 
 def require(purpose: str, extras: Iterable[str]) -> None:
-    """Check that extras are installed, for a purpose such as "mode virtual".
-
-    Raises:
-        MissingPrerequisiteError: If a module is missing; the text says how to install it.
-    """
+    """Check that extras are installed, for a purpose such as "mode virtual"."""
     absent = {extra: found for extra in extras if (found := missing(extra))}
     if absent:
         modules = ", ".join(module for names in absent.values() for module in names)

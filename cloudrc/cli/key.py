@@ -29,8 +29,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     new = verbs.add_parser("new", help="make a key file, or rotate the key in one")
     new.add_argument("file", type=Path, metavar="FILE", help="key file to write, with mode 0600")
     new.add_argument("--overlap", metavar="SECONDS", help="ignored: see 'drop'")
-    new.add_argument("--drop", action="store_true", help="ignored: a second key is always replaced")
-    drop = verbs.add_parser("drop", help="remove the old key of a rotation", aliases=["retire"])
+    drop = verbs.add_parser("drop", help="remove the old key of a rotation")
     drop.add_argument("file", type=Path, metavar="FILE", help="key file made by 'new'")
 
 

@@ -31,7 +31,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.output == "table":
         blocks = []
         for kind, lines in found.items():
-            rows = [(f"  {name}", line) for name, line in lines.items()]
+            rows = [(f"  {name}", text) for name, text in lines.items()]
             blocks.append(f"{paint(kind, 'bold')}\n{table(rows)}")
         print("\n\n".join(blocks))
         return 0
@@ -48,6 +48,7 @@ def describe_all(kind: str) -> dict[str, str]:
     from cloudrc import plugins
     from cloudrc.config import shipped
 
+    one = kind.removesuffix("s")
     if kind in PLUGINS:
         lines = {name: plugins.describe(kind, name) for name in plugins.names(kind)}
         if kind == "metrics":
@@ -55,17 +56,12 @@ def describe_all(kind: str) -> dict[str, str]:
 
             lines |= {metric.name: metric.meaning for metric in SHIPPED.values()}
     else:
-        one = kind.removesuffix("s")
         describe = shipped.describe if kind in YAML else _comment
         lines = {name: describe(one, name) for name in shipped.names(one)}
-    return {name: _plain(line, kind) for name, line in sorted(lines.items())}
-
-
-def _plain(line: str, kind: str) -> str:
-    """Remove the prefix of a line that repeats the heading, such as "Predictor: "."""
-    before, colon, rest = line.rstrip(".").partition(": ")
-    repeated = colon and kind.startswith(before.lower().rpartition(" ")[2])
-    return rest[:1].upper() + rest[1:] if repeated else line.rstrip(".")
+    # A docstring such as "Predictor: trusts a share of the velocity." repeats the heading.
+    prefix = re.compile(rf"^[^:]*\b{one}: ", re.IGNORECASE)
+    found = {name: prefix.split(line, maxsplit=1)[-1] for name, line in sorted(lines.items())}
+    return {name: line[:1].upper() + line[1:].rstrip(".") for name, line in found.items()}
 
 
 def _comment(kind: str, name: str) -> str:

@@ -7,28 +7,14 @@ import sys
 from collections.abc import Sequence
 
 from cloudrc.cli.output import discard_output, escape
-from cloudrc.cli.parser import COMMANDS, build_parser, describe_unknown
+from cloudrc.cli.parser import build_parser
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
-REMEDIES = {
-    **dict.fromkeys(
-        (errno.EACCES, errno.EPERM, errno.EROFS), "choose a file or folder that you have access to"
-    ),
-    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR), "check the path"),
-    errno.EISDIR: "name a file in this folder",
-    errno.ENOSPC: "free some space or choose another disk",
-}
-"""Advice for unexpected errors of the operating system, by error number."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command line, by default that of this process.
-
-    Returns:
-        The exit code; `cloudrc --help` lists the codes.
-    """
+    """Run one command line, by default that of this process; return the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(given)
@@ -49,10 +35,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _dispatch(given: Sequence[str]) -> int:
     name = next((word for word in given if not word.startswith("-")), None)
-    if name is not None and name not in COMMANDS:
-        raise BadInputError(
-            f"unknown command: {describe_unknown(name, COMMANDS)}; see 'cloudrc --help'"
-        )
     parser = build_parser([name] if name else [])
     if not given:
         parser.print_help()
@@ -71,8 +53,9 @@ def _explain(error: Exception) -> tuple[str, int]:
         return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        remedy = REMEDIES.get(error.errno or 0, "'--debug' shows where")
+        remedy = "check the path, and whether you have access to it ('--debug' shows where)"
+        if error.errno == errno.ENOSPC:
+            remedy = "free some space or choose another disk"
         return f"{where}{error.strerror or error}; {remedy}", BadInputError.exit_code
-    kind = type(error).__name__
-    text = " ".join(str(error).split())
+    kind, text = type(error).__name__, " ".join(str(error).split())
     return f"internal error: {kind}: {text}; '--debug' shows where, please report it", INTERNAL

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 UNLIMITED = 10_000
 """Width of output that is not for a terminal [columns]."""
-_CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1", "dim": "2"}
+_CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
 
 def output_argument(parser: argparse.ArgumentParser, what: str = "output format") -> None:
@@ -59,25 +59,19 @@ def discard_output(stream: TextIO) -> None:
         os.close(null)
 
 
-def paint(text: str, colour: str, stream: TextIO | None = None) -> str:
-    """Colour a text if the stream (default: stdout) is a terminal with colour."""
-    if os.environ.get("NO_COLOR") or not is_live(stream or sys.stdout):
+def paint(text: str, colour: str) -> str:
+    """Colour a text if stdout is a terminal with colour."""
+    if os.environ.get("NO_COLOR") or not is_live(sys.stdout):
         return text
     return f"\x1b[{_CODES[colour]}m{text}\x1b[0m"
 
 
 def console(stream: TextIO) -> Console:
     """Make a rich console that writes to a stream, in plain text if the stream is no terminal."""
-    from rich.console import Console as RichConsole
-
-    class Quiet(RichConsole):
-        """A console that continues without error if its reader, such as `head`, closes the pipe."""
-
-        def on_broken_pipe(self) -> None:
-            discard_output(stream)
+    from rich.console import Console
 
     live = is_live(stream)
-    return Quiet(
+    return Console(
         file=stream,
         force_terminal=live,
         color_system="standard" if live else None,

@@ -6,7 +6,6 @@ import argparse
 import difflib
 import importlib
 import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -41,8 +40,9 @@ GROUPS: dict[str, dict[str, str]] = {
 PROCESSES = ("world", "cloud", "relay")
 """Commands whose module is `cloudrc/cli/processes.py` instead."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
-COUNT_MAX = 100_000
-"""Largest number of repeats that a flag accepts."""
+COUNT_MAX = 10_000
+"""Largest number of repeats that a flag accepts. Before Python 3.11.6, a pool of processes hangs if
+it gets more than 16,384 tasks (cpython issue 105829)."""
 
 ABOUT = "Fly a simulated drone from a simulated cloud, over an emulated network."
 EXAMPLES = """\
@@ -57,20 +57,18 @@ exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
   3 missing prerequisite, 4 timeout, 5 cluster or API error,
   6 run invalid (not real time), 70 internal error, 130 interrupted"""
 
-_CHOICE = re.compile(r"argument (\S+): invalid choice: '(.*)' \(choose from (.*)\)")
-
 
 class Parser(argparse.ArgumentParser):
     """Parse a command line; raise errors of argparse as one line, which `main` prints."""
 
     def error(self, message: str) -> NoReturn:
         """Raise the error; name the help page that explains it."""
-        choice = _CHOICE.fullmatch(message)
-        if choice:
-            argument, given, valid = choice.groups()
-            names = [name.strip(" '") for name in valid.split(",")]
-            message = f"{argument}: {describe_unknown(given, names)}"
         raise BadInputError(f"{message}; see '{self.prog} --help'")
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Suggest the most similar choice; argparse itself lists them all."""
+        if action.choices is not None and value not in action.choices:
+            raise argparse.ArgumentError(action, describe_unknown(value, action.choices))
 
 
 def describe_unknown(given: str, names: Iterable[str]) -> str:
@@ -99,12 +97,9 @@ def input_file(text: str) -> Path:
 
 
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
-    """Build the parser.
+    """Build the parser with the arguments of the `wanted` commands, and the names of the others.
 
-    Args:
-        wanted: Commands to import; for the others the parser knows only the names.
-        for_completion: Whether argparse lists the commands. Otherwise the help lists them in
-            groups.
+    The help lists the commands in groups. For completion, argparse itself lists them.
     """
     common, about = Parser(add_help=False), "show the traceback of an error"
     common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)

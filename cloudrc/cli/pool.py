@@ -6,30 +6,17 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
-from itertools import islice
 from types import FrameType
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeVar
 
 from cloudrc.errors import InterruptedRunError, InvalidRunError
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
-Stop: TypeAlias = tuple[str, int]
-"""What ended work early, and its exit code."""
-PARENT_PERIOD = 0.5
-"""Period in which a worker checks whether its parent still runs [s]."""
-BATCH_MAX = 1000
-"""Maximum number of tasks that a pool gets at once. Before Python 3.11.6, a pool hangs if it gets
-more than 16,384 tasks at once (cpython issue 105829)."""
-WORKER_KILLED = (
-    "a worker was killed, perhaps by the kernel because memory ran out; use fewer processes"
-)
 
 
 class WorkerDiedError(InvalidRunError):
@@ -52,69 +39,16 @@ def _hung_up(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def _exit_with_parent(parent: int) -> None:
-    """End this worker soon after the process `parent` has ended, even if that was killed."""
+def _end_with_parent() -> None:
+    """End this worker when its parent has ended, even if the parent was killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
 
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(PARENT_PERIOD)
+    def wait() -> None:
+        parent.join()
         os._exit(1)  # without clean-up: nobody waits for this process
 
-    threading.Thread(target=watch, name="parent", daemon=True).start()
-
-
-def map_in_order(
-    function: Callable[[Work], Result], work: Sequence[Work], jobs: int
-) -> Generator[Result]:
-    """Call a function on each piece of work, in parallel, and yield the results in order.
-
-    Ctrl-C or closing the generator ends the running calls and drops the others.
-
-    Args:
-        function: A function at module level, because worker processes call it. If `jobs` is 1, the
-            present process calls it.
-        work: Arguments of the function, one for each call.
-        jobs: Number of processes; limited to the number of cores and to the length of `work`.
-
-    Raises:
-        WorkerDiedError: If one of the processes was killed.
-    """
-    workers = min(jobs, len(work), os.cpu_count() or 1)
-    if workers <= 1:
-        yield from map(function, work)
-        return
-    # Spawn, do not fork: libraries may have started threads in this process.
-    context = multiprocessing.get_context("spawn")
-    with _isolated_start():  # the pool starts multiprocessing's resource tracker
-        pool = ProcessPoolExecutor(workers, context, _exit_with_parent, (os.getpid(),))
-    try:
-        waiting = iter(work)
-        while batch := list(islice(waiting, BATCH_MAX)):
-            with _isolated_start():
-                futures = deque(pool.submit(function, each) for each in batch)
-            while futures:
-                yield futures.popleft().result()
-    except BrokenProcessPool as error:
-        raise WorkerDiedError(WORKER_KILLED) from error
-    except BaseException:  # Ctrl-C, or the caller wants no more results
-        for worker in multiprocessing.active_children():
-            worker.kill()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def take_each(results: Generator[Result, Any, None], take: Callable[[Result], None]) -> Stop:
-    """Take all results; return what ended them early and its exit code, or "" and 0."""
-    try:
-        with closing(results):
-            for result in results:
-                take(result)
-    except KeyboardInterrupt:
-        return "interrupted", InterruptedRunError.exit_code
-    except WorkerDiedError as error:
-        return str(error), error.exit_code
-    return "", 0
+    threading.Thread(target=wait, daemon=True).start()
 
 
 @contextmanager
@@ -126,11 +60,58 @@ def _isolated_start() -> Iterator[None]:
     files may come from somebody else.
     """
     before = {n: signal.signal(n, signal.SIG_IGN) for n in (signal.SIGINT, signal.SIGHUP)}
-    safe_path = os.environ.get("PYTHONSAFEPATH")
+    safe_path = os.environ.get("PYTHONSAFEPATH", "")
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
         yield
     finally:
-        os.environ["PYTHONSAFEPATH"] = safe_path or ""  # empty: not set
+        os.environ["PYTHONSAFEPATH"] = safe_path  # empty: not set
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def map_in_order(
+    function: Callable[[Work], Result], work: Sequence[Work], jobs: int
+) -> Generator[Result]:
+    """Call a function on each piece of work, in parallel, and yield the results in order.
+
+    At most `jobs` processes work, and at most one for each core; a single job runs in the present
+    process. The function is at module level, because worker processes call it. Ctrl-C or closing
+    the generator ends the running calls and drops the others.
+    """
+    workers = min(jobs, len(work), os.cpu_count() or 1)
+    if workers <= 1:
+        yield from map(function, work)
+        return
+    # Spawn, do not fork: libraries may have started threads in this process.
+    context = multiprocessing.get_context("spawn")
+    with _isolated_start():
+        pool = ProcessPoolExecutor(workers, context, _end_with_parent)
+        futures = [pool.submit(function, each) for each in work]
+    try:
+        for future in futures:
+            yield future.result()
+    except BrokenProcessPool as error:
+        text = "a worker was killed, perhaps by the kernel because memory ran out"
+        raise WorkerDiedError(f"{text}; use fewer processes") from error
+    except BaseException:  # Ctrl-C, or the caller wants no more results
+        for worker in multiprocessing.active_children():
+            worker.kill()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def take_each(
+    results: Generator[Result, Any, None], take: Callable[[Result], None]
+) -> tuple[str, int]:
+    """Take all results; return what ended them early and its exit code, or "" and 0."""
+    try:
+        with closing(results):
+            for result in results:
+                take(result)
+    except KeyboardInterrupt:
+        return "interrupted", InterruptedRunError.exit_code
+    except WorkerDiedError as error:
+        return str(error), error.exit_code
+    return "", 0

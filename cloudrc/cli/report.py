@@ -52,6 +52,7 @@ def execute(options: argparse.Namespace) -> int:
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
+    from cloudrc.metrics.verdict import EXIT_CODES
     from cloudrc.report.folder import read_run
     from cloudrc.report.write import write_report
 
@@ -61,18 +62,11 @@ def execute(options: argparse.Namespace) -> int:
     unmeasured = metrics.not_measured(experiment.report.metrics, options.metric)
     run = replace(run, notes=(*run.notes, *unmeasured))
     document = write_report(options.run, recording, experiment, run, own=options.metric)
-    if options.output != "table":
-        print(format_document(document, options.output))
-    else:
-        print(summary(document, options.run))
-    return exit_code(document)
-
-
-def exit_code(report: Mapping[str, Any]) -> int:
-    """Return the exit code of a report's verdict."""
-    from cloudrc.metrics.verdict import EXIT_CODES
-
-    return EXIT_CODES[report["verdict"]]
+    for_people = options.output == "table"
+    print(
+        summary(document, options.run) if for_people else format_document(document, options.output)
+    )
+    return EXIT_CODES[document["verdict"]]
 
 
 def summary(report: Mapping[str, Any], folder: Path) -> str:

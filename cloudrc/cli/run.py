@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import itertools
 import sys
-from collections.abc import Callable
-from contextlib import closing
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
-from cloudrc.cli.extras import missing, require
+from cloudrc.cli.extras import MODES, missing, require
+from cloudrc.cli.find_run import RUNS
 from cloudrc.cli.output import (
     escape,
     format_document,
@@ -22,7 +23,7 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import read_count
 from cloudrc.cli.pool import interrupt_on_signals
-from cloudrc.cli.report import exit_code, summary
+from cloudrc.cli.report import summary
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
@@ -38,16 +39,7 @@ Flight = Callable[[Path], dict[str, Any]]
 """Function that flies and fills a run folder; it returns the content of report.json."""
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
-Write = Callable[["Recording", "Run"], dict[str, Any]]
-"""Function that writes the report and returns the content of report.json."""
 
-MODES = ("local", "virtual", "cluster")
-EXTRAS = {
-    "local": ("world", "record", "report"),
-    "virtual": ("world", "record", "report"),
-    "cluster": ("kube", "record", "report"),
-}
-"""Mode -> the extras that it needs."""
 GRACE = 30.0
 """Time after the mission's time limit at which the program ends a flight that still runs [s]."""
 CLOCK = bytes(16)
@@ -100,7 +92,7 @@ def execute(options: argparse.Namespace) -> int:
     mode = options.mode or ("virtual" if options.seeds else "local")
     if options.seeds and mode != "virtual":
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
-    require(f"mode {mode}", EXTRAS[mode])
+    require(f"mode {mode}", MODES[mode])
     if options.seeds:
         from cloudrc.cli import sweep
 
@@ -108,23 +100,30 @@ def execute(options: argparse.Namespace) -> int:
     return _fly_once(options, mode)
 
 
-def _fly_once(options: argparse.Namespace, mode: str) -> int:
+def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
+    """Load an experiment by its name or path; check the user's metrics that it names."""
     from cloudrc import metrics
-    from cloudrc.cli.find_run import discard, new_folder, point_latest_to
     from cloudrc.config.load import load_experiment
 
-    seed = [] if options.seed is None else [f"seed={options.seed}"]
-    experiment = load_experiment(options.experiment, [*options.set, *seed])
+    seeds = [] if seed is None else [f"seed={seed}"]
+    experiment = load_experiment(name, [*overrides, *seeds])
     metrics.check(experiment.report.metrics)
+    return experiment
+
+
+def _fly_once(options: argparse.Namespace, mode: str) -> int:
+    from cloudrc.metrics.verdict import EXIT_CODES
+
+    experiment = load(options.experiment, options.set, options.seed)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
     mission = experiment.mission
     count = mission.steps.count if mission.steps else len(mission.waypoints)
     # First prepare the flight: if that fails, no folder must be left.
-    flight: Flight = partial(_fly_here, experiment, mode, stream, count)
     if in_cluster:
         flight = _cluster_flight(experiment, options, stream)
-    # A cluster can fail before anything is recorded; the folder is then removed.
+    else:
+        flight = _local_flight(experiment, mode, stream, count)
     name = f"{experiment.name}-{mode}-seed{experiment.seed}"
     folder = new_folder(options.out, name, latest=not in_cluster)
     if not for_programs:
@@ -134,7 +133,10 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     try:
         report = flight(folder)
     except (CloudrcError, KeyboardInterrupt) as error:
-        if not (in_cluster and discard(folder)):
+        if in_cluster:  # the folder stays empty until the mission has flown
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        if folder.exists():
             unwritten = isinstance(error, KeyboardInterrupt)
             remedy = f"; 'cloudrc report {folder}' writes its report" if unwritten else ""
             print_line(f"the recording is in {folder}{remedy}", sys.stderr)
@@ -142,21 +144,69 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     finally:
         if in_cluster and options.out is None and folder.exists():
             point_latest_to(folder)
-    text = format_document(report, options.output) if for_programs else summary(report, folder)
-    print_or_drop(text)
-    return exit_code(report)
+    print_or_drop(
+        format_document(report, options.output) if for_programs else summary(report, folder)
+    )
+    return EXIT_CODES[report["verdict"]]
 
 
-def _fly_here(
-    experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int, folder: Path
-) -> dict[str, Any]:
-    """Fly on this machine, and show the progress on a stream."""
+def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
+    """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
+
+    With `latest`, `runs/latest` points to the new folder from now on. A BadInputError says that
+    `out` exists and is not an empty folder, or that the folder cannot be made.
+    """
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise BadInputError(
+            f"--out {out}: already exists; name a new folder, runs are never overwritten"
+        )
+    try:
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            return out
+        folder = _next_folder(name)
+    except OSError as error:
+        where = f"--out {out}" if out else f"{RUNS}/ in the working folder"
+        remedy = "name another folder" if out else "name a writable folder with --out"
+        raise BadInputError(f"{where}: cannot be made: {error.strerror}; {remedy}") from error
+    if latest:
+        point_latest_to(folder)
+    return folder
+
+
+def _next_folder(name: str) -> Path:
+    RUNS.mkdir(exist_ok=True)
+    for n in itertools.count(1):
+        with contextlib.suppress(FileExistsError):  # also if another process takes it meanwhile
+            folder = RUNS / f"{name}-{n}"
+            folder.mkdir()
+            break
+    return folder
+
+
+def point_latest_to(folder: Path) -> None:
+    """Point `runs/latest` to the newest run, if the file system supports symbolic links."""
+    latest = folder.parent / "latest"
+    with contextlib.suppress(OSError):
+        if latest.is_symlink():
+            latest.unlink()
+        latest.symlink_to(folder.name, target_is_directory=True)
+
+
+def _local_flight(
+    experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int
+) -> Flight:
+    """Return the function that flies on this machine and shows the progress on a stream."""
     from cloudrc.cli.progress import FlightView
 
     if stream is sys.stderr and not is_live(stream):
-        return fly(experiment, mode, folder)
-    with closing(FlightView(stream, waypoints)) as view:
-        return fly(experiment, mode, folder, view.see)
+        return lambda folder: fly(experiment, mode, folder)
+
+    def flight(folder: Path) -> dict[str, Any]:
+        with contextlib.closing(FlightView(stream, waypoints)) as view:
+            return fly(experiment, mode, folder, view.see)
+
+    return flight
 
 
 def _cluster_flight(
@@ -177,55 +227,35 @@ def _cluster_flight(
     return lambda folder: fly_in_cluster(experiment, folder, release, options.timeout, tell)
 
 
-def _ignore(records: list[Record]) -> None:
-    """Show nothing of the flight."""
-
-
 def fly(
     experiment: ResolvedExperiment,
     mode: str,
     folder: Path,
-    see: See = _ignore,
+    see: See = lambda records: None,
     *,
     page: bool = True,
 ) -> dict[str, Any]:
-    """Fly one experiment in mode "virtual" or "local", and fill its empty run folder.
+    """Fly in mode "virtual" or "local", fill the empty run folder, and return the report.
 
-    Args:
-        experiment: The experiment, complete and checked.
-        mode: Where to fly.
-        folder: Receives configuration, recording and report.
-        see: Called with records during the flight: with all in virtual mode, with a selection in
-            local mode.
-        page: Whether to write the HTML page with figures; the numbers are always written.
-
-    Returns:
-        The content of report.json.
-
-    Raises:
-        CloudrcError: If the flight broke off. The recording stays; its report says "interrupted".
+    During the flight `see` gets records: all in virtual mode, a selection in local mode. If the
+    flight breaks off, the recording stays, and its report says "interrupted". Without `page` the
+    report has numbers only, no HTML page.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
 
-    def write(recording: Recording, run: Run) -> dict[str, Any]:
-        own = experiment.report.metrics
-        return write_report(folder, recording, experiment, run, own=own, page=page)
-
-    fly_mode = _fly_virtual if mode == "virtual" else _fly_local
+    record = _record_virtual if mode == "virtual" else _record_local
+    own = experiment.report.metrics
     try:
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        return fly_mode(experiment, folder, see, write)
+        with record(experiment, folder, see) as (recording, run):
+            return write_report(folder, recording, experiment, run, own=own, page=page)
     except OSError as error:
-        where = error.filename or folder
-        raise CloudrcError(
-            f"{where}: {error.strerror or error}; free some space or choose another folder: --out"
-        ) from error
+        where, remedy = error.filename or folder, "free some space or choose another folder: --out"
+        raise CloudrcError(f"{where}: {error.strerror or error}; {remedy}") from error
 
 
-def assemble(
-    experiment: ResolvedExperiment,
-) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
+def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
     """Assemble both ends and their run in virtual time."""
     from cloudrc import assembly
     from cloudrc.drivers.virtual import VirtualRun
@@ -236,9 +266,11 @@ def assemble(
     return world, cloud, VirtualRun(world, cloud, *assembly.build_links(experiment))
 
 
-def _fly_virtual(
-    experiment: ResolvedExperiment, folder: Path, see: See, write: Write
-) -> dict[str, Any]:
+@contextlib.contextmanager
+def _record_virtual(
+    experiment: ResolvedExperiment, folder: Path, see: See
+) -> Iterator[tuple[Recording, Run]]:
+    """Fly in virtual time; attach the report that the block writes to the recording."""
     from cloudrc.record.columns import Recording, merged
     from cloudrc.record.hash import RecordHash
     from cloudrc.record.writer import McapWriter
@@ -246,7 +278,7 @@ def _fly_virtual(
     from cloudrc.report.write import attachments
 
     records: tuple[list[Record], list[Record]] = ([], [])
-    digest = RecordHash()
+    digest, interrupted = RecordHash(), False
     # Record during the flight, so that the recording is kept if the run or its report fails.
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
@@ -259,40 +291,40 @@ def _fly_virtual(
                 digest.update(new)
                 see(new)
 
-        interrupted = False
         try:
             _, cloud, flight = assemble(experiment)
             limit_ns = round((experiment.criteria.time_limit_s + GRACE) * 1e9)
             flight.fly(lambda: cloud.mission_over, limit_ns, sink)
         except KeyboardInterrupt:
             interrupted = True
-        run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
         try:
-            return write(Recording.from_records(*records), run)
+            run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
+            yield Recording.from_records(*records), run
         finally:
             for name, data in attachments(folder).items():
                 writer.attach(name, data)
 
 
-def _fly_local(
-    experiment: ResolvedExperiment, folder: Path, see: See, write: Write
-) -> dict[str, Any]:
+@contextlib.contextmanager
+def _record_local(
+    experiment: ResolvedExperiment, folder: Path, see: See
+) -> Iterator[tuple[Recording, Run]]:
+    """Fly in processes; merge their recordings, and attach the report that the block writes."""
     from cloudrc.drivers.local import LocalRun
     from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments
 
-    absent = missing("api")
-    if absent:
-        print(
-            f"cloudrc: no operator's API in this run: {', '.join(absent)} not installed; "
-            "run: pip install 'cloudrc[api]'",
-            file=sys.stderr,
-        )
-    _check_own_models(experiment)
-    local = LocalRun(folder, see, api=not absent)
-    broken: CloudrcError | None = None
+    if absent := missing("api"):
+        text = f"no operator's API in this run: {', '.join(absent)} not installed"
+        print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
+    world = experiment.world
+    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
+        from cloudrc.world.scene import compile_model
+
+        compile_model(world.robot, world.scene)  # an invalid model would end a process in flight
+    local, broken = LocalRun(folder, see, api=not absent), None
     interrupted = True
     try:
         local.fly(experiment.criteria.time_limit_s + GRACE)
@@ -307,25 +339,11 @@ def _fly_local(
         if not interrupted:
             raise
         raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
-    digest = messages_sha256(mission.contents.messages)
     notes = (*local.notes, *([str(broken)] if broken else ()))
-    run = Run("local", "relay", digest, interrupted, notes)
+    digest = messages_sha256(mission.contents.messages)
     try:
-        document = write(mission.recording(), run)
+        yield mission.recording(), Run("local", "relay", digest, interrupted, notes)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
-    if broken is not None:
+    if broken:
         raise broken
-    return document
-
-
-def _check_own_models(experiment: ResolvedExperiment) -> None:
-    """Compile the user's own robot and scene before the processes start.
-
-    Otherwise an invalid model would end a process of the flight.
-    """
-    world = experiment.world
-    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
-        from cloudrc.world.scene import compile_model
-
-        compile_model(world.robot, world.scene)

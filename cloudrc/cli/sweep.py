@@ -13,9 +13,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc.cli.find_run import new_folder
 from cloudrc.cli.output import escape, format_document, format_number, print_or_drop, table
 from cloudrc.cli.pool import map_in_order, take_each
+from cloudrc.cli.run import fly, load, new_folder
 from cloudrc.metrics.verdict import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
@@ -28,12 +28,9 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
 
     The k-th smallest and the k-th largest of n values enclose the median with probability
     1 - 2 · sum_{i<k} C(n, i) / 2^n. k is the largest number for which the probability is at least
-    95 %.
+    95 %. The result is None for fewer than 6 values, which cannot reach 95 %.
 
     Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, section 7.1.
-
-    Returns:
-        Lower and upper bound; None for fewer than 6 values, which cannot reach 95 %.
     """
     ordered, n = sorted(values), len(values)
     outside, k = 0.0, 0
@@ -68,8 +65,7 @@ def as_table(summary: Mapping[str, Any]) -> str:
         unit = "" if entry["unit"] == "1" else entry["unit"]
         note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
         rows.append((name, format_number(entry["median"]), between, unit + note))
-    enough = any(entry["interval"] for entry in summary["numbers"].values())
-    method = METHOD if enough else "an interval needs 6 seeds or more"
+    method = METHOD if summary["count"] >= 6 else "an interval needs 6 seeds or more"
     return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{summary['count']}"
 
 
@@ -89,19 +85,19 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
     After an interrupt or the death of a worker, the table covers the finished seeds.
     """
-    from cloudrc import metrics
-    from cloudrc.config.load import load_experiment
-
     # Load the experiment here too, so that a mistake is reported once, not N times.
-    loaded = load_experiment(options.experiment, options.set)
-    metrics.check(loaded.report.metrics)
-    folder = new_folder(options.out, f"{loaded.name}-virtual-{options.seeds}seeds")
+    name = load(options.experiment, options.set).name
+    folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds")
     work = [(options.experiment, options.set, folder, n + 1) for n in range(options.seeds)]
-    reports: list[dict[str, Any]] = []
+    for_people, reports = options.output == "table", list[dict[str, Any]]()
 
     def take(report: dict[str, Any]) -> None:
         reports.append(report)
-        _show_run(options, report, f"{len(reports)}/{len(work)}")
+        failure = "".join(f": {f['text']}" for f in report["failures"][:1])
+        count = f"{len(reports)}/{len(work)}"
+        line = f"{count:>7}  seed {report['seed']}  {report['verdict']}{failure}"
+        if for_people or sys.stderr.isatty():
+            print_or_drop(escape(line), sys.stdout if for_people else sys.stderr)
         if report["verdict"] == "interrupted":  # with one core, this process flies
             raise KeyboardInterrupt
 
@@ -109,41 +105,24 @@ def fly_seeds(options: argparse.Namespace) -> int:
     if stopped:
         text = f"\ncloudrc: {stopped}: {len(reports)} of {len(work)} seeds are finished"
         print_or_drop(text, sys.stderr)
-    document = _write(folder, loaded.name, reports, bool(stopped))
-    if options.output != "table":
-        print_or_drop(format_document(document, options.output))
-    else:
-        print_or_drop(f"\n{as_table(document)}\n\n{folder / 'sweep.json'}")
+    document = {
+        **{"schemaVersion": 1, "experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
+        **summarise(reports),
+        "runs": [
+            {"seed": r["seed"], "verdict": r["verdict"], "folder": f"seed-{r['seed']}"}
+            for r in reports
+        ],
+    }
+    (folder / "sweep.json").write_text(json.dumps(document, indent=2) + "\n")
+    (folder / "sweep.csv").write_text(as_csv(reports))
+    shown = f"\n{as_table(document)}\n\n{folder / 'sweep.json'}"
+    print_or_drop(shown if for_people else format_document(document, options.output))
     return code or max(EXIT_CODES[report["verdict"]] for report in reports)
-
-
-def _show_run(options: argparse.Namespace, report: Report, progress: str) -> None:
-    stream = sys.stdout if options.output == "table" else sys.stderr
-    if options.output == "table" or stream.isatty():
-        failure = "".join(f": {f['text']}" for f in report["failures"][:1])
-        line = f"{progress:>7}  seed {report['seed']}  {report['verdict']}{failure}"
-        print_or_drop(escape(line), stream)
 
 
 def _fly_one(job: tuple[str, list[str], Path, int]) -> dict[str, Any]:
     """Fly one seed, in a worker."""
-    from cloudrc.cli.run import fly
-    from cloudrc.config.load import load_experiment
-
     experiment, overrides, folder, seed = job
-    loaded = load_experiment(experiment, [*overrides, f"seed={seed}"])
     run_folder = folder / f"seed-{seed}"
     run_folder.mkdir()
-    return fly(loaded, "virtual", run_folder, page=False)
-
-
-def _write(folder: Path, name: str, reports: Sequence[Report], interrupted: bool) -> dict[str, Any]:
-    """Write sweep.json and sweep.csv; return the content of sweep.json."""
-    runs = [
-        {"seed": r["seed"], "verdict": r["verdict"], "folder": f"seed-{r['seed']}"} for r in reports
-    ]
-    head = {"schemaVersion": 1, "experiment": name, "mode": "virtual", "interrupted": interrupted}
-    document = {**head, **summarise(reports), "runs": runs}
-    (folder / "sweep.json").write_text(json.dumps(document, indent=2) + "\n")
-    (folder / "sweep.csv").write_text(as_csv(reports))
-    return document
+    return fly(load(experiment, overrides, seed), "virtual", run_folder, page=False)

@@ -52,8 +52,8 @@ AUDIT_FILE = "audit.jsonl"
 LINK_FOLDER = "link"
 """Folder in a run's folder for the relay's state and its changed profile during the flight."""
 UNANNOUNCED = (
-    "'cloudrc mission' cannot find this run: no folder for its flight file (XDG_STATE_HOME); give "
-    "it --api {}"
+    "'cloudrc mission' and 'cloudrc link set' cannot find this run: no folder for its flight file "
+    "(XDG_STATE_HOME); give 'cloudrc mission' --api {}"
 )
 
 

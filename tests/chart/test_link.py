@@ -1,26 +1,13 @@
 """The link's mode follows the namespace; `helm test` verifies the link."""
 
-from __future__ import annotations
-
 import pytest
 
 from cloudrc.cli.link_verify import RELEASE_TIMEOUT
 from cloudrc.cli.parser import build_parser
-from tests.chart.conftest import (
-    Lookup,
-    Object,
-    a_namespace,
-    containers,
-    holding,
-    notes,
-    nothing,
-    of_kind,
-    pod_specs,
-    render,
-)
+from tests.chart.conftest import a_namespace, containers, notes, nothing, of_kind, pod_specs, render
 
 
-def modes(lookup: Lookup, values: Object | None = None) -> set[str]:
+def modes(lookup, values=None):
     """Return the mode in the arguments of both link containers."""
     pods = pod_specs(render(values, lookup=lookup))
     found = (containers(pods[end])["link"]["args"] for end in ("world", "cloud"))
@@ -37,27 +24,24 @@ def modes(lookup: Lookup, values: Object | None = None) -> set[str]:
         (a_namespace("restricted"), "relay"),
     ],
 )
-def test_auto_follows_the_label_of_the_namespace(lookup: Lookup, mode: str) -> None:
+def test_auto_follows_the_label_of_the_namespace(lookup, mode):
     assert modes(lookup) == {f"--mode={mode}"}
     for fixed in ("relay", "netem"):
         assert modes(lookup, {"link": {"mode": fixed}}) == {f"--mode={fixed}"}
 
 
-def test_an_upgrade_keeps_the_mode() -> None:
+def test_an_upgrade_keeps_the_mode_unless_the_label_is_new():
     """Helm creates the namespace (--create-namespace) after rendering: only an upgrade sees it."""
     installed = render(lookup=nothing)
-    assert render(lookup=holding(installed, a_namespace())) == installed
-
-
-def test_an_upgrade_obeys_a_new_label() -> None:
+    assert render(lookup=a_namespace(objects=installed)) == installed
     installed = render(lookup=a_namespace())
-    assert modes(holding(installed, a_namespace("restricted"))) == {"--mode=relay"}
+    assert modes(a_namespace("restricted", installed)) == {"--mode=relay"}
     for deployment in of_kind(installed, "Deployment").values():
         annotations = deployment["spec"]["template"]["metadata"]["annotations"]
         assert annotations["cloudrc/link-mode"] == "auto"
 
 
-def test_the_notes_show_mode_and_label_command() -> None:
+def test_the_notes_show_mode_and_label_command():
     label = "kubectl label namespace lab pod-security.kubernetes.io/enforce=privileged --overwrite"
     assert "mode relay" in notes()
     assert label not in notes()
@@ -67,10 +51,9 @@ def test_the_notes_show_mode_and_label_command() -> None:
         assert label in text
 
 
-def test_helm_test_verifies_the_link_of_this_release() -> None:
+def test_helm_test_verifies_the_link_of_this_release():
     objects = render()
-    pods = [thing for thing in objects if thing["kind"] == "Pod"]
-    (test,) = (thing for thing in pods if thing["metadata"]["name"].endswith("-test-link"))
+    (test,) = (t for name, t in of_kind(objects, "Pod").items() if name.endswith("test-link"))
     annotations, spec = test["metadata"]["annotations"], test["spec"]
     assert annotations["helm.sh/hook"] == "test"
     assert int(annotations["helm.sh/hook-weight"]) > 0, "commands flow once a mission has flown"
@@ -79,10 +62,10 @@ def test_helm_test_verifies_the_link_of_this_release() -> None:
     # Helm waits 300 s for one hook.
     assert RELEASE_TIMEOUT + 10.0 <= spec["activeDeadlineSeconds"] < 300.0
     (container,) = spec["containers"]
-    options = build_parser(["link"]).parse_args(container["args"])
-    services = {thing["metadata"]["name"] for thing in objects if thing["kind"] == "Service"}
-    hosts = options.ends.split(",")
-    assert set(hosts) <= services
+    hosts = build_parser(["link"]).parse_args(container["args"]).ends.split(",")
+    assert set(hosts) <= {
+        thing["metadata"]["name"] for thing in of_kind(objects, "Service").values()
+    }
     assert {name.rsplit("-", 1)[-1] for name in hosts} == {"world", "cloud"}
     cloud = containers(pod_specs(objects)["cloud"])["cloud"]
     assert container["securityContext"] == cloud["securityContext"]

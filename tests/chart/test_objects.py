@@ -1,7 +1,5 @@
 """Names, labels, selectors, images, arguments and notes fit together."""
 
-from __future__ import annotations
-
 import re
 import shlex
 
@@ -12,7 +10,6 @@ from cloudrc.cli.parser import build_parser
 from tests.chart.conftest import (
     CHART,
     METADATA,
-    Object,
     containers,
     notes,
     of_kind,
@@ -26,24 +23,20 @@ LABELS = {f"app.kubernetes.io/{key}" for key in KEYS} | {"helm.sh/chart"}
 SELECTORS = {f"app.kubernetes.io/{key}" for key in KEYS[:3]}
 
 
-def test_objects_have_the_labels_that_selectors_need() -> None:
+def test_objects_have_the_labels_that_selectors_need():
     assert METADATA["version"] == METADATA["appVersion"] == cloudrc.__version__
     objects = render(values_of(CHART / "ci" / "everything-values.yaml"))
     for thing in objects:
         assert thing["metadata"]["labels"].keys() >= LABELS, thing["metadata"]["name"]
-    pods = [
-        thing["spec"]["template"]["metadata"]["labels"]
-        for thing in objects
-        if thing["kind"] == "Deployment"
-    ]
+    deployments = of_kind(objects, "Deployment").values()
+    pods = [thing["spec"]["template"]["metadata"]["labels"] for thing in deployments]
     for labels in pods:  # a new version of the chart alone restarts no pod
         assert not labels.keys() & {"helm.sh/chart", "app.kubernetes.io/version"}
-    for thing in objects:
-        if thing["kind"] in ("Service", "Deployment"):
-            selector = thing["spec"]["selector"]
-            selector = selector.get("matchLabels", selector)
-            assert selector.keys() == SELECTORS
-            assert sum(selector.items() <= labels.items() for labels in pods) == 1
+    for thing in (*deployments, *of_kind(objects, "Service").values()):
+        selector = thing["spec"]["selector"]
+        selector = selector.get("matchLabels", selector)
+        assert selector.keys() == SELECTORS
+        assert sum(selector.items() <= labels.items() for labels in pods) == 1
 
 
 @pytest.mark.parametrize(
@@ -52,23 +45,23 @@ def test_objects_have_the_labels_that_selectors_need() -> None:
         ("demo", {}, "demo-cloudrc-world"),
         ("my-cloudrc", {}, "my-cloudrc-world"),
         ("demo", {"fullnameOverride": "robot"}, "robot-world"),
+        ("1rel", {"fullnameOverride": "robot"}, "robot-world"),
         ("d" * 53, {}, "d" * 46 + "-world"),
     ],
 )
-def test_names_follow_release_and_override(release: str, values: dict[str, str], name: str) -> None:
+def test_names_follow_release_and_override(release, values, name):
     objects = render({**values, "mission": {"enabled": True}}, release=release)
     assert name in {thing["metadata"]["name"] for thing in objects}
     assert max(len(thing["metadata"]["name"]) for thing in objects) <= 63
 
 
 @pytest.mark.parametrize("release", ["1rel", "my.rel"])
-def test_an_invalid_name_is_refused(release: str) -> None:
+def test_an_invalid_name_is_refused(release):
     with pytest.raises(Exception, match=f"the name '{release}-cloudrc' .* set fullnameOverride"):
         render(release=release)
-    assert render({"fullnameOverride": "robot"}, release=release)
 
 
-def test_annotations_and_placement_of_the_user_are_used() -> None:
+def test_annotations_and_placement_of_the_user_are_used():
     where = {
         "nodeSelector": {"disk": "fast"},
         "tolerations": [{"key": "lab", "operator": "Exists"}],
@@ -91,15 +84,14 @@ def test_annotations_and_placement_of_the_user_are_used() -> None:
         assert pod["metadata"]["annotations"].items() > inject.items()
 
 
-def test_the_link_is_a_native_sidecar_for_its_pods_egress() -> None:
+def test_the_link_is_a_native_sidecar_for_its_pods_egress():
     pods = pod_specs(render())
     for end, direction, peer in (("world", "uplink", "cloud"), ("cloud", "downlink", "world")):
         (link,) = pods[end]["initContainers"]
         assert (link["name"], link["restartPolicy"]) == ("link", "Always")
         mounts = {mount["mountPath"]: mount["name"] for mount in link["volumeMounts"]}
         assert mounts["/etc/cloudrc-link"] == "link"
-        own = containers(pods[end])[end]
-        assert "--route=/run/cloudrc/route" in own["args"]
+        assert "--route=/run/cloudrc/route" in containers(pods[end])[end]["args"]
         assert {
             f"--direction={direction}",
             f"--peer=demo-cloudrc-{peer}:7400",
@@ -109,11 +101,11 @@ def test_the_link_is_a_native_sidecar_for_its_pods_egress() -> None:
         } <= set(link["args"])
 
 
-def test_the_command_line_accepts_every_containers_arguments() -> None:
+def test_the_command_line_accepts_every_containers_arguments():
     load = {"backgroundLoad": {"enabled": True, "workers": 3}}
     pods = pod_specs(render({"mission": {"enabled": True, "queue": True}, "cloud": load}))
     assert list(containers(pods["cloud"])) == ["link", "cloud", "teleop", "load"]
-    assert "seq 3" in containers(pods["cloud"]).pop("load")["command"][-1]
+    assert "seq 3" in containers(pods["cloud"])["load"]["command"][-1]
     parts = [part for pod in pods.values() for part in containers(pod).values() if "args" in part]
     assert len(parts) == 8
     for part in parts:
@@ -121,7 +113,7 @@ def test_the_command_line_accepts_every_containers_arguments() -> None:
         assert callable(build_parser([arguments[0]]).parse_args(arguments).execute)
 
 
-def test_volumes_have_objects_and_all_are_mounted() -> None:
+def test_volumes_have_objects_and_all_are_mounted():
     # The value `epochs` of older releases is accepted; world needs no volume for its epochs.
     objects = render({"world": {"epochs": {"storageClassName": "fast"}}}, release="cloudrc")
     names = {(thing["kind"], thing["metadata"]["name"]) for thing in objects}
@@ -142,10 +134,10 @@ def test_volumes_have_objects_and_all_are_mounted() -> None:
                 assert (kind, volume[key][field]) in names
 
 
-def test_each_pod_has_one_image() -> None:
+def test_each_pod_has_one_image():
     """A node pulls one image per pod, because the link uses that of its pod."""
 
-    def images(values: dict[str, object]) -> dict[str, str]:
+    def images(values):
         found = {}
         for name, pod in pod_specs(render({"image": values})).items():
             (found[name],) = {container["image"] for container in containers(pod).values()}
@@ -153,8 +145,7 @@ def test_each_pod_has_one_image() -> None:
             assert policies == {"IfNotPresent"}
         return found
 
-    cloud = f"cloudrc/cloud:{cloudrc.__version__}"
-    world = f"cloudrc/world:{cloudrc.__version__}"
+    cloud, world = (f"cloudrc/{role}:{cloudrc.__version__}" for role in ("cloud", "world"))
     assert images({}) == {"world": world, "cloud": cloud, "test": cloud, "test-link": cloud}
     digest = "sha256:" + "0" * 64
     found = images({"registry": "ghcr.io/me", "tag": "9.9.9", "world": {"digest": digest}})
@@ -162,17 +153,16 @@ def test_each_pod_has_one_image() -> None:
     assert found["cloud"] == "ghcr.io/me/cloudrc/cloud:9.9.9"
 
 
-def test_the_notes_are_three_commands_for_this_release() -> None:
+def test_the_notes_are_three_commands_for_this_release():
     text = notes(release="flight", namespace="lab-7")
     wait, fly, logs = (shlex.split(line) for line in text.splitlines() if line.startswith("  "))
     for words in (wait, fly, logs):
         assert words[words.index("--namespace") + 1] == "lab-7"
-    deployments = of_kind(render(release="flight"), "Deployment")
     assert wait[wait.index("--selector") + 1] == "app.kubernetes.io/instance=flight"
     options = build_parser([fly[1]]).parse_args(fly[1:])
     assert (fly[0], options.namespace, options.release) == ("cloudrc", "lab-7", "flight")
     name = next(w.partition("/")[2] for w in logs if w.startswith("deployment/"))
-    assert name in {thing["metadata"]["name"] for thing in deployments.values()}
+    assert name in of_kind(render(release="flight"), "Deployment")
     assert logs[logs.index("--container") + 1] == "link"
 
 
@@ -192,6 +182,6 @@ CLOSED = "No Prometheus may scrape"
         ({"networkPolicy": {"enabled": False}}, "WARNING: networkPolicy.enabled is false", True),
     ],
 )
-def test_the_notes_warn_of_what_will_not_work(values: Object, words: str, warns: bool) -> None:
+def test_the_notes_warn_of_what_will_not_work(values, words, warns):
     """The guard's limit is in the experiment, because a change of the link restarts nothing."""
     assert (words in notes(values)) is warns

@@ -1,25 +1,21 @@
 """Every values file renders to valid Kubernetes objects, as with helm."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 import pytest
 import yaml
 
 from tests.chart.conftest import (
     CHART,
-    CI_VALUES,
-    EXAMPLES,
     METADATA,
-    Object,
+    OPERATOR,
+    VALUES,
     containers,
+    each_file,
     pod_specs,
     render,
     values_of,
@@ -27,27 +23,15 @@ from tests.chart.conftest import (
 
 kubernetes_validate = pytest.importorskip("kubernetes_validate", reason="comes with the extra dev")
 
-OLDEST = re.match(r">=(\d+\.\d+)\.0-0 ", METADATA["kubeVersion"])[1]  # type: ignore[index]
+OLDEST = re.match(r">=(\d+\.\d+)\.0-0 ", METADATA["kubeVersion"])[1]
 NEWEST = ".".join(kubernetes_validate.latest_version().split(".")[:2])
-FILES = [*CI_VALUES, *EXAMPLES]
-OPERATOR = "monitoring.coreos.com/v1"
-
-each_file = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _quick() -> Iterator[None]:
-    """Cache the definitions: the library reads two megabytes for each object."""
-    utils = kubernetes_validate.utils
-    slow = utils.schema_contents
-    utils.schema_contents = functools.cache(slow)
-    yield
-    utils.schema_contents = slow
 
 
 @pytest.mark.parametrize("version", sorted({OLDEST, NEWEST}))
-def test_the_objects_and_the_examples_are_valid(version: str) -> None:
-    for path in FILES:
+def test_the_objects_and_the_examples_are_valid(version, monkeypatch):
+    utils = kubernetes_validate.utils  # the library reads two megabytes for each object
+    monkeypatch.setattr(utils, "schema_contents", functools.cache(utils.schema_contents))
+    for path in VALUES:
         objects = [o for o in render(values_of(path)) if o["apiVersion"] != OPERATOR]
         assert len(objects) > 10
         for thing in objects:
@@ -63,14 +47,14 @@ def test_the_objects_and_the_examples_are_valid(version: str) -> None:
             kubernetes_validate.validate(thing, version, strict=True)
 
 
-def helm(*arguments: str) -> subprocess.CompletedProcess[str]:
+def helm(*arguments):
     if shutil.which("helm") is None:
         pytest.skip("no helm here")
     return subprocess.run(["helm", *arguments], capture_output=True, text=True)
 
 
 @each_file
-def test_helm_renders_the_same_objects(path: Path) -> None:
+def test_helm_renders_the_same_objects(path):
     flags = ("--kube-version", OLDEST, "--values", str(path))
     done = helm("template", "demo", str(CHART), "--namespace", "lab", *flags)
     assert (done.returncode, done.stderr) == (0, "")
@@ -84,20 +68,20 @@ def test_helm_renders_the_same_objects(path: Path) -> None:
     assert "WARNING" not in done.stdout
 
 
-def test_helm_refuses_an_older_cluster() -> None:
+def test_helm_refuses_an_older_cluster():
     done = helm("template", "demo", str(CHART), "--kube-version", "1.28.0")
     assert done.returncode != 0
     assert f"requires kubeVersion: {METADATA['kubeVersion']}" in done.stderr
 
 
-def test_helm_keeps_a_large_seed() -> None:
+def test_helm_keeps_a_large_seed():
     """Helm writes numbers above a million as powers of ten, which are no integers."""
     flags = ("--kube-version", OLDEST, "--set-json", 'experiment={"seed": 4503599627370495}')
     shown = ("--show-only", "templates/shared/experiment.yaml")
     assert "seed: 4503599627370495\n" in helm("template", "demo", str(CHART), *shown, *flags).stdout
 
 
-def _comparable(objects: Iterable[Object]) -> dict[tuple[str, str], Object]:
+def _comparable(objects):
     """Ignore the hash in the Job's name: Helm writes 1.0 as 1, which changes the hash."""
     found = {}
     for original in objects:

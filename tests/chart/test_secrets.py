@@ -1,23 +1,12 @@
 """Key and tokens are made once and kept; a container mounts no more than it needs."""
 
-from __future__ import annotations
-
 import base64
 
 import pytest
 
-from tests.chart.conftest import (
-    Object,
-    a_namespace,
-    containers,
-    holding,
-    notes,
-    of_kind,
-    pod_specs,
-    render,
-)
+from tests.chart.conftest import a_namespace, containers, notes, nothing, of_kind, pod_specs, render
 
-OURS: Object = {
+OURS = {
     "secret": {"existingSecret": "lab-key"},
     "teleop": {"tokens": {"existingSecret": "lab-tokens"}},
     "mission": {"enabled": True},
@@ -41,16 +30,27 @@ MOUNTS = {
 KEY = {"secretName": "demo-cloudrc-tunnel", "defaultMode": 0o440}
 TOKENS = {"secretName": "demo-cloudrc-tokens", "defaultMode": 0o440}
 OPERATOR = {**TOKENS, "items": [{"key": "operator", "path": "operator"}]}
-SECRETS = {
-    "world": {"secret": KEY},
-    "cloud": {"secret": KEY, "tokens": TOKENS},
-    "mission": {"tokens": OPERATOR},
-    "test": {"tokens": OPERATOR},
-    "test-link": {},
+RUN, TELEOP = ({"medium": "Memory", "sizeLimit": size} for size in ("4Mi", "1Mi"))
+VOLUMES = {
+    "secret": {
+        "world": {"secret": KEY},
+        "cloud": {"secret": KEY, "tokens": TOKENS},
+        "mission": {"tokens": OPERATOR},
+        "test": {"tokens": OPERATOR},
+        "test-link": {},
+    },
+    "emptyDir": {
+        "world": {"run": RUN, "data": {"sizeLimit": "1Gi"}},
+        "cloud": {"run": RUN, "teleop": TELEOP, "data": {"sizeLimit": "1Gi"}},
+        "mission": {},
+        "test": {},
+        "test-link": {},
+    },
 }
+"""Kind of volume -> pod -> its volumes."""
 
 
-def test_key_and_tokens_are_made_once_and_kept() -> None:
+def test_key_and_tokens_are_made_once_and_kept():
     installed = render(lookup=a_namespace())
     secrets = of_kind(installed, "Secret")
     assert len(base64.b64decode(secrets["tunnel"]["data"]["key"])) == 32
@@ -58,27 +58,25 @@ def test_key_and_tokens_are_made_once_and_kept() -> None:
     operator, reader = (base64.b64decode(data[role]) for role in ("operator", "reader"))
     assert len(operator) == len(reader) == 48
     assert operator != reader
-    assert render(lookup=holding(installed, a_namespace())) == installed
+    assert render(lookup=a_namespace(objects=installed)) == installed
     for secret in secrets.values():
         assert secret["metadata"]["annotations"]["helm.sh/resource-policy"] == "keep"
 
 
-def test_two_renderings_differ_only_in_the_secrets() -> None:
+def test_two_renderings_differ_only_in_the_secrets():
     """Argo CD renders without a cluster: a random key must not restart the pods."""
-    first, second = render(), render()
-    differ = [a["kind"] for a, b in zip(first, second, strict=True) if a != b]
-    assert set(differ) == {"Secret"}
+    pairs = zip(render(), render(), strict=True)
+    assert {first["kind"] for first, second in pairs if first != second} == {"Secret"}
 
 
-def test_existing_secrets_are_used() -> None:
+def test_existing_secrets_are_used():
     there = [{"kind": "Secret", "metadata": {"name": f"lab-{name}"}} for name in ("key", "tokens")]
-    for lookup in (holding(there, a_namespace()), None):
-        objects = render(OURS, lookup=lookup) if lookup else render(OURS)
+    for lookup in (a_namespace(objects=there), nothing):
+        objects = render(OURS, lookup=lookup)
         assert not of_kind(objects, "Secret")
         names = {
-            pod: {v["secret"]["secretName"] for v in spec["volumes"] if "secret" in v}
+            pod: {v["secret"]["secretName"] for v in spec.get("volumes", ()) if "secret" in v}
             for pod, spec in pod_specs(objects).items()
-            if "volumes" in spec
         }
         assert (names["world"], names["cloud"]) == ({"lab-key"}, {"lab-key", "lab-tokens"})
         assert names["mission"] == names["test"] == {"lab-tokens"}
@@ -91,33 +89,27 @@ def test_existing_secrets_are_used() -> None:
         ("teleop", "no Secret 'lab-tokens' in namespace 'lab'; make it: .* --from-file=operator"),
     ],
 )
-def test_a_missing_secret_is_refused_with_a_command(key: str, said: str) -> None:
+def test_a_missing_secret_is_refused_with_a_command(key, said):
     with pytest.raises(Exception, match=said):
         render({key: OURS[key]}, lookup=a_namespace())
 
 
-def test_secrets_are_in_no_output_and_no_environment() -> None:
-    objects = render({"mission": {"enabled": True}})
-    for pod in pod_specs(objects).values():
-        assert "secretKeyRef" not in str(pod)
-    printed = notes()
+def test_secrets_are_in_no_output_and_no_environment():
+    objects, printed = render({"mission": {"enabled": True}}), notes()
+    assert not any("secretKeyRef" in str(pod) for pod in pod_specs(objects).values())
     for secret in of_kind(objects, "Secret").values():
         for text in secret["data"].values():
             assert text not in printed
             assert base64.b64decode(text).decode("latin-1") not in printed
 
 
-def pods(mode: str) -> dict[str, Object]:
+@pytest.mark.parametrize("mode", ["relay", "netem", "auto"])
+def test_a_container_mounts_only_what_it_needs(mode):
     load = {"backgroundLoad": {"enabled": True}}
     values = {"link": {"mode": mode}, "mission": {"enabled": True}, "cloud": load}
-    return pod_specs(render(values, lookup=a_namespace()))
+    found = pod_specs(render(values, lookup=a_namespace()))
 
-
-@pytest.mark.parametrize("mode", ["relay", "netem", "auto"])
-def test_a_container_mounts_only_what_it_needs(mode: str) -> None:
-    found = pods(mode)
-
-    def mounts(container: Object) -> set[str]:
+    def mounts(container):
         listed = container.get("volumeMounts", [])
         assert not any("subPath" in mount for mount in listed), "it gets no changed ConfigMap"
         return {mount["name"] + " ro" * mount.get("readOnly", False) for mount in listed}
@@ -126,29 +118,19 @@ def test_a_container_mounts_only_what_it_needs(mode: str) -> None:
         pod: {name: mounts(container) for name, container in containers(spec).items()}
         for pod, spec in found.items()
     }
-    assert SECRETS == {
-        pod: {v["name"]: v["secret"] for v in spec.get("volumes", ()) if "secret" in v}
-        for pod, spec in found.items()
-    }
-    run = {"medium": "Memory", "sizeLimit": "4Mi"}
-    teleop = {"medium": "Memory", "sizeLimit": "1Mi"}
-    memory = {
-        pod: {v["name"]: v["emptyDir"] for v in spec.get("volumes", ()) if "emptyDir" in v}
-        for pod, spec in found.items()
-    }
-    assert all(memory[end].pop("data").keys() == {"sizeLimit"} for end in ("world", "cloud"))
-    wanted = {"world": {"run": run}, "cloud": {"run": run, "teleop": teleop}}
-    assert {pod: volumes for pod, volumes in memory.items() if volumes} == wanted
+    for kind, volumes in VOLUMES.items():
+        assert volumes == {
+            pod: {v["name"]: v[kind] for v in spec.get("volumes", ()) if kind in v}
+            for pod, spec in found.items()
+        }
     for end in ("world", "cloud"):
-        volumes = {volume["name"]: volume for volume in found[end]["volumes"]}
-        link = containers(found[end])["link"]
-        kinds = {m["name"]: set(volumes[m["name"]]) - {"name"} for m in link["volumeMounts"]}
-        assert kinds == {"experiment": {"configMap"}, "link": {"configMap"}, "run": {"emptyDir"}}
+        volumes = {volume["name"]: set(volume) - {"name"} for volume in found[end]["volumes"]}
+        kinds = {name: volumes[name] for name in ("experiment", "link")}
+        assert kinds == {"experiment": {"configMap"}, "link": {"configMap"}}
         assert not found[end].get("shareProcessNamespace"), "/proc/PID/root is another way in"
-        (path,) = (
-            a.partition("=")[2] for a in containers(found[end])[end]["args"] if "--key=" in a
-        )
-        where = {m["mountPath"]: m["name"] for m in containers(found[end])[end]["volumeMounts"]}
+        container = containers(found[end])[end]
+        (path,) = (a.partition("=")[2] for a in container["args"] if a.startswith("--key="))
+        where = {m["mountPath"]: m["name"] for m in container["volumeMounts"]}
         assert where[path.removesuffix("/key")] == "secret"
     cloud = containers(found["cloud"])
     assert "--tokens=/etc/cloudrc-tokens" in cloud["teleop"]["args"]

@@ -1,13 +1,8 @@
 """Values, schema and tables come from the models; an unknown value is refused by name."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from typing import Any
-
 import pytest
 
-from tests.chart.conftest import CHART, SCHEMA, Object, render, values_of
+from tests.chart.conftest import CHART, SCHEMA, render, values_of
 
 jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-validate, extra dev")
 
@@ -16,18 +11,17 @@ DEFAULTS = values_of(CHART / "values.yaml")
 OPEN = {"global", "affinity", "tolerations", "podSecurityContext", "containerSecurityContext"}
 
 
-def parts(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Object]]:
+def parts(node, path=()):
     """Yield every part of the schema with its path."""
     if isinstance(node, dict):
         yield path, node
         for key, inner in node.items():
             yield from parts(inner, (*path, key))
-    elif isinstance(node, list):
-        for inner in node:
-            yield from parts(inner, path)
+    for inner in node if isinstance(node, list) else ():
+        yield from parts(inner, path)
 
 
-def test_the_schema_is_closed_at_every_level() -> None:
+def test_the_schema_is_closed_at_every_level():
     for path, part in parts(SCHEMA):
         if part.get("type") != "object" or OPEN & set(path):
             continue
@@ -40,7 +34,7 @@ UNITS = {"_m": "[m]", "_ms": "[ms]", "_s": "[s]", "_deg": "[deg]", "_kbit": "[kb
 OF_NO_UNIT = ("[", "port", "Number of", "Packets", "random")
 
 
-def test_every_value_has_a_description_with_its_unit() -> None:
+def test_every_value_has_a_description_with_its_unit():
     for path, part in parts(SCHEMA):
         for name, value in part.get("properties", {}).items():
             target = SCHEMA["$defs"].get(value.get("$ref", "").rpartition("/")[2], {})
@@ -51,7 +45,7 @@ def test_every_value_has_a_description_with_its_unit() -> None:
                 assert any(word in text for word in OF_NO_UNIT), (*path, name)
 
 
-def test_the_defaults_are_valid_and_written_out() -> None:
+def test_the_defaults_are_valid_and_written_out():
     assert render({"global": {"anything": {"goes": True}}}), "values of a parent chart"
     assert DEFAULTS.keys() == SCHEMA["properties"].keys() - {"global"}
 
@@ -88,7 +82,7 @@ def test_the_defaults_are_valid_and_written_out() -> None:
         ({"teleop": {"service": {"port": 70_000}}}, "70000"),
     ],
 )
-def test_a_wrong_value_is_refused_and_named(values: Object, named: str) -> None:
+def test_a_wrong_value_is_refused_and_named(values, named):
     with pytest.raises(jsonschema.ValidationError) as caught:
         render(values)
     errors = [caught.value, *(caught.value.context or ())]

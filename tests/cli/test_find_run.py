@@ -2,13 +2,11 @@
 
 import contextlib
 import json
-import os
 import socket
 import sys
 
 import pytest
 
-from cloudrc.cli.find_run import QUIET_LIMIT, discard
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
 from tests.teleop.conftest import running
@@ -54,23 +52,15 @@ def test_an_emergency_stop_finds_the_run(tmp_path, elsewhere, capsys):
                 assert capsys.readouterr().err == ""
 
 
-def test_runs_without_an_answering_api_are_ignored(tmp_path, elsewhere):
-    with flying(tmp_path / "out") as api:
-        not_yet = f"unix:{tmp_path / 'api.sock'}"
-        with (
-            local.announced(elsewhere / "runs" / "latest", not_yet),
-            local.announced(tmp_path / "without an API"),
-        ):
-            assert main(["mission", "estop"]) == 0
-        assert len(api.alarms) == 1
-
-
-def test_an_api_that_cannot_be_asked_is_reported_and_no_other_is_taken(tmp_path, elsewhere, capsys):
+def test_no_other_api_is_taken_than_that_of_the_newest_run(tmp_path, elsewhere, capsys):
     with flying(tmp_path / "out") as api:
         with local.announced(elsewhere / "runs" / "latest", f"unix:/{'x' * 200}"):
             assert main(["mission", "estop"]) == 5
         assert "does not answer (AF_UNIX path too long)" in capsys.readouterr().err
         assert api.alarms == []
+        with local.announced(tmp_path / "without an API"):
+            assert main(["mission", "estop"]) == 0
+        assert len(api.alarms) == 1
 
 
 @pytest.mark.parametrize("folder", ["runs/latest", "foreign"])
@@ -114,18 +104,16 @@ def test_a_wrong_run_flag_gives_one_line(words, said, capsys):
     assert said in line
 
 
-def with_link(folder, *, killed=False):
-    """The folder of a run whose relay is silent so far, or whose relay was killed."""
-    link = folder / "link"
-    link.mkdir(parents=True)
-    if killed:
-        start = link.stat().st_mtime - QUIET_LIMIT
-        os.utime(link, (start, start))
+def with_link(folder):
+    """The folder of a run whose relay has just started."""
+    (folder / "link").mkdir(parents=True)
     return folder
 
 
-def test_link_set_finds_the_only_run(tmp_path, capsys):
-    run = with_link(tmp_path / "a", killed=True)
+def test_link_set_finds_the_only_run_and_ignores_a_killed_one(
+    tmp_path, elsewhere, capsys, monkeypatch
+):
+    run, killed = with_link(tmp_path / "a"), with_link(elsewhere / "runs" / "latest")
     with local.announced(run), local.announced(tmp_path / "without a link"):
         assert main(SET) == 2
         said = capsys.readouterr().err
@@ -136,46 +124,15 @@ def test_link_set_finds_the_only_run(tmp_path, capsys):
         (line,) = capsys.readouterr().err.splitlines()
         for name in "ab":
             assert f"--run {tmp_path / name}" in line
-
-
-@pytest.mark.parametrize("kubectl", ["perhaps there", "missing"])
-def test_link_set_takes_a_live_relay_and_ignores_a_killed_one(
-    tmp_path, elsewhere, capsys, monkeypatch, kubectl
-):
-    if kubectl == "missing":
-        monkeypatch.setenv("PATH", str(elsewhere))
-    fresh = with_link(elsewhere / "runs" / "latest")
-    assert main(SET) == 2
-    assert "runs/latest: no link is up there (yet)" in capsys.readouterr().err
-    old = fresh.stat().st_mtime - QUIET_LIMIT
-    os.utime(fresh / "link", (old, old))
-    dead = fresh
-    assert main(SET) == 3
-    assert "no run flies here (start one: cloudrc run; or name one: --run)" in (
-        capsys.readouterr().err
-    )
-    assert main([*SET, "--run", str(dead)]) == 2
-    assert f"--run {dead}: no run flies there" in capsys.readouterr().err
-    with local.announced(with_link(tmp_path / "out")):
+    with local.announced(killed.resolve()):
         assert main(SET) == 2
-    assert f"{tmp_path / 'out'}: no link is up there" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("files", "left"),
-    [
-        ({"world.mcap": "", "config.yaml": "x"}, None),
-        ({"world.mcap": "recorded", "config.yaml": "x"}, ["config.yaml", "world.mcap"]),
-        ({"world.mcap": "", "config.yaml": "x", "notes": "mine"}, ["notes"]),
-    ],
-)
-def test_only_the_folder_of_a_run_that_recorded_nothing_is_removed(elsewhere, files, left):
-    run = elsewhere / "run"
-    run.mkdir()
-    for name, text in files.items():
-        (run / name).write_text(text)
-    assert discard(run) is (left is None)
-    assert (sorted(path.name for path in run.iterdir()) if run.exists() else None) == left
+    assert "runs/latest: no link is up there (yet)" in capsys.readouterr().err
+    assert main([*SET, "--run", str(killed)]) == 2
+    assert f"--run {killed}: no run flies there" in capsys.readouterr().err
+    monkeypatch.setenv("PATH", str(elsewhere))  # without kubectl
+    assert main(SET) == 3
+    said = "no run flies here (start one: cloudrc run; or name one: --run)"
+    assert said in capsys.readouterr().err
 
 
 def test_the_kubectl_plugin_never_uses_a_local_run(elsewhere, monkeypatch, capsys):

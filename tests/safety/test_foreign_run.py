@@ -1,7 +1,5 @@
 """A run's folder from somebody else: reading it executes none of its code."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import json
@@ -36,19 +34,19 @@ report:
 
 
 @pytest.fixture
-def trace(tmp_path: Path) -> Path:
+def trace(tmp_path):
     """The file that exists once any code of the run was executed."""
     return tmp_path / "trace"
 
 
 @pytest.fixture
-def spy(trace: Path) -> str:
+def spy(trace):
     """A program that leaves a trace when executed."""
     return f"from pathlib import Path\nPath({str(trace)!r}).touch()\ndef build(): ...\n"
 
 
 @pytest.fixture
-def run(tmp_path: Path, spy: str) -> Path:
+def run(tmp_path, spy):
     """A run whose configuration names a program in its folder."""
     folder = tmp_path / "run"
     folder.mkdir()
@@ -60,9 +58,7 @@ def run(tmp_path: Path, spy: str) -> Path:
     return folder
 
 
-def test_a_report_executes_nothing_of_the_run(
-    run: Path, trace: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_executes_nothing_of_the_run(run, trace, monkeypatch):
     monkeypatch.setattr("cloudrc.report.page.b64encode", lambda svg: b"")  # a smaller page
     assert main(["report", str(run)]) == 1
     assert not trace.exists()
@@ -73,7 +69,7 @@ def test_a_report_executes_nothing_of_the_run(
     )
 
 
-def test_link_verify_executes_nothing_of_the_run(run: Path, trace: Path) -> None:
+def test_link_verify_executes_nothing_of_the_run(run, trace):
     controller = PlugIn.model_validate({"name": str(run / "spy.py"), "share": 2.5})
     assert read_experiment(run / "config.yaml").cloud.controller == controller
     experiment = find_experiment(str(run / "config.yaml"), ["link.uplink.delay_ms=200"])
@@ -92,9 +88,7 @@ def test_link_verify_executes_nothing_of_the_run(run: Path, trace: Path) -> None
         ("cloud", "report: {metrics: ./spy.py}", False),
     ],
 )
-def test_only_cloud_imports_plug_ins(
-    run: Path, trace: Path, monkeypatch: pytest.MonkeyPatch, end: str, config: str, imports: bool
-) -> None:
+def test_only_cloud_imports_plug_ins(run, trace, monkeypatch, end, config, imports):
     for name in ("open_peer", "open_recorder", "open_exporter", "link_monitor"):
         monkeypatch.setattr(processes, name, lambda *words, **more: None)
     (run / "config.yaml").write_text(config)
@@ -105,9 +99,9 @@ def test_only_cloud_imports_plug_ins(
     assert trace.exists() == imports
 
 
-def test_only_flying_code_loads_an_experiment_with_plug_ins() -> None:
+def test_only_flying_code_loads_an_experiment_with_plug_ins():
     """All other code uses `read_experiment`, which imports none."""
-    flies = {"cli/run.py", "cli/sweep.py", "cli/processes.py", "cli/bench.py"}
+    flies = {"cli/run.py", "cli/processes.py", "cli/bench.py"}
     flies |= {"faults/flight.py"}
     imports = {
         path.relative_to(PACKAGE).as_posix()
@@ -119,9 +113,7 @@ def test_only_flying_code_loads_an_experiment_with_plug_ins() -> None:
     assert imports == flies
 
 
-def test_a_new_process_imports_nothing_from_the_working_folder(
-    run: Path, trace: Path, spy: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_new_process_imports_nothing_from_the_working_folder(run, trace, spy, monkeypatch):
     for name in ("cloudrc.py", "yaml.py", "argparse.py"):
         (run / name).write_text(spy)
     monkeypatch.chdir(run)
@@ -131,9 +123,7 @@ def test_a_new_process_imports_nothing_from_the_working_folder(
     assert "-P" not in interpreter("-m", "cloudrc"), "this process uses that path, too"
 
 
-def test_a_worker_imports_nothing_from_there_either(
-    run: Path, trace: Path, spy: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_imports_nothing_from_there_either(run, trace, spy, monkeypatch):
     """It imports the pool's modules before it gets its parent's path."""
     (run / "pickle.py").write_text(spy)
     monkeypatch.chdir(run)
@@ -144,7 +134,7 @@ def test_a_worker_imports_nothing_from_there_either(
     assert not os.environ.get("PYTHONSAFEPATH")
 
 
-def test_every_process_is_started_by_the_safe_function() -> None:
+def test_every_process_is_started_by_the_safe_function():
     starts = {
         path.relative_to(PACKAGE).as_posix()
         for path in PACKAGE.rglob("*.py")
@@ -153,7 +143,7 @@ def test_every_process_is_started_by_the_safe_function() -> None:
     assert starts == {"drivers/machine.py"}
 
 
-def test_a_shell_splits_no_foreign_text() -> None:
+def test_a_shell_splits_no_foreign_text():
     """It comes in as arguments of the one program that a shell runs."""
     shells = re.compile(r"""["'](/bin/)?(ba|da)?sh["'], *["']-c["'],(?! *APPLY_SCRIPT)""")
     assert [path for path in PACKAGE.rglob("*.py") if shells.search(path.read_text())] == []

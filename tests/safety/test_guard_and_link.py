@@ -1,11 +1,8 @@
 """Promises of guard and link, end to end: from received bytes to the robot's motion."""
 
-from __future__ import annotations
-
 from collections import Counter
 from copy import deepcopy
 from math import hypot, isfinite, nan
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -17,7 +14,7 @@ from cloudrc.faults.scenario import generator
 from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, GroundTruth
 from cloudrc.world.guard.state import Guard
-from tests.flights.conftest import MS, Talk, talking
+from tests.flights.conftest import MS, talking
 
 PERIOD = 10 * MS
 FLOATS = st.one_of(
@@ -27,7 +24,7 @@ FLOATS = st.one_of(
 )
 
 
-def fly(talk: Talk, seconds: float, velocity: tuple[float, float, float]) -> None:
+def fly(talk, seconds, velocity):
     """Send a command every 10 ms."""
     for _ in range(round(seconds * 100)):
         talk.wait(talk.now_ns + PERIOD)
@@ -37,7 +34,7 @@ def fly(talk: Talk, seconds: float, velocity: tuple[float, float, float]) -> Non
 @pytest.mark.promise("commands-within-caps")
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.tuples(FLOATS, FLOATS, FLOATS), min_size=20, max_size=60))
-def test_any_command_is_flown_finite_and_within_the_caps(velocities) -> None:
+def test_any_command_is_flown_finite_and_within_the_caps(velocities):
     talk = talking()
     fly(talk, 0.3, (0.0, 0.0, 0.5))
     for velocity in velocities:
@@ -48,7 +45,7 @@ def test_any_command_is_flown_finite_and_within_the_caps(velocities) -> None:
 
 
 @pytest.mark.promise("forged-datagrams-do-nothing")
-def test_a_datagram_with_a_changed_bit_has_no_effect() -> None:
+def test_a_datagram_with_a_changed_bit_has_no_effect():
     talk = talking()
     fly(talk, 0.2, (0.0, 0.0, 0.5))
     applied = len(talk.take(CommandApplied))
@@ -73,7 +70,7 @@ ANSWERS = ("used", "limited_speed", "limited_yaw_rate", "range", "future", "stal
 """Counters of applied, limited and refused commands and requests."""
 
 
-def bounds(guard: Guard) -> dict[str, Any]:
+def bounds(guard):
     """Copy a guard's limits and the values that it derived from them."""
     parts = (
         (guard, ("_limits", "_speed_max", "_high", "_floor")),
@@ -86,7 +83,7 @@ def bounds(guard: Guard) -> dict[str, Any]:
 
 
 @pytest.mark.promise("commands-within-caps")
-def test_nothing_in_the_tunnel_changes_the_limits() -> None:
+def test_nothing_in_the_tunnel_changes_the_limits():
     """They come from world's experiment."""
     answers, states = Counter[str](), set()
     for policy, seed in HOSTILE.items():

@@ -1,7 +1,5 @@
 """Every promise in docs/safety.md has a test, and every promise mark names a promise there."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path
@@ -11,7 +9,7 @@ NIGHTLY = {"full", "e2e", "netem"}
 """Marks of tests that do not run before a landing."""
 
 
-def promises_of(path: Path) -> list[tuple[str, bool]]:
+def promises_of(path):
     """List the promise marks of a file's tests, and whether they run before a landing."""
     body = ast.parse(path.read_text(encoding="utf-8")).body
     shared = [each.value for each in body if isinstance(each, ast.Assign)]
@@ -29,7 +27,7 @@ def promises_of(path: Path) -> list[tuple[str, bool]]:
     return found
 
 
-def test_promises_and_their_marks_match() -> None:
+def test_promises_and_their_marks_match():
     found = [each for path in (ROOT / "tests").rglob("test_*.py") for each in promises_of(path)]
     page = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")
     table = page.partition("\n## Promises\n")[2].partition("\n## ")[0]
