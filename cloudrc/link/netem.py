@@ -379,7 +379,7 @@ class Steps:
 
 
 class Netem:
-    """One direction of the link in the kernel; a `Shaper`.
+    """One direction of the link in the kernel.
 
     Attributes:
         steps: Counts and lateness of the steps along the time line so far.
@@ -421,7 +421,14 @@ class Netem:
             write_measured(self._tables, profile)
 
     def follow_peer(self, peer: Address) -> Address:
-        """Shape datagrams to this peer from now on, on the interface that leads to the peer."""
+        """Shape datagrams to this peer from now on, on the interface that leads to the peer.
+
+        Returns:
+            The route: the address to which this pod's tunnel end has to send.
+
+        Raises:
+            CloudrcError: If netem cannot realise the profile, or the kernel refuses.
+        """
         device = self._iproute2.device(peer[0])
         if device != self._device:
             self.close()
@@ -437,7 +444,11 @@ class Netem:
         return peer
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on, as `Shaper.follow_profile`."""
+        """Shape by this profile from now on; its time line starts now (`restart`) or continues.
+
+        Datagrams in flight are not lost. If netem cannot realise the profile, the old profile stays
+        in force, and a CloudrcError is raised.
+        """
         check(profile)
         qdiscs = self._look()
         if self._damage:

@@ -390,7 +390,7 @@ class Relay(Lanes):
 
 
 class RelayShaper(Lanes):
-    """One direction of the link in userspace; a `Shaper`."""
+    """One direction of the link in userspace, with the same methods as `Netem`."""
 
     name = "relay"
 
@@ -425,13 +425,17 @@ class RelayShaper(Lanes):
         tighten_slack()
 
     def follow_peer(self, peer: Address) -> Address:
-        """Send to this peer from now on, including the datagrams in flight; return the route."""
+        """Send to this peer from now on, including the datagrams in flight.
+
+        Returns:
+            The route: the address to which this pod's tunnel end has to send.
+        """
         self._peer = peer
         host, port = self._inside.getsockname()
         return host, port
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on, as `Shaper.follow_profile`."""
+        """Shape by this profile from now on; its time line starts now (`restart`) or continues."""
         self.take_in()  # what has arrived until now belongs to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
 

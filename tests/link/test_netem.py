@@ -1,12 +1,8 @@
 """netem: a profile in tc's words, set up, found again, stepped and removed, by a fake kernel."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,14 +43,14 @@ NO_CLASSIFIER = Answer(
 class Kernel:
     """An interface with its qdiscs and filters."""
 
-    def __init__(self, *lacks: str) -> None:
+    def __init__(self, *lacks):
         self.lacks = lacks
         self.held = 4
-        self.said: list[str] = []
+        self.said = []
         self.refuses = "nothing"
         self.clear()
 
-    def run(self, words: Sequence[str]) -> Answer:
+    def run(self, words):
         line = " ".join(words)
         if not line.startswith(("tc -s -j", "ip")):
             self.said.append(line.removeprefix("tc ").replace("dev eth0 ", ""))
@@ -90,19 +86,19 @@ class Kernel:
                 del self.filters[int(number)]
         return Answer(0, "", "")
 
-    def qdiscs(self) -> list[dict[str, object]]:
+    def qdiscs(self):
         leaf = {"kind": "netem", "handle": "7401:", "packets": 90, "drops": 10}
         leaf["qlen"] = self.held
         leaf["options"] = listing(self.netem or [])
         return [self.root, *([leaf] if self.netem is not None else [])]
 
-    def clear(self) -> None:
+    def clear(self):
         self.root = {"kind": "noqueue", "handle": "0:", "root": True}
-        self.netem: list[str] | None = None
-        self.filters: dict[int, str] = {}
+        self.netem = None
+        self.filters = {}
 
 
-def listing(words: Sequence[str]) -> dict[str, object]:
+def listing(words):
     """Return the "options" that `tc -j qdisc show` prints for the words of a netem command."""
     given = dict(pairwise(words))
     delay = float(given.get("delay", "0us").removesuffix("us")) * 1e-6
@@ -112,19 +108,19 @@ def listing(words: Sequence[str]) -> dict[str, object]:
 class Clock:
     now_ns = 0
 
-    def __call__(self) -> int:
+    def __call__(self):
         return self.now_ns
 
-    def wait(self, duration: float) -> None:
+    def wait(self, duration):
         self.now_ns += round(duration * 1e9)
 
 
 def netem(
-    kernel: Kernel,
-    profile: DirectionProfile,
-    clock: Clock | None = None,
-    log: Callable[[str], None] = lambda line: None,
-) -> Netem:
+    kernel,
+    profile,
+    clock=None,
+    log=lambda line: None,
+):
     clock = clock or Clock()
     return Netem(kernel.run, profile, origin_ns=0, clock=clock, wait=clock.wait, log=log)
 
@@ -143,7 +139,7 @@ BURSTS = GilbertElliott(0.1, 0.5, delay_bad=0.04)
 SLOW = DirectionProfile(0.3, rate=2e6, queue_packets=100)
 
 
-def text(profile: DirectionProfile, at: float = 0.0) -> str:
+def text(profile, at=0.0):
     check(profile)
     return " ".join(options(profile, Timeline(profile).at(round(at * 1e9)), limit(profile)))
 
@@ -169,7 +165,7 @@ def text(profile: DirectionProfile, at: float = 0.0) -> str:
         (TIMED, 2.3, "delay 100000.000us loss random 50% duplicate 10%"),
     ],
 )
-def test_a_profile_is_put_into_tcs_words(profile: DirectionProfile, at: float, words: str) -> None:
+def test_a_profile_is_put_into_tcs_words(profile, at, words):
     assert words in text(profile, at)
 
 
@@ -186,14 +182,14 @@ def test_a_profile_is_put_into_tcs_words(profile: DirectionProfile, at: float, w
         (DirectionProfile(blackouts=(Blackout(1.0, 0.004),)), "here 4 ms at 1 s"),
     ],
 )
-def test_what_netem_cannot_do_is_refused_by_name(profile: DirectionProfile, key: str) -> None:
+def test_what_netem_cannot_do_is_refused_by_name(profile, key):
     with pytest.raises(BadInputError, match=r"netem cannot do .*; set link\.mode=relay") as refused:
         check(profile)
     assert key in str(refused.value)
 
 
 @pytest.mark.parametrize("name", names("profile"))
-def test_only_lossy_of_the_shipped_profiles_needs_the_relay(name: str) -> None:
+def test_only_lossy_of_the_shipped_profiles_needs_the_relay(name):
     profile = link_profile(load_profile(name).downlink)
     if name != "lossy":
         assert text(profile)
@@ -202,7 +198,7 @@ def test_only_lossy_of_the_shipped_profiles_needs_the_relay(name: str) -> None:
         check(profile)
 
 
-def test_what_netem_does_differently_is_said() -> None:
+def test_what_netem_does_differently_is_said():
     profile = DirectionProfile(0.1, 0.01, correlation=0.3)
     assert notes(profile) == ["netem realises next to nothing of correlation 0.3"]
     assert notes(replace(profile, correlation=0.0)) == []
@@ -211,7 +207,7 @@ def test_what_netem_does_differently_is_said() -> None:
     assert "2 of 4 steps of the time line come sooner" in notes(DirectionProfile(trace=trace))[0]
 
 
-def test_the_limit_has_room_for_all_that_is_under_way() -> None:
+def test_the_limit_has_room_for_all_that_is_under_way():
     fast = replace(SLOW, delay=0.01)
     assert limit(replace(fast, changes=(Change(1.0, delay=0.3),))) == 747
     assert limit(replace(fast, changes=(Change(1.0, delay=0.3),), rate=None)) == 10_000
@@ -221,7 +217,7 @@ def test_the_limit_has_room_for_all_that_is_under_way() -> None:
     assert 20 + 100 * 0.04 <= limit(later) <= 20 + 1000 * 0.04
 
 
-def test_a_measured_distribution_becomes_a_table(tmp_path: Path) -> None:
+def test_a_measured_distribution_becomes_a_table(tmp_path):
     drawn = np.random.default_rng(1).exponential(size=3000)
     values = tuple(np.sort((drawn - drawn.mean()) / drawn.std()).tolist())
     profile = DirectionProfile(0.04, 0.002, distribution="table", table=values)
@@ -239,13 +235,13 @@ def test_a_measured_distribution_becomes_a_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("distribution", sorted(STRETCH))
-def test_tables_are_the_models_distributions(distribution: str, tmp_path: Path) -> None:
+def test_tables_are_the_models_distributions(distribution, tmp_path):
     write_tables(tmp_path)
     _, *rows = (tmp_path / f"{distribution}.dist").read_text().splitlines()
     entries = np.array(table(distribution))
     assert [int(row) for row in rows] == entries.tolist()
     assert np.abs(entries).max() < 2**15
-    profile = DirectionProfile(jitter=1.0, distribution=distribution)  # type: ignore[arg-type]
+    profile = DirectionProfile(jitter=1.0, distribution=distribution)
     key = stream_key(1, True, 1, 3)
     drawn = np.concatenate([shape(key, Purpose.DELAY, block, profile) for block in range(80)])
     unit = STRETCH[distribution] / 8192
@@ -268,7 +264,7 @@ def test_tables_are_the_models_distributions(distribution: str, tmp_path: Path) 
         (Answer(3, "", ""), "exit code 3"),
     ],
 )
-def test_an_error_of_tc_becomes_one_sentence(answer: Answer, words: str) -> None:
+def test_an_error_of_tc_becomes_one_sentence(answer, words):
     said = str(explain("tc", ("qdisc", "add", "netem"), answer))
     assert words in said
     assert "link.mode=relay" in said
@@ -283,12 +279,12 @@ def test_an_error_of_tc_becomes_one_sentence(answer: Answer, words: str) -> None
         ("10001\t10001\t10001\t10001", "0000000000001000", False),
     ],
 )
-def test_root_with_the_capability_may_shape(uid: str, capabilities: str, may: bool) -> None:
+def test_root_with_the_capability_may_shape(uid, capabilities, may):
     status = f"Name:\tpython\nUid:\t{uid}\nCapPrm:\t0\nCapEff:\t{capabilities}\n"
     assert may_shape(status) is may
 
 
-def test_only_the_tunnels_flow_is_sent_to_netem_and_all_is_removed() -> None:
+def test_only_the_tunnels_flow_is_sent_to_netem_and_all_is_removed():
     kernel = Kernel()
     shaper = netem(kernel, PLAIN)
     assert shaper.follow_peer(PEER) == PEER
@@ -306,7 +302,7 @@ def test_only_the_tunnels_flow_is_sent_to_netem_and_all_is_removed() -> None:
     ]
 
 
-def test_the_set_up_of_a_killed_process_is_taken_over() -> None:
+def test_the_set_up_of_a_killed_process_is_taken_over():
     kernel = Kernel()
     netem(kernel, PLAIN).follow_peer(PEER)
     kernel.said.clear()
@@ -319,7 +315,7 @@ def test_the_set_up_of_a_killed_process_is_taken_over() -> None:
     assert len(kernel.filters) == 1
 
 
-def test_a_new_address_gets_its_filter_before_the_old_one_goes() -> None:
+def test_a_new_address_gets_its_filter_before_the_old_one_goes():
     kernel = Kernel()
     shaper = netem(kernel, PLAIN)
     for last in (7, 8, 9, 9):
@@ -329,7 +325,7 @@ def test_a_new_address_gets_its_filter_before_the_old_one_goes() -> None:
     assert [line.split()[1] for line in kernel.said[3:5]] == ["add", "del"]
 
 
-def test_what_is_under_way_has_room_until_it_has_left() -> None:
+def test_what_is_under_way_has_room_until_it_has_left():
     kernel, clock = Kernel(), Clock()
     shaper = netem(kernel, DirectionProfile(1.0, rate=1e6, queue_packets=10), clock)
     shaper.follow_peer(PEER)
@@ -346,7 +342,7 @@ def test_what_is_under_way_has_room_until_it_has_left() -> None:
 
 
 @pytest.mark.parametrize("delay", [300.0, 0.1])
-def test_what_is_refused_leaves_the_old_profile_in_force(delay: float) -> None:
+def test_what_is_refused_leaves_the_old_profile_in_force(delay):
     """`check` refuses the first, and tc the second."""
     kernel = Kernel()
     shaper = netem(kernel, PLAIN)
@@ -358,7 +354,7 @@ def test_what_is_refused_leaves_the_old_profile_in_force(delay: float) -> None:
     assert kernel.netem == before
 
 
-def test_a_qdisc_of_somebody_else_is_left_alone() -> None:
+def test_a_qdisc_of_somebody_else_is_left_alone():
     kernel = Kernel()
     kernel.root = {"kind": "tbf", "handle": "8001:", "root": True}
     with pytest.raises(MissingPrerequisiteError, match=r"eth0 has a qdisc already \(tbf 8001:\)"):
@@ -374,14 +370,14 @@ def test_a_qdisc_of_somebody_else_is_left_alone() -> None:
         (("u32", "flower"), "neither cls_u32 nor cls_flower"),
     ],
 )
-def test_a_kernel_that_lacks_something_is_named(lacks: tuple[str, ...], says: str) -> None:
+def test_a_kernel_that_lacks_something_is_named(lacks, says):
     kernel = Kernel(*lacks)
     with pytest.raises(MissingPrerequisiteError, match=says):
         netem(kernel, PLAIN).follow_peer(PEER)
     assert kernel.root["kind"] == "noqueue"
 
 
-def test_flower_stands_in_for_u32() -> None:
+def test_flower_stands_in_for_u32():
     kernel = Kernel("u32")
     netem(kernel, PLAIN).follow_peer(PEER)
     assert kernel.filters == {
@@ -389,15 +385,15 @@ def test_flower_stands_in_for_u32() -> None:
     }
 
 
-def remove_all(kernel: Kernel) -> None:
+def remove_all(kernel):
     kernel.clear()
 
 
-def remove_leaf(kernel: Kernel) -> None:
+def remove_leaf(kernel):
     kernel.netem = None
 
 
-def take_the_delay_out(kernel: Kernel) -> None:
+def take_the_delay_out(kernel):
     assert kernel.netem is not None
     kernel.netem[kernel.netem.index("delay") + 1] = "0.000us"
 
@@ -410,10 +406,8 @@ def take_the_delay_out(kernel: Kernel) -> None:
         (take_the_delay_out, 'was changed to {"limit": 10000, "delay": {"delay": 0.0}'),
     ],
 )
-def test_a_foreign_change_is_an_error_and_not_repaired(
-    harm: Callable[[Kernel], None], words: str
-) -> None:
-    kernel, clock, log = Kernel(), Clock(), list[str]()
+def test_a_foreign_change_is_an_error_and_not_repaired(harm, words):
+    kernel, clock, log = Kernel(), Clock(), []
     profile = DirectionProfile(0.04, changes=(Change(5.0, loss=0.1), Change(9.0, delay=0.2)))
     shaper = netem(kernel, profile, clock, log.append)
     shaper.follow_peer(PEER)
@@ -438,11 +432,11 @@ def test_a_foreign_change_is_an_error_and_not_repaired(
 class Watched(Kernel):
     """Notes from when on [ms] which delay [us] and loss were in force."""
 
-    def __init__(self, clock: Clock, slow_ms: int = 0) -> None:
+    def __init__(self, clock, slow_ms=0):
         super().__init__()
         self.clock, self.slow_ms, self.history = clock, slow_ms, list[tuple[float, str, str]]()
 
-    def run(self, words: Sequence[str]) -> Answer:
+    def run(self, words):
         answer = super().run(words)
         if "change" in words:
             self.clock.now_ns += self.slow_ms * 1_000_000
@@ -452,7 +446,7 @@ class Watched(Kernel):
         return answer
 
 
-def follow(profile: DirectionProfile, until: float, slow_ms: int = 0) -> tuple[Watched, Netem]:
+def follow(profile, until, slow_ms=0):
     clock = Clock()
     kernel = Watched(clock, slow_ms)
     shaper = netem(kernel, profile, clock)
@@ -462,12 +456,12 @@ def follow(profile: DirectionProfile, until: float, slow_ms: int = 0) -> tuple[W
     return kernel, shaper
 
 
-def steps(shaper: Netem) -> tuple[int, ...]:
+def steps(shaper):
     """Return how many steps were taken, were late, were passed over; median, p99 [ns]."""
     return tuple(shaper.steps.counts().values())
 
 
-def test_a_step_is_taken_when_it_is_due() -> None:
+def test_a_step_is_taken_when_it_is_due():
     profile = DirectionProfile(
         delay=0.02, changes=(Change(1.003, delay=0.1),), blackouts=(Blackout(1.511, 0.05),)
     )
@@ -480,7 +474,7 @@ def test_a_step_is_taken_when_it_is_due() -> None:
     assert steps(shaper)[:3] == (3, 0, 0)
 
 
-def test_changes_faster_than_the_step_are_skipped_and_counted() -> None:
+def test_changes_faster_than_the_step_are_skipped_and_counted():
     times = tuple(0.001 * n for n in range(1000))
     trace = Trace(times, tuple(0.03 + 1e-5 * n for n in range(1000)))
     kernel, shaper = follow(DirectionProfile(trace=trace), 1.2)
@@ -490,7 +484,7 @@ def test_changes_faster_than_the_step_are_skipped_and_counted() -> None:
     assert kernel.history[-1][1] == "39990.000us"
 
 
-def test_a_slow_machine_reports_its_lateness() -> None:
+def test_a_slow_machine_reports_its_lateness():
     changes = tuple(Change(0.1 * n, delay=0.01 * n) for n in range(1, 11))
     _, shaper = follow(DirectionProfile(changes=changes), 1.5, slow_ms=30)
     shaper.steps.note(40_000_000, 0)
@@ -499,7 +493,7 @@ def test_a_slow_machine_reports_its_lateness() -> None:
 
 
 @pytest.mark.parametrize(("restart", "due_ms"), [(True, 1300.0), (False, 800.0)])
-def test_a_new_time_line_may_count_from_now_or_go_on(restart: bool, due_ms: float) -> None:
+def test_a_new_time_line_may_count_from_now_or_go_on(restart, due_ms):
     clock = Clock()
     kernel = Watched(clock)
     shaper = netem(kernel, DirectionProfile(0.01), clock)
@@ -520,6 +514,6 @@ LISTED = """[{"kind":"prio","handle":"7400:","root":true,"refcnt":3,"options":{"
 "qlen":2}]"""
 
 
-def test_counters_are_read_from_tcs_json() -> None:
+def test_counters_are_read_from_tcs_json():
     assert counters(json.loads(LISTED)) == {"forwarded": 10, "lost": 3, "held": 2}
     assert counters(json.loads('[{"kind":"noqueue","handle":"0:","root":true}]')) == {}

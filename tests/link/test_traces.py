@@ -1,9 +1,5 @@
 """Traces are read and written; what is none is refused with file, line, value and remedy."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from cloudrc.errors import BadInputError
@@ -30,9 +26,7 @@ HEAD = "time_s,delay_ms"
         (b"time_s,delay_ms,loss\n" + b"0,0,0\n1,90,0\n"[:6] + b"9,90,0\n", (0, 9), (0, 90), 1),
     ],
 )
-def test_a_trace_is_read_into_si(
-    tmp_path: Path, data: bytes, times: tuple[float], delays: tuple[float], losses: int
-) -> None:
+def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
     path = tmp_path / "trace.csv"
     path.write_bytes(data)
     trace = read_trace(path)
@@ -72,13 +66,13 @@ def test_a_trace_is_read_into_si(
         (f'{HEAD}\n0,"' + "9" * 200_000, "field larger than field limit"),
     ],
 )
-def test_what_is_not_a_trace_is_refused(text: str, says: str) -> None:
+def test_what_is_not_a_trace_is_refused(text, says):
     with pytest.raises(BadInputError, match=f"^trace x\\.csv[^\\n]*{says}") as caught:
         parse_trace(text.splitlines(), "x.csv")
     assert len(str(caught.value)) < 300
 
 
-def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "binary.csv").write_bytes(b"\0\1\2")
     for name, says in (("none", "No such file"), (".", "Is a dir"), ("binary.csv", "not a text")):
         with pytest.raises(BadInputError, match=says):
@@ -86,7 +80,7 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])
-def test_what_is_written_is_read_again(scale: float) -> None:
+def test_what_is_written_is_read_again(scale):
     delays = tuple(delay * scale for delay in (0.040, 0.045, 0.060))
     trace = Trace((0.0, 0.005, 0.015), delays, (0.0, 1.0, 0.5))
     again = parse_trace(write_trace(trace).splitlines(), "x")
@@ -95,14 +89,14 @@ def test_what_is_written_is_read_again(scale: float) -> None:
     assert again.losses == trace.losses
 
 
-def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path: Path) -> None:
+def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path):
     path = tmp_path / "trace.csv"
     path.write_text(f"{HEAD},loss\n0,60,0\n1,40,0.5\n2,900,1\n3,40,0\n4,60,0\n")
     assert read_table(path) == pytest.approx((-1.0, -1.0, 1.0, 1.0))
 
 
 @pytest.mark.parametrize("rows", ["0,45,0", "0,45,0\n1,45,0", "0,45,1\n1,50,1"])
-def test_a_table_without_a_spread_is_refused(tmp_path: Path, rows: str) -> None:
+def test_a_table_without_a_spread_is_refused(tmp_path, rows):
     path = tmp_path / "trace.csv"
     path.write_text(f"{HEAD},loss\n{rows}\n")
     with pytest.raises(BadInputError, match="at least two different delays"):
@@ -110,7 +104,7 @@ def test_a_table_without_a_spread_is_refused(tmp_path: Path, rows: str) -> None:
 
 
 @pytest.mark.parametrize("hours", [0, 3])
-def test_a_trace_that_loops_begins_again(hours: int) -> None:
+def test_a_trace_that_loops_begins_again(hours):
     """Its last row lasts as long as a mean row: the period is 3 s."""
     trace = Trace((0.0, 0.5, 2.0), (0.040, 0.050, 0.060), (0.0, 0.0, 1.0), loop=True)
     timeline = Timeline(DirectionProfile(trace=trace))
