@@ -28,7 +28,7 @@ from cloudrc.link.relay import (
     BATCH,
     QUANTILES,
     Lane,
-    Recent,
+    Lanes,
     Relay,
     RelayShaper,
     ReleaseErrors,
@@ -251,13 +251,14 @@ def test_percentiles_are_those_of_the_sample_to_2_percent(scale):
 
 
 def test_recent_means_the_last_ten_calls():
-    errors, recent, said = ReleaseErrors(), Recent(), []
-    assert recent.counts(errors) == {"released_early": 0}
-    recent = Recent()
+    with bind_loopback() as source:
+        lane = Lane(source, int, LinkDirection(PLAIN, 1, True), peek)
+    lanes, said = Lanes([lane], None), []
+    assert lanes.recent() == {"released_early": 0}
+    lanes = Lanes([lane], None)
     for second in range(14):
-        errors = errors.copy()
-        errors.observe(9 * MS if second == 2 else 10_000)
-        said.append(recent.counts(errors)["release_error_p999_ns"])
+        lane.errors.observe(9 * MS if second == 2 else 10_000)
+        said.append(lanes.recent()["release_error_p999_ns"])
     assert [late_ns > 8 * MS for late_ns in said] == [2 <= n < 12 for n in range(14)]
 
 
