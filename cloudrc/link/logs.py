@@ -56,7 +56,6 @@ HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
 )
-_CLOCKS = "the two clocks differ; synchronise them, or take half of each round trip (--halve-rtt)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +98,6 @@ class Log:
         entries: The packets in the order of the source.
         counts: What was left out, merged or changed -> how often.
         unusable: One reason for each row that cannot be used.
-        clocks: What the user should do if the two clocks differ.
         gap: Shortest gap, and shortest jump back, in median times between packets [1].
     """
 
@@ -108,7 +106,6 @@ class Log:
     counts: Counter[str] = field(default_factory=Counter)
     unusable: list[str] = field(default_factory=list)
     halved: bool = False
-    clocks: str = _CLOCKS
     gap: int = GAP
 
     def packets(self) -> Packets:
@@ -148,8 +145,10 @@ class Log:
     def refuse_early(self, least: float) -> None:
         """Refuse a log whose shortest delay, `least` [s], is negative."""
         if least < 0.0:
-            early = f"a packet arrived {-least * 1e3:.4g} ms before it was sent"
-            raise self.error(f"{early}: {self.clocks}")
+            raise self.error(
+                f"a packet arrived {-least * 1e3:.4g} ms before it was sent: the two clocks differ;"
+                " synchronise them, or use round trips and take half of each (--halve-rtt)"
+            )
 
     def _refuse_steps(self, times: Floats) -> None:
         """Refuse times that jump far back one to three times: sorting would mix two sessions."""
@@ -356,7 +355,6 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     if not unit:
         raise BadInputError(f"{name}: {_no_unit(delay)}")
     log = Log(name, halved=delay.startswith("rtt"))
-    log.clocks = "the two clocks differ; synchronise them, or record round trips as rtt_ms"
     if log.halved and not halve:
         raise BadInputError(f"{name}, column {delay}: has round trips; {HALVE}")
     loss = next((column for column in LOSSES if column in columns), None)

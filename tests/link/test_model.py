@@ -337,8 +337,8 @@ def test_a_trace_holds_each_row_until_the_next(loop):
     """If it loops, its last row lasts as long as a mean row: the period is 4 s."""
     trace = Trace((1.0, 2.0, 3.0), (0.010, 0.020, 0.030), (0.0, 1.0, 0.0), loop)
     direction = link(DirectionProfile(9.0, loss=1.0, trace=trace))
-    hours = 3 * 3600 + 1 if loop else 100
-    for t, delay in ((0, 10), (1, 10), (2, None), (3, 30), (hours, 10 if loop else 30)):
+    late = ((3 * 3600 + t, delay) for t, delay in ((0, 10), (2, None), (3, 30)) if loop)
+    for t, delay in ((0, 10), (1, 10), (2, None), (3, 30), (4, 10 if loop else 30), *late):
         at = () if delay is None else (t * SECOND + delay * MS,)
         assert direction.send(1, 3, 0, SIZE, t * SECOND) == at
 

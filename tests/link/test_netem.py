@@ -41,14 +41,20 @@ NO_CLASSIFIER = Answer(
 
 
 class Kernel:
-    """An interface with its qdiscs and filters."""
+    """An interface with its qdiscs and filters, and the time, which a slow change takes.
 
-    def __init__(self, *lacks):
-        self.lacks = lacks
-        self.held = 4
-        self.said = []
+    Its history notes from when on [ms] which delay [us] and loss were in force.
+    """
+
+    def __init__(self, lacks="nothing", slow_ms=0):
+        self.lacks, self.slow_ms = lacks, slow_ms
+        self.held, self.now_ns = 4, 0
+        self.said, self.history = [], []
         self.refuses = "nothing"
         self.clear()
+
+    def wait(self, duration):
+        self.now_ns += round(duration * 1e9)
 
     def run(self, words):
         line = " ".join(words)
@@ -66,7 +72,7 @@ class Kernel:
                 self.clear()
             case ["tc", "qdisc", verb, *rest]:
                 kind = "netem" if "netem" in rest else "prio"
-                if kind in self.lacks:
+                if kind == self.lacks:
                     return UNKNOWN
                 if self.refuses in rest:
                     return Answer(1, "", "Illegal delay")
@@ -77,8 +83,13 @@ class Kernel:
                         return NO_QDISC
                     assert (verb == "add") is (self.netem is None)
                     self.netem = list(rest[rest.index("netem") + 1 :])
+                if verb == "change":
+                    self.now_ns += self.slow_ms * 1_000_000
+                    delay, loss = self.netem.index("delay") + 1, self.netem.index("loss") + 2
+                    at_ms = self.now_ns * 1e-6
+                    self.history.append((at_ms, self.netem[delay], self.netem[loss]))
             case ["tc", "filter", "add", "dev", _, "parent", _, "pref", number, *rest]:
-                if rest[2] in self.lacks:
+                if rest[2] == self.lacks:
                     return NO_CLASSIFIER
                 assert int(number) not in self.filters
                 self.filters[int(number)] = " ".join(rest)
@@ -105,19 +116,11 @@ def listing(words):
     return {"limit": int(given.get("limit", 1000)), "delay": {"delay": delay}, "words": words}
 
 
-class Clock:
-    now_ns = 0
+def netem(kernel, profile, log=lambda line: None):
+    def clock():
+        return kernel.now_ns
 
-    def __call__(self):
-        return self.now_ns
-
-    def wait(self, duration):
-        self.now_ns += round(duration * 1e9)
-
-
-def netem(kernel, profile, clock=None, log=lambda line: None):
-    clock = clock or Clock()
-    return Netem(kernel.run, profile, origin_ns=0, clock=clock, wait=clock.wait, log=log)
+    return Netem(kernel.run, profile, origin_ns=0, clock=clock, wait=kernel.wait, log=log)
 
 
 PLAIN = DirectionProfile(0.04)
@@ -324,8 +327,8 @@ def test_a_new_address_gets_its_filter_before_the_old_one_goes():
 
 
 def test_what_is_under_way_has_room_until_it_has_left():
-    kernel, clock = Kernel(), Clock()
-    shaper = netem(kernel, DirectionProfile(1.0, rate=1e6, queue_packets=10), clock)
+    kernel = Kernel()
+    shaper = netem(kernel, DirectionProfile(1.0, rate=1e6, queue_packets=10))
     shaper.follow_peer(PEER)
     kernel.held = 100
     small = DirectionProfile(0.02, rate=1e6, queue_packets=10)
@@ -381,9 +384,9 @@ def take_the_delay_out(kernel):
     ],
 )
 def test_a_foreign_change_is_an_error_and_not_repaired(harm, words):
-    kernel, clock, log = Kernel(), Clock(), []
+    kernel, log = Kernel(), []
     profile = DirectionProfile(0.04, changes=(Change(5.0, loss=0.1), Change(9.0, delay=0.2)))
-    shaper = netem(kernel, profile, clock, log.append)
+    shaper = netem(kernel, profile, log.append)
     shaper.follow_peer(PEER)
     shaper.step(1.5)
     assert (log, shaper.counts()["restored"]) == ([], 0)
@@ -403,29 +406,11 @@ def test_a_foreign_change_is_an_error_and_not_repaired(harm, words):
     assert shaper.counts()["restored"] == 1
 
 
-class Watched(Kernel):
-    """Notes from when on [ms] which delay [us] and loss were in force."""
-
-    def __init__(self, clock, slow_ms=0):
-        super().__init__()
-        self.clock, self.slow_ms, self.history = clock, slow_ms, list[tuple[float, str, str]]()
-
-    def run(self, words):
-        answer = super().run(words)
-        if "change" in words:
-            self.clock.now_ns += self.slow_ms * 1_000_000
-            at = list(words).index("delay")
-            loss = words[list(words).index("loss") + 2]
-            self.history.append((self.clock.now_ns * 1e-6, words[at + 1], loss))
-        return answer
-
-
 def follow(profile, until, slow_ms=0):
-    clock = Clock()
-    kernel = Watched(clock, slow_ms)
-    shaper = netem(kernel, profile, clock)
+    kernel = Kernel(slow_ms=slow_ms)
+    shaper = netem(kernel, profile)
     shaper.follow_peer(PEER)
-    while clock.now_ns < until * 1e9:
+    while kernel.now_ns < until * 1e9:
         shaper.step(0.1)
     return kernel, shaper
 
@@ -466,9 +451,8 @@ def test_a_slow_machine_reports_its_lateness():
 
 @pytest.mark.parametrize(("restart", "due_ms"), [(True, 1300.0), (False, 800.0)])
 def test_a_new_time_line_may_count_from_now_or_go_on(restart, due_ms):
-    clock = Clock()
-    kernel = Watched(clock)
-    shaper = netem(kernel, DirectionProfile(0.01), clock)
+    kernel = Kernel()
+    shaper = netem(kernel, DirectionProfile(0.01))
     shaper.follow_peer(PEER)
     shaper.step(0.5)
     after = DirectionProfile(0.02, changes=(Change(0.8, delay=0.09),))

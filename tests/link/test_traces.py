@@ -3,7 +3,7 @@
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.profile import DirectionProfile, Timeline, Trace
+from cloudrc.link.profile import Trace
 from cloudrc.link.traces import parse_trace, read_table, read_trace, write_trace
 
 HEAD = "time_s,delay_ms"
@@ -101,13 +101,3 @@ def test_a_table_without_a_spread_is_refused(tmp_path, rows):
     path.write_text(f"{HEAD},loss\n{rows}\n")
     with pytest.raises(BadInputError, match="at least two different delays"):
         read_table(path)
-
-
-@pytest.mark.parametrize("hours", [0, 3])
-def test_a_trace_that_loops_begins_again(hours):
-    """Its last row lasts as long as a mean row: the period is 3 s."""
-    trace = Trace((0.0, 0.5, 2.0), (0.040, 0.050, 0.060), (0.0, 0.0, 1.0), loop=True)
-    timeline = Timeline(DirectionProfile(trace=trace))
-    for elapsed, delay in ((0.0, 40), (2.9, 60), (3.1, 40), (3.6, 50), (5.5, 60), (602.0, 60)):
-        now = timeline.at(round((hours * 3600 + elapsed) * 1e9))
-        assert (now.delay_ns, now.loss) == (delay * 1_000_000, float(delay == 60))
