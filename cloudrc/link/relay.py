@@ -399,13 +399,9 @@ class RelayShaper(Lanes):
             OSError: If `listen` is in use, or cannot be reached from `end`.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._inside.bind(listen)
-            if end is not None:
-                self._inside.connect(end)
-        except OSError:
-            self._inside.close()
-            raise
+        self._inside.bind(listen)
+        if end is not None:
+            self._inside.connect(end)
         # The kernel refuses to send from a socket bound to 127.0.0.1 to another machine.
         self._outside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._outside.setblocking(False)

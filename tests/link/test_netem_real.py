@@ -26,7 +26,7 @@ from cloudrc.cli.link_verify import inside
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.link.model import LinkDirection, Stream, numbers
+from cloudrc.link.model import LinkDirection, numbers, sample
 from cloudrc.link.netem import STRETCH, Netem, table, write_tables
 from cloudrc.link.profile import (
     Blackout,
@@ -192,11 +192,6 @@ def measure(count, period=0.01):
     return flow.settle()
 
 
-def show(words, **values):
-    """Print a number, which pytest shows with -s."""
-    print(words, {name: round(float(value), 5) for name, value in values.items()})
-
-
 def least(error, enough):
     """Return the smallest of up to three errors, since a stall of the machine spoils one."""
     found = error()
@@ -235,7 +230,6 @@ def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped):
         tunnel, stranger = Flow(), Flow(port=7402)
         tunnel.send(200, meanwhile=lambda: stranger.send(1, 0.0))
         delay, other = np.median(tunnel.settle().delays()), np.median(stranger.settle().delays())
-        show("60 ms asked", tunnel=delay, other_port=other)
         assert other < 0.020
         return float(abs(delay - other - 0.060))
 
@@ -267,9 +261,7 @@ def test_jitter_is_distributed_as_asked(shaped, distribution):
 
     def off():
         delays = measure(800, 0.004).delays()
-        error = np.abs(np.quantile(delays, shares) - asked).max()
-        show(distribution, mean=delays.mean(), deviation=delays.std(), quantile_off=error)
-        return float(error)
+        return float(np.abs(np.quantile(delays, shares) - asked).max())
 
     assert least(off, 0.006) < 0.006
 
@@ -282,7 +274,6 @@ def test_losses_are_as_many_as_asked_and_counted(shaped, asked, share, burst):
     flow, counts = measure(2000, 0.002), shaped.counts()
     lost = sorted(set(range(2000)) - set(flow.numbers()))
     mean = len(lost) / (1 + sum(after - before > 1 for before, after in pairwise(lost)))
-    show("losses", asked=share, measured=len(lost) / 2000, burst=mean)
     assert (counts["forwarded"], counts["lost"]) == (2000 - len(lost), len(lost))
     assert len(lost) / 2000 == pytest.approx(share, abs=0.07 if burst > 2 else 0.045)
     assert mean == pytest.approx(burst, rel=0.5)
@@ -308,7 +299,6 @@ def test_a_shipped_profile_for_a_minute(shaped, name, way, figure):
         drawn[:] = [drawn_for(tunnel, profile, seed) for seed in range(20)]
         beside, mean = stranger.settle().delays().mean(), tunnel.delays().mean()
         asked = float(np.mean([each.mean for each in drawn]))
-        show(f"{name}, {way}, for a minute", asked=asked, measured=mean, other_port=beside)
         return float(abs(mean - beside - asked))
 
     error = least(off, WITHIN)
@@ -319,20 +309,13 @@ def test_a_shipped_profile_for_a_minute(shaped, name, way, figure):
     overtaken = float(np.mean(np.maximum.accumulate(order)[:-1] > order[1:]))
     for what, measured in (("loss", loss), ("overtaken", overtaken)):
         values = np.array([getattr(each, what) for each in drawn])
-        show(f"{name}, {way}: {what}", asked=values.mean(), measured=measured)
         assert abs(measured - values.mean()) <= 5 * values.std() + 0.003, what
 
 
 def drawn_for(flow, profile, seed):
     """What the model does to packets that are sent when those of a flow were."""
     sent_ns = [at_ns - flow.sent_ns[0] for at_ns in flow.sent_ns]
-    model = LinkDirection(profile, seed, True)
-    fates = [model.send(1, int(Kind.TELEMETRY), n, SIZE, at_ns) for n, at_ns in enumerate(sent_ns)]
-    delays = [
-        (min(f) - at_ns) * 1e-9 if f else np.nan for f, at_ns in zip(fates, sent_ns, strict=True)
-    ]
-    copies = np.array([len(fate) for fate in fates])
-    return numbers(Stream(np.array(sent_ns) * 1e-9, np.array(delays), copies))
+    return numbers(sample(LinkDirection(profile, seed, True), Kind.TELEMETRY, sent_ns, SIZE))
 
 
 def test_a_change_in_flight_loses_nothing(shaped):
@@ -360,7 +343,6 @@ def test_a_bottleneck_has_its_rate(shaped):
         flow.settle()
         took = (flow.arrived[-1][1] - flow.arrived[0][1]) * 1e-9
         measured = 99 * 200 * 8 / took  # 172 bytes and 28 of headers
-        show("400 kbit/s asked", measured=measured)
         return abs(measured / 400e3 - 1.0)
 
     assert least(off, 0.03) < 0.03
@@ -370,7 +352,6 @@ def test_a_bottleneck_has_its_rate(shaped):
         flow = Flow()
         flow.send(sent, 0.0)
         arrived = len(flow.settle(1.0).arrived)
-        show("at once", sent=sent, arrived=arrived)
         assert least_arrived <= arrived <= min(sent, 799)
 
 
@@ -435,7 +416,6 @@ def test_a_measured_distribution_is_applied(tables, shaped):
     shaped.follow_profile(profile)
     delays = measure(600, 0.004).delays()
     near = np.abs(delays[:, None] - (0.1 + 0.03 * np.unique(values))).min(axis=1)
-    show("four delays asked", mean=delays.mean(), deviation=delays.std(), off=np.median(near))
     assert np.median(near) < WITHIN
     assert delays.std() == pytest.approx(0.03, abs=0.004)
 
@@ -464,7 +444,6 @@ def test_changes_and_blackouts_take_effect_when_they_are_due(tables):
     arrived, delays = since[flow.numbers()], flow.delays()
     lost = np.delete(since, flow.numbers())
     before, after = delays[arrived < 2.45], delays[arrived > 2.5 + LATE]
-    show("step", before=np.median(before), after=np.median(after), dark=np.ptp(lost))
     assert np.median(before) == pytest.approx(0.02, abs=0.005)
     assert np.median(after) == pytest.approx(0.1, abs=0.005)
     assert (lost.min(), lost.max()) == pytest.approx((3.5, 3.8), abs=LATE)
@@ -482,7 +461,6 @@ def test_a_trace_is_followed(tables):
         on = (since[flow.numbers()] > 0.0) & (since[flow.numbers()] < times[-1])
         asked = rows[np.searchsorted(times, since[flow.numbers()][on], side="right") - 1]
         correlation = float(np.corrcoef(asked, flow.delays()[on])[0, 1])
-        show(netem.steps.in_words(), correlation=correlation)
         assert netem.steps.applied + netem.steps.passed_over == len(times) - 1
         return 1.0 - correlation
 
@@ -546,14 +524,6 @@ def test_a_pod_takes_netem_follows_the_profile_and_leaves_nothing(tables, tmp_pa
         pod.end()
         assert qdiscs() == before
         assert not pod.route.exists()
-
-
-def test_a_qdisc_deleted_in_flight_is_an_error_in_the_log(tables, tmp_path):
-    with Pod(tmp_path, "netem") as pod:
-        sh("tc", "-n", NEAR, "qdisc", "del", "dev", DEVICE, "root")
-        until(lambda: f"error: the qdisc of {DEVICE} was removed by another" in pod.log.read_text())
-        assert "netem" not in qdiscs(), "it is not repaired"
-        pod.end()
 
 
 @pytest.mark.usefixtures("tables")
