@@ -160,13 +160,7 @@ def pareto(z):
     ("shape", "cumulative", "deviation"),
     [("uniform", uniform, 1 / sqrt(3)), ("normal", normal, 1.0), ("pareto", pareto, 1.0)],
 )
-def test_many_draws_match_their_distribution(
-    shape,
-    cumulative,
-    deviation,
-    count,
-    figure,
-):
+def test_many_draws_match_their_distribution(shape, cumulative, deviation, count, figure):
     delay, jitter, loss, root = 0.060, 0.005, 0.02, sqrt(count)
     fates = flow(DirectionProfile(delay, jitter, shape, loss=loss), count)
     lost = np.array([not copies for copies in fates])

@@ -28,13 +28,7 @@ from cloudrc.config.shipped import names
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, numbers, sample
 from cloudrc.link.netem import STRETCH, Netem, table, write_tables
-from cloudrc.link.profile import (
-    Blackout,
-    Change,
-    DirectionProfile,
-    GilbertElliott,
-    Trace,
-)
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Trace
 from cloudrc.tunnel.codec import Kind
 
 MINUTES = [

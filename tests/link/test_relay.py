@@ -287,9 +287,7 @@ def in_a_thread(act):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux alone has it")
-def test_a_thread_gets_priority_if_permitted_and_exact_sleeps(
-    monkeypatch,
-):
+def test_a_thread_gets_priority_if_permitted_and_exact_sleeps(monkeypatch):
     def first():
         return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
 

@@ -15,15 +15,7 @@ from cloudrc.link.follow import Loaded
 from cloudrc.link.netem import Answer, notes
 from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott, Trace
 from cloudrc.link.profile import Change as Step
-from cloudrc.link.sidecar import (
-    Machine,
-    Near,
-    Sidecar,
-    Told,
-    look_near,
-    read_told,
-    write_told,
-)
+from cloudrc.link.sidecar import Machine, Near, Sidecar, Told, look_near, read_told, write_told
 from cloudrc.link.state import Change, publish
 
 PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
@@ -63,14 +55,7 @@ class Shaper:
 class Bench:
     """A sidecar whose time passes in `wait`, which runs the planned events."""
 
-    def __init__(
-        self,
-        folder,
-        mode,
-        refuses=None,
-        may_shape=True,
-        profile=None,
-    ):
+    def __init__(self, folder, mode, refuses=None, may_shape=True, profile=None):
         self.did, self.log, self.routes = [], [], []
         self.now_ns = 0
         self.plan = []
