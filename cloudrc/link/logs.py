@@ -469,7 +469,7 @@ def _without_marks(raw: list[Entry], column: str, decimals: int, log: Log) -> li
 _WRAP = 1 << 16
 _STAMP = re.compile(
     r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"
-    r"|(?:\d{4}-\d\d-\d\d)?[T ]?(?P<hour>\d\d):(?P<minute>\d\d):(?P<second>\d\d\.\d+)\S* +"
+    r"|(?P<date>\d{4}-\d\d-\d\d)?[T ]?(?P<hour>\d\d):(?P<minute>\d\d):(?P<second>\d\d\.\d+)\S* +"
 )
 """Time stamp of a line: from `ping -D`, `ts '[%.s]'` or `ping --apple-time`, or date and time."""
 _NUMBER = re.compile(r"\b(?:icmp6?_)?(?:seq|req)[= ](\d{1,12})\b|(?<= : )\[(\d{1,12})\], ")
@@ -586,6 +586,8 @@ class _Ping:
         if stamp["unix"]:
             return float(stamp["unix"])
         clock = int(stamp["hour"]) * 3600 + int(stamp["minute"]) * 60 + float(stamp["second"])
+        if stamp["date"]:
+            return datetime.fromisoformat(stamp["date"] + "T00:00:00+00:00").timestamp() + clock
         if self._clock - clock > 43_200:  # midnight
             self._midnight += 86_400.0
         self._clock = clock

@@ -395,5 +395,10 @@ def test_a_step_of_the_clock_or_a_pause_is_named():
     assert len(packets.sent) == 8
     packets = ping(*(reply(n, n + 10.0 * (n > 5)) for n in range(1, 12)))
     assert packets.notes[0].startswith("nothing sent for 11 s after packet 5: a pause, ")
+    dated = [
+        f"2024-01-{day} 10:00:00.5 {reply(number, 0.0)[11:]}"
+        for number, day in enumerate((10, 11, 12, 13, 18))
+    ]
+    assert ping(*dated).notes[0].startswith("nothing sent for 4.32e+05 s after packet 4: a pause, ")
     back = ping(*FIVE, reply(6, 0.3))
     assert back.notes == ("1 out of order, sorted",)
