@@ -253,26 +253,26 @@ def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[
     return sample(LinkDirection(profile, seed, uplink), kind, sent_ns, SIZES[kind])
 
 
-_STATISTICS: tuple[tuple[str, str, float, Callable[[Numbers], float]], ...] = (
-    ("mean", "ms", 1e3, lambda one: one.mean),
-    ("standard deviation", "ms", 1e3, lambda one: one.deviation),
-    ("least", "ms", 1e3, lambda one: one.least),
-    ("median", "ms", 1e3, lambda one: one.median),
-    ("99 %", "ms", 1e3, lambda one: one.p99),
-    ("most", "ms", 1e3, lambda one: one.most),
-    ("correlation with the next", "", 1.0, lambda one: one.correlation),
-    ("overtaken by a later one", "%", 1e2, lambda one: one.overtaken),
-    ("duplicated", "%", 1e2, lambda one: one.duplicated),
-    ("lost", "%", 1e2, lambda one: one.loss),
-    ("lost in a row, mean", "", 1.0, lambda one: fmean(one.runs) if one.runs else nan),
-    ("lost in a row, most", "", 1.0, lambda one: max(one.runs, default=0)),
-)
-"""Name, unit, scale and value of each line."""
+_STATISTICS: dict[str, tuple[str, float, Callable[[Numbers], float]]] = {
+    "mean": ("ms", 1e3, lambda one: one.mean),
+    "standard deviation": ("ms", 1e3, lambda one: one.deviation),
+    "least": ("ms", 1e3, lambda one: one.least),
+    "median": ("ms", 1e3, lambda one: one.median),
+    "99 %": ("ms", 1e3, lambda one: one.p99),
+    "most": ("ms", 1e3, lambda one: one.most),
+    "correlation with the next": ("", 1.0, lambda one: one.correlation),
+    "overtaken by a later one": ("%", 1e2, lambda one: one.overtaken),
+    "duplicated": ("%", 1e2, lambda one: one.duplicated),
+    "lost": ("%", 1e2, lambda one: one.loss),
+    "lost in a row, mean": ("", 1.0, lambda one: fmean(one.runs) if one.runs else nan),
+    "lost in a row, most": ("", 1.0, lambda one: max(one.runs, default=0)),
+}
+"""Name -> unit, scale and value of each line."""
 
 
 def _table(counted: dict[str, Numbers]) -> str:
     rows = [["one way", *(counted if len(counted) > 1 else ("",)), ""]]
-    for name, unit, scale, value in _STATISTICS:
+    for name, (unit, scale, value) in _STATISTICS.items():
         values = [value(one) for one in counted.values()]
         cells = ["-" if isnan(number) else f"{number * scale:.4g}" for number in values]
         rows.append([name, *cells, unit])

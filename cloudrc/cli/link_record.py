@@ -66,16 +66,13 @@ def execute(options: argparse.Namespace) -> int:
     source, output, only = options.source, options.output, options.direction
     if not (source.is_dir() or source.is_file()):
         raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")
-    halve = options.halve_rtt
-    found: dict[str, Packets] = {}
     if not _is_run(source):
-        packets = _from_log(source, only, halve=halve, trust_units=options.trust_units)
-        found[only or "uplink"] = packets
+        found = {only or "uplink": _from_log(source, options)}
     else:
         require("a trace of a run", ("record",))
         recording = _recording(source)
-        if halve:
-            found[only or "uplink"] = _halves(recording, source)
+        if options.halve_rtt:
+            found = {only or "uplink": _halves(recording, source)}
         else:
             ways = (only,) if only else DIRECTIONS
             found = {way: one_way(recording, source, way) for way in ways}
@@ -116,22 +113,20 @@ def _is_run(path: Path) -> bool:
         return file.read(8) == b"\x89MCAP0\r\n"
 
 
-def _from_log(
-    path: Path, direction: Direction | None, *, halve: bool, trust_units: bool
-) -> Packets:
+def _from_log(path: Path, options: argparse.Namespace) -> Packets:
     """Read a log of ping or irtt, or a CSV file; recognise the kind by the content."""
     from cloudrc.link.logs import is_ping, read_csv, read_irtt, read_ping, refuse_others
     from cloudrc.link.traces import read_lines
 
-    name = str(path)
+    name, halve = str(path), options.halve_rtt
     remedy = "give a run, a log of ping or irtt, or a CSV file"
     lines = _unpack(path) if path.suffix == ".gz" else read_lines(path, name, remedy)
     refuse_others(lines, name)
     if lines and lines[0].lstrip().startswith(("{", "[{")):
-        return read_irtt("\n".join(lines), name, direction, halve=halve)
+        return read_irtt("\n".join(lines), name, options.direction, halve=halve)
     if is_ping(lines):
         return read_ping(lines, name, halve=halve)
-    return read_csv(lines, name, halve=halve, trust_units=trust_units)
+    return read_csv(lines, name, halve=halve, trust_units=options.trust_units)
 
 
 def _unpack(path: Path) -> list[str]:
@@ -169,21 +164,19 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     """
     from cloudrc.link.logs import Log
 
-    sent_topic, topic = TOPICS[direction]
+    log, (sent_topic, topic) = Log(str(path)), TOPICS[direction]
     sent, arrivals = recording[sent_topic], recording[topic]
     if not len(sent) or not len(arrivals):
         missing = sent_topic if not len(sent) else topic
-        raise BadInputError(
-            f"{path}: no rows on {missing}, so no {direction}; "
-            "give the run's folder or its mission.mcap"
+        raise log.error(
+            f"no rows on {missing}, so no {direction}; give the run's folder or its mission.mcap"
         )
-    log = Log(str(path))
     delays: dict[tuple[float, float], float] = {}
     for epoch, counter, delay in _columns(arrivals, "epoch", "counter", "delay"):
         if isnan(delay):
-            raise BadInputError(
-                f"{path}: its ends did not share a clock, so one-way delays are not known; take "
-                "half of each round trip with --halve-rtt"
+            raise log.error(
+                "its ends did not share a clock, so one-way delays are not known; take half of "
+                "each round trip with --halve-rtt"
             )
         log.counts["duplicates left out"] += (epoch, counter) in delays
         delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
@@ -211,7 +204,7 @@ def _halves(recording: Recording, path: Path) -> Packets:
     """
     from cloudrc.link.logs import Log
 
-    log, previous, start_ns = Log(str(path), halved=True), None, None
+    log, previous = Log(str(path), halved=True), None
     for stamp_ns, rtt, loop in _columns(
         recording["/delay_estimate"], "stamp_ns", "rtt", "loop_delay"
     ):
@@ -220,11 +213,10 @@ def _halves(recording: Recording, path: Path) -> Packets:
         if (rtt, loop) == previous:
             log.counts["repeated echoes left out"] += 1
             continue
-        previous, sent_ns = (rtt, loop), stamp_ns - round(loop * 1e9)
-        start_ns = sent_ns if start_ns is None else start_ns
-        log.entries.append(((sent_ns - start_ns) * 1e-9, rtt / 2))
+        previous = rtt, loop
+        log.entries.append((stamp_ns * 1e-9 - loop, rtt / 2))
     if not log.entries:
-        raise BadInputError(f"{path}: holds no round trip; give the folder of a run that flew")
+        raise log.error("holds no round trip; give the folder of a run that flew")
     return log.packets()
 
 

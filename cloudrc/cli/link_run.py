@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -30,11 +29,9 @@ from cloudrc.cli.processes import (
     warn_if_exposed,
 )
 from cloudrc.drivers.process import StopSignal
-from cloudrc.records import Counted
 
 if TYPE_CHECKING:
-    from cloudrc.drivers.exporter import Exporter
-    from cloudrc.link.follow import Load, Profiles
+    from cloudrc.link.follow import Load
     from cloudrc.link.netem import Answer
     from cloudrc.link.sidecar import Machine, Near, Sidecar
 
@@ -76,26 +73,40 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Shape one direction of the link until SIGTERM."""
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
-    from cloudrc.link.follow import HANDED_FILE, Profiles
+    from cloudrc.link.follow import HANDED_FILE, PEER_PAUSE, PROFILE_PERIOD, PeerName, Profiles
     from cloudrc.link.netem import write_tables
-    from cloudrc.link.sidecar import Settings, Sidecar
-    from cloudrc.link.state import STATE_FILE
+    from cloudrc.link.sidecar import Sidecar
 
     warn_if_exposed(options.listen)
     exporter = open_exporter(options, "link")
-    metrics = Metrics(exporter, options.direction, options.mode) if exporter else None
-    document, state = (options.route.with_name(name) for name in (HANDED_FILE, STATE_FILE))
+    document = options.route.with_name(HANDED_FILE)
     profiles = Profiles(options.profile, document, make_profile_loader(options.direction), log)
-    profile = profiles.first()
-    settings = Settings(options.mode, options.direction, options.route, state)
+    profile, peer = profiles.first(), PeerName(options.peer, ipv4_addresses, log)
     with TemporaryDirectory(prefix="tc-", dir=options.route.parent) as tables:
         write_tables(Path(tables))
         programs = Programs(tables)
-        sidecar = Sidecar(settings, _machine(options, programs, Path(tables)), profile, metrics)
+        sidecar = Sidecar(
+            _machine(options, programs, Path(tables)),
+            profile,
+            mode=options.mode,
+            direction=options.direction,
+            route=options.route,
+            metrics=exporter,
+        )
+
+        def poll_profile() -> None:
+            sidecar.profile = profiles.poll() or sidecar.profile
+
+        def resolve_peer() -> None:
+            sidecar.peer = peer.poll() or sidecar.peer
+            if exporter:
+                exporter.unresolved(peer.failures)
+
         if exporter:
             exporter.tells(LinkStatusSource(sidecar).text)
         try:
-            _start_watching(sidecar, profiles, options, metrics)
+            _repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
+            _repeat(resolve_peer, *PEER_PAUSE)
             sidecar.run(stop)
         finally:
             programs.close()
@@ -141,85 +152,33 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
 
     def netem(profile: DirectionProfile, origin_ns: int) -> Netem:
         return Netem(
-            *(programs, profile),
-            origin_ns=origin_ns,
-            clock=clock,
-            wait=wait,
-            tables=tables,
-            log=log,
+            programs, profile, origin_ns=origin_ns, clock=clock, wait=wait, tables=tables, log=log
         )
 
-    return Machine(
-        relay=relay,
-        netem=netem,
-        may_shape=may_shape(Path("/proc/self/status").read_text(encoding="ascii")),
-        clock=clock,
-        today=lambda: datetime.now(UTC).isoformat(timespec="seconds"),
-        wait=wait,
-        log=log,
-    )
+    allowed = may_shape(Path("/proc/self/status").read_text(encoding="ascii"))
+    return Machine(relay, netem, allowed, clock, wait, log)
 
 
-def _start_watching(
-    sidecar: Sidecar, profiles: Profiles, options: argparse.Namespace, metrics: Metrics | None
-) -> None:
-    """Start the threads that watch the profile and resolve the peer's name."""
-    from cloudrc.link.follow import PEER_PAUSE, PROFILE_PERIOD, PeerName
+def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None:
+    """Call a function forever in a thread, with random pauses between two limits [s]."""
 
-    name = PeerName(options.peer, ipv4_addresses, log)
-
-    def poll_profile() -> None:
-        sidecar.profile = profiles.poll() or sidecar.profile
-
-    def resolve_peer() -> None:
-        sidecar.peer = name.poll() or sidecar.peer
-        if metrics is not None:
-            metrics.unresolved(name.failures)
-
-    def repeat(action: Callable[[], None], shortest: float, longest: float) -> None:
+    def work() -> None:
         while True:
             action()
             time.sleep(random.uniform(shortest, longest))
 
-    steady = (PROFILE_PERIOD, PROFILE_PERIOD)
-    for action, pause in ((poll_profile, steady), (resolve_peer, PEER_PAUSE)):
-        threading.Thread(target=repeat, args=(action, *pause), daemon=True).start()
-
-
-class Metrics:
-    """Export the metrics of a sidecar; implement `Watcher`."""
-
-    def __init__(self, exporter: Exporter, direction: str, mode: str) -> None:
-        self._exporter, self._direction, self._mode = exporter, direction, mode
-        self.unresolved = exporter.unresolved
-
-    def shapes(self, shaper: str) -> None:
-        """Export which shaper is in use, and report ready."""
-        self._exporter.shaped(shaper, self._direction, self._mode)
-        self._exporter.ready(True)
-
-    def asked(self, delay: float) -> None:
-        """Export the mean `delay` [s] that the profile requests."""
-        self._exporter.asked(self._direction, delay)
-
-    def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
-        """Export the counters of datagrams."""
-        self._exporter.see([Counted(stamp_ns, "link", name, n) for name, n in counts.items()])
+    threading.Thread(target=work, daemon=True).start()
 
 
 def inspect_network(host: str) -> Near | None:
     """Find the netem qdiscs of this network namespace and its route to a host (IPv4 address)."""
     from cloudrc.link.sidecar import look_near
 
-    programs = Programs()
-    try:
-        return look_near(programs, host)
-    finally:
-        programs.close()
+    return look_near(run_tool, host)
 
 
 class LinkStatusSource:
-    """Describe the state of a sidecar as JSON; any thread may call the methods."""
+    """Describes the state of a sidecar as JSON; any thread may call `text`."""
 
     def __init__(
         self,
@@ -231,21 +190,31 @@ class LinkStatusSource:
         self._lock, self._text, self._valid_until = threading.Lock(), EMPTY_STATUS, -STATUS_PERIOD
 
     def text(self) -> str:
-        """Return the state as JSON; return the previous answer if tc or ip hangs."""
+        """Return the state as JSON; ask tc and ip at most once a second."""
         from cloudrc.link.sidecar import write_told
 
-        if not self._lock.acquire(timeout=STATUS_PERIOD):
-            return self._text
-        try:
+        with self._lock:
             if self._clock() >= self._valid_until:
                 status, peer = self._sidecar.told(), self._sidecar.peer
-                self._text = EMPTY_STATUS
                 if status is not None and peer is not None:
                     self._text = write_told(replace(status, near=self._look(peer[0])))
                 self._valid_until = self._clock() + STATUS_PERIOD
             return self._text
-        finally:
-            self._lock.release()
+
+
+def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) -> Answer:
+    """Run a program to its end in a new process."""
+    from cloudrc.link.netem import NOT_FOUND, Answer
+
+    try:
+        done = subprocess.run(
+            words, capture_output=True, text=True, env=environment, timeout=TOOL_TIMEOUT
+        )
+    except FileNotFoundError:
+        return Answer(NOT_FOUND, "", "")
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return Answer(1, "", str(error))
+    return Answer(done.returncode, done.stdout, done.stderr)
 
 
 class Programs:
@@ -270,7 +239,7 @@ class Programs:
                     return self._ask(" ".join(words[3:]), lists=True)
         except OSError:  # killed, or too old for -batch: start one for this command
             self.close()
-        return self._once(words)
+        return run_tool(words, self._environment)
 
     def close(self) -> None:
         """End the lasting tc process, if there is one."""
@@ -278,22 +247,6 @@ class Programs:
             self._tc.kill()
             self._tc.communicate()
             self._tc = None
-
-    def _once(self, words: Sequence[str]) -> Answer:
-        from cloudrc.link.netem import NOT_FOUND, Answer
-
-        environment = self._environment
-        try:
-            done = subprocess.run(
-                words, capture_output=True, text=True, env=environment, timeout=TOOL_TIMEOUT
-            )
-        except FileNotFoundError:
-            return Answer(NOT_FOUND, "", "")
-        except OSError as error:  # no permission, or the limit of processes is reached
-            return Answer(1, "", error.strerror or str(error))
-        except subprocess.TimeoutExpired:
-            return Answer(1, "", f"no answer within {TOOL_TIMEOUT:g} s")
-        return Answer(done.returncode, done.stdout, done.stderr)
 
     def _ask(self, line: str, *, lists: bool) -> Answer:
         """Send a line to the lasting tc; raise an OSError if tc does not answer."""

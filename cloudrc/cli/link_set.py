@@ -6,7 +6,6 @@ import argparse
 import json
 import secrets
 import sys
-from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -39,6 +38,8 @@ examples:
 KEY is a key of a direction in a profile file. With --profile, time lines start
 anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
+COLUMNS = ("delay_ms", "jitter_ms", "distribution", "loss", "rate_kbit")
+"""Keys of a direction that have their own columns in the table."""
 LOCAL_TIMEOUT = 5.0
 """Time limit for a local relay to apply a change [s]; a relay needs about 0.2 s."""
 
@@ -148,6 +149,7 @@ def _row(state: LinkState) -> tuple[str, ...]:
     delay, jitter, loss, rate = (
         asked.get(key) or 0.0 for key in ("delay", "jitter", "loss", "rate")
     )
+    others = (_describe(key, own[key]) for key in own if key not in COLUMNS)
     return (
         state.direction,
         state.shaper,
@@ -155,18 +157,12 @@ def _row(state: LinkState) -> tuple[str, ...]:
         f"{jitter * 1e3:g} ms" + (f" {own.get('distribution', 'uniform')}" if jitter else ""),
         f"{loss * 100:.3g} %",
         f"{rate * 1e-3:g} kbit/s" if rate else "-",
-        ", ".join(_other_settings(own)) or "-",
+        ", ".join(others) or "-",
     )
 
 
-def _other_settings(own: Mapping[str, Any]) -> Iterator[str]:
-    """Name the settings beyond delay, loss and rate: the time line and further impairments."""
-    yield from (f"{len(own[key])} {key}" for key in ("changes", "blackouts") if own.get(key))
-    if own.get("trace"):
-        yield f"trace {Path(own['trace']).name}"
-    shares = ("duplicate", "reorder", "corrupt")
-    yield from (f"{key} {own[key] * 100:.3g} %" for key in shares if own.get(key))
-    if own.get("correlation"):
-        yield f"correlation {own['correlation']:g}"
-    if own.get("keep_order"):
-        yield "order kept"
+def _describe(key: str, value: Any) -> str:
+    """Describe a further setting: of a time line the number of entries, of a file the name."""
+    if isinstance(value, list):
+        return f"{len(value)} {key}"
+    return f"{key} {Path(value).name if isinstance(value, str) else value}"

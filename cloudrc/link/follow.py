@@ -212,10 +212,7 @@ class PeerName:
     """
 
     def __init__(
-        self,
-        peer: Address,
-        resolve: Callable[[str], Sequence[str]],
-        log: Callable[[str], None],
+        self, peer: Address, resolve: Callable[[str], Sequence[str]], log: Callable[[str], None]
     ) -> None:
         """Set up; `resolve` returns the addresses of a name or raises an OSError."""
         self._name, self._port = peer

@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import pairwise
@@ -30,12 +30,14 @@ from statistics import fmean, median
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import Row, decimals_of, looks_lost, read_rows
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
+Floats: TypeAlias = NDArray[np.float64]
 Entry: TypeAlias = tuple[float, float | None]
 """Time of sending [s] and delay [s], None if the packet was lost."""
 LONGEST = 5.0
@@ -54,7 +56,6 @@ HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
 )
-_CLOCKS = "the two clocks differ; synchronise them, or take half of each round trip (--halve-rtt)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +98,6 @@ class Log:
         entries: The packets in the order of the source.
         counts: What was left out, merged or changed -> how often.
         unusable: One reason for each row that cannot be used.
-        clocks: What the user should do if the two clocks differ.
         gap: Shortest gap, and shortest jump back, in median times between packets [1].
     """
 
@@ -106,7 +106,6 @@ class Log:
     counts: Counter[str] = field(default_factory=Counter)
     unusable: list[str] = field(default_factory=list)
     halved: bool = False
-    clocks: str = _CLOCKS
     gap: int = GAP
 
     def packets(self) -> Packets:
@@ -115,59 +114,57 @@ class Log:
         Raises a BadInputError if more than 1 % of the rows cannot be used or repeat the time of an
         earlier row, if no packet arrived, if a delay is negative, or if the times jump back.
         """
-        self._refuse_beyond_limit(len(self.unusable), self.unusable[0] if self.unusable else "")
+        self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
         arrived = [delay for _, delay in self.entries if delay is not None]
         if not arrived:
-            raise BadInputError(
-                f"{self.name}: no packet arrived; give a log with at least one reply"
-            )
+            raise self.error("no packet arrived; give a log with at least one reply")
         self.refuse_early(min(arrived))
-        self._refuse_steps()
-        unique = dict(reversed(self.entries))  # of packets with the same time the first remains
-        repeated = len(self.entries) - len(unique)
-        same = "have the same time as another one; give times with more digits"
-        self._refuse_beyond_limit(
-            repeated, f"{self.name}: {repeated} of {len(self.entries)} packets {same}"
-        )
         times = np.array([sent for sent, _ in self.entries])
-        late = int(np.sum(times < np.maximum.accumulate(times)))
-        self.counts["out of order, sorted"] += late
+        self._refuse_steps(times)
+        unique = dict(reversed(self.entries))  # of packets with the same time the first remains
+        repeated = len(times) - len(unique)
+        same = f"{repeated} of {len(times)} packets have the same time as another one"
+        self._refuse_beyond_limit(repeated, f"{self.name}: {same}; give times with more digits")
+        self.counts["out of order, sorted"] += int(np.sum(times < np.maximum.accumulate(times)))
         self.counts["left out, at the time of another one"] += repeated
         self.counts["left out, unreadable"] += len(self.unusable)
         notes = [f"{count} {what}" for what, count in self.counts.items() if count]
         sent, delays = zip(*sorted(unique.items(), key=itemgetter(0)), strict=True)
-        return Packets(sent, delays, (*notes, *self._gaps(sent)), self.halved)
+        steps = np.diff(sent)
+        if steps.max(initial=0.0) > self._far(steps):
+            notes.append(
+                f"nothing sent for {steps.max():.4g} s after packet {steps.argmax() + 1}: a pause, "
+                "two sessions in one log, or a step of the clock"
+            )
+        return Packets(sent, delays, tuple(notes), self.halved)
+
+    def error(self, text: str) -> BadInputError:
+        """Make an error that begins with the name of the log."""
+        return BadInputError(f"{self.name}: {text}")
 
     def refuse_early(self, least: float) -> None:
         """Refuse a log whose shortest delay, `least` [s], is negative."""
         if least < 0.0:
-            early = f"a packet arrived {-least * 1e3:.4g} ms before it was sent"
-            raise BadInputError(f"{self.name}: {early}: {self.clocks}")
-
-    def _refuse_steps(self) -> None:
-        """Refuse times that jump far back one to three times: sorting would mix two sessions."""
-        steps = [after - before for (before, _), (after, _) in pairwise(self.entries)]
-        far = max(GAP_MIN, self.gap * median([abs(step) for step in steps] or [0.0]))
-        back = [row for row, step in enumerate(steps, 1) if step < -far]
-        if 1 <= len(back) <= STEPS_MAX:
-            raise BadInputError(
-                f"{self.name}: after row {back[0]} the times go back by "
-                f"{-steps[back[0] - 1]:.4g} s: a step of the clock, or two sessions in one log; "
-                "give the rows before or after it"
+            raise self.error(
+                f"a packet arrived {-least * 1e3:.4g} ms before it was sent: the two clocks differ;"
+                " synchronise them, or use round trips and take half of each (--halve-rtt)"
             )
 
-    def _gaps(self, times: Sequence[float]) -> list[str]:
-        """Report the longest time without a packet, if it is unusual for this log."""
-        steps = [after - before for before, after in pairwise(times)]
-        longest = max(steps, default=0.0)
-        if longest <= max(GAP_MIN, self.gap * median(steps or [0.0])):
-            return []
-        return [
-            f"nothing sent for {longest:.4g} s after packet {steps.index(longest) + 1}: a pause, "
-            "two sessions in one log, or a step of the clock"
-        ]
+    def _refuse_steps(self, times: Floats) -> None:
+        """Refuse times that jump far back one to three times: sorting would mix two sessions."""
+        steps = np.diff(times)
+        back = np.flatnonzero(steps < -self._far(steps))
+        if 1 <= len(back) <= STEPS_MAX:
+            raise self.error(
+                f"after row {back[0] + 1} the times go back by {-steps[back[0]]:.4g} s: a step of "
+                "the clock, or two sessions in one log; give the rows before or after it"
+            )
 
-    def _refuse_beyond_limit(self, count: int, reason: str) -> None:
+    def _far(self, steps: Floats) -> float:
+        """Return the time above which a gap or a jump back is unusual for this log [s]."""
+        return max(GAP_MIN, self.gap * float(np.median(np.abs(steps)))) if len(steps) else GAP_MIN
+
+    def _refuse_beyond_limit(self, count: int, reason: str = "") -> None:
         rows = len(self.entries) + len(self.unusable)
         if count > UNUSABLE_MAX * rows:
             more = f" ({count} of {rows} rows cannot be used)" if count > 1 else ""
@@ -235,18 +232,18 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
         document = json.loads(text)
         trips = document["round_trips"]
         if direction is None and not halve:
-            raise BadInputError(
-                f"{name}: irtt measures both directions; choose --direction uplink (sent by its "
-                "client) or downlink"
+            raise log.error(
+                "irtt measures both directions; choose --direction uplink (sent by its client) or "
+                "downlink"
             )
         _compare_counts(document.get("stats") or {}, trips, log)
         if not halve:
             _check_clocks([trip for trip in trips if _arrived(trip)], log)
         log.entries = _irtt_entries(trips, "halves" if halve or not direction else direction)
     except _MISSHAPEN as error:
-        raise BadInputError(
-            f"{name}: not a log of irtt ({type(error).__name__}: {error}); "
-            "give the file that 'irtt client -o FILE.json' writes"
+        raise log.error(
+            f"not a log of irtt ({type(error).__name__}: {error}); give the file that 'irtt client "
+            "-o FILE.json' writes"
         ) from None
     return log.packets()
 
@@ -263,9 +260,9 @@ def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log
     sent = int(stats.get("packets_sent", len(trips)))
     received = int(stats.get("packets_received", arrived))
     if sent != len(trips) or received not in (arrived, arrived + copies):
-        raise BadInputError(
-            f"{log.name}: its counts are {sent} sent and {received} received, but it has "
-            f"{len(trips)} packets and {arrived} replies; give the whole file of irtt"
+        raise log.error(
+            f"its counts are {sent} sent and {received} received, but it has {len(trips)} packets "
+            f"and {arrived} replies; give the whole file of irtt"
         )
 
 
@@ -279,14 +276,16 @@ def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
         stamps = [trip["timestamps"][end][event] for trip in arrived]
         if not all("monotonic" in stamp for stamp in stamps):
             continue
-        for before, after in pairwise(stamps):
-            passed = int(after["monotonic"]) - int(before["monotonic"])
-            step = int(after["wall"]) - int(before["wall"]) - passed
-            if abs(step) > 1_000_000 + passed // 1000:  # 1 ms, and 0.1 % for a clock in adjustment
-                raise BadInputError(
-                    f"{log.name}: the clock of irtt's {end} made a step of {step * 1e-6:.4g} ms; "
-                    "measure again, or take half of each round trip (--halve-rtt)"
-                )
+        passed, wall = (
+            np.diff([int(stamp[clock]) for stamp in stamps]) for clock in ("monotonic", "wall")
+        )
+        # 1 ms, and 0.1 % for a clock in adjustment.
+        far = np.flatnonzero(np.abs(wall - passed) > 1_000_000 + passed // 1000)
+        if len(far):
+            raise log.error(
+                f"the clock of irtt's {end} made a step of {(wall - passed)[far[0]] * 1e-6:.4g} "
+                "ms; measure again, or take half of each round trip (--halve-rtt)"
+            )
 
 
 _IRTT_NAMES = {
@@ -305,23 +304,19 @@ def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     on the downlink is estimated with the median uplink delay.
     """
     other, key = _IRTT_NAMES[what]
-    clients = [trip["timestamps"]["client"]["send"] for trip in trips]
-    clock = "monotonic" if all("monotonic" in stamps for stamps in clients) else "wall"
-    usual = 0
+    part, usual = 0.5 if what == "halves" else 1.0, 0
     if what == "downlink":
         usual = round(median([int(t["delay"]["send"]) for t in trips if _arrived(t)] or [0]))
-    entries: list[tuple[int, int | None]] = []
-    for trip, stamps in zip(trips, clients, strict=True):
+    entries: list[tuple[int, float | None]] = []
+    for trip in trips:
         if str(trip["lost"]).lower() != other:
-            sent, delay = int(stamps[clock]), int(trip["delay"][key]) if _arrived(trip) else None
+            stamps, delays = trip["timestamps"]["client"]["send"], trip["delay"]
+            sent, arrived = int(stamps.get("monotonic", stamps.get("wall"))), _arrived(trip)
             if what == "downlink":
-                sent += usual if delay is None else int(trip["delay"]["send"])
-            entries.append((sent, delay))
-    start, part = min((sent for sent, _ in entries), default=0), 0.5 if what == "halves" else 1.0
-    return [
-        ((sent - start) * 1e-9, None if delay is None else delay * part * 1e-9)
-        for sent, delay in entries
-    ]
+                sent += int(delays["send"]) if arrived else usual
+            entries.append((sent, int(delays[key]) * part * 1e-9 if arrived else None))
+    start = min((sent for sent, _ in entries), default=0)
+    return [((sent - start) * 1e-9, delay) for sent, delay in entries]
 
 
 SCALES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -360,7 +355,6 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     if not unit:
         raise BadInputError(f"{name}: {_no_unit(delay)}")
     log = Log(name, halved=delay.startswith("rtt"))
-    log.clocks = "the two clocks differ; synchronise them, or record round trips as rtt_ms"
     if log.halved and not halve:
         raise BadInputError(f"{name}, column {delay}: has round trips; {HALVE}")
     loss = next((column for column in LOSSES if column in columns), None)
@@ -511,21 +505,20 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
         BadInputError: If `halve` is false, if the log `name` has no replies, no time stamps, too
             many packets or several sessions, or if it contradicts its summary.
     """
-    if not halve:
-        raise BadInputError(f"{name}: ping measures round trips; {HALVE}")
     log = Log(name, halved=True, gap=GAP_OF_PING)
+    if not halve:
+        raise log.error(f"ping measures round trips; {HALVE}")
     ping = _Ping(lines, log)
     if not ping.replies:
         nothing = f"{name}: has no replies; give the output of: ping -D -O HOST"
         raise BadInputError([*log.unusable, nothing][0])
     first, last = ping.check_range()
-    period = ping.period()
     known = np.array(sorted(ping.replies))
     sent = np.array([ping.replies[number][0] for number in known])
     numbers = np.arange(first, last + 1)
     # Without a reply, the time of sending lies on a straight line between the replies around.
     outside = np.minimum(numbers - known[0], 0) + np.maximum(numbers - known[-1], 0)
-    times = np.interp(numbers, known, sent) + outside * period
+    times = np.interp(numbers, known, sent) + outside * ping.period()
     for number, at in zip(numbers.tolist(), times.tolist(), strict=True):
         reply = ping.replies.get(number)
         log.entries.append((at, reply[1] / 2 if reply else None))
@@ -541,13 +534,13 @@ class _Ping:
 
     def __init__(self, lines: list[str], log: Log) -> None:
         self.replies: dict[int, tuple[float, float]] = {}
-        self._log, self._lines = log, lines
+        self._log, self._text = log, "\n".join(lines[:1000])
         self._told: dict[int, float] = {}  # number -> time stamp of its line, 0 without one [s]
         self._trips: list[float] = []  # with those of duplicates [s]
         self._summaries: list[tuple[int, int]] = []  # packets sent and received
         self._headers, self._base = 0, 1  # lines that begin a log; first number of this ping
         self._wraps = self._newest = 0
-        self._day = self._last_stamp = 0.0
+        self._midnight = self._clock = 0.0
         for line in lines:
             if (number := _NUMBER.search(line)) is not None:
                 self._read_packet(line, number)
@@ -561,25 +554,24 @@ class _Ping:
             log.unusable.append(f"{log.name}: {reason}; run: LC_ALL=C ping -D -O HOST")
             return
         if trip and stamp is None:
-            text = "\n".join(self._lines[:1000])
-            remedy = next(words for kind, words in _NO_STAMPS.items() if re.search(kind, text))
-            raise BadInputError(f"{log.name}: its lines have no [time]; {remedy}")
+            kinds = _NO_STAMPS.items()
+            remedy = next(words for kind, words in kinds if re.search(kind, self._text))
+            raise log.error(f"its lines have no [time]; {remedy}")
         round_trip = float(trip[1].replace(",", ".")) * 1e-3 if trip else 0.0
         self._trips += [round_trip] if trip else []
         if "DUP!" in line:
             log.counts["duplicates left out"] += 1
             return
         count = self._unwrap(int(number[1] or number[2]))
-        log.counts["out of order, sorted"] += bool(trip) and count < self._newest
-        self._newest = max(self._newest, count)
-        at = self._time(stamp) if stamp else 0.0
-        if trip and count in self.replies:
-            self._refuse_sessions(f"number {count} comes twice")
-        if trip:
-            self.replies[count] = at - round_trip, round_trip
-        self._told[count] = at
         if count == 0 or number[2]:
             self._base = 0
+        self._told[count] = at = self._time(stamp) if stamp else 0.0
+        if trip:
+            log.counts["out of order, sorted"] += count < self._newest
+            if count in self.replies:
+                self._refuse_sessions(f"number {count} comes twice")
+            self.replies[count] = at - round_trip, round_trip
+        self._newest = max(self._newest, count)
 
     def _unwrap(self, number: int) -> int:
         """Count on after 65535, where ping continues with 0; a late reply may be from before."""
@@ -593,13 +585,13 @@ class _Ping:
         """Convert a time stamp to the time since 1970, or since the midnight before the log [s]."""
         if stamp["unix"]:
             return float(stamp["unix"])
-        day = datetime.fromisoformat((stamp["date"] or "1970-01-01") + "T00:00:00+00:00")
         clock = int(stamp["hour"]) * 3600 + int(stamp["minute"]) * 60 + float(stamp["second"])
-        at = day.timestamp() + clock + self._day
-        if not stamp["date"] and self._last_stamp - at > 43_200:  # midnight
-            at, self._day = at + 86_400.0, self._day + 86_400.0
-        self._last_stamp = at
-        return at
+        if stamp["date"]:
+            return datetime.fromisoformat(stamp["date"] + "T00:00:00+00:00").timestamp() + clock
+        if self._clock - clock > 43_200:  # midnight
+            self._midnight += 86_400.0
+        self._clock = clock
+        return self._midnight + clock
 
     def _read_other(self, line: str) -> None:
         """Read a line without a sequence number: header, summary, or another line."""
@@ -610,9 +602,9 @@ class _Ping:
         elif mean is not None:
             told, read = float(mean[1]), fmean(self._trips or [0.0]) * 1e3
             if abs(told - read) > 0.1 + 0.01 * told:
-                raise BadInputError(
-                    f"{log.name}: its summary gives a mean of {told:g} ms, but its replies have "
-                    f"{read:.4g} ms; give the whole log as ping wrote it"
+                raise log.error(
+                    f"its summary gives a mean of {told:g} ms, but its replies have {read:.4g} ms; "
+                    "give the whole log as ping wrote it"
                 )
         if summary is not None:
             sent, received = (int(word) for word in summary.groups() if word)
@@ -628,15 +620,15 @@ class _Ping:
         first, last = min(self._told), max(self._told)
         for sent, received in self._summaries:
             if received != len(self.replies) or sent < last - self._base + 1:
-                raise BadInputError(
-                    f"{self._log.name}: its summary counts {sent} sent and {received} received, but"
-                    f" it has {len(self.replies)} replies up to number {last}; give the whole log"
+                raise self._log.error(
+                    f"its summary counts {sent} sent and {received} received, but it has "
+                    f"{len(self.replies)} replies up to number {last}; give the whole log"
                 )
             first, last = self._base, self._base + sent - 1
         if last - first >= PACKETS_MAX:
-            raise BadInputError(
-                f"{self._log.name}: its sequence numbers span {last - first + 1} packets, more than"
-                f" {PACKETS_MAX}; give the output of one ping"
+            raise self._log.error(
+                f"its sequence numbers span {last - first + 1} packets, more than {PACKETS_MAX}; "
+                "give the output of one ping"
             )
         return first, last
 
@@ -648,7 +640,6 @@ class _Ping:
         return max(median([(b - a) / (m - n) for (n, a), (m, b) in pairs] or [1.0]), 1e-6)
 
     def _refuse_sessions(self, sign: str) -> None:
-        raise BadInputError(
-            f"{self._log.name}: has more than one session of ping ({sign}); give the lines of one "
-            "session"
+        raise self._log.error(
+            f"has more than one session of ping ({sign}); give the lines of one session"
         )

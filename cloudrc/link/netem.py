@@ -12,7 +12,7 @@ removes or changes the qdiscs of `Netem`, the log says so and a metric counts th
 netem draws jitter from a table of at most 16,384 integers of 16 bits; the entry 8192 means one
 times the jitter. The tables that come with tc differ from the model's distributions.
 
-Source: tc-prio(8), tc-netem(8), tc-u32(8), tc-flower(8); iproute2 netem/README.distribution; Linux,
+Source: tc-prio(8), tc-netem(8), tc-u32(8); iproute2 netem/README.distribution; Linux,
 net/sched/sch_netem.c (tabledist).
 """
 
@@ -25,10 +25,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from hashlib import blake2b
 from itertools import pairwise
-from math import ceil, inf, sqrt
+from math import ceil, inf
 from pathlib import Path
-from statistics import NormalDist, fmean
+from statistics import NormalDist
 from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 from cloudrc.link.draws import PARETO_CUT
@@ -43,12 +46,10 @@ PERIOD_NS = 1_000_000_000
 """Time between two checks of the qdiscs [ns]."""
 STEP_NS = 5_000_000
 """Shortest time between two steps of the qdisc [ns]; steps that follow sooner are skipped."""
-LATE_NS = 20_000_000
-"""A step counts as late if its lateness is above this [ns]: two periods of the loop."""
 LIMIT = 10_000
 """Limit of packets in a qdisc without a bottleneck [1], as in the relay."""
-DELAY_MAX_NS = 274_000_000_000
-"""Longest delay that tc accepts [ns]: ticks of 64 ns in 32 bits."""
+DELAY_MAX_MS = 274_000
+"""Longest delay that tc accepts [ms]: ticks of 64 ns in 32 bits."""
 ENTRIES = 4096
 """Number of entries of a table [1]."""
 STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
@@ -73,6 +74,7 @@ _PACKETS = 1_000
 """Assumed packet rate without a bottleneck [1/s], higher than that of a tunnel or a probe."""
 # The kernel's own default for three bands: nothing falls into the fourth by its type of service.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
+_MODULES = ("sch_netem", "sch_prio", "cls_u32")
 _INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
 
 
@@ -84,6 +86,7 @@ class Answer(NamedTuple):
     error: str
 
 
+Floats: TypeAlias = NDArray[np.float64]
 Run: TypeAlias = Callable[[Sequence[str]], Answer]
 """Function that runs a program to its end."""
 
@@ -115,30 +118,25 @@ class Iproute2:
 
 def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
     """Make the error for a failed call: the cause and the remedy."""
-    text = answer.error or answer.output
-    kind = next((word for word in words if word in ("netem", "prio")), "")
-    if kind and "change" not in words and "No such file or directory" in text:
-        text = "qdisc kind is unknown"
-    module = f"sch_{kind or 'netem'}"
-    known = {
-        "qdisc kind is unknown": (
-            f"this kernel has no {module}; {_INSTEAD}, or use nodes whose kernel has it "
-            f"('modprobe {module}' there) and a namespace for privileged pods"
-        ),
-        "classifier not found": (
-            f"this kernel has neither cls_u32 nor cls_flower; {_INSTEAD}, or use another node"
-        ),
-        "Operation not permitted": (
+    text = " ".join((answer.error or answer.output).split())
+    unknown = "kind is unknown", "classifier not found", "No such file"
+    if answer.code == NOT_FOUND:
+        cause = f"no program {program} (package iproute2); install it, or {_INSTEAD}"
+    elif "Operation not permitted" in text:
+        cause = (
             "tc may not change the network of this container; give it NET_ADMIN and uid 0, or "
             f"{_INSTEAD}"
-        ),
-    }
-    line = " ".join(text.split()) or f"exit code {answer.code}"
-    said = f"'{program} {' '.join(words)}' failed: {line}; {_INSTEAD}"
-    said = next((remedy for sign, remedy in known.items() if sign in text), said)
-    if answer.code == NOT_FOUND:
-        said = f"no program {program} (package iproute2); install it, or {_INSTEAD}"
-    return MissingPrerequisiteError(said)
+        )
+    elif "add" in words and any(sign in text for sign in unknown):
+        cause = (
+            f"this kernel lacks {', '.join(_MODULES[:-1])} or {_MODULES[-1]}; {_INSTEAD}, or use "
+            f"nodes whose kernel has them ('modprobe -a {' '.join(_MODULES)}' there) and a "
+            "namespace for privileged pods"
+        )
+    else:
+        reason = text or f"exit code {answer.code}"
+        cause = f"'{program} {' '.join(words)}' failed: {reason}; {_INSTEAD}"
+    return MissingPrerequisiteError(cause)
 
 
 def may_shape(status: str) -> bool:
@@ -151,10 +149,10 @@ def may_shape(status: str) -> bool:
     return bool(uid and effective and int(effective[1], 16) >> 12 & 1)
 
 
-_QUANTILES: dict[str, Callable[[float], float]] = {
+_QUANTILES: dict[str, Callable[[Floats], Floats]] = {
     "uniform": lambda share: 2.0 * share - 1.0,
-    "normal": NormalDist().inv_cdf,
-    "pareto": lambda share: float((PARETO_CUT + (1.0 - PARETO_CUT) * (1.0 - share)) ** (-1 / 3)),
+    "normal": np.vectorize(NormalDist().inv_cdf),
+    "pareto": lambda share: (PARETO_CUT + (1.0 - PARETO_CUT) * (1.0 - share)) ** (-1 / 3),
 }
 
 
@@ -164,13 +162,11 @@ def table(distribution: str) -> list[int]:
     Returns:
         Quantile · 8192 / STRETCH in units of the jitter, rounded, rising, shape (4096,).
     """
-    quantile = _QUANTILES[distribution]
-    values = [quantile((index + 0.5) / ENTRIES) for index in range(ENTRIES)]
+    values = _QUANTILES[distribution]((np.arange(ENTRIES) + 0.5) / ENTRIES)
     if distribution != "uniform":  # mean 0, standard deviation 1
-        mean = fmean(values)
-        deviation = sqrt(fmean([(value - mean) ** 2 for value in values]))
-        values = [(value - mean) / deviation for value in values]
-    return [round(value * _ONE / STRETCH[distribution]) for value in values]
+        values = (values - values.mean()) / values.std()
+    entries: list[int] = np.rint(values * _ONE / STRETCH[distribution]).astype(int).tolist()
+    return entries
 
 
 def stretch(profile: DirectionProfile) -> int:
@@ -209,25 +205,27 @@ def _write(folder: Path, name: str, entries: Sequence[int]) -> None:
 def check(profile: DirectionProfile) -> None:
     """Raise a BadInputError if netem cannot realise a profile; the text names the reason."""
     pieces = Timeline(profile).pieces
+    losses = [piece.loss for piece in pieces]
+    chances = [chance for loss in losses for chance in _chances(loss)]
+    chances += [profile.duplicate, profile.reorder, profile.corrupt]
+    slowest_ms = max(piece.delay_ns for piece in pieces) * 1e-6
     found = ""
     if profile.trace is not None and profile.trace.loop:
         found = "loop (a trace that begins again)"
-    if any(isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces):
+    if any(isinstance(loss, GilbertElliott) and loss.delay_bad for loss in losses):
         found = "loss.delay_bad_ms (more delay while a burst of losses lasts)"
     if any(piece.rate and piece.jitter for piece in pieces) and not profile.keep_order:
         found = "rate_kbit with jitter_ms but without keep_order (overtaking behind a bottleneck)"
     if any(0.0 < (piece.rate or inf) < _RATE_MIN for piece in pieces):
         found = f"rate_kbit below {_RATE_MIN * 1e-3:g} (tc takes it for no limit)"
-    chances = [chance for piece in pieces for chance in _chances(piece.loss)]
-    chances += [profile.duplicate, profile.reorder, profile.corrupt]
     if any(0.0 < chance < _CHANCE_MIN for chance in chances):
         found = "a probability below 2**-32 (tc takes it for 0)"
-    if (slowest := max(piece.delay_ns for piece in pieces)) > DELAY_MAX_NS:
-        found = f"delay_ms above 274000 (its clock ends there, here {slowest * 1e-6:g} ms)"
+    if slowest_ms > DELAY_MAX_MS:
+        found = f"delay_ms above {DELAY_MAX_MS} (its clock ends there, here {slowest_ms:g} ms)"
     for one in profile.blackouts:
         if one.duration * 1e9 < STEP_NS:
-            found = f"blackouts shorter than {STEP_NS * 1e-6:g} ms (here {one.duration * 1e3:g} ms "
-            found += f"at {one.start:g} s)"
+            here = f"here {one.duration * 1e3:g} ms at {one.start:g} s"
+            found = f"blackouts shorter than {STEP_NS * 1e-6:g} ms ({here})"
     if found:
         raise BadInputError(
             f"netem cannot do {found}; set link.mode=relay, which can, or leave it out"
@@ -339,10 +337,15 @@ def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
 
 
 class Steps:
-    """Counts the steps of a qdisc along a time line."""
+    """Counts the steps of a qdisc along a time line.
+
+    Attributes:
+        applied: Number of steps that were taken.
+        passed_over: Number of steps that were skipped, because the next one was due.
+    """
 
     def __init__(self) -> None:
-        self._applied = self._late = self._passed_over = 0
+        self.applied = self.passed_over = 0
         self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
 
     def note(self, lateness_ns: int, passed_over: int) -> None:
@@ -350,36 +353,29 @@ class Steps:
 
         The lateness [ns] is the time from when the step was due until tc reports it in force.
         """
-        self._applied += 1
-        self._late += lateness_ns > LATE_NS
-        self._passed_over += passed_over
+        self.applied += 1
+        self.passed_over += passed_over
         self._lateness_ns.append(lateness_ns)
 
     def counts(self) -> dict[str, int]:
-        """Return the number of steps and their lateness [ns]; empty before the first."""
-        ordered = sorted(self._lateness_ns)
-        if not ordered:
+        """Return the median and the 99th percentile of the lateness [ns]; empty before a step."""
+        if not self._lateness_ns:
             return {}
-        return {
-            "steps": self._applied,
-            "steps_late": self._late,
-            "steps_passed_over": self._passed_over,
-            "step_lateness_p50_ns": ordered[(len(ordered) - 1) // 2],
-            "step_lateness_p99_ns": ordered[ceil(0.99 * (len(ordered) - 1))],
-        }
+        found = np.quantile(self._lateness_ns, (0.5, 0.99), method="inverted_cdf").tolist()
+        return {"step_lateness_p50_ns": found[0], "step_lateness_p99_ns": found[1]}
 
     def in_words(self) -> str:
         """Describe how late the steps of the time line were; needs at least one step."""
-        applied, late, over, median_ns, worst_ns = self.counts().values()
+        median_ns, worst_ns = self.counts().values()
         return (
-            f"{applied} steps of the time line, late by {median_ns * 1e-6:.2f} ms in the median "
-            f"and {worst_ns * 1e-6:.2f} ms at the 99th percentile, {late} above "
-            f"{LATE_NS * 1e-6:g} ms, {over} passed over"
+            f"{self.applied} steps of the time line, late by {median_ns * 1e-6:.2f} ms in the "
+            f"median and {worst_ns * 1e-6:.2f} ms at the 99th percentile, {self.passed_over} "
+            "passed over"
         )
 
 
 class Netem:
-    """One direction of the link in the kernel; a `Shaper`.
+    """One direction of the link in the kernel.
 
     Attributes:
         steps: Counts and lateness of the steps along the time line so far.
@@ -421,7 +417,14 @@ class Netem:
             write_measured(self._tables, profile)
 
     def follow_peer(self, peer: Address) -> Address:
-        """Shape datagrams to this peer from now on, on the interface that leads to the peer."""
+        """Shape datagrams to this peer from now on, on the interface that leads to the peer.
+
+        Returns:
+            The route: the address to which this pod's tunnel end has to send.
+
+        Raises:
+            CloudrcError: If netem cannot realise the profile, or the kernel refuses.
+        """
         device = self._iproute2.device(peer[0])
         if device != self._device:
             self.close()
@@ -437,7 +440,11 @@ class Netem:
         return peer
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on, as `Shaper.follow_profile`."""
+        """Shape by this profile from now on; its time line starts now (`restart`) or continues.
+
+        Datagrams in flight are not lost. If netem cannot realise the profile, the old profile stays
+        in force, and a CloudrcError is raised.
+        """
         check(profile)
         qdiscs = self._look()
         if self._damage:
@@ -514,13 +521,7 @@ class Netem:
                 f"cloudrc's; remove it ('tc qdisc del {' '.join(place)}'), or set link.mode=relay"
             )
         if not _is_ours(root):
-            try:
-                self._iproute2.tc("qdisc", "add", *place, "handle", ROOT, *_PRIO)
-            except MissingPrerequisiteError:
-                # A kernel without prio mostly lacks netem, too, which is what people look for.
-                self._iproute2.tc("qdisc", "add", *place, "netem")
-                self._iproute2.tc("qdisc", "del", *place)
-                raise
+            self._iproute2.tc("qdisc", "add", *place, "handle", ROOT, *_PRIO)
         self._apply("add" if leaf_of(qdiscs) is None else "change")
 
     def _step(self) -> None:
@@ -562,18 +563,12 @@ class Netem:
         old = sorted({int(one["pref"]) for one in listed})
         new = next(number for number in range(1, len(old) + 2) if number not in old)
         host, port = peer
-        u32 = f"u32 match ip protocol 17 0xff match ip dst {host}/32 match ip dport {port} 0xffff"
-        flower = f"flower ip_proto udp dst_ip {host} dst_port {port}"
-        try:
-            self._filter("add", new, "protocol", "ip", *u32.split(), "flowid", BAND)
-        except MissingPrerequisiteError:
-            self._filter("add", new, "protocol", "ip", *flower.split(), "classid", BAND)
+        match = f"ip protocol 17 0xff match ip dst {host}/32 match ip dport {port} 0xffff"
+        place = ("dev", self._device, "parent", ROOT, "pref")
+        words = ("protocol", "ip", "u32", "match", *match.split(), "flowid", BAND)
+        self._iproute2.tc("filter", "add", *place, str(new), *words)
         for number in old:
-            self._filter("del", number)
-
-    def _filter(self, verb: str, number: int, *match: str) -> None:
-        place = ("dev", self._device, "parent", ROOT, "pref", str(number))
-        self._iproute2.tc("filter", verb, *place, *match)
+            self._iproute2.tc("filter", "del", *place, str(number))
 
     def _qdiscs(self) -> list[dict[str, Any]]:
         return self._iproute2.show("qdisc", "show", "dev", self._device)

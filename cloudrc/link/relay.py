@@ -59,7 +59,7 @@ _BITS = 7
 _EARLY = -1
 """Bucket of the datagrams that left before they were due."""
 _RECENT = 10
-"""Number of calls of `Recent.counts` that its percentiles cover [1]."""
+"""Number of calls of `Lanes.recent` that its percentiles cover [1]."""
 _FIFO_PRIORITY = 10
 """Real-time priority [1]: above ordinary processes, below the kernel's own threads (50)."""
 _SWITCH_INTERVAL = 0.0002
@@ -95,24 +95,6 @@ class ReleaseErrors(Counter[int]):
             while wanted and below >= wanted[0][1] * whole:
                 found[wanted.pop(0)[0]] = (start + 1) << shift
         return found
-
-
-class Recent:
-    """Percentiles over the last ten calls of `counts`: ten seconds if called once a second."""
-
-    def __init__(self) -> None:
-        """Start before the first datagram."""
-        self._past: deque[ReleaseErrors] = deque([ReleaseErrors()], maxlen=_RECENT)
-
-    def counts(self, errors: ReleaseErrors) -> dict[str, int]:
-        """Return `released_early` since the beginning, and the recent percentiles [ns], if any.
-
-        `errors` are the counts since the beginning, as a copy that no thread changes any more.
-        """
-        recent = ReleaseErrors(errors - self._past[0]).in_ns()
-        self._past.append(errors)
-        recent.pop("released", None)
-        return {**recent, "released_early": errors[_EARLY]}
 
 
 def ask_for_stamps(one: socket.socket) -> None:
@@ -282,7 +264,8 @@ class Lanes:
     """
 
     def __init__(self, lanes: Sequence[Lane], origin_ns: int | None) -> None:
-        self._lanes, self._recent = tuple(lanes), Recent()
+        self._lanes = tuple(lanes)
+        self._past: deque[ReleaseErrors] = deque([ReleaseErrors()], maxlen=_RECENT)
         for lane in self._lanes:
             lane.origin_ns = origin_ns
 
@@ -334,8 +317,15 @@ class Lanes:
         return dict(outcomes)
 
     def recent(self) -> dict[str, int]:
-        """Return the recent lateness as from `Recent.counts`; call this method once a second."""
-        return self._recent.counts(self.errors())
+        """Return the percentiles [ns] since the tenth call before, and `released_early` in total.
+
+        Call this method once a second: then the percentiles cover ten seconds.
+        """
+        errors = self.errors()
+        recent = ReleaseErrors(errors - self._past[0]).in_ns()
+        self._past.append(errors)
+        recent.pop("released", None)
+        return {**recent, "released_early": errors[_EARLY]}
 
     def errors(self) -> ReleaseErrors:
         """Add up how late the datagrams of all lanes have left."""
@@ -390,7 +380,7 @@ class Relay(Lanes):
 
 
 class RelayShaper(Lanes):
-    """One direction of the link in userspace; a `Shaper`."""
+    """One direction of the link in userspace, with the same methods as `Netem`."""
 
     name = "relay"
 
@@ -409,13 +399,9 @@ class RelayShaper(Lanes):
             OSError: If `listen` is in use, or cannot be reached from `end`.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._inside.bind(listen)
-            if end is not None:
-                self._inside.connect(end)
-        except OSError:
-            self._inside.close()
-            raise
+        self._inside.bind(listen)
+        if end is not None:
+            self._inside.connect(end)
         # The kernel refuses to send from a socket bound to 127.0.0.1 to another machine.
         self._outside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._outside.setblocking(False)
@@ -425,13 +411,17 @@ class RelayShaper(Lanes):
         tighten_slack()
 
     def follow_peer(self, peer: Address) -> Address:
-        """Send to this peer from now on, including the datagrams in flight; return the route."""
+        """Send to this peer from now on, including the datagrams in flight.
+
+        Returns:
+            The route: the address to which this pod's tunnel end has to send.
+        """
         self._peer = peer
         host, port = self._inside.getsockname()
         return host, port
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on, as `Shaper.follow_profile`."""
+        """Shape by this profile from now on; its time line starts now (`restart`) or continues."""
         self.take_in()  # what has arrived until now belongs to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
 

@@ -7,65 +7,41 @@ uses the shaper.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
 from pydantic import TypeAdapter
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
-from cloudrc.link.netem import Iproute2, Run, notes
+from cloudrc.link.netem import Iproute2, Netem, Run, notes
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
-from cloudrc.link.relay import Address
-from cloudrc.link.state import RELEASED_SUFFIX, Change, LinkState, publish, summary, to_text
+from cloudrc.link.relay import Address, RelayShaper
+from cloudrc.link.state import (
+    RELEASED_SUFFIX,
+    STATE_FILE,
+    Change,
+    LinkState,
+    publish,
+    summary,
+    to_text,
+)
+from cloudrc.records import Counted
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: "relay" and "netem" are strict, "auto" uses netem if possible."""
 COUNT_PERIOD_NS = 1_000_000_000
-"""Time between two updates of the metrics [ns]."""
-RELEASED_PERIOD_NS = 2_000_000_000
-"""Time between two publications of how late datagrams left [ns]; an end reads with this period."""
+"""Time between two updates of the metrics, and of the file with `RELEASED_SUFFIX` [ns]."""
 STEP = 0.05
 """Longest time until the thread in `run` sees a new peer or profile [s]."""
 
 
-class Shaper(Protocol):
-    """Shapes the datagrams from this pod's tunnel end to the other pod's: relay or netem."""
-
-    @property
-    def name(self) -> str:
-        """Name as in the setting `link.mode`: "relay" or "netem"."""
-
-    def follow_peer(self, peer: Address) -> Address:
-        """Shape the datagrams to this peer from now on; raise a CloudrcError if that fails.
-
-        Returns:
-            The route: the address to which this pod's tunnel end has to send.
-        """
-
-    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on; datagrams in flight are not lost.
-
-        The time line starts now (`restart`) or continues. If the shaper cannot do this, the old
-        profile stays in force, and a CloudrcError is raised.
-        """
-
-    def step(self, timeout: float) -> None:
-        """Work or wait for about `timeout` [s]."""
-
-    def counts(self) -> dict[str, int]:
-        """Return the number of datagrams so far, by outcome."""
-
-    def released(self) -> dict[str, int]:
-        """Return by how much datagrams left too late, as counts; empty if unknown."""
-
-    def close(self) -> None:
-        """Stop shaping and leave nothing behind."""
-
-
+Shaper: TypeAlias = RelayShaper | Netem
+"""Shapes the datagrams from this pod's tunnel end to the other pod's."""
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 """Function that makes a shaper from conditions and the start of their time line [ns]."""
 
@@ -123,21 +99,7 @@ def read_told(text: str) -> Told:
     return TypeAdapter(Told).validate_json(text)
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Settings of a sidecar: `link.mode`, "uplink" or "downlink", route file and state file.
-
-    The route file holds the address to which this pod's tunnel end has to send.
-    """
-
-    mode: Mode
-    direction: str
-    route: Path
-    state: Path
-
-
-@dataclass(frozen=True, slots=True)
-class Machine:
+class Machine(NamedTuple):
     """Functions and facts of the machine that a sidecar needs.
 
     Attributes:
@@ -145,29 +107,32 @@ class Machine:
         netem: Makes the `Netem`, without touching the network yet.
         may_shape: Whether this process is root with NET_ADMIN.
         clock: Returns the time on the monotonic clock [ns].
-        today: Returns date and time in UTC as text, for reports.
+        wait: Sleeps for a time [s].
+        log: Writes one line to the log.
     """
 
     relay: Make
     netem: Make
     may_shape: bool
     clock: Callable[[], int]
-    today: Callable[[], str]
     wait: Callable[[float], None]
     log: Callable[[str], None]
 
 
-class Watcher(Protocol):
-    """Keeps the metrics of a sidecar."""
+class Metrics(Protocol):
+    """Exports the metrics of a sidecar."""
 
-    def shapes(self, shaper: str) -> None:
-        """Note that this shaper is in force from now on, and that the route is published."""
+    def shaped(self, shaper: str, direction: str, mode: str) -> None:
+        """Set the shaper of a direction from now on."""
 
-    def asked(self, delay: float) -> None:
-        """Note the mean delay [s] that the profile in force requests."""
+    def ready(self, ready: bool) -> None:
+        """Set whether the route is published."""
 
-    def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
-        """Note the number of datagrams so far by outcome; called once a second."""
+    def asked(self, direction: str, delay: float) -> None:
+        """Set the mean delay [s] that the profile in force requests."""
+
+    def see(self, records: Iterable[Counted]) -> None:
+        """Set the number of datagrams so far by outcome; called once a second."""
 
 
 class Sidecar:
@@ -179,18 +144,28 @@ class Sidecar:
     """
 
     def __init__(
-        self, settings: Settings, machine: Machine, profile: Loaded, watcher: Watcher | None = None
+        self,
+        machine: Machine,
+        profile: Loaded,
+        *,
+        mode: Mode,
+        direction: str,
+        route: Path,
+        metrics: Metrics | None = None,
     ) -> None:
+        """Set up; `route` is the file for the address to which this pod's tunnel end has to send.
+
+        The state file is in the same folder. `direction` is "uplink" or "downlink".
+        """
         self.peer: Address | None = None
         self.profile = profile
-        self._settings, self._machine, self._watcher = settings, machine, watcher
-        self._reason = ""
-        self._origin_ns: int | None = None
-        self._state: LinkState | None = None
-        self._published: LinkState | None = None
+        self._machine, self._metrics = machine, metrics
+        self._mode, self._direction, self._route = mode, direction, route
+        self._state_file = route.with_name(STATE_FILE)
+        self._released_file = self._state_file.with_suffix(RELEASED_SUFFIX)
+        self._reason, self._origin_ns, self._number = "", 0, profile.change.number
         self._in_force: tuple[LinkState, DirectionProfile] | None = None
-        self._released, self._released_ns = settings.state.with_suffix(RELEASED_SUFFIX), 0
-        self._number = profile.change.number
+        self._published: LinkState | None = None
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Wait for the peer, then shape, until `stop` returns True.
@@ -198,17 +173,17 @@ class Sidecar:
         Raises:
             CloudrcError: If the mode is strict and its shaper cannot realise the profile.
         """
-        files = self._settings.route, self._released
-        files[0].unlink(missing_ok=True)  # an earlier process may have left one
+        self._route.unlink(missing_ok=True)  # an earlier process may have left one
         while self.peer is None:
             if stop():
                 return
             self._machine.wait(STEP)
+        self._origin_ns = self._machine.clock()
         try:
             while not stop():
                 self._shape(self.peer, stop)
         finally:
-            for file in files:
+            for file in (self._route, self._released_file):
                 file.unlink(missing_ok=True)
 
     def told(self) -> Told | None:
@@ -225,19 +200,18 @@ class Sidecar:
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Shape with one shaper until `stop`, or until a new profile needs another shaper."""
-        profile = self.profile
-        if self._origin_ns is None or (self._state and self._change_of(profile).restart):
-            self._origin_ns = self._machine.clock()
+        profile, machine = self.profile, self._machine
+        if self._in_force and self._change_of(profile).restart:
+            self._origin_ns = machine.clock()
         shaper, route = self._choose(profile, peer)
         try:
-            self._machine.log(
-                f"{shaper.name} shapes the {self._settings.direction} ({self._reason})"
-            )
+            machine.log(f"{shaper.name} shapes the {self._direction} ({self._reason})")
             self._tell(shaper, profile)
             self._publish_route(route)
-            if self._watcher:
-                self._watcher.shapes(shaper.name)
-            count_ns = self._machine.clock()
+            if self._metrics:
+                self._metrics.shaped(shaper.name, self._direction, self._mode)
+                self._metrics.ready(True)
+            count_ns = machine.clock()
             while not stop():
                 if self.peer is not None and self.peer != peer:
                     peer = self.peer
@@ -247,7 +221,7 @@ class Sidecar:
                     if not self._replace(shaper, profile):
                         return
                 shaper.step(STEP)
-                if (now_ns := self._machine.clock()) >= count_ns:
+                if (now_ns := machine.clock()) >= count_ns:
                     count_ns = now_ns + COUNT_PERIOD_NS
                     self._count(shaper, now_ns)
         finally:
@@ -255,10 +229,10 @@ class Sidecar:
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
         """Choose the shaper and store the reason; in mode "auto" try netem, then use the relay."""
-        machine, mode = self._machine, self._settings.mode
+        machine, mode = self._machine, self._mode
         self._reason = f"link.mode={mode}"
         if mode != "relay":
-            netem = machine.netem(profile.direction, self._origin_ns or 0)
+            netem = machine.netem(profile.direction, self._origin_ns)
             try:
                 if not machine.may_shape:
                     raise MissingPrerequisiteError(
@@ -270,7 +244,7 @@ class Sidecar:
                 if mode == "netem":
                     raise
                 self._reason = f"netem does not work here: {_cause(error)}"
-        relay = machine.relay(profile.direction, self._origin_ns or 0)
+        relay = machine.relay(profile.direction, self._origin_ns)
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
@@ -279,13 +253,14 @@ class Sidecar:
         try:
             shaper.follow_profile(profile.direction, restart=change.restart)
         except CloudrcError as error:
-            if self._settings.mode == "auto":
+            if self._mode == "auto":
                 self._machine.log(f"changes the shaper: {_cause(error)}")
                 return False
             self._machine.log(f"the new profile is refused, the old one stays: {error}")
-            if self._state is not None:
-                number = profile.change.number
-                self._state = replace(self._state, refused=number, refusal=str(error))
+            if self._in_force is not None:
+                state, old = self._in_force
+                state = replace(state, refused=profile.change.number, refusal=str(error))
+                self._in_force = state, old
                 self._publish()
             return True
         if change.restart:
@@ -300,16 +275,17 @@ class Sidecar:
 
     def _tell(self, shaper: Shaper, profile: Loaded) -> None:
         """Publish shaper and profile in force from now on, for ends, users and reports."""
-        before, change, asked = self._state, self._change_of(profile), summary(profile.direction)
+        change, asked = self._change_of(profile), summary(profile.direction)
+        before = self._in_force[0] if self._in_force else None
         for note in notes(profile.direction) if shaper.name == "netem" else ():
             self._machine.log(note)
-        self._state = LinkState(
+        state = LinkState(
             shaper=shaper.name,
             reason=self._reason,
-            mode=self._settings.mode,
-            direction=self._settings.direction,
+            mode=self._mode,
+            direction=self._direction,
             profile=profile.values,
-            since=self._machine.today(),
+            since=datetime.now(UTC).isoformat(timespec="seconds"),
             since_ns=self._machine.clock(),
             changes=before.changes + 1 if before else 0,
             change=change.number,
@@ -317,32 +293,31 @@ class Sidecar:
             asked=asked,
             origin_ns=self._origin_ns,
         )
-        self._in_force = self._state, profile.direction
-        self._number = profile.change.number
+        self._in_force, self._number = (state, profile.direction), profile.change.number
         self._publish()
-        if self._watcher:
-            self._watcher.asked(asked["delay"] or 0.0)
+        if self._metrics:
+            self._metrics.asked(self._direction, asked["delay"] or 0.0)
 
     def _count(self, shaper: Shaper, now_ns: int) -> None:
         """Update the metrics, and tell this pod's end how late datagrams left."""
-        if self._watcher:
-            self._watcher.counted(now_ns, shaper.counts())
+        if self._metrics:
+            counts = shaper.counts().items()
+            self._metrics.see([Counted(now_ns, "link", name, number) for name, number in counts])
         self._publish()
-        if now_ns >= self._released_ns and (released := shaper.released()):
-            self._released_ns = now_ns + RELEASED_PERIOD_NS
+        if released := shaper.released():
             with suppress(OSError):  # a full disk is no reason to stop shaping
-                publish(self._released, json.dumps(released))
+                publish(self._released_file, json.dumps(released))
 
     def _publish(self) -> None:
         """Write a new state; if the disk is full, the next attempt follows a second later."""
-        if self._state is not None and self._state is not self._published:
+        if self._in_force is not None and self._in_force[0] is not self._published:
             with suppress(OSError):
-                publish(self._settings.state, to_text(self._state))
-                self._published = self._state
+                publish(self._state_file, to_text(self._in_force[0]))
+                self._published = self._in_force[0]
 
     def _publish_route(self, route: Address) -> None:
         """Write the route file for this pod's tunnel end: one line HOST:PORT."""
-        publish(self._settings.route, f"{route[0]}:{route[1]}\n")
+        publish(self._route, f"{route[0]}:{route[1]}\n")
 
 
 def _cause(error: CloudrcError) -> str:

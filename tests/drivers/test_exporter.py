@@ -26,7 +26,7 @@ from cloudrc.exposition.table import (
     of_role,
 )
 from cloudrc.link.netem import Steps
-from cloudrc.link.relay import Recent, ReleaseErrors
+from cloudrc.link.relay import ReleaseErrors
 from cloudrc.messages import ZERO
 from cloudrc.records import (
     Contact,
@@ -65,7 +65,7 @@ def flight():
     for late_ns in (3_000, 30_000, 300_000, 3_000_000, 300_000_000):
         errors.observe(late_ns)
     steps.note(1_000_000, 0)
-    counts = dict.fromkeys(LINK_OUTCOMES, 5) | Recent().counts(errors) | {"restored": 1}
+    counts = dict.fromkeys(LINK_OUTCOMES, 5) | errors.in_ns() | {"restored": 1}
     counts |= steps.counts()
     seen["link"] = [Counted(0, "link", name, total) for name, total in counts.items()]
     return seen

@@ -1,10 +1,7 @@
 """A ConfigMap's file, a change that is handed over, and a name whose address changes."""
 
-from __future__ import annotations
-
 import json
 import os
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +11,6 @@ from cloudrc.link.follow import (
     HANDED_FILE,
     SIZE_MAX,
     Handed,
-    Loaded,
     PeerName,
     ProfileFile,
     Profiles,
@@ -29,13 +25,13 @@ LOAD = make_profile_loader("uplink")
 class ConfigMap:
     """A folder as the kubelet mounts it: profile.yaml > ..data/profile.yaml, ..data > a version."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self._folder = folder
         self._version = 0
         self.file = folder / "profile.yaml"
         self.file.symlink_to("..data/profile.yaml")
 
-    def put(self, text: str) -> None:
+    def put(self, text):
         self._version += 1
         version = self._folder / f"..version_{self._version}"
         version.mkdir()
@@ -45,8 +41,8 @@ class ConfigMap:
         (self._folder / "..data_tmp").replace(self._folder / "..data")
 
 
-def test_a_swapped_config_map_is_read_once_and_refused_until_fixed(tmp_path: Path) -> None:
-    config_map, log = ConfigMap(tmp_path), list[str]()
+def test_a_swapped_config_map_is_read_once_and_refused_until_fixed(tmp_path):
+    config_map, log = ConfigMap(tmp_path), []
     file = ProfileFile(config_map.file, LOAD, log.append)
     with pytest.raises(BadInputError, match="no such file"):
         file.first()
@@ -70,11 +66,11 @@ def test_a_swapped_config_map_is_read_once_and_refused_until_fixed(tmp_path: Pat
     assert file.poll() is not None
 
 
-def test_a_file_written_during_a_read_is_read_again(tmp_path: Path) -> None:
-    place, log = tmp_path / "profile.yaml", list[str]()
+def test_a_file_written_during_a_read_is_read_again(tmp_path):
+    place, log = tmp_path / "profile.yaml", []
     halves = ["", "uplink: {delay_ms: 12}\n", "uplink: {delay_ms: 120}\n"]
 
-    def load_while_written(path: Path) -> Loaded:
+    def load_while_written(path):
         """Load as if an editor emptied the file first."""
         try:
             return LOAD(path)
@@ -90,52 +86,52 @@ def test_a_file_written_during_a_read_is_read_again(tmp_path: Path) -> None:
     assert log == []
 
 
-def note(number: str) -> str:
+def note(number):
     return json.dumps({"number": number, "cause": f"cause {number}", "restart": False})
 
 
-def up(delay_ms: float) -> str:
+def up(delay_ms):
     return f"uplink: {{delay_ms: {delay_ms}}}\n"
 
 
 class Pod:
     """The two folders of a link container: the ConfigMap's, and the one beside the route."""
 
-    def __init__(self, folder: Path) -> None:
-        self.map, self.run, self.log = folder / "map", folder / "run", list[str]()
+    def __init__(self, folder):
+        self.map, self.run, self.log = folder / "map", folder / "run", []
         self.map.mkdir()
         self.run.mkdir()
         self.put(40.0, "")
         self.start()
 
-    def start(self) -> None:
+    def start(self):
         paths = self.map / "profile.yaml", self.run / HANDED_FILE
         self.profiles = Profiles(*paths, LOAD, self.log.append)
 
-    def put(self, delay_ms: float, number: str) -> None:
+    def put(self, delay_ms, number):
         if number:
             publish(self.map / "change.json", note(number))
         publish(self.map / "profile.yaml", up(delay_ms))
 
-    def hand(self, delay_ms: float, number: str) -> None:
+    def hand(self, delay_ms, number):
         document = Handed(note(number), {"profile.yaml": up(delay_ms)})
         publish(self.run / HANDED_FILE, write_handed(document))
 
-    def first(self) -> float:
+    def first(self):
         return self.profiles.first().direction.delay
 
-    def poll(self) -> tuple[float, str] | None:
+    def poll(self):
         loaded = self.profiles.poll()
         return None if loaded is None else (loaded.direction.delay, loaded.change.number)
 
 
 @pytest.fixture
-def pod(tmp_path: Path) -> Pod:
+def pod(tmp_path):
     return Pod(tmp_path)
 
 
 @pytest.mark.parametrize("faster", ["hand", "put"])
-def test_a_change_that_comes_both_ways_takes_effect_once(pod: Pod, faster: str) -> None:
+def test_a_change_that_comes_both_ways_takes_effect_once(pod, faster):
     assert pod.first() == 0.04
     ways = [pod.hand, pod.put] if faster == "hand" else [pod.put, pod.hand]
     ways[0](120.0, "a1")
@@ -148,7 +144,7 @@ def test_a_change_that_comes_both_ways_takes_effect_once(pod: Pod, faster: str) 
     assert set(os.listdir(pod.run)) == {HANDED_FILE}, "nothing else is left behind"
 
 
-def test_a_late_config_map_does_not_bring_an_older_change_back(pod: Pod) -> None:
+def test_a_late_config_map_does_not_bring_an_older_change_back(pod):
     pod.first()
     for delay_ms, number in ((120.0, "a1"), (20.0, "b2")):
         pod.hand(delay_ms, number)
@@ -162,7 +158,7 @@ def test_a_late_config_map_does_not_bring_an_older_change_back(pod: Pod) -> None
     assert pod.poll() is None
 
 
-def test_an_upgrade_after_a_change_by_hand_takes_effect(pod: Pod) -> None:
+def test_an_upgrade_after_a_change_by_hand_takes_effect(pod):
     """Helm puts the profile back and leaves the note of who changed it, or breaks the note."""
     pod.first()
     pod.put(120.0, "a1")
@@ -174,7 +170,7 @@ def test_an_upgrade_after_a_change_by_hand_takes_effect(pod: Pod) -> None:
     assert pod.poll() == (0.05, "")
 
 
-def test_a_trace_is_read_beside_the_handed_profile(pod: Pod) -> None:
+def test_a_trace_is_read_beside_the_handed_profile(pod):
     pod.first()
     files = {"profile.yaml": "uplink: {trace: t.csv}\n", "t.csv": "time_s,delay_ms\n0,40\n1,60\n"}
     document = Handed(note("a1"), files)
@@ -200,9 +196,7 @@ def test_a_trace_is_read_beside_the_handed_profile(pod: Pod) -> None:
         "of another user",
     ],
 )
-def test_an_invalid_document_is_refused_in_one_line(
-    pod: Pod, monkeypatch: pytest.MonkeyPatch, text: str
-) -> None:
+def test_an_invalid_document_is_refused_in_one_line(pod, monkeypatch, text):
     assert pod.first() == 0.04
     publish(pod.run / HANDED_FILE, text)
     if text == "of another user":
@@ -215,12 +209,12 @@ def test_an_invalid_document_is_refused_in_one_line(
     assert os.listdir(pod.run) == [HANDED_FILE]
 
 
-def test_the_newest_address_is_the_peer_and_stays_without_an_answer() -> None:
+def test_the_newest_address_is_the_peer_and_stays_without_an_answer():
     """While an old and a new pod overlap, their name has two addresses."""
-    log: list[str] = []
-    answers: list[list[str]] = [[], ["b"], ["a", "b"], [], ["b", "a"], ["a", "b", "c"], ["a"]]
+    log = []
+    answers = [[], ["b"], ["a", "b"], [], ["b", "a"], ["a", "b", "c"], ["a"]]
 
-    def resolve(name: str) -> list[str]:
+    def resolve(name):
         if not (found := answers.pop(0)):
             raise OSError(-2, "Name or service not known")
         return found

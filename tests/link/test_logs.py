@@ -1,15 +1,11 @@
 """Logs of ping, irtt and CSV: units, losses, directions; everything left out is counted."""
 
-from __future__ import annotations
-
 import json
-from typing import Any
 
 import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.logs import (
-    Direction,
     Log,
     Packets,
     is_ping,
@@ -21,11 +17,11 @@ from cloudrc.link.logs import (
 )
 
 
-def read(text: str, *, halve: bool = False, trust_units: bool = False) -> Packets:
+def read(text, *, halve=False, trust_units=False):
     return read_csv(text.splitlines(), "x.csv", halve=halve, trust_units=trust_units)
 
 
-def test_a_row_of_a_trace_begins_halfway_between_two_packets() -> None:
+def test_a_row_of_a_trace_begins_halfway_between_two_packets():
     trace = trace_of(Packets((5.0, 5.01, 5.02, 5.03), (0.040, None, 0.060, 0.045)))
     assert trace.times == pytest.approx((0.0, 0.005, 0.015, 0.025))
     assert trace.delays == (0.040, 0.040, 0.060, 0.045)
@@ -50,7 +46,7 @@ def test_a_row_of_a_trace_begins_halfway_between_two_packets() -> None:
         ),
     ],
 )
-def test_units_and_separators_are_those_of_the_header(text: str, delays: tuple[float]) -> None:
+def test_units_and_separators_are_those_of_the_header(text, delays):
     packets = read(text)
     assert packets.sent == pytest.approx((0.0, 0.5))
     assert packets.delays == pytest.approx(delays)
@@ -70,19 +66,19 @@ def test_units_and_separators_are_those_of_the_header(text: str, delays: tuple[f
         ("time_s,delay_ms", "1,0", "1 with delay_ms 0 taken as lost"),
     ],
 )
-def test_the_marks_of_lost_packets_are_known(header: str, row: str, note: str) -> None:
+def test_the_marks_of_lost_packets_are_known(header, row, note):
     end = ",0" if "loss" in header else ""
     packets = read(f"{header}\n0,45{end}\n{row}\n2,46{end}")
     assert packets.delays == pytest.approx((0.045, None, 0.046))
     assert packets.notes == ((note,) if note else ())
 
 
-def test_zeros_are_delays_if_rounded_or_said_to_have_arrived() -> None:
+def test_zeros_are_delays_if_rounded_or_said_to_have_arrived():
     assert read("time_s,delay_ms\n0,0\n1,1\n2,2").lost == 0
     assert read("time_s,delay_ms,loss\n0,0,0\n1,90,0").lost == 0
 
 
-def test_round_trips_are_halved_if_asked_only() -> None:
+def test_round_trips_are_halved_if_asked_only():
     assert read("time_s,rtt_ms\n0,90\n1,80", halve=True).delays == pytest.approx((0.045, 0.040))
     assert read("time_s,delay_ms\n0,90\n1,80", halve=True).delays == pytest.approx((0.090, 0.080))
     with pytest.raises(BadInputError, match=r"column rtt_ms: has round trips; .*--halve-rtt"):
@@ -122,7 +118,7 @@ def test_round_trips_are_halved_if_asked_only() -> None:
         ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "after row 3 the times go back by 100 s"),
     ],
 )
-def test_what_cannot_be_used_is_refused(text: str, says: str) -> None:
+def test_what_cannot_be_used_is_refused(text, says):
     with pytest.raises(BadInputError) as caught:
         read(text, halve="rtt" in says)
     assert str(caught.value).startswith("x.csv")
@@ -130,7 +126,7 @@ def test_what_cannot_be_used_is_refused(text: str, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_up_to_1_percent_may_be_unusable_and_all_is_counted() -> None:
+def test_up_to_1_percent_may_be_unusable_and_all_is_counted():
     """Of 200 rows one is torn, one comes late, one is at the time of another; then a pause."""
     rows = [f"{n / 10:g},{40 + n % 5}" for n in range(200)]
     rows[20], rows[21] = rows[21], rows[20]
@@ -150,7 +146,7 @@ def test_up_to_1_percent_may_be_unusable_and_all_is_counted() -> None:
         read("\n".join(["time_s,delay_ms", *rows]))
 
 
-def test_packets_are_put_in_the_order_of_sending() -> None:
+def test_packets_are_put_in_the_order_of_sending():
     log = Log("x", [(2.0, 0.1), (1.0, None)])
     packets = log.packets()
     assert (packets.sent, packets.delays) == ((1.0, 2.0), (None, 0.1))
@@ -171,12 +167,12 @@ def test_packets_are_put_in_the_order_of_sending() -> None:
         ("traceroute to 192.0.2.1, 30 hops max", "traceroute or mtr"),
     ],
 )
-def test_other_tools_are_called_by_their_names(line: str, says: str) -> None:
+def test_other_tools_are_called_by_their_names(line, says):
     with pytest.raises(BadInputError, match=f"x: the output of .*{says}|x: the {says}"):
         refuse_others(["", line], "x")
 
 
-def trip(number: int, lost: Any = False, send: int = 30, receive: int = 20) -> dict[str, Any]:
+def trip(number, lost=False, send=30, receive=20):
     """Make a round trip as irtt 0.9 writes it; delays in [ms], one packet every 10 ms."""
     wall = 1_700_000_000_000_000_000 + number * 10_000_000
     send, receive = send * 1_000_000, receive * 1_000_000
@@ -192,7 +188,7 @@ def trip(number: int, lost: Any = False, send: int = 30, receive: int = 20) -> d
     }
 
 
-def irtt(trips: list[dict[str, Any]], direction: Direction | None = None, **stats: int) -> Packets:
+def irtt(trips, direction=None, **stats):
     text = json.dumps({"round_trips": trips, "stats": stats})
     return read_irtt(text, "x", direction, halve=direction is None)
 
@@ -208,9 +204,7 @@ TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(
         (None, (0.0, 0.010, 0.020, 0.030, 0.040), (0.025, None, None, None, 0.025)),
     ],
 )
-def test_irtt_knows_both_ways(
-    direction: Direction | None, sent: tuple[float, ...], delays: tuple[float | None, ...]
-) -> None:
+def test_irtt_knows_both_ways(direction, sent, delays):
     """Packets lost on the uplink were never on the downlink, and vice versa."""
     packets = irtt(TRIPS, direction, packets_sent=5, packets_received=3, duplicates=1)
     assert packets.sent == pytest.approx(sent)
@@ -241,9 +235,7 @@ del NO_STAMPS[0]["delay"]["send"]
         ([], {}, "no packet arrived"),
     ],
 )
-def test_irtt_that_contradicts_itself_is_refused(
-    trips: list[dict[str, Any]], stats: dict[str, int], says: str, direction: Direction
-) -> None:
+def test_irtt_that_contradicts_itself_is_refused(trips, stats, says, direction):
     with pytest.raises(BadInputError, match=says):
         irtt(trips, direction, **stats)
 
@@ -255,7 +247,7 @@ ENDLESS = {"lost": "false", "timestamps": {"client": {"send": {"wall": float("in
     "text",
     ["{", "{}", '{"round_trips": [{}]}', "[" * 100_000, json.dumps({"round_trips": [ENDLESS]})],
 )
-def test_other_json_is_refused(text: str) -> None:
+def test_other_json_is_refused(text):
     with pytest.raises(BadInputError, match="not a log of irtt"):
         read_irtt(text, "x", "uplink", halve=False)
 
@@ -263,15 +255,15 @@ def test_other_json_is_refused(text: str) -> None:
 HEAD = "PING 192.0.2.1 (192.0.2.1) 56(84) bytes of data."
 
 
-def reply(number: int, stamp: float, time: str = "20.0", end: str = "") -> str:
+def reply(number, stamp, time="20.0", end=""):
     return f"[{stamp:.6f}] 64 bytes from 192.0.2.1: icmp_seq={number} ttl=57 time={time} ms{end}"
 
 
-def summary(sent: int, received: int) -> str:
+def summary(sent, received):
     return f"{sent} packets transmitted, {received} received, 40% packet loss, time 800ms"
 
 
-def ping(*lines: str) -> Packets:
+def ping(*lines):
     assert is_ping(list(lines))
     return read_ping(list(lines), "x", halve=True)
 
@@ -293,7 +285,7 @@ END = (
 
 
 @pytest.mark.parametrize(("end", "lost"), [((), 2), (END, 3)])
-def test_ping_gives_halves_sent_when_the_request_left(end: tuple[str, ...], lost: int) -> None:
+def test_ping_gives_halves_sent_when_the_request_left(end, lost):
     """A packet after the last line is known from the summary only."""
     packets = ping(*PING, *end)
     assert packets.sent == pytest.approx((100.0, 100.2, 100.4, 100.6, 100.8, 101.0)[: 3 + lost])
@@ -302,7 +294,7 @@ def test_ping_gives_halves_sent_when_the_request_left(end: tuple[str, ...], lost
     assert packets.notes == ("1 duplicates left out",)
 
 
-def test_losses_before_the_first_reply_are_counted_if_told() -> None:
+def test_losses_before_the_first_reply_are_counted_if_told():
     told = [f"no answer yet for icmp_seq={number}" for number in (1, 2)]
     for lines in ([*told, reply(3, 10.02)], [reply(3, 10.02), summary(3, 1)]):
         packets = ping(HEAD, *lines)
@@ -350,14 +342,12 @@ STAMPED = "[1700000000.5] "
         ),
     ],
 )
-def test_other_pings_and_languages_are_read(
-    lines: list[str], delays: tuple[float | None, ...]
-) -> None:
+def test_other_pings_and_languages_are_read(lines, delays):
     found = [delay and delay * 1e3 for delay in ping(*lines).delays]
     assert found == pytest.approx(list(delays))
 
 
-def test_ping_counts_on_after_65535() -> None:
+def test_ping_counts_on_after_65535():
     """A late reply from before the wrap keeps its place."""
     packets = ping(reply(65534, 1.0), reply(0, 3.0), reply(65535, 2.0), reply(1, 4.0))
     assert packets.sent == pytest.approx((0.98, 1.98, 2.98, 3.98))
@@ -394,16 +384,21 @@ FIVE = [reply(number, number / 5) for number in range(1, 6)]
         ([reply(1, 1.0), reply(999_999_999_999, 2.0)], "span 999999999999 packets"),
     ],
 )
-def test_a_ping_that_cannot_be_used_is_refused(lines: list[str], says: str) -> None:
+def test_a_ping_that_cannot_be_used_is_refused(lines, says):
     with pytest.raises(BadInputError, match=f"^x: [^\\n]*(?:{says})"):
         ping(*lines)
 
 
-def test_a_step_of_the_clock_or_a_pause_is_named() -> None:
+def test_a_step_of_the_clock_or_a_pause_is_named():
     packets = ping(*FIVE, *(reply(number, 3600 + number / 5) for number in range(6, 9)))
     assert packets.notes[0].startswith("nothing sent for 3600 s after packet 5: a pause, ")
     assert len(packets.sent) == 8
     packets = ping(*(reply(n, n + 10.0 * (n > 5)) for n in range(1, 12)))
     assert packets.notes[0].startswith("nothing sent for 11 s after packet 5: a pause, ")
+    dated = [
+        f"2024-01-{day} 10:00:00.5 {reply(number, 0.0)[11:]}"
+        for number, day in enumerate((10, 11, 12, 13, 18))
+    ]
+    assert ping(*dated).notes[0].startswith("nothing sent for 4.32e+05 s after packet 4: a pause, ")
     back = ping(*FIVE, reply(6, 0.3))
     assert back.notes == ("1 out of order, sorted",)

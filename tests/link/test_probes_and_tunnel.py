@@ -1,7 +1,5 @@
 """A probe of the link is no datagram of the tunnel, whoever sends it: refused and counted."""
 
-from __future__ import annotations
-
 from cloudrc.cli.link_verify import make_plans
 from cloudrc.config.load import load_experiment
 from cloudrc.link.verify.probe import PROBE
@@ -10,7 +8,7 @@ from cloudrc.tunnel.codec import Direction, Kind
 from tests.tunnel.hostile import Target
 
 
-def test_no_end_takes_a_probe_for_a_datagram_or_answers_it() -> None:
+def test_no_end_takes_a_probe_for_a_datagram_or_answers_it():
     """Headers in the clear before nothing, of every length that a datagram of the tunnel has."""
     assert PROBE not in set(Kind)
     target = Target()
@@ -31,7 +29,7 @@ def test_no_end_takes_a_probe_for_a_datagram_or_answers_it() -> None:
         assert end._counts["malformed"] - count == len(sent)
 
 
-def test_probes_are_as_long_as_what_flies_there() -> None:
+def test_probes_are_as_long_as_what_flies_there():
     asked = make_plans(load_experiment("paper"), 5.0, "relay")
     for way, kind in {"uplink": Kind.TELEMETRY, "downlink": Kind.COMMAND}.items():
         assert asked[way].flow.size == codec.SIZES[kind]

@@ -1,7 +1,5 @@
 """The relay over real sockets on 127.0.0.1: in this process, as a process, and as a pod's link."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os
@@ -12,13 +10,11 @@ import sys
 import threading
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from cloudrc.cluster.link import APPLY_SCRIPT
 from cloudrc.config.load import load_experiment
@@ -32,7 +28,7 @@ from cloudrc.link.relay import (
     BATCH,
     QUANTILES,
     Lane,
-    Recent,
+    Lanes,
     Relay,
     RelayShaper,
     ReleaseErrors,
@@ -53,7 +49,7 @@ TRIES = 3
 PLAIN = DirectionProfile()
 
 
-def bind_loopback(port: int = 0) -> socket.socket:
+def bind_loopback(port=0):
     """Open a UDP socket on 127.0.0.1; port 0 lets the kernel choose."""
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     bound.bind(("127.0.0.1", port))
@@ -61,17 +57,17 @@ def bind_loopback(port: int = 0) -> socket.socket:
     return bound
 
 
-def peek(data: bytes) -> tuple[int, int, int]:
+def peek(data):
     if len(data) != 4:
         raise ValueError("not ours")
     return 3, 1, int.from_bytes(data, "little")
 
 
-def packet(n: int) -> bytes:
+def packet(n):
     return n.to_bytes(4, "little")
 
 
-def until(condition: Callable[[], bool]) -> float:
+def until(condition):
     began = time.monotonic()
     while not condition():
         assert time.monotonic() < began + PATIENCE, "never came true"
@@ -82,7 +78,7 @@ def until(condition: Callable[[], bool]) -> float:
 class Bench:
     """A world, a cloud and a relay between them, each with a socket."""
 
-    def __init__(self, up: DirectionProfile, down: DirectionProfile) -> None:
+    def __init__(self, up, down):
         self.world, self.cloud, self.world_side, self.cloud_side = (
             bind_loopback() for _ in range(4)
         )
@@ -99,13 +95,13 @@ class Bench:
         self._thread = threading.Thread(target=self.relay.run, args=(self._stop.is_set,))
         self._thread.start()
 
-    def up(self, data: bytes) -> None:
+    def up(self, data):
         self.world.sendto(data, self.world_side.getsockname())
 
-    def down(self, data: bytes) -> None:
+    def down(self, data):
         self.cloud.sendto(data, self.cloud_side.getsockname())
 
-    def close(self) -> None:
+    def close(self):
         self._stop.set()
         began = time.monotonic()
         self._thread.join(PATIENCE)
@@ -115,10 +111,10 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Iterator[Callable[..., Bench]]:
-    made: list[Bench] = []
+def bench():
+    made = []
 
-    def make(up: DirectionProfile = PLAIN, down: DirectionProfile = PLAIN) -> Bench:
+    def make(up=PLAIN, down=PLAIN):
         made.append(Bench(up, down))
         return made[-1]
 
@@ -127,7 +123,7 @@ def bench() -> Iterator[Callable[..., Bench]]:
         one.close()
 
 
-def test_a_packet_leaves_when_the_model_says_never_earlier(bench: Callable[..., Bench]) -> None:
+def test_a_packet_leaves_when_the_model_says_never_earlier(bench):
     profile = DirectionProfile(0.020, 0.010)
     pair, model = bench(profile), LinkDirection(profile, 1, True)
     errors = []
@@ -144,9 +140,7 @@ def test_a_packet_leaves_when_the_model_says_never_earlier(bench: Callable[..., 
     assert pair.relay.released("downlink") == {}
 
 
-def test_every_datagram_is_counted_once(
-    bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_datagram_is_counted_once(bench, monkeypatch):
     monkeypatch.setattr(module, "IN_FLIGHT_MAX", 3)
     pair = bench(DirectionProfile(0.1), DirectionProfile(loss=1.0))
     for data in (b"", b"xyz", bytes(1400), bytes(5000)):
@@ -159,7 +153,7 @@ def test_every_datagram_is_counted_once(
     until(lambda: pair.relay.outcomes() == {**dict.fromkeys(LINK_OUTCOMES, 0), **counts})
 
 
-def test_a_datagram_is_damaged_as_the_model_says(bench: Callable[..., Bench]) -> None:
+def test_a_datagram_is_damaged_as_the_model_says(bench):
     profile = DirectionProfile(corrupt=1.0)
     pair = bench(profile)
     pair.up(packet(5))
@@ -167,7 +161,7 @@ def test_a_datagram_is_damaged_as_the_model_says(bench: Callable[..., Bench]) ->
     assert pair.cloud.recv(100) == damaged != packet(5)
 
 
-def test_a_flood_is_counted_and_over_in_a_second(bench: Callable[..., Bench]) -> None:
+def test_a_flood_is_counted_and_over_in_a_second(bench):
     pair = bench(PLAIN, DirectionProfile(0.02))
     for n in range(20_000):
         pair.up(packet(n))
@@ -178,14 +172,14 @@ def test_a_flood_is_counted_and_over_in_a_second(bench: Callable[..., Bench]) ->
     assert time.monotonic() < began + 0.5
     pair.up(packet(0))  # with it the kernel tells what it had no room for
 
-    def counted() -> int:
+    def counted():
         counts = pair.relay.outcomes()
         return counts["forwarded"] + counts["unread"]
 
     until(lambda: counted() == 20_002)
 
 
-def test_strangers_reach_neither_end(bench: Callable[..., Bench]) -> None:
+def test_strangers_reach_neither_end(bench):
     pair = bench(PLAIN, DirectionProfile(duplicate=1.0))
     with bind_loopback() as stranger:
         for side in (pair.world_side, pair.cloud_side):
@@ -198,7 +192,7 @@ def test_strangers_reach_neither_end(bench: Callable[..., Bench]) -> None:
     assert pair.relay.counts()["received"] == 2
 
 
-def test_an_end_that_restarts_is_served_again(bench: Callable[..., Bench]) -> None:
+def test_an_end_that_restarts_is_served_again(bench):
     pair = bench()
     address = pair.cloud.getsockname()
     pair.cloud.close()
@@ -211,10 +205,10 @@ def test_an_end_that_restarts_is_served_again(bench: Callable[..., Bench]) -> No
     assert packet(3) in (pair.cloud.recv(100) for _ in range(4))
 
 
-def test_a_refused_datagram_is_unsent() -> None:
+def test_a_refused_datagram_is_unsent():
     with bind_loopback() as source, bind_loopback() as sender:
 
-        def send(data: bytes) -> None:
+        def send(data):
             raise PermissionError
 
         lane = Lane(source, send, LinkDirection(PLAIN, 1, True), peek)
@@ -226,7 +220,7 @@ def test_a_refused_datagram_is_unsent() -> None:
         assert (lane.counts()["unsent"], lane.due_ns()) == (BATCH, None)
 
 
-def test_the_peer_can_change_in_flight() -> None:
+def test_the_peer_can_change_in_flight():
     ends = bind_loopback(), bind_loopback()
     shaper = RelayShaper(("127.0.0.1", 0), LinkDirection(DirectionProfile(0.05), 1, True), peek)
     with bind_loopback() as out, ends[0], ends[1]:
@@ -241,7 +235,7 @@ def test_the_peer_can_change_in_flight() -> None:
 
 
 @pytest.mark.parametrize("scale", [50.0, 200e6])
-def test_percentiles_are_those_of_the_sample_to_2_percent(scale: float) -> None:
+def test_percentiles_are_those_of_the_sample_to_2_percent(scale):
     sample = np.random.default_rng(1).exponential(scale, 20_000).astype(int)
     errors = ReleaseErrors()
     for error_ns in (-1, *sample.tolist()):
@@ -256,23 +250,24 @@ def test_percentiles_are_those_of_the_sample_to_2_percent(scale: float) -> None:
         assert true <= said <= 1.02 * true + 1.1
 
 
-def test_recent_means_the_last_ten_calls() -> None:
-    errors, recent, said = ReleaseErrors(), Recent(), []
-    assert recent.counts(errors) == {"released_early": 0}
-    recent = Recent()
+def test_recent_means_the_last_ten_calls():
+    with bind_loopback() as source:
+        lane = Lane(source, int, LinkDirection(PLAIN, 1, True), peek)
+    lanes, said = Lanes([lane], None), []
+    assert lanes.recent() == {"released_early": 0}
+    lanes = Lanes([lane], None)
     for second in range(14):
-        errors = errors.copy()
-        errors.observe(9 * MS if second == 2 else 10_000)
-        said.append(recent.counts(errors)["release_error_p999_ns"])
+        lane.errors.observe(9 * MS if second == 2 else 10_000)
+        said.append(lanes.recent()["release_error_p999_ns"])
     assert [late_ns > 8 * MS for late_ns in said] == [2 <= n < 12 for n in range(14)]
 
 
-def stamp(wall_ns: int) -> tuple[int, int, bytes]:
+def stamp(wall_ns):
     seconds, rest = divmod(wall_ns, SECOND)
     return 1, 35, seconds.to_bytes(8, "little") + rest.to_bytes(8, "little")
 
 
-def test_a_stamp_becomes_an_age_and_drops_are_counted_beyond_32_bits() -> None:
+def test_a_stamp_becomes_an_age_and_drops_are_counted_beyond_32_bits():
     stamps, now_ns = Stamps(), 1_700_000_000 * SECOND
     for age_ns, counted_ns in ((7_000, 7_000), (0, 0), (-3_000, 0), (80 * MS, AGE_MAX_NS)):
         assert stamps.age_ns([stamp(now_ns - age_ns)], now_ns) == counted_ns
@@ -282,9 +277,9 @@ def test_a_stamp_becomes_an_age_and_drops_are_counted_beyond_32_bits() -> None:
     assert stamps.dropped == 2**32 + 3
 
 
-def in_a_thread(act: Callable[[], object]) -> object:
+def in_a_thread(act):
     """Return what `act` returns in a thread, with which its priority and slack end."""
-    found: list[object] = []
+    found = []
     thread = threading.Thread(target=lambda: found.append(act()))
     thread.start()
     thread.join()
@@ -292,20 +287,18 @@ def in_a_thread(act: Callable[[], object]) -> object:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux alone has it")
-def test_a_thread_gets_priority_if_permitted_and_exact_sleeps(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def first() -> bool:
+def test_a_thread_gets_priority_if_permitted_and_exact_sleeps(monkeypatch):
+    def first():
         return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
 
-    def ask() -> object:
+    def ask():
         tighten_slack()
         slack_ns = ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)  # PR_GET_TIMERSLACK
         return (not ask_for_fifo()) is first(), in_a_thread(first), slack_ns <= 1
 
     assert in_a_thread(ask) == (True, False, True), "a child thread is ordinary again"
 
-    def refuse(*_: object) -> None:
+    def refuse(*_):
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
@@ -323,7 +316,7 @@ LIVELY: dict[str, object] = {
 @pytest.mark.process
 @pytest.mark.promise("link-follows-the-seed")
 @pytest.mark.parametrize("link", [{"profile": "lossy"}, LIVELY])
-def test_a_relay_run_draws_the_virtual_sequence(tmp_path: Path, link: dict[str, object]) -> None:
+def test_a_relay_run_draws_the_virtual_sequence(tmp_path, link):
     """Ask a model that never saw a clock: which numbers arrive, how often, how late."""
     relay = ours(tmp_path, link)
     flows = run_flow(relay.ways, 200.0, 1.5, 0.5)
@@ -341,7 +334,7 @@ def test_a_relay_run_draws_the_virtual_sequence(tmp_path: Path, link: dict[str, 
 
 
 @pytest.mark.process
-def test_profiles_with_queue_and_kept_order_are_as_drawn(tmp_path: Path) -> None:
+def test_profiles_with_queue_and_kept_order_are_as_drawn(tmp_path):
     """`lte` has a rate and keeps order; `make bench-link` measures all profiles for a minute."""
     for row in measure_profiles(tmp_path, {"lte": {"profile": "lte"}}, 2.0, fifo=fifo_allowed()):
         judged = row.judged
@@ -351,7 +344,7 @@ def test_profiles_with_queue_and_kept_order_are_as_drawn(tmp_path: Path) -> None
         assert judged.swapped <= 0.01 * judged.errors.size
 
 
-def test_lost_invented_and_swapped_datagrams_are_found() -> None:
+def test_lost_invented_and_swapped_datagrams_are_found():
     """The bench's judge and its times of sending are right."""
     flow, profile = Flow(True), DirectionProfile(0.040, 0.030, loss=0.1)
     link, start = LinkDirection(profile, SEED, True, SECOND), SECOND
@@ -373,7 +366,7 @@ def test_lost_invented_and_swapped_datagrams_are_found() -> None:
     assert min(min(at % (10 * MS), -at % (10 * MS)) for at in times[1:]) == 10 * MS // 4
 
 
-def flood(target: tuple[str, int], rate: float, duration: float) -> None:
+def flood(target, rate, duration):
     """Send what looks like telemetry as a stranger, at most `rate` [1/s], for `duration` [s]."""
     data, sent, start = encode_header(Kind.TELEMETRY, 0, 1, 7).ljust(SIZE, b"\0"), 0, time.time()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as source:
@@ -386,7 +379,7 @@ def flood(target: tuple[str, int], rate: float, duration: float) -> None:
 
 
 @pytest.mark.process
-def test_5000_strangers_a_second_cost_no_hold(tmp_path: Path) -> None:
+def test_5000_strangers_a_second_cost_no_hold(tmp_path):
     """A local flight of a few seconds, in which strangers flood both sides of its relay."""
     holds = []
     for attempt in range(TRIES):
@@ -413,7 +406,7 @@ def test_5000_strangers_a_second_cost_no_hold(tmp_path: Path) -> None:
     pytest.fail(f"HOLDs in {TRIES} flights: {holds}")
 
 
-def relay_addresses(parent: int) -> list[tuple[str, int]]:
+def relay_addresses(parent):
     """Find the addresses of a local run's relay, world's side and cloud's, in its command line."""
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
@@ -430,7 +423,7 @@ def relay_addresses(parent: int) -> list[tuple[str, int]]:
 class Pod:
     """A link container in relay mode, the pod's tunnel end before it and the peer behind it."""
 
-    def __init__(self, folder: Path, profile: str, direction: str = "uplink") -> None:
+    def __init__(self, folder, profile, direction="uplink"):
         self.route, self.log = folder / "run" / "route", folder / "log"
         self.profile = folder / "profile.yaml"
         self.route.parent.mkdir()
@@ -440,8 +433,8 @@ class Pod:
             tcp.bind(("127.0.0.1", 0))
             self.listen = udp.getsockname()
             self.metrics = f"127.0.0.1:{tcp.getsockname()[1]}"
-        self.arrived: dict[int, int] = {}
-        self.sent_ns: dict[int, int] = {}
+        self.arrived = {}
+        self.sent_ns = {}
         command = [sys.executable, "-m", "cloudrc", "link", "run", "--config", "paper"]
         command += ["--profile", str(self.profile), "--direction", direction, "--mode", "relay"]
         command += ["--peer", f"localhost:{self.peer.getsockname()[1]}"]
@@ -456,7 +449,7 @@ class Pod:
         until(lambda: self.route.exists() or self.process.poll() is not None)
         assert self.process.poll() is None, self.log.read_text()
 
-    def send(self, count: int) -> None:
+    def send(self, count):
         for _ in range(count):
             number = len(self.sent_ns)
             data = encode_header(Kind.TELEMETRY, 0, 1, number) + bytes(150)
@@ -464,16 +457,16 @@ class Pod:
             self.end.sendto(data, self.listen)
             time.sleep(0.005)
 
-    def delays(self, count: int) -> list[float]:
+    def delays(self, count):
         """Wait until all packets have arrived; return their delays [s]."""
         until(lambda: len(self.arrived) == count)
         return [(self.arrived[n] - self.sent_ns[n]) * 1e-9 for n in range(count)]
 
-    def page(self, path: str) -> str:
+    def page(self, path):
         with urllib.request.urlopen(f"http://{self.metrics}{path}", timeout=5) as answer:
             return str(answer.read().decode())
 
-    def close(self) -> None:
+    def close(self):
         self._open = False
         self._thread.join()
         self.process.kill()
@@ -481,7 +474,7 @@ class Pod:
         self.end.close()
         self.peer.close()
 
-    def _receive(self) -> None:
+    def _receive(self):
         self.peer.settimeout(0.1)
         while self._open:
             with suppress(TimeoutError):
@@ -490,10 +483,10 @@ class Pod:
 
 
 @pytest.fixture
-def pod(tmp_path: Path) -> Iterator[Callable[..., Pod]]:
-    pods: list[Pod] = []
+def pod(tmp_path):
+    pods = []
 
-    def make(*words: str) -> Pod:
+    def make(*words):
         pods.append(Pod(tmp_path, *words))
         return pods[-1]
 
@@ -502,7 +495,7 @@ def pod(tmp_path: Path) -> Iterator[Callable[..., Pod]]:
         one.close()
 
 
-def drawn(profile: DirectionProfile, *, uplink: bool) -> NDArray[np.float64]:
+def drawn(profile, *, uplink):
     """Return the delays [s] that the model draws for the first 20 datagrams of a pod."""
     model = LinkDirection(profile, load_experiment("paper").seed, uplink)
     return np.array([model.send(1, Kind.TELEMETRY, n, 166, 0)[0] * 1e-9 for n in range(20)])
@@ -510,7 +503,7 @@ def drawn(profile: DirectionProfile, *, uplink: bool) -> NDArray[np.float64]:
 
 @pytest.mark.process
 @pytest.mark.promise("link-changes-in-flight")
-def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(pod: Callable[..., Pod]) -> None:
+def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(pod):
     link = pod("uplink: {delay_ms: 300, jitter_ms: 50}\n")
     link.send(20)
     draft = link.profile.with_name("draft")
@@ -528,7 +521,7 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(pod: Callable[...,
 
 
 @pytest.mark.process
-def test_a_change_handed_inside_is_in_force_at_the_commands_end(pod: Callable[..., Pod]) -> None:
+def test_a_change_handed_inside_is_in_force_at_the_commands_end(pod):
     link = pod("downlink: {delay_ms: 300}\n", "downlink")
     note = json.dumps({"number": "a1", "cause": "by hand", "restart": True})
     profile = "{uplink: {delay_ms: 5}, downlink: {delay_ms: 60, jitter_ms: 20}}\n"
@@ -544,7 +537,7 @@ def test_a_change_handed_inside_is_in_force_at_the_commands_end(pod: Callable[..
 
 
 @pytest.mark.process
-def test_it_is_ready_counts_and_ends_in_half_a_second(pod: Callable[..., Pod]) -> None:
+def test_it_is_ready_counts_and_ends_in_half_a_second(pod):
     link = pod("uplink: {loss: 1.0}\n")
     assert link.page("/readyz") == "ready\n"
     link.end.sendto(b"short", link.listen)

@@ -1,12 +1,9 @@
 """The sidecar's decisions, with shapers that only take notes; and what it tells `link verify`."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
 from errno import ENOSPC
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,17 +15,7 @@ from cloudrc.link.follow import Loaded
 from cloudrc.link.netem import Answer, notes
 from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott, Trace
 from cloudrc.link.profile import Change as Step
-from cloudrc.link.sidecar import (
-    Machine,
-    Mode,
-    Near,
-    Settings,
-    Sidecar,
-    Told,
-    look_near,
-    read_told,
-    write_told,
-)
+from cloudrc.link.sidecar import Machine, Near, Sidecar, Told, look_near, read_told, write_told
 from cloudrc.link.state import Change, publish
 
 PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
@@ -37,52 +24,45 @@ NO_NETEM = MissingPrerequisiteError("this kernel has no sch_netem; set link.mode
 
 
 class Shaper:
-    def __init__(self, bench: Bench, name: str, refuses: Exception | None) -> None:
+    def __init__(self, bench, name, refuses):
         self.name, self._bench, self._refuses = name, bench, refuses
 
-    def follow_peer(self, peer: tuple[str, int]) -> tuple[str, int]:
+    def follow_peer(self, peer):
         if self._refuses:
             raise self._refuses
         self._bench.did.append(f"{self.name} {peer[0]}")
         return peer if self.name == "netem" else ("127.0.0.1", 7401)
 
-    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+    def follow_profile(self, profile, *, restart=False):
         if self.name == "netem" and profile.delay == 9.0:
             raise REFUSED
         self._bench.did.append(f"{self.name} {profile.delay:g} s{' from now' if restart else ''}")
 
-    def step(self, timeout: float) -> None:
+    def step(self, timeout):
         assert timeout <= 0.1
         self._bench.wait(timeout)
 
-    def counts(self) -> dict[str, int]:
+    def counts(self):
         return {"forwarded": len(self._bench.did)}
 
-    def released(self) -> dict[str, int]:
+    def released(self):
         return {"released": 1, "overflow": 0} if self.name == "relay" else {}
 
-    def close(self) -> None:
+    def close(self):
         self._bench.did.append(f"{self.name} closes")
 
 
 class Bench:
     """A sidecar whose time passes in `wait`, which runs the planned events."""
 
-    def __init__(
-        self,
-        folder: Path,
-        mode: Mode,
-        refuses: Exception | None = None,
-        may_shape: bool = True,
-        profile: DirectionProfile | None = None,
-    ) -> None:
-        self.did, self.log, self.routes = list[str](), list[str](), list[str]()
+    def __init__(self, folder, mode, refuses=None, may_shape=True, profile=None):
+        self.did, self.log, self.routes = [], [], []
         self.now_ns = 0
-        self.plan: list[tuple[float, Callable[[], object]]] = []
-        self.counted_ns, self.origins_ns, self.delays = list[int](), list[int](), list[float]()
+        self.plan = []
+        self.counted_ns, self.origins_ns, self.delays = [], [], []
         self.route, self.state = folder / "route", folder / "link.json"
 
-        def make(name: str, origin_ns: int, refusal: Exception | None = None) -> Shaper:
+        def make(name, origin_ns, refusal=None):
             self.origins_ns.append(origin_ns)
             return Shaper(self, name, refusal)
 
@@ -93,48 +73,51 @@ class Bench:
             ),
             may_shape=may_shape,
             clock=lambda: self.now_ns,
-            today=lambda: "2026-01-02T03:04:05+00:00",
             wait=self.wait,
             log=self.log.append,
         )
-        settings = Settings(mode, "uplink", self.route, self.state)
         loaded = Loaded(profile or DirectionProfile(), {"description": "nothing"})
-        self.sidecar = Sidecar(settings, machine, loaded, self)
+        self.sidecar = Sidecar(
+            machine, loaded, mode=mode, direction="uplink", route=self.route, metrics=self
+        )
         self.sidecar.peer = PEER
 
-    def at(self, time: float, action: Callable[[], object]) -> None:
+    def at(self, time, action):
         self.plan.append((time, action))
 
-    def wait(self, duration: float) -> None:
+    def wait(self, duration):
         self.now_ns += round(duration * 1e9)
         for entry in [one for one in self.plan if one[0] * 1e9 <= self.now_ns]:
             self.plan.remove(entry)
             entry[1]()
 
-    def run(self, until: float = 3.0) -> Bench:
+    def run(self, until=3.0):
         self.at(until - 1.0, lambda: self.routes.append(self.route.read_text()))
         self.sidecar.run(lambda: self.now_ns >= until * 1e9)
         return self
 
-    def shapes(self, shaper: str) -> None:
+    def shaped(self, shaper, direction, mode):
         self.did.append(f"metric {shaper}")
 
-    def asked(self, delay: float) -> None:
+    def ready(self, ready):
+        assert self.route.exists() is ready
+
+    def asked(self, direction, delay):
         self.delays.append(delay)
 
-    def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
-        self.counted_ns.append(stamp_ns)
+    def see(self, records):
+        self.counted_ns.append(records[0].stamp_ns)
 
-    def replace(self, delay: float, change: Change = Change()) -> None:  # noqa: B008
+    def replace(self, delay, change=Change()):  # noqa: B008
         values = {"description": f"{delay:g} s"}
         self.sidecar.profile = Loaded(DirectionProfile(delay), values, change)
 
-    def told(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.state.read_text())
+    def told(self):
+        found = json.loads(self.state.read_text())
         return found
 
 
-def test_relay_touches_no_netem_and_leaves_no_route(tmp_path: Path) -> None:
+def test_relay_touches_no_netem_and_leaves_no_route(tmp_path):
     bench = Bench(tmp_path, "relay", refuses=AssertionError("touched"))
     bench.at(3.0, lambda: bench.routes.append((tmp_path / "link.released").read_text()))
     bench.run(5.05)
@@ -147,16 +130,17 @@ def test_relay_touches_no_netem_and_leaves_no_route(tmp_path: Path) -> None:
     assert periods == pytest.approx([1e9] * 5, abs=0.1e9)
 
 
-def test_auto_takes_netem_where_it_works(tmp_path: Path) -> None:
+def test_auto_takes_netem_where_it_works(tmp_path):
     bench = Bench(tmp_path, "auto").run()
     assert bench.routes == ["10.244.0.7:7400\n"]
-    assert bench.told() == {
+    told = bench.told()
+    assert datetime.now(UTC) - datetime.fromisoformat(told.pop("since")) < timedelta(minutes=1)
+    assert told == {
         "shaper": "netem",
         "reason": "link.mode=auto",
         "mode": "auto",
         "direction": "uplink",
         "profile": {"description": "nothing"},
-        "since": "2026-01-02T03:04:05+00:00",
         "since_ns": 0,
         "changes": 0,
         "change": "",
@@ -177,8 +161,8 @@ def test_auto_takes_netem_where_it_works(tmp_path: Path) -> None:
     ],
 )
 def test_where_netem_fails_auto_takes_the_relay_and_netem_ends(
-    tmp_path: Path, refuses: Exception | None, may_shape: bool, reason: str
-) -> None:
+    tmp_path, refuses, may_shape, reason
+):
     bench = Bench(tmp_path, "auto", refuses, may_shape).run()
     reason_said = f"netem does not work here: {reason}".replace("\\", "")
     assert bench.log == [f"relay shapes the uplink ({reason_said})"]
@@ -189,7 +173,7 @@ def test_where_netem_fails_auto_takes_the_relay_and_netem_ends(
     assert not bench.route.exists()
 
 
-def test_the_peer_is_waited_for_and_its_new_address_followed(tmp_path: Path) -> None:
+def test_the_peer_is_waited_for_and_its_new_address_followed(tmp_path):
     """The time line counts from when the link came up, whatever shaper follows."""
     bench = Bench(tmp_path, "auto")
     bench.route.write_text("10.0.0.1:7400\n")  # an earlier process was killed
@@ -207,9 +191,9 @@ def test_the_peer_is_waited_for_and_its_new_address_followed(tmp_path: Path) -> 
     assert 2.0e9 <= bench.origins_ns[0] < 2.2e9
 
 
-def test_a_new_profile_is_followed_within_a_step(tmp_path: Path) -> None:
+def test_a_new_profile_is_followed_within_a_step(tmp_path):
     bench = Bench(tmp_path, "relay")
-    states: list[dict[str, Any]] = []
+    states = []
     by_hand = Change("a1", "downlink.delay_ms=500", restart=False)
     bench.at(1.0, lambda: bench.replace(0.5, by_hand))
     bench.at(1.15, lambda: bench.did.append("later"))
@@ -229,9 +213,7 @@ def test_a_new_profile_is_followed_within_a_step(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("mode", "left"), [("netem", "netem"), ("auto", "relay")])
-def test_a_profile_netem_cannot_do_is_refused_or_relayed(
-    tmp_path: Path, mode: Mode, left: str
-) -> None:
+def test_a_profile_netem_cannot_do_is_refused_or_relayed(tmp_path, mode, left):
     bench = Bench(tmp_path, mode)
     bench.at(1.0, lambda: bench.replace(9.0, Change("b2", "far")))
     assert bench.run().did[-1] == f"{left} closes"
@@ -245,7 +227,7 @@ def test_a_profile_netem_cannot_do_is_refused_or_relayed(
 
 
 @pytest.mark.parametrize("mode", ["netem", "relay"])
-def test_netems_deviations_are_logged_for_each_profile(tmp_path: Path, mode: Mode) -> None:
+def test_netems_deviations_are_logged_for_each_profile(tmp_path, mode):
     first, later = DirectionProfile(corrupt=0.1), DirectionProfile(corrupt=0.2)
     bench = Bench(tmp_path, mode, profile=first)
     bench.at(1.0, lambda: setattr(bench.sidecar, "profile", Loaded(later, {})))
@@ -254,13 +236,11 @@ def test_netems_deviations_are_logged_for_each_profile(tmp_path: Path, mode: Mod
     assert said == (notes(first) + notes(later) if mode == "netem" else [])
 
 
-def test_a_full_disk_ends_nothing_and_delays_the_state(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_ends_nothing_and_delays_the_state(tmp_path, monkeypatch):
     bench = Bench(tmp_path, "netem")
     full = {"is": False}
 
-    def write(path: Path, text: str) -> None:
+    def write(path, text):
         if full["is"]:
             raise OSError(ENOSPC, "No space left on device")
         publish(path, text)
@@ -282,7 +262,7 @@ OURS: dict[str, Any] = {"kind": "netem", "handle": "7401:", "dev": "eth0", "opti
 THEIRS: dict[str, Any] = {"kind": "netem", "handle": "8001:", "dev": "eth1", "options": {}}
 
 
-def test_a_status_is_written_and_read_again() -> None:
+def test_a_status_is_written_and_read_again():
     for status in (
         Told("netem", "link.mode=auto", RICH, Near("eth0", {"eth0": [OURS]})),
         Told("relay", "link.mode=relay", None),
@@ -294,27 +274,27 @@ def test_a_status_is_written_and_read_again() -> None:
 
 
 @pytest.mark.parametrize("code", [0, 127])
-def test_all_netems_of_a_namespace_are_found(code: int) -> None:
+def test_all_netems_of_a_namespace_are_found(code):
     qdiscs = [{"kind": "noqueue", "dev": "lo"}, OURS, OURS, THEIRS]
 
-    def run(words: Sequence[str]) -> Answer:
+    def run(words):
         return Answer(code, json.dumps([{"dev": "eth1"}] if words[0] == "ip" else qdiscs), "")
 
     found = Near("eth1", {"eth0": [OURS, OURS], "eth1": [THEIRS]})
     assert look_near(run, PEER[0]) == (found if code == 0 else None)
 
 
-def statuses(bench: Bench, *at: float) -> list[Told | None]:
+def statuses(bench, *at):
     """Return what a sidecar tells at these times [s]."""
     assert bench.sidecar.told() is None
-    found: list[Told | None] = []
+    found = []
     for one in at:
         bench.at(one, lambda: found.append(bench.sidecar.told()))
     bench.run(max(at) + 0.5)
     return found
 
 
-def test_a_sidecar_tells_what_is_in_force(tmp_path: Path) -> None:
+def test_a_sidecar_tells_what_is_in_force(tmp_path):
     """While a time line runs, nothing is."""
     bench = Bench(tmp_path, "relay", profile=RICH)
     bench.at(1.0, lambda: bench.replace(0.07))
@@ -331,7 +311,7 @@ def test_a_sidecar_tells_what_is_in_force(tmp_path: Path) -> None:
     ]
 
 
-def test_a_time_line_that_loops_is_never_over(tmp_path: Path) -> None:
+def test_a_time_line_that_loops_is_never_over(tmp_path):
     """Once it counted as over after an hour, with its last row in force."""
     looping = DirectionProfile(trace=Trace((0.0, 1.0), (0.040, 0.050), loop=True))
     bench = Bench(tmp_path, "relay", profile=looping)
@@ -340,10 +320,10 @@ def test_a_time_line_that_loops_is_never_over(tmp_path: Path) -> None:
     assert told == bench.sidecar.told() == Told("relay", "link.mode=relay", None)
 
 
-def test_tools_are_started_at_most_once_a_second(tmp_path: Path) -> None:
-    bench, asked, now = Bench(tmp_path, "relay"), list[str](), [0.0]
+def test_tools_are_started_at_most_once_a_second(tmp_path):
+    bench, asked, now = Bench(tmp_path, "relay"), [], [0.0]
 
-    def look(host: str) -> Near:
+    def look(host):
         asked.append(host)
         return Near("eth0", {})
 

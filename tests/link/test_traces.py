@@ -1,13 +1,9 @@
 """Traces are read and written; what is none is refused with file, line, value and remedy."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.profile import DirectionProfile, Timeline, Trace
+from cloudrc.link.profile import Trace
 from cloudrc.link.traces import parse_trace, read_table, read_trace, write_trace
 
 HEAD = "time_s,delay_ms"
@@ -30,9 +26,7 @@ HEAD = "time_s,delay_ms"
         (b"time_s,delay_ms,loss\n" + b"0,0,0\n1,90,0\n"[:6] + b"9,90,0\n", (0, 9), (0, 90), 1),
     ],
 )
-def test_a_trace_is_read_into_si(
-    tmp_path: Path, data: bytes, times: tuple[float], delays: tuple[float], losses: int
-) -> None:
+def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
     path = tmp_path / "trace.csv"
     path.write_bytes(data)
     trace = read_trace(path)
@@ -44,11 +38,13 @@ def test_a_trace_is_read_into_si(
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "line 1: no column time_s, found nothing"),
-        ("time_s\n0", "line 1: no column delay_ms, found time_s"),
-        ("time_s,delay_ms,lost\n0,1,0", "line 1: column 'lost' is unknown"),
-        ("time_s,delay_ms,delay_ms\n0,1,1", "column 'delay_ms' is unknown or repeated"),
-        ("time_s,delay_ms,delay_us\n0,1,1", "column .delay_us. is unknown or repeated"),
+        ("", "line 1: the columns are missing; the header is time_s,delay_ms or"),
+        ("time_s\n0", "line 1: the columns are time_s; the header is"),
+        *(
+            (f"{HEAD},{more}\n0,1,0", "the columns are")
+            for more in ("lost", "delay_ms", "delay_us")
+        ),
+        (f"{HEAD},loss,loss\n0,1,0,0", "the columns are"),
         (HEAD, "no rows"),
         (f"{HEAD}\n1,45\n0.5,45", "line 3: time_s 0.5 does not come after 1; sort"),
         (f"{HEAD}\n1,45\n1,45", "line 3: time_s 1 does not come after 1"),
@@ -72,13 +68,13 @@ def test_a_trace_is_read_into_si(
         (f'{HEAD}\n0,"' + "9" * 200_000, "field larger than field limit"),
     ],
 )
-def test_what_is_not_a_trace_is_refused(text: str, says: str) -> None:
+def test_what_is_not_a_trace_is_refused(text, says):
     with pytest.raises(BadInputError, match=f"^trace x\\.csv[^\\n]*{says}") as caught:
         parse_trace(text.splitlines(), "x.csv")
     assert len(str(caught.value)) < 300
 
 
-def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "binary.csv").write_bytes(b"\0\1\2")
     for name, says in (("none", "No such file"), (".", "Is a dir"), ("binary.csv", "not a text")):
         with pytest.raises(BadInputError, match=says):
@@ -86,7 +82,7 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])
-def test_what_is_written_is_read_again(scale: float) -> None:
+def test_what_is_written_is_read_again(scale):
     delays = tuple(delay * scale for delay in (0.040, 0.045, 0.060))
     trace = Trace((0.0, 0.005, 0.015), delays, (0.0, 1.0, 0.5))
     again = parse_trace(write_trace(trace).splitlines(), "x")
@@ -95,25 +91,15 @@ def test_what_is_written_is_read_again(scale: float) -> None:
     assert again.losses == trace.losses
 
 
-def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path: Path) -> None:
+def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path):
     path = tmp_path / "trace.csv"
     path.write_text(f"{HEAD},loss\n0,60,0\n1,40,0.5\n2,900,1\n3,40,0\n4,60,0\n")
     assert read_table(path) == pytest.approx((-1.0, -1.0, 1.0, 1.0))
 
 
 @pytest.mark.parametrize("rows", ["0,45,0", "0,45,0\n1,45,0", "0,45,1\n1,50,1"])
-def test_a_table_without_a_spread_is_refused(tmp_path: Path, rows: str) -> None:
+def test_a_table_without_a_spread_is_refused(tmp_path, rows):
     path = tmp_path / "trace.csv"
     path.write_text(f"{HEAD},loss\n{rows}\n")
     with pytest.raises(BadInputError, match="at least two different delays"):
         read_table(path)
-
-
-@pytest.mark.parametrize("hours", [0, 3])
-def test_a_trace_that_loops_begins_again(hours: int) -> None:
-    """Its last row lasts as long as a mean row: the period is 3 s."""
-    trace = Trace((0.0, 0.5, 2.0), (0.040, 0.050, 0.060), (0.0, 0.0, 1.0), loop=True)
-    timeline = Timeline(DirectionProfile(trace=trace))
-    for elapsed, delay in ((0.0, 40), (2.9, 60), (3.1, 40), (3.6, 50), (5.5, 60), (602.0, 60)):
-        now = timeline.at(round((hours * 3600 + elapsed) * 1e9))
-        assert (now.delay_ns, now.loss) == (delay * 1_000_000, float(delay == 60))
