@@ -12,6 +12,7 @@ import socket
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from math import ceil, inf
 
 import numpy as np
@@ -27,7 +28,7 @@ PROBE = 254
 FIRST_PROBE = 1.0
 """Time from the start of the link to the first probe [s]."""
 COUNT = 1500
-"""Number of probes; more where chance hides more than a tolerance."""
+"""Number of probes; more where chance hides more than a tolerance [1]."""
 LONGEST, AFTER = 120.0, 5.0
 """Longest time to probe, and time to probe after the last change of a time line [s]."""
 RATE, LINK_SHARE = 200.0, 0.4
@@ -37,7 +38,7 @@ RATE_MAX = 1e8
 """Highest rate that this process can measure [bit/s]."""
 TRAIN_SIZE, TRAIN_SPAN = 1400, 0.06
 """UDP payload of a probe of a train [bytes], one Ethernet frame, and time of a train [s]."""
-_BUFFER, _DRAIN = 4_000_000, 64
+_BUFFER = 4_000_000
 
 
 def plan_probes(
@@ -62,26 +63,19 @@ def plan_probes(
         return Plan(profile, flow, (starts[:, None] + block).ravel(), train)
 
     last = timeline.last_ns * 1e-9
-    found = plan(seconds or max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
-    if drawn and not last and not seconds:
-        found = plan(max(COUNT * step, min(found.needed() * step, LONGEST)))
-    return found
+    if seconds or last or not drawn:
+        return plan(seconds or max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
+    return plan(max(COUNT * step, min(plan(COUNT * step).needed() * step, LONGEST)))
 
 
+@dataclass(frozen=True)
 class ProbeEnd:
-    """One end of the link: its socket, the caller's to close, and the probes that it sends."""
+    """One end of the link: what it sends where, and when the link came up [ns, wall clock]."""
 
-    def __init__(
-        self, own: socket.socket, route: tuple[str, int], plan: Plan, origin_ns: int
-    ) -> None:
-        """Set up; `route` is where it sends, `origin_ns` when the link came up, wall clock [ns]."""
-        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        ask_for_stamps(own)
-        self.socket, self.plan, self._route, self._origin_ns = own, plan, route, origin_ns
-        late = max(0.0, (time.time_ns() - origin_ns) * 1e-9 + 0.05 - float(plan.sent[0]))
-        self._due_ns = (origin_ns + np.rint((plan.sent + late) * 1e9)).astype(np.int64).tolist()
-        self._stamps = Stamps()
-        self._sent_ns, self._arrivals = list[int](), list[tuple[int, int]]()
+    socket: socket.socket
+    route: tuple[str, int]
+    plan: Plan
+    origin_ns: int
 
     def data(self, number: int) -> bytes:
         """Encode a probe; its header fills all of it, so that damage shows."""
@@ -90,70 +84,58 @@ class ProbeEnd:
         header = encode_header(kind, way, 1, number)
         return (header * (size // len(header) + 1))[:size]
 
-    def wait(self) -> float:
-        """Return the time until the next probe is due [s]; infinite after the last."""
-        number = len(self._sent_ns)
-        return (self._due_ns[number] - time.time_ns()) * 1e-9 if number < len(self._due_ns) else inf
-
-    def send(self) -> bool:
-        """Send the next probe; False if the kernel has no room for it yet."""
-        data = self.data(len(self._sent_ns))
-        self._sent_ns.append(time.time_ns())
-        try:
-            self.socket.sendto(data, self._route)
-        except BlockingIOError:
-            self._sent_ns.pop()
-            return False
-        except OSError:  # then it does not arrive
-            pass
-        return True
-
-    def receive(self, own: socket.socket) -> None:
-        """Note the probes of this end that wait in the other end's socket, nothing else."""
-        for _ in range(_DRAIN):
-            try:
-                data, ancillary, _, _ = own.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
-            except BlockingIOError:
-                return
-            except OSError:  # an earlier probe found nobody listening
-                continue
-            at_ns = self._stamps.wall_ns(ancillary) or time.time_ns()
-            with suppress(ValueError):
-                number = peek(data)[2]
-                if number < len(self._sent_ns) and data == self.data(number):
-                    self._arrivals.append((number, at_ns))
-
-    def stream(self) -> Stream:
-        """Return what was measured."""
-        delays, copies = np.full(len(self._sent_ns), np.inf), np.zeros(len(self._sent_ns), int)
-        for number, at_ns in self._arrivals:
-            delays[number] = min(delays[number], (at_ns - self._sent_ns[number]) * 1e-9)
-            copies[number] += 1
-        sent = (np.array(self._sent_ns, dtype=np.int64) - self._origin_ns) * 1e-9
-        return Stream(sent, np.where(copies, delays, np.nan), copies)
-
 
 def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
     """Send the probes of both ends and listen until none can arrive; return what each measured.
 
     What the first end sends the second receives, and the other way round.
     """
-    heard = {end.socket: other for end, other in zip(ends, reversed(ends), strict=True)}
+    probes = [[end.data(number) for number in range(len(end.plan.sent))] for end in ends]
     drawn = [end.plan.draw(end.plan.sent).delays for end in ends]
-    quiet = 0.5 + 2.0 * max(float(np.max(one, initial=0.0, where=one > 0.0)) for one in drawn)
+    longest = max(float(np.max(one, initial=0.0, where=one > 0.0)) for one in drawn)
+    sent_ns = [np.zeros(len(end.plan.sent), dtype=np.int64) for end in ends]
+    delays = [np.full(len(end.plan.sent), inf) for end in ends]
+    copies = [np.zeros(len(end.plan.sent), int) for end in ends]
+    stamps = [Stamps(), Stamps()]
+    for end in ends:
+        end.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        ask_for_stamps(end.socket)
+
+    def receive(far: int) -> None:
+        """Note a probe that waits in an end's socket, and nothing else."""
+        with suppress(OSError, ValueError):  # nobody listened to an earlier probe; foreign data
+            data, ancillary, _, _ = ends[far].socket.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
+            at_ns = stamps[far].wall_ns(ancillary) or time.time_ns()
+            near, number = 1 - far, peek(data)[2]
+            if number < len(probes[near]) and data == probes[near][number]:
+                delay = (at_ns - int(sent_ns[near][number])) * 1e-9
+                delays[near][number] = min(delays[near][number], delay)
+                copies[near][number] += 1
+
+    def listen(until_ns: int) -> None:
+        sockets = [end.socket for end in ends]
+        while (left_ns := until_ns - time.time_ns()) > 0:
+            for ready in select.select(sockets, (), (), left_ns * 1e-9)[0]:
+                receive(sockets.index(ready))
+
+    late = max((time.time_ns() - end.origin_ns) * 1e-9 + 0.05 - FIRST_PROBE for end in ends)
+    schedule = sorted(
+        (end.origin_ns + round((at + max(0.0, late)) * 1e9), near, number)
+        for near, end in enumerate(ends)
+        for number, at in enumerate(end.plan.sent.tolist())
+    )
     gc.collect()
     gc.disable()  # a collection takes milliseconds
-    last = time.monotonic()
     try:
-        while (wait := min(end.wait() for end in ends)) < inf or time.monotonic() - last < quiet:
-            readable, _, _ = select.select(list(heard), (), (), min(max(wait, 0.0), 0.05))
-            for own in readable:
-                heard[own].receive(own)
-            for end in ends:
-                while end.wait() <= 0.0 and end.send():
-                    pass
-            if readable or wait < inf:
-                last = time.monotonic()
+        for due_ns, near, number in schedule:
+            listen(due_ns)
+            sent_ns[near][number] = time.time_ns()
+            with suppress(OSError):  # the kernel refuses it: it does not arrive
+                ends[near].socket.sendto(probes[near][number], ends[near].route)
+        listen(time.time_ns() + round((0.5 + 2.0 * longest) * 1e9))
     finally:
         gc.enable()
-    return [end.stream() for end in ends]
+    return [
+        Stream((at - end.origin_ns) * 1e-9, np.where(count, delay, np.nan), count)
+        for end, at, delay, count in zip(ends, sent_ns, delays, copies, strict=True)
+    ]

@@ -18,7 +18,7 @@ from cloudrc.link.model import LinkDirection, Stream
 from cloudrc.link.netem import check, stretch, table
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Timeline
 from cloudrc.link.verify.causes import Evidence, Findings
-from cloudrc.link.verify.judge import Flow, Plan, Row, judge
+from cloudrc.link.verify.judge import Flow, Plan, Row
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from cloudrc.records import Arrival, Fault, LinkChecked, Record
@@ -117,7 +117,6 @@ OVERHEAD = 8e-5
 def rows_of(
     profile: DirectionProfile,
     real: DirectionProfile | VirtualNetem,
-    evidence: Evidence = Evidence(),  # noqa: B008  # frozen
     *,
     stall: float = 0.0,
     seconds: float | None = None,
@@ -129,7 +128,7 @@ def rows_of(
     rng = np.random.default_rng(SEED)
     late = stall * rng.random(len(stream.sent)) * (rng.random(len(stream.sent)) < 0.3)
     stream = replace(stream, delays=stream.delays + OVERHEAD + late)
-    return judge(plan, stream, plan.expected(stream), plan.applied(evidence.applied))
+    return plan.judge(stream)
 
 
 def meet(plan: Plan, real: DirectionProfile | VirtualNetem) -> Stream:
@@ -148,7 +147,7 @@ def verify(
 ) -> dict[str, Findings]:
     """Request a profile both ways and find another one in each."""
     ways = {"uplink": up, "downlink": down}
-    return {way: Findings(rows_of(profile, one, known), known) for way, one in ways.items()}
+    return {way: Findings(rows_of(profile, one), known) for way, one in ways.items()}
 
 
 def arrivals(

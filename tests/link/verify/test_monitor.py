@@ -14,7 +14,7 @@ import pytest
 from cloudrc.config.shipped import names
 from cloudrc.link.profile import DirectionProfile, Trace
 from cloudrc.link.state import STATE_MAX
-from cloudrc.link.verify.monitor import KEPT, Asked, LinkMonitor
+from cloudrc.link.verify.monitor import Asked, LinkMonitor
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 from tests.link.verify.conftest import (
     PERIOD_NS,
@@ -155,7 +155,7 @@ def test_a_time_line_that_loops_is_not_judged_after_an_hour_either() -> None:
     moments, faults = checked(monitor, [*arrivals(PAPER, 1.0), *hour])
     assert faults == []
     assert moments
-    assert set(moments[-1]) == {"datagrams", "time_line"}
+    assert set(moments[-1]) == {"time_line"}
     assert moments[-1]["time_line"].measured == 1.0, "so that nobody waits for a verdict"
 
 
@@ -165,7 +165,7 @@ def test_a_counter_that_jumps_costs_no_memory(gap: int) -> None:
         Arrival(n * PERIOD_NS, False, 1, n + gap * (n >= 1500), 0.070, True) for n in range(3000)
     ]
     moments, _ = checked(hearing(*[DirectionProfile(0.070)] * 2), heard)
-    assert moments[-1]["datagrams"].measured <= KEPT
+    assert is_believed(moments[-1]), "only what came after the jump counts"
 
 
 def run(monitor: LinkMonitor, records: list[Arrival]) -> list[Record]:
@@ -221,4 +221,4 @@ def test_the_thread_judges_like_the_loop() -> None:
     monitor = hearing(PAPER, PAPER)
     monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
     told = run(monitor, arrivals(PAPER, 12.0))
-    assert {one.verdict for one in told if isinstance(one, LinkChecked)} == {"ok", "told"}
+    assert {one.verdict for one in told if isinstance(one, LinkChecked)} == {"ok"}
