@@ -9,8 +9,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
-from cloudrc.exposition.ends import LinkVerdict
-from cloudrc.exposition.live import ONE_SHAPER, LiveMetrics
+from cloudrc.exposition.live import ONE_SHAPER, LinkVerdict, LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.records import (

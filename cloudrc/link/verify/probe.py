@@ -12,7 +12,6 @@ import socket
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from math import ceil, inf
 
 import numpy as np
@@ -68,21 +67,48 @@ def plan_probes(
     return plan(max(COUNT * step, min(plan(COUNT * step).needed() * step, LONGEST)))
 
 
-@dataclass(frozen=True)
 class ProbeEnd:
-    """One end of the link: what it sends where, and when the link came up [ns, wall clock]."""
+    """One end of the link: its socket, the caller's to close, and the probes that it sends."""
 
-    socket: socket.socket
-    route: tuple[str, int]
-    plan: Plan
-    origin_ns: int
+    def __init__(
+        self, own: socket.socket, route: tuple[str, int], plan: Plan, origin_ns: int
+    ) -> None:
+        """Set up; `route` is where it sends, `origin_ns` when the link came up, wall clock [ns]."""
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        ask_for_stamps(own)
+        self.socket, self.route, self.plan, self.origin_ns = own, route, plan, origin_ns
+        count = len(plan.sent)
+        self.probes = [self._encode(number) for number in range(count)]
+        self._stamps, self._sent_ns = Stamps(), np.zeros(count, dtype=np.int64)
+        self._delays, self._copies = np.full(count, inf), np.zeros(count, int)
 
-    def data(self, number: int) -> bytes:
+    def _encode(self, number: int) -> bytes:
         """Encode a probe; its header fills all of it, so that damage shows."""
         _, uplink, kind, size = self.plan.flow
         way = Direction.UPLINK if uplink else Direction.DOWNLINK
         header = encode_header(kind, way, 1, number)
         return (header * (size // len(header) + 1))[:size]
+
+    def send(self, number: int) -> None:
+        """Send a probe; if the kernel refuses it, it does not arrive."""
+        self._sent_ns[number] = time.time_ns()
+        with suppress(OSError):
+            self.socket.sendto(self.probes[number], self.route)
+
+    def receive(self, far: socket.socket) -> None:
+        """Note a probe of this end that waits in the other end's socket, and nothing else."""
+        with suppress(OSError, ValueError):  # nobody listened to an earlier probe; foreign data
+            data, ancillary, _, _ = far.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
+            at_ns, number = self._stamps.wall_ns(ancillary) or time.time_ns(), peek(data)[2]
+            if number < len(self.probes) and data == self.probes[number]:
+                delay = (at_ns - int(self._sent_ns[number])) * 1e-9
+                self._delays[number] = min(self._delays[number], delay)
+                self._copies[number] += 1
+
+    def stream(self) -> Stream:
+        """Return what was measured."""
+        delays = np.where(self._copies, self._delays, np.nan)
+        return Stream((self._sent_ns - self.origin_ns) * 1e-9, delays, self._copies)
 
 
 def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
@@ -90,52 +116,28 @@ def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
 
     What the first end sends the second receives, and the other way round.
     """
-    probes = [[end.data(number) for number in range(len(end.plan.sent))] for end in ends]
-    drawn = [end.plan.draw(end.plan.sent).delays for end in ends]
-    longest = max(float(np.max(one, initial=0.0, where=one > 0.0)) for one in drawn)
-    sent_ns = [np.zeros(len(end.plan.sent), dtype=np.int64) for end in ends]
-    delays = [np.full(len(end.plan.sent), inf) for end in ends]
-    copies = [np.zeros(len(end.plan.sent), int) for end in ends]
-    stamps = [Stamps(), Stamps()]
-    for end in ends:
-        end.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        ask_for_stamps(end.socket)
-
-    def receive(far: int) -> None:
-        """Note a probe that waits in an end's socket, and nothing else."""
-        with suppress(OSError, ValueError):  # nobody listened to an earlier probe; foreign data
-            data, ancillary, _, _ = ends[far].socket.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
-            at_ns = stamps[far].wall_ns(ancillary) or time.time_ns()
-            near, number = 1 - far, peek(data)[2]
-            if number < len(probes[near]) and data == probes[near][number]:
-                delay = (at_ns - int(sent_ns[near][number])) * 1e-9
-                delays[near][number] = min(delays[near][number], delay)
-                copies[near][number] += 1
-
-    def listen(until_ns: int) -> None:
-        sockets = [end.socket for end in ends]
-        while (left_ns := until_ns - time.time_ns()) > 0:
-            for ready in select.select(sockets, (), (), left_ns * 1e-9)[0]:
-                receive(sockets.index(ready))
-
+    heard = {end.socket: other for end, other in zip(ends, reversed(ends), strict=True)}
+    drawn = np.concatenate([end.plan.draw(end.plan.sent).delays for end in ends])
+    quiet = 0.5 + 2.0 * float(np.max(drawn, initial=0.0, where=drawn > 0.0))
     late = max((time.time_ns() - end.origin_ns) * 1e-9 + 0.05 - FIRST_PROBE for end in ends)
     schedule = sorted(
-        (end.origin_ns + round((at + max(0.0, late)) * 1e9), near, number)
-        for near, end in enumerate(ends)
+        (end.origin_ns + round((at + max(0.0, late)) * 1e9), place, number)
+        for place, end in enumerate(ends)
         for number, at in enumerate(end.plan.sent.tolist())
     )
+
+    def listen(until_ns: int) -> None:
+        while (left_ns := until_ns - time.time_ns()) > 0:
+            for far in select.select(list(heard), (), (), left_ns * 1e-9)[0]:
+                heard[far].receive(far)
+
     gc.collect()
     gc.disable()  # a collection takes milliseconds
     try:
-        for due_ns, near, number in schedule:
+        for due_ns, place, number in schedule:
             listen(due_ns)
-            sent_ns[near][number] = time.time_ns()
-            with suppress(OSError):  # the kernel refuses it: it does not arrive
-                ends[near].socket.sendto(probes[near][number], ends[near].route)
-        listen(time.time_ns() + round((0.5 + 2.0 * longest) * 1e9))
+            ends[place].send(number)
+        listen(time.time_ns() + round(quiet * 1e9))
     finally:
         gc.enable()
-    return [
-        Stream((at - end.origin_ns) * 1e-9, np.where(count, delay, np.nan), count)
-        for end, at, delay, count in zip(ends, sent_ns, delays, copies, strict=True)
-    ]
+    return [end.stream() for end in ends]
