@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import pytest
 
@@ -15,7 +14,7 @@ from tests.exposition.conftest import MS, period
 from tests.flights.conftest import records
 
 
-def flying_along_x(predicted_lead: float, *, every_ms: int = 10) -> Iterator[Control]:
+def flying_along_x(predicted_lead, *, every_ms=10):
     """Yield a flight at 1 m/s along x, predicted 25 ms ahead with an error `predicted_lead` [m]."""
     for at in range(0, 400, every_ms):
         x = at * 1e-3
@@ -24,9 +23,7 @@ def flying_along_x(predicted_lead: float, *, every_ms: int = 10) -> Iterator[Con
 
 
 @pytest.mark.parametrize(("lead", "every_ms", "judged"), [(0.01, 10, 37), (0, 10, 37), (1, 60, 0)])
-def test_a_prediction_is_compared_at_its_own_instant(
-    lead: float, every_ms: int, judged: int
-) -> None:
+def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
     """The last three wait for a measurement 25 ms later; none is compared across a gap."""
     judge = PredictionJudge()
     for control in flying_along_x(lead, every_ms=every_ms):
@@ -36,7 +33,7 @@ def test_a_prediction_is_compared_at_its_own_instant(
     assert judge.error == pytest.approx((lead, 0, 0) if judged else (math.nan,) * 3, nan_ok=True)
 
 
-def test_predictions_of_other_sessions_and_older_odometry_do_not_count() -> None:
+def test_predictions_of_other_sessions_and_older_odometry_do_not_count():
     judge = PredictionJudge()
     judge.take(period(0, 0, horizon=0.01, position=(9.0, 9.0, 9.0)))
     judge.reset()
@@ -50,7 +47,7 @@ def test_predictions_of_other_sessions_and_older_odometry_do_not_count() -> None
 
 
 @pytest.mark.parametrize(("loop_delay", "error"), [(0.145, -0.02), (0.144, math.nan)])
-def test_a_delay_estimate_is_compared_with_the_true_delay(loop_delay: float, error: float) -> None:
+def test_a_delay_estimate_is_compared_with_the_true_delay(loop_delay, error):
     """An echo of an unknown command is ignored."""
     judge = DelayJudge()
     judge.sent(period(1000, 500, horizon=0.08))  # a command from odometry of 500 ms
@@ -60,7 +57,7 @@ def test_a_delay_estimate_is_compared_with_the_true_delay(loop_delay: float, err
 
 
 @pytest.mark.parametrize("offset_ns", [0, 5_000_000_000])
-def test_delay_errors_of_a_flight_match_its_ground_truth(offset_ns: int) -> None:
+def test_delay_errors_of_a_flight_match_its_ground_truth(offset_ns):
     experiment = load_experiment("hover", ["link.profile=paper-p2"])
     world, cloud = records(experiment, offset_ns=offset_ns)
     controls = {(c.epoch, c.counter): c for c in cloud if isinstance(c, Control)}

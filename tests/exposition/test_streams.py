@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable
 
 import pytest
 from hypothesis import given, settings
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from cloudrc.exposition.parts import WINDOW, DatagramTally
 
 
-def taken(counters: Iterable[int], epoch: int = 1) -> DatagramTally:
+def taken(counters, epoch=1):
     stream = DatagramTally()
     for counter in counters:
         stream.take(epoch, counter)
@@ -30,12 +29,12 @@ def taken(counters: Iterable[int], epoch: int = 1) -> DatagramTally:
     ],
     ids=["in the window", "left it", "late", "repeated", "a long silence"],
 )
-def test_losses_are_counted(counters: list[int], expected: int, lost: int, reordered: int) -> None:
+def test_losses_are_counted(counters, expected, lost, reordered):
     stream = taken(counters)
     assert (stream.expected, stream.lost, stream.reordered) == (expected, lost, reordered)
 
 
-def test_a_new_epoch_starts_at_its_first_arrival() -> None:
+def test_a_new_epoch_starts_at_its_first_arrival():
     stream = taken(range(2 * WINDOW))
     for counter in range(1000, 1000 + WINDOW):
         stream.take(2, counter)
@@ -44,7 +43,7 @@ def test_a_new_epoch_starts_at_its_first_arrival() -> None:
 
 @given(seed=st.integers(0, 10_000), loss=st.floats(0, 0.9), jitter=st.integers(0, 60))
 @settings(max_examples=40, deadline=None)
-def test_counts_match_the_true_loss_and_reordering(seed: int, loss: float, jitter: int) -> None:
+def test_counts_match_the_true_loss_and_reordering(seed, loss, jitter):
     rng, count = random.Random(seed), 400
     sent = [0] + [n for n in range(1, count) if rng.random() >= loss]
     sent[1:] = sorted(sent[1:], key=lambda n: n + rng.random() * jitter)

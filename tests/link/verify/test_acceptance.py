@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from cloudrc.config.shipped import names
 from cloudrc.link.netem import check
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
-from cloudrc.link.verify.judge import Flow, Row, look_twice, verdict_of
+from cloudrc.link.verify.judge import Flow, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from tests.link.verify.conftest import (
     VirtualNetem,
@@ -31,12 +30,12 @@ NARROW = DirectionProfile(0.020, 0.002, rate=2e6, queue_packets=200, keep_order=
 NOTHING = DirectionProfile()
 
 
-def doubts(rows: list[Row]) -> list[tuple[str, str]]:
+def doubts(rows):
     return [(row.name, row.verdict) for row in rows if row.verdict not in ("ok", "told")]
 
 
 @pytest.mark.promise("verify-tells-the-link")
-def test_200_honest_links_of_200_are_believed(figure: Callable[..., None]) -> None:
+def test_200_honest_links_of_200_are_believed(figure):
     rng = np.random.default_rng(1)
     links = [asked(name, way) for name in names("profile") for way in ("uplink", "downlink")]
     links += [random_profile(rng) for _ in range(200 - len(links))]
@@ -46,8 +45,8 @@ def test_200_honest_links_of_200_are_believed(figure: Callable[..., None]) -> No
     assert found == {}
 
 
-def netem(**facts: object) -> Evidence:
-    return Evidence(**{"shaper": "netem", "layers": 1, **facts})  # type: ignore[arg-type]
+def netem(**facts):
+    return Evidence(**{"shaper": "netem", "layers": 1, **facts})
 
 
 # Requested, found on the uplink, found on the downlink, reported by the machine.
@@ -72,7 +71,7 @@ FAULTS: dict[str, tuple[DirectionProfile, DirectionProfile, DirectionProfile, Ev
 
 @pytest.mark.promise("verify-tells-the-link")
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_seeded_fault_is_named(fault: str, figure: Callable[..., None]) -> None:
+def test_a_seeded_fault_is_named(fault, figure):
     causes = {cause.code for cause in find_causes(verify(*FAULTS[fault]))}
     figure("seeded faults of the link: not named", int(causes != {fault}), "==", 0)
     assert causes == {fault}
@@ -101,9 +100,9 @@ OFF = {
 
 
 @pytest.mark.parametrize("name", OFF)
-def test_a_link_beyond_its_tolerance_is_off(name: str) -> None:
+def test_a_link_beyond_its_tolerance_is_off(name):
     profile, values, quantity = OFF[name]
-    assert (quantity, "off") in doubts(rows_of(profile, replace(profile, **values)))  # type: ignore[arg-type]
+    assert (quantity, "off") in doubts(rows_of(profile, replace(profile, **values)))
 
 
 @pytest.mark.parametrize(
@@ -113,7 +112,7 @@ def test_a_link_beyond_its_tolerance_is_off(name: str) -> None:
         for name in names("profile")
     ],
 )
-def test_an_honest_netem_is_believed(name: str) -> None:
+def test_an_honest_netem_is_believed(name):
     for way in ("uplink", "downlink"):
         profile = asked(name, way)
         if can(profile):
@@ -124,9 +123,9 @@ def test_an_honest_netem_is_believed(name: str) -> None:
     ("values", "quantity"),
     [({"delay": 0.09}, "mean"), ({"jitter": 0.026}, "deviation"), ({"loss": 0.05}, "loss")],
 )
-def test_a_wrong_netem_is_off(values: dict[str, float], quantity: str) -> None:
+def test_a_wrong_netem_is_off(values, quantity):
     profile = DirectionProfile(0.08, 0.02, correlation=0.9)
-    rows = rows_of(profile, VirtualNetem(replace(profile, **values), 7))  # type: ignore[arg-type]
+    rows = rows_of(profile, VirtualNetem(replace(profile, **values), 7))
     assert (quantity, "off") in doubts(rows)
 
 
@@ -138,7 +137,7 @@ def test_a_wrong_netem_is_off(values: dict[str, float], quantity: str) -> None:
         DirectionProfile(0.045, 0.0, loss=0.1, corrupt=0.1),
     ],
 )
-def test_the_model_without_correlation_is_what_the_kernel_draws(profile: DirectionProfile) -> None:
+def test_the_model_without_correlation_is_what_the_kernel_draws(profile):
     check(profile)
     plan = plan_probes(profile, Flow(1, True, PROBE, 203), 300.0)
     made = replace(plan, profile=replace(profile, correlation=0.0))
@@ -150,7 +149,7 @@ def test_the_model_without_correlation_is_what_the_kernel_draws(profile: Directi
         assert ours[name] == pytest.approx(value, rel=0.05, abs=0.015), name
 
 
-def test_a_draw_of_the_model_is_predicted_exactly() -> None:
+def test_a_draw_of_the_model_is_predicted_exactly():
     profile = replace(asked("lossy", "uplink"), duplicate=0.1, corrupt=0.1)
     plan = plan_probes(profile, Flow(1, True, PROBE, 203))
     first, again = plan.draw(plan.sent), plan.draw(plan.sent[500:], 1, 500)
@@ -159,7 +158,7 @@ def test_a_draw_of_the_model_is_predicted_exactly() -> None:
     assert not plan.expected(replace(plan, flow=plan.flow._replace(seed=2)).draw(plan.sent)).known
 
 
-def causes_of(rows: list[Row], known: Evidence) -> list[str]:
+def causes_of(rows, known):
     return [cause.code for cause in find_causes({"uplink": Findings(rows, known)})]
 
 
@@ -174,10 +173,10 @@ STARVED = Evidence("relay", starved="500 datagrams not read in time")
         ({"delay": PAPER.delay / 3, "keep_order": True}, ["order_kept"]),
     ],
 )
-def test_a_lack_of_cpu_is_named_beside_other_faults(real: dict[str, float], causes) -> None:
+def test_a_lack_of_cpu_is_named_beside_other_faults(real, causes):
     """It is not named where nothing is slower than requested."""
     stall = 0.0 if "keep_order" in real else 0.04
-    rows = rows_of(PAPER, replace(PAPER, **real), stall=stall)  # type: ignore[arg-type]
+    rows = rows_of(PAPER, replace(PAPER, **real), stall=stall)
     assert [one.code for one in find_causes({"uplink": Findings(rows, STARVED)})] == causes
 
 
@@ -195,17 +194,17 @@ SLOW = replace(PAPER, delay=0.090)
         (*[replace(PAPER, loss=1.0)] * 2, Evidence(), [("nothing_arrives", "both")]),
     ],
 )
-def test_directions_are_told_apart(up, down, known, causes) -> None:
+def test_directions_are_told_apart(up, down, known, causes):
     found = find_causes(verify(PAPER, up, down, known))
     assert [(cause.code, cause.way) for cause in found] == causes
 
 
-def test_too_few_or_dead_probes_decide_nothing() -> None:
+def test_too_few_or_dead_probes_decide_nothing():
     assert verdict_of(rows_of(PAPER, PAPER, seconds=1.0)) == "open"
     assert ("mean", "open") in doubts(rows_of(PAPER, replace(PAPER, loss=1.0)))
 
 
-def test_only_what_is_off_twice_is_off() -> None:
+def test_only_what_is_off_twice_is_off():
     good, slow, lossy = (
         rows_of(PAPER, replace(PAPER, **values))
         for values in ({}, {"delay": 0.09}, {"delay": 0.09, "loss": 0.5})

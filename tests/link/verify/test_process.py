@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 
 from cloudrc.cli import link_verify
-from cloudrc.cli.link_verify import Way, find_experiment, make_plans, probe_link, run_link
+from cloudrc.cli.link_verify import find_experiment, make_plans, probe_link, run_link
 from cloudrc.cli.main import main
 from cloudrc.config.schema import Profile
 from cloudrc.errors import CloudrcError
-from cloudrc.link.verify.causes import Findings, find_causes
+from cloudrc.link.verify.causes import find_causes
 from cloudrc.link.verify.judge import verdict_of
 
 # Far above what a machine adds that does other things, too.
@@ -25,17 +25,17 @@ LINK = ["link.uplink.delay_ms=100", "link.uplink.jitter_ms=40", "link.downlink.d
 LINK += ["link.downlink.jitter_ms=30"]
 
 
-def asked(*settings: str) -> Any:
+def asked(*settings):
     return find_experiment("paper-p1", [*LINK, *settings])
 
 
-def changed(**values: Any) -> Profile:
+def changed(**values):
     """Return the profile with other values both ways: a fault."""
     ways = (getattr(asked(), way).model_copy(update=values) for way in ("uplink", "downlink"))
     return Profile(uplink=next(ways), downlink=next(ways))
 
 
-def probe(experiment: Any, applied: Profile | None = None, around: bool = False) -> Any:
+def probe(experiment, applied=None, around=False):
     """Probe a link of another profile `applied`, or `around` its shapers."""
     with run_link(experiment, "relay", applied) as ways:
         for way in ways.values():
@@ -44,12 +44,12 @@ def probe(experiment: Any, applied: Profile | None = None, around: bool = False)
         return probe_link(ways, make_plans(experiment, 4.0, "relay"))
 
 
-def codes(found: dict[str, Findings]) -> set[str]:
+def codes(found):
     return {cause.code for cause in find_causes(found)}
 
 
 @pytest.mark.process
-def test_an_honest_link_is_believed_unless_the_machine_delays_it() -> None:
+def test_an_honest_link_is_believed_unless_the_machine_delays_it():
     found = probe(asked())
     for rows, known in found.values():
         if "throttled" not in codes(found):  # the suite runs on machines that do other things, too
@@ -58,9 +58,7 @@ def test_an_honest_link_is_believed_unless_the_machine_delays_it() -> None:
 
 
 @pytest.mark.process
-def test_a_fault_is_named_on_the_command_line(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fault_is_named_on_the_command_line(capsys, monkeypatch):
     both = {"uplink": {"delay_ms": 200.0, "jitter_ms": 40.0},
             "downlink": {"delay_ms": 160.0, "jitter_ms": 30.0}}  # fmt: skip
     wrong = Profile.model_validate(both)
@@ -76,12 +74,12 @@ def test_a_fault_is_named_on_the_command_line(
 
 @pytest.mark.process
 @pytest.mark.full
-def test_a_relay_without_its_cpu_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_relay_without_its_cpu_is_named(monkeypatch):
     """Both shapers are stopped as a CPU limit does: 60 ms of every 100."""
     true, over = link_verify.send_probes, threading.Event()
     with run_link(asked(), "relay") as ways:
 
-        def throttle() -> None:
+        def throttle():
             while not over.wait(0.04):
                 for number, pause in ((signal.SIGSTOP, 0.06), (signal.SIGCONT, 0.0)):
                     for way in ways.values():
@@ -89,7 +87,7 @@ def test_a_relay_without_its_cpu_is_named(monkeypatch: pytest.MonkeyPatch) -> No
                         way.process.send_signal(number)
                     over.wait(pause)
 
-        def held_up(ends: Any) -> Any:
+        def held_up(ends):
             thread = threading.Thread(target=throttle)
             thread.start()
             try:
@@ -104,7 +102,7 @@ def test_a_relay_without_its_cpu_is_named(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.process
 @pytest.mark.full
-def test_a_bypass_is_named() -> None:
+def test_a_bypass_is_named():
     assert codes(probe(asked(), around=True)) == {"bypassed"}
 
 
@@ -125,7 +123,7 @@ FAULTS: dict[str, tuple[list[str], Any]] = {
 @pytest.mark.process
 @pytest.mark.full
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_seeded_fault_is_named(fault: str) -> None:
+def test_a_seeded_fault_is_named(fault):
     settings, make = FAULTS[fault]
     kept = [one for one in LINK if not any(one.split("=")[0] in new for new in settings)]
     experiment = find_experiment("paper-p1", [*kept, *settings])
@@ -134,9 +132,7 @@ def test_a_seeded_fault_is_named(fault: str) -> None:
     assert {fault} <= found <= {fault, "throttled"}
 
 
-def test_netem_without_root_is_a_missing_prerequisite(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_netem_without_root_is_a_missing_prerequisite(monkeypatch, capsys):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     assert main(["link", "verify", "ideal", "--shaper", "netem"]) == 3
     said = capsys.readouterr().err.strip()
@@ -154,10 +150,8 @@ def test_netem_without_root_is_a_missing_prerequisite(
         (0, "", 6, "its process ended with 0: it left no message"),
     ],
 )
-def test_an_early_end_has_the_exit_code_of_the_process(
-    code: int, words: str, exit_code: int, says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def start(name: str, way: Way, shaper: str) -> subprocess.Popen[bytes]:
+def test_an_early_end_has_the_exit_code_of_the_process(code, words, exit_code, says, monkeypatch):
+    def start(name, way, shaper):
         (way.folder / "log").write_text(f"before\n{words}\n" if words else "")
         return subprocess.Popen(["sh", "-c", f"exit {code}" if name == "uplink" else "sleep 9"])
 
