@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -144,11 +144,6 @@ class Way:
     folder: Path = Path()
     process: subprocess.Popen[bytes] | None = None
 
-    def get(self, page: str) -> str:
-        """Fetch a page of the process; "" without an answer."""
-        with inside(self.namespace):
-            return fetch(f"http://{LOOPBACK}:{self.ports[1]}/{page}")
-
 
 def verify(
     title: str, experiment: ResolvedExperiment, shaper: str, seconds: float | None
@@ -191,23 +186,20 @@ def make_plans(
 
 def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
     """Send all probes over a running link and judge them."""
-    since_wall_ns, found = time.time_ns() - time.monotonic_ns(), {}
+    since_wall_ns, found, ends = time.time_ns() - time.monotonic_ns(), {}, []
     states = {name: from_text((way.folder / STATE_FILE).read_text()) for name, way in ways.items()}
-    ends = [
-        ProbeEnd(
-            *(way.own, split_address((way.folder / "route").read_text()), plans[name]),
-            (states[name].origin_ns or 0) + since_wall_ns,
-        )
-        for name, way in ways.items()
-    ]
+    for name, way in ways.items():
+        route = split_address((way.folder / "route").read_text())
+        origin_ns = (states[name].origin_ns or 0) + since_wall_ns
+        ends.append(ProbeEnd(way.own, route, plans[name], origin_ns))
     streams = send_probes(ends)
     time.sleep(COUNTS_WAIT)
     for (name, way), stream in zip(ways.items(), streams, strict=True):
-        page, metrics = way.get("link.json"), read_metrics(way.get("metrics"))
-        with inside(way.namespace):  # a process that hangs says nothing, the kernel does
+        with inside(way.namespace):
             near = inspect_network(way.peer[0])
-        told = read_told(page) if page else Told(states[name].shaper, states[name].reason, None)
-        known = read_evidence(replace(told, near=near), metrics, len(stream.sent))
+            metrics = read_metrics(fetch(f"http://{LOOPBACK}:{way.ports[1]}/metrics"))
+        told = Told(states[name].shaper, states[name].reason, None, near)
+        known = read_evidence(told, metrics, len(stream.sent))
         found[name] = Findings(plans[name].judge(stream), known)
     return found
 
@@ -278,11 +270,9 @@ def _advise(text: str) -> str:
 def _ended(name: str, code: int, log: str) -> CloudrcError:
     """Pass on the error of a process: the last line of its log, and its exit code."""
     last = (log.strip().splitlines() or ["it left no message"])[-1]
-    words = _advise(last.removeprefix("cloudrc: error: "))
+    text = f"the {name} is not shaped: {_advise(last.removeprefix('cloudrc: error: '))}"
     known = {one.exit_code: one for one in (BadInputError, MissingPrerequisiteError, TimedOutError)}
-    if code in known:
-        return known[code](f"the {name} is not shaped: {words}")
-    return InvalidRunError(f"the {name} is not shaped: its process ended with {code}: {words}")
+    return known.get(code, InvalidRunError)(text + f" (exit code {code})" * (code not in known))
 
 
 @contextlib.contextmanager
@@ -338,18 +328,19 @@ def _pods(options: argparse.Namespace) -> Iterator[Pods]:
     hosts = options.ends.split(",") if options.ends else []
     if hosts and (len(hosts) != 2 or not all(hosts)):
         raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
-    with contextlib.ExitStack() as stack:
-        bases = [[f"{host}:{port}" for port in PORTS] for host in hosts]
-        if not hosts:
-            from cloudrc.cluster.pods import find_pod, forwarded
+    if hosts:
+        pairs = zip(("world", "cloud"), hosts, strict=True)
+        yield {end: [f"http://{host}:{port}" for port in PORTS] for end, host in pairs}
+        return
+    from cloudrc.cluster.pods import find_pod, forwarded
 
-            release = release_from_flags(options)
-            for end in ("world", "cloud"):
-                pod = find_pod(release, end).metadata.name
-                local = stack.enter_context(forwarded(release, pod, PORTS))
-                bases.append([f"{LOOPBACK}:{local[port]}" for port in PORTS])
-        urls = [[f"http://{base}" for base in pair] for pair in bases]
-        yield dict(zip(("world", "cloud"), urls, strict=True))
+    pods, release = {}, release_from_flags(options)
+    with contextlib.ExitStack() as stack:
+        for end in ("world", "cloud"):
+            pod = find_pod(release, end).metadata.name
+            local = stack.enter_context(forwarded(release, pod, PORTS))
+            pods[end] = [f"http://{LOOPBACK}:{local[port]}" for port in PORTS]
+        yield pods
 
 
 def verify_release(title: str, pods: Pods, limit: float) -> Report:

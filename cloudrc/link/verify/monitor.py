@@ -181,6 +181,8 @@ class LinkMonitor:
         rows, skipped = list[Row](), UNJUDGED if timed else UNJUDGED | DELAYS
         if len(stream.sent) >= FEWEST:
             rows = self._plans[0].judge(stream, self._epoch, first)
+        elif self._arrivals:  # of a new session or profile: an older verdict holds no more
+            rows = [told("loss", nan)._replace(verdict="open")]
         rows = [row for row in rows if row.name not in skipped]
         if not timed and len(self._trips) >= FEWEST:
             rows.append(self._round_trip())

@@ -73,6 +73,17 @@ def test_a_wrong_link_is_a_fault_after_a_second_look(quantity, overhead):
     assert faults[0].text.startswith("the downlink is not what was asked for: ")
 
 
+def test_a_new_session_starts_undecided():
+    monitor = hearing(PAPER, PAPER)
+    assert is_believed(checked(monitor, arrivals(PAPER, 20.0))[0][-1])
+    (few,) = [one._replace(epoch=2, stamp_ns=one.stamp_ns + 20_000_000_000)
+              for one in arrivals(PAPER, 0.01)]  # fmt: skip
+    monitor.after([few], few.stamp_ns)
+    later_ns = few.stamp_ns + 7_000_000_000
+    (row,) = monitor.after([few._replace(counter=1, stamp_ns=later_ns)], later_ns)
+    assert (row.quantity, row.verdict) == ("loss", "open")
+
+
 def test_one_bad_window_is_no_fault():
     dead = range(300, 700)
     heard = [one for one in arrivals(PAPER, 40.0) if one.counter not in dead]
