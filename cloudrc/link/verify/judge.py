@@ -58,7 +58,10 @@ class Flow(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One quantity of one direction, in `unit`; an unknown value is NaN."""
+    """One quantity of one direction; an unknown value is NaN.
+
+    The values asked, measured, low and high have the unit `unit`, so any unit.
+    """
 
     name: str  # as in `Plan.quantities`, or "round_trip"
     unit: str  # "s", "1" or "bit/s"
@@ -247,12 +250,14 @@ class Plan:
 def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
     """Return the delay that a profile requests at each time since the link came up [s]."""
     timeline = Timeline(profile)
+    if len(timeline.pieces) == 1:
+        return np.full(len(sent), timeline.pieces[0].delay_ns * 1e-9)
     times = np.rint(sent * 1e9).astype(np.int64).tolist()
     return np.array([timeline.at(elapsed_ns).delay_ns for elapsed_ns in times]) * 1e-9
 
 
 def told(name: str, asked: float, measured: float = nan) -> Row:
-    """Return the row of a quantity that is requested but not judged [unit of the quantity]."""
+    """Return a row that is not judged, with `asked` and `measured` values [any unit]."""
     return Row(name, UNITS.get(name, "1"), asked, measured, nan, nan, "told")
 
 
