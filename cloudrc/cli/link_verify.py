@@ -121,13 +121,15 @@ def execute(options: argparse.Namespace) -> int:
 
 def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
     """Find the experiment; a profile replaces the link of the default experiment."""
-    is_profile = target not in shipped.names("experiment")
+    experiments, profiles = shipped.names("experiment"), shipped.names("profile")
+    is_profile = target not in experiments
     if shipped.is_path(target):
         keys = set(shipped.read("profile", target, Path.cwd()).tree)
         is_profile = keys.isdisjoint(Experiment.model_fields.keys() - Profile.model_fields.keys())
         target = str(Path.cwd() / target)
-    elif is_profile:
-        shipped.read("profile", target, Path())  # an unknown name is an error of this command
+    elif target not in (*experiments, *profiles):
+        names = ", ".join([*profiles, *experiments])
+        raise BadInputError(f"no profile or experiment named '{target}'; available: {names}")
     if not is_profile:
         return read_experiment(target, settings)
     return read_experiment(VERIFY_DEFAULT, [f"link.profile={target}", *settings])
