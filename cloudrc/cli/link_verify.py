@@ -17,9 +17,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from math import inf, isfinite, nan
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -48,22 +48,16 @@ from cloudrc.errors import (
     TimedOutError,
 )
 from cloudrc.link.netem import check
-from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Told, read_told
 from cloudrc.link.state import STATE_FILE, from_text
-from cloudrc.link.verify.causes import Findings, find_causes, read_evidence, read_metrics
-from cloudrc.link.verify.judge import (
-    RUN_LENGTH,
-    UNITS,
-    Flow,
-    Plan,
-    Row,
-    judge,
-    look_twice,
-    tolerance,
-    verdict_of,
+from cloudrc.link.verify.causes import (
+    Findings,
+    find_causes,
+    in_unit,
+    read_evidence,
+    read_metrics,
 )
-from cloudrc.link.verify.monitor import PERIOD
+from cloudrc.link.verify.judge import UNITS, Expected, Flow, Plan, Row, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
 from cloudrc.tunnel.codec import SIZES, Kind
 
@@ -73,10 +67,10 @@ START_LIMIT = 90.0
 """Longest time for both processes to start, which a slow disk needs [s]."""
 COUNTS_WAIT = 1.3
 """Time until the processes have counted the last probe [s]; they do so once a second."""
-POLL_PERIOD, OFF_TIMEOUT, HTTP_TIMEOUT = 2.0, 30.0, 3.0
-"""Pause between two polls, longest wait for a verdict once the other is "off", for a page [s]."""
+POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0
+"""Pause between two polls, and longest wait for a page [s]."""
 PORTS = END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]
-LOOPBACK, DEVICE, PORT = "127.0.0.1", "tunnel", 7400
+LOOPBACK, DEVICE = "127.0.0.1", "tunnel"
 HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}
 """Direction -> address of its sending end, in that end's namespace."""
 WAYS = {
@@ -84,21 +78,26 @@ WAYS = {
     "downlink": ("cloud", "world", Kind.COMMAND),
 }
 """Direction -> the end that sends in it, the end that receives, and what."""
-NAMES = {"mean": "delay, mean", "deviation": "standard deviation", "loss": "lost"}
-SCALES = {"s": (1e3, "ms"), "1": (1e2, "%"), "bit/s": (1e-3, "kbit/s")}
+KEYS = ("asked", "measured", "low", "high")
+"""Values of a row."""
 NOT_JUDGED = "NOT JUDGED"
 """Mark in a note: something that the profile asks for was not verified."""
-_MORE = "was not measured for long enough: give more --seconds, or ask again"
+TOLD = {
+    "correlation": f"correlation {NOT_JUDGED}: netem realises almost none of it",
+    "rate": f"rate {NOT_JUDGED}: only trains of probes measure it, up to 100 Mbit/s",
+    "time_line": f"its time line {NOT_JUDGED} in flight, only what follows it",
+}
+"""Quantity of a row that is not judged -> its note."""
+LOOPS = f"{NOT_JUDGED} in flight: a time line loops; probe it without --mode cluster"
 VERDICTS = {
     "off": ("not believed", "red", "does not match its profile"),
-    "open": ("undecided", "yellow", _MORE),
+    "open": ("undecided", "yellow", "was not measured for long enough: give more --seconds"),
     "ok": ("believed", "green", "matches its profile"),
 }
 """Verdict of the rows, the worst first -> verdict on the link, its colour and a text."""
 _CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
 Report: TypeAlias = dict[str, Any]
-Tell: TypeAlias = Callable[[str], None]
 Pods: TypeAlias = Mapping[str, Sequence[str]]
 """End -> URLs of its own pages and of those of its link container."""
 
@@ -109,33 +108,26 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seconds {options.seconds:g}: give a number from 1 to 3600")
     interrupt_on_signals()  # on a signal, remove namespaces and processes
     if options.ends or options.mode == "cluster":
-        limit = options.seconds or RELEASE_TIMEOUT
         with _pods(options) as pods:
-            report = verify_release(options.release or "cloudrc", pods, limit, _tell)
+            limit = options.seconds or RELEASE_TIMEOUT
+            report = verify_release(options.release or "cloudrc", pods, limit)
     else:
         experiment = find_experiment(options.target, options.settings)
-        report = verify(options.target, experiment, options.shaper, options.seconds, _tell)
+        report = verify(options.target, experiment, options.shaper, options.seconds)
     is_table = options.output == "table"
     print(as_text(report) if is_table else format_document(report, options.output))
     return 0 if report["verdict"] == "believed" else 1
 
 
-def _tell(line: str) -> None:
-    """Show progress in one line, on a terminal only."""
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{escape(line)}", end="", file=sys.stderr, flush=True)
-
-
 def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
     """Find the experiment; a profile replaces the link of the default experiment."""
     experiments, profiles = shipped.names("experiment"), shipped.names("profile")
+    is_profile = target not in experiments
     if shipped.is_path(target):
         keys = set(shipped.read("profile", target, Path.cwd()).tree)
         is_profile = keys.isdisjoint(Experiment.model_fields.keys() - Profile.model_fields.keys())
         target = str(Path.cwd() / target)
-    elif target in (*experiments, *profiles):
-        is_profile = target not in experiments
-    else:
+    elif target not in (*experiments, *profiles):
         names = ", ".join([*profiles, *experiments])
         raise BadInputError(f"no profile or experiment named '{target}'; available: {names}")
     if not is_profile:
@@ -148,54 +140,29 @@ class Way:
     """One direction of a link under test: its probes' socket, the shaper's files and process."""
 
     own: socket.socket
-    peer: tuple[str, int]
-    ports: Sequence[int]  # where a relay receives, and where the process serves its pages
-    namespace: str = ""  # of the network; "" for this process's
+    ports: tuple[int, int]  # where a relay receives, and where the process serves its pages
+    namespace: str  # of the network; "" for this process's
+    peer: tuple[str, int] = ("", 0)
     folder: Path = Path()
     process: subprocess.Popen[bytes] | None = None
 
-    def get(self, page: str) -> str:
-        """Fetch a page of the process; "" without an answer."""
-        with inside(self.namespace):
-            return fetch(f"http://{LOOPBACK}:{self.ports[1]}/{page}")
-
 
 def verify(
-    title: str,
-    experiment: ResolvedExperiment,
-    shaper: str,
-    seconds: float | None,
-    tell: Tell,
-    applied: Profile | None = None,
-    meddle: Callable[[Mapping[str, Way]], None] = lambda ways: None,
+    title: str, experiment: ResolvedExperiment, shaper: str, seconds: float | None
 ) -> Report:
-    """Probe a link for `seconds` [s], None for as long as needed; look twice at what is off.
-
-    Tests inject faults: by another profile `applied`, and by a function that gets the running link.
-    """
-    tell("planning the probes")
+    """Probe a link for `seconds` [s], None for as long as needed; measure twice what is off."""
     plans, found = make_plans(experiment, seconds, shaper), dict[str, Findings]()
-    for look in ("sending probes", "looking again at what is off"):
-        tell(f"{look}: {max(plan.sent[-1] for plan in plans.values()):.0f} s")
-        with run_link(experiment, shaper, applied) as ways:
-            meddle(ways)
+    longest = max(plan.sent[-1] for plan in plans.values())
+    for look in ("sending probes", "measuring again what is off"):
+        with run_link(experiment, shaper) as ways:
+            print(f"{look} for {longest:.0f} s", file=sys.stderr, flush=True)
             now = probe_link(ways, plans)
         rows = {way: look_twice(found.get(way, now[way]).rows, now[way].rows) for way in now}
         found = {way: now[way]._replace(rows=rows[way]) for way in now}
         if "off" not in {verdict_of(one.rows) for one in found.values()}:
             break
-    tell("")
-    notes = [
-        _on_correlation(way, plan.profile.correlation)
-        for way, plan in plans.items()
-        if shaper == "netem" and plan.profile.correlation and plan.profile.jitter
-    ] + [
-        f"{way}: rate {NOT_JUDGED}: this machine itself is hardly faster"
-        for way, plan in plans.items()
-        if plan.profile.rate and not plan.train
-    ]
     counts = {way: f"{len(p.sent)} probes of {p.flow.size} bytes" for way, p in plans.items()}
-    return make_report(title, found, counts, notes)
+    return make_report(title, found, counts)
 
 
 def make_plans(
@@ -221,25 +188,21 @@ def make_plans(
 
 def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
     """Send all probes over a running link and judge them."""
-    since_wall_ns, found = time.time_ns() - time.monotonic_ns(), {}
+    since_wall_ns, found, ends = time.time_ns() - time.monotonic_ns(), {}, []
     states = {name: from_text((way.folder / STATE_FILE).read_text()) for name, way in ways.items()}
-    ends = [
-        ProbeEnd(
-            *(way.own, split_address((way.folder / "route").read_text()), plans[name]),
-            (states[name].origin_ns or 0) + since_wall_ns,
-        )
-        for name, way in ways.items()
-    ]
+    for name, way in ways.items():
+        route = split_address((way.folder / "route").read_text())
+        origin_ns = (states[name].origin_ns or 0) + since_wall_ns
+        ends.append(ProbeEnd(way.own, route, plans[name], origin_ns))
     streams = send_probes(ends)
     time.sleep(COUNTS_WAIT)
     for (name, way), stream in zip(ways.items(), streams, strict=True):
-        plan, page, metrics = plans[name], way.get("link.json"), read_metrics(way.get("metrics"))
-        with inside(way.namespace):  # a process that hangs says nothing, the kernel does
+        with inside(way.namespace):
             near = inspect_network(way.peer[0])
-        told = read_told(page) if page else Told(states[name].shaper, states[name].reason, None)
-        known = read_evidence(replace(told, near=near), metrics, len(stream.sent))
-        rows = judge(plan, stream, plan.expected(stream), plan.applied(known.applied))
-        found[name] = Findings(rows, known)
+            metrics = read_metrics(fetch(f"http://{LOOPBACK}:{way.ports[1]}/metrics"))
+        told = Told(states[name].shaper, states[name].reason, None, near)
+        known = read_evidence(told, metrics, len(stream.sent))
+        found[name] = Findings(plans[name].judge(stream), known)
     return found
 
 
@@ -249,18 +212,28 @@ def run_link(
 ) -> Iterator[dict[str, Way]]:
     """Run both directions of a link: on loopback, or for netem in two namespaces.
 
+    Tests give the processes another profile `applied`.
+
     Raises:
         CloudrcError: If a process ends early, with its message and exit code, or starts too slowly.
     """
     profile = applied or Profile(uplink=experiment.uplink, downlink=experiment.downlink)
     text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
     with contextlib.ExitStack() as stack:
-        ways = stack.enter_context(_open_namespaces() if shaper == "netem" else _open_loopback())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cloudrc-verify-")))
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
         (folder / "profile.yaml").write_text(text, encoding="utf-8")
-        for name, way in ways.items():
-            way.folder = folder / name
+        names, hosts = dict.fromkeys(WAYS, ""), dict.fromkeys(WAYS, LOOPBACK)
+        if shaper == "netem":
+            names, hosts = stack.enter_context(_namespaces()), HOSTS
+        ways = {}
+        for name in WAYS:
+            with inside(names[name]):
+                own = stack.enter_context(bind((hosts[name], 0)))
+                ports = free_ports(1)[0], free_ports(1, socket.SOCK_STREAM)[0]
+            ways[name] = Way(own, ports, names[name], folder=folder / name)
+        for (name, way), other in zip(ways.items(), reversed(ways.values()), strict=True):
+            way.peer = other.own.getsockname()
             way.folder.mkdir()
             way.process = _start(name, way, shaper)
             stack.callback(end_process, way.process)
@@ -299,45 +272,31 @@ def _advise(text: str) -> str:
 def _ended(name: str, code: int, log: str) -> CloudrcError:
     """Pass on the error of a process: the last line of its log, and its exit code."""
     last = (log.strip().splitlines() or ["it left no message"])[-1]
-    words = _advise(last.removeprefix("cloudrc: error: "))
+    text = f"the {name} is not shaped: {_advise(last.removeprefix('cloudrc: error: '))}"
     known = {one.exit_code: one for one in (BadInputError, MissingPrerequisiteError, TimedOutError)}
-    if code in known:
-        return known[code](f"the {name} is not shaped: {words}")
-    return InvalidRunError(f"the {name} is not shaped: its process ended with {code}: {words}")
+    return known.get(code, InvalidRunError)(text + f" (exit code {code})" * (code not in known))
 
 
 @contextlib.contextmanager
-def _open_loopback() -> Iterator[dict[str, Way]]:
-    with bind((LOOPBACK, 0)) as up, bind((LOOPBACK, 0)) as down:
-        ports = zip(free_ports(2), free_ports(2, socket.SOCK_STREAM), strict=True)
-        yield {
-            "uplink": Way(up, down.getsockname(), next(ports)),
-            "downlink": Way(down, up.getsockname(), next(ports)),
-        }
-
-
-@contextlib.contextmanager
-def _open_namespaces() -> Iterator[dict[str, Way]]:
+def _namespaces() -> Iterator[dict[str, str]]:
+    """Make the two network namespaces of netem, joined by a veth pair; yield direction -> name."""
     if os.geteuid() != 0:
         raise MissingPrerequisiteError(
             "netem is verified between two network namespaces, which needs root; run this as root,"
             " or verify the relay (--shaper relay)"
         )
-    names, ways = {way: f"cloudrc-{way}-{os.getpid()}" for way in HOSTS}, {}
+    names = {way: f"cloudrc-{way}-{os.getpid()}" for way in HOSTS}
     near, far = names.values()
     with contextlib.ExitStack() as stack:
         for name in names.values():
             _ip("netns", "add", name)
             stack.callback(_ip, "netns", "del", name)
         _ip("-n", near, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", far)
-        for (way, name), peer in zip(names.items(), reversed(HOSTS.values()), strict=True):
+        for way, name in names.items():
             _ip("-n", name, "addr", "add", f"{HOSTS[way]}/24", "dev", DEVICE)
             for device in ("lo", DEVICE):
                 _ip("-n", name, "link", "set", device, "up")
-            with inside(name):
-                own = stack.enter_context(bind((HOSTS[way], PORT)))
-            ways[way] = Way(own, (peer, PORT), (PORT + 1, PORT + 2), name)
-        yield ways
+        yield names
 
 
 def _ip(*words: str) -> None:
@@ -371,48 +330,43 @@ def _pods(options: argparse.Namespace) -> Iterator[Pods]:
     hosts = options.ends.split(",") if options.ends else []
     if hosts and (len(hosts) != 2 or not all(hosts)):
         raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
+    if hosts:
+        pairs = zip(("world", "cloud"), hosts, strict=True)
+        yield {end: [f"http://{host}:{port}" for port in PORTS] for end, host in pairs}
+        return
+    from cloudrc.cluster.pods import find_pod, forwarded
+
+    pods, release = {}, release_from_flags(options)
     with contextlib.ExitStack() as stack:
-        bases = [[f"{host}:{port}" for port in PORTS] for host in hosts]
-        if not hosts:
-            from cloudrc.cluster.pods import find_pod, forwarded
-
-            release = release_from_flags(options)
-            for end in ("world", "cloud"):
-                pod = find_pod(release, end).metadata.name
-                local = stack.enter_context(forwarded(release, pod, PORTS))
-                bases.append([f"{LOOPBACK}:{local[port]}" for port in PORTS])
-        urls = [[f"http://{base}" for base in pair] for pair in bases]
-        yield dict(zip(("world", "cloud"), urls, strict=True))
+        for end in ("world", "cloud"):
+            pod = find_pod(release, end).metadata.name
+            local = stack.enter_context(forwarded(release, pod, PORTS))
+            pods[end] = [f"http://{LOOPBACK}:{local[port]}" for port in PORTS]
+        yield pods
 
 
-def verify_release(title: str, pods: Pods, limit: float, tell: Tell) -> Report:
+def verify_release(title: str, pods: Pods, limit: float) -> Report:
     """Wait at most `limit` [s] for the verdicts of both ends.
 
     Raises:
         TimedOutError: If an end does not answer in time.
     """
-    deadline, off_deadline = time.monotonic() + limit, inf
-    seen = dict[str, Any]()
+    deadline, seen = time.monotonic() + limit, dict[str, Any]()
     while True:
-        tell(", ".join(note for way, found in seen.items() for note in _patience(way, found)))
         time.sleep(POLL_PERIOD)
         for way, (_, receiver, _) in WAYS.items():
             if page := fetch(f"{pods[receiver][0]}/link.json"):
                 seen[way] = json.loads(page)
-        verdicts, now = [found["verdict"] for found in seen.values()], time.monotonic()
-        off_deadline = min(off_deadline, now + OFF_TIMEOUT) if "off" in verdicts else inf
-        waits = [way for way in WAYS if way not in seen or _may_change(seen[way])]
-        if not waits or now >= min(deadline, off_deadline):
+        decided = len(seen) == len(WAYS) and not any(map(_may_change, seen.values()))
+        if decided or time.monotonic() >= deadline:
             break
-    tell("")
     if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
         text = f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
         raise TimedOutError(text)
-    findings = {way: _findings(way, seen[way], pods[WAYS[way][0]][1]) for way in WAYS}
+    findings = {way: _findings(seen[way], pods[WAYS[way][0]][1]) for way in WAYS}
     counts = {way: max([row["datagrams"] for row in seen[way]["rows"]], default=0) for way in WAYS}
     probes = {way: f"{counts[way]} of the tunnel's own datagrams" for way in WAYS}
-    notes = [note for way in WAYS for note in _notes(way, seen[way], findings[way])]
-    return make_report(title, findings, probes, notes)
+    return make_report(title, findings, probes)
 
 
 def fetch(url: str) -> str:
@@ -430,67 +384,36 @@ def _may_change(found: Mapping[str, Any]) -> bool:
     return bool(found["verdict"] == "open") and not loops
 
 
-def _findings(way: str, found: Mapping[str, Any], link: str) -> Findings:
+def _findings(found: Mapping[str, Any], link: str) -> Findings:
     """Combine the receiver's verdict with what the sender's link reports at a URL."""
-    kind, told = WAYS[way][2], Told("", "", None)
+    told, rows = Told("", "", None), []
     with contextlib.suppress(ValueError):
         told = read_told(fetch(f"{link}/link.json"))
-    known = read_evidence(told, read_metrics(fetch(f"{link}/metrics")))
-    flow = Flow(0, way == "uplink", kind, SIZES[kind])
-    plan = Plan(DirectionProfile(), flow, np.arange(float(RUN_LENGTH)) * PERIOD)
-    applied, rows = plan.applied(known.applied), []
-    for row in found["rows"]:
-        name, verdict = row["quantity"], row["verdict"]
-        values = (row.get(key, nan) for key in ("asked", "measured", "low", "high"))
+    for one in found["rows"]:
+        name, values = one["quantity"], (one.get(key, nan) for key in KEYS)
         asked, measured, low, high = map(float, values)
-        in_force = applied.get(name, nan)
-        if name == "rate" and known.applied:  # single datagrams do not measure it
-            in_force, slack = known.applied.rate or inf, tolerance("rate", asked)
-            if abs(in_force - asked) > slack:
-                verdict, low, high = "off", asked - slack, asked + slack
-        if verdict != "told":
-            unit = UNITS.get(name, "1")
-            rows.append(Row(name, unit, asked, in_force, measured, low, high, verdict))
-    return Findings(rows, known)
+        row = Row(name, UNITS.get(name, "1"), asked, measured, low, high, one["verdict"])
+        if name == "rate" and told.applied:  # by the shaper's word: single datagrams do not show it
+            expected = Expected({name: (asked, asked, asked)}, np.zeros(0), known=True)
+            row = expected.judge(name, told.applied.rate or inf)
+        rows.append(row)
+    return Findings(rows, read_evidence(told, read_metrics(fetch(f"{link}/metrics"))))
 
 
-def _notes(way: str, found: Mapping[str, Any], finding: Findings) -> Iterator[str]:
-    """Note what was not judged, and how much longer it takes."""
-    rows = {row["quantity"]: row for row in found["rows"]}
-    judged = {row.name for row in finding.rows}
-    if not judged and "time_line" not in rows:
-        hint = "fly a mission first" if way == "downlink" else "is the other end ready?"
-        yield f"{way}: no datagrams to measure; {hint}"
-    elif "round_trip" in judged:
-        yield f"{way}: the ends do not share a clock: judged by round trips, not one-way delays"
+def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
+    """Note what was not judged."""
+    judged = {row.name for row in rows if row.verdict != "told"}
+    if not rows:
+        yield f"{way}: no datagrams to measure; fly a mission first"
     elif judged and "mean" not in judged:
-        yield f"{way}: delays {NOT_JUDGED}: the ends do not share a clock"
-    if "rate" in rows and "rate" not in judged:
-        yield f"{way}: rate {NOT_JUDGED}: single datagrams do not measure it"
-    if "correlation" in rows:
-        yield _on_correlation(way, rows["correlation"]["asked"])
-    if rows.get("time_line", {}).get("measured"):
-        yield f"{way}: {NOT_JUDGED} in flight: a time line loops; probe it without --mode cluster"
-    elif "time_line" in rows:
-        yield f"{way}: its time line {NOT_JUDGED} in flight, only what follows it"
-    yield from _patience(way, found)
+        yield f"{way}: one-way delays {NOT_JUDGED}: the ends do not share a clock"
+    for row in rows:
+        if row.verdict == "told":
+            loops = row.name == "time_line" and row.measured == 1.0
+            yield f"{way}: {LOOPS if loops else TOLD[row.name]}"
 
 
-def _patience(way: str, found: Mapping[str, Any]) -> Iterator[str]:
-    for row in found["rows"]:
-        if _may_change(found) and row["quantity"] == "datagrams":
-            needs, count = round(row["asked"]), round(row["measured"])
-            seconds = max(0, needs - count) * PERIOD
-            yield f"{way}: {count} of {needs} datagrams, {seconds:.0f} s more"
-
-
-def _on_correlation(way: str, asked: float) -> str:
-    return f"{way}: correlation {asked:g} {NOT_JUDGED}: netem realises almost none of it"
-
-
-def make_report(
-    title: str, findings: Mapping[str, Findings], probes: Mapping[str, str], notes: Sequence[str]
-) -> Report:
+def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[str, str]) -> Report:
     """Make plain values in SI units, shares in [0, 1]; unknown values are left out."""
     shapers = {one.evidence.shaper or "an unknown shaper" for one in findings.values()}
     verdicts = {verdict_of(one.rows) for one in findings.values()}
@@ -500,12 +423,12 @@ def make_report(
         "link": title,
         "shaper": f"shaped by {' and '.join(sorted(shapers))}",
         "causes": [cause._asdict() for cause in find_causes(findings)],
-        "notes": list(notes),
+        "notes": [note for way, one in findings.items() for note in _notes(way, one.rows)],
         "directions": {
             way: {
                 "probes": probes[way],
-                "rows": [_known(row._asdict()) for row in found.rows],
-                "evidence": _known(asdict(found.evidence) | {"applied": None}),
+                "rows": [_known(row._asdict()) for row in found.rows if row.verdict != "told"],
+                "evidence": _known(found.evidence._asdict()),
             }
             for way, found in findings.items()
         },
@@ -521,9 +444,8 @@ def as_text(report: Report) -> str:
     """Format a table per direction, notes, causes, and the verdict in the last line."""
     lines = [escape(f"{report['link']}: {report['shaper']}")]
     for way, found in report["directions"].items():
-        heads = [way, "asked", "applied", "measured", "allowed", "verdict"]
-        head, _, body = table([heads, *map(_cells, found["rows"])], [1, 2, 3, 4]).partition("\n")
-        lines += ["", head, escape(f"  {found['probes']}"), body]
+        rows = [[way, "asked", "measured", "allowed", "verdict"], *map(_cells, found["rows"])]
+        lines += ["", escape(f"{way}: {found['probes']}"), table(rows, [1, 2, 3])]
     causes = [f"  {one['way']}: {one['text']}  [{one['code']}]" for one in report["causes"]]
     lines += ["", *map(escape, [*report["notes"], *causes])]
     partly = any(NOT_JUDGED in note for note in report["notes"]) and report["verdict"] == "believed"
@@ -533,13 +455,6 @@ def as_text(report: Report) -> str:
 
 
 def _cells(row: Mapping[str, Any]) -> list[str]:
-    scale, unit = SCALES[row["unit"]]
-    names = ("asked", "applied", "measured", "low", "high")
-    asked, applied, measured, low, high = (_number(row.get(name, nan) * scale) for name in names)
-    allowed = f"{low} .. {high}" if row.get("low") else f"<= {high}"
-    name = NAMES.get(row["name"], row["name"].replace("_", " "))
-    return [f"  {name} [{unit}]", asked, applied, measured, allowed, row["verdict"]]
-
-
-def _number(value: float) -> str:
-    return "-" if not isfinite(value) else f"{value:.2f}" if value < 1e4 else f"{value:.0f}"
+    values = (row.get(key, nan) for key in KEYS)
+    asked, measured, low, high = (in_unit(value, row["unit"]) for value in values)
+    return [f"  {row['name']}", asked, measured, f"{low} .. {high}", row["verdict"]]

@@ -25,7 +25,7 @@ from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.drivers.recording import FlightsOnly, RecordingThread
 from cloudrc.endpoint import Endpoint
 from cloudrc.errors import to_one_line
-from cloudrc.exposition.ends import CLOCK_SET
+from cloudrc.exposition.live import CLOCK_SET
 from cloudrc.files import read, version
 from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, from_text
 from cloudrc.records import (

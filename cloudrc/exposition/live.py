@@ -1,26 +1,47 @@
-"""The current metrics of one process, computed from its records."""
+"""The current metrics of one process, computed from its records.
+
+Errors of predictions and delay estimates come from `Control` records alone. Each stamp is compared
+only with stamps of its own clock, so the errors are right without a shared clock.
+"""
 
 from __future__ import annotations
 
+import json
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from math import isfinite, nan
 from typing import Any
 
-from cloudrc.exposition.ends import CloudEnd, End, WorldEnd
-from cloudrc.exposition.parts import Handlers, Readings, by_label, unlabelled
-from cloudrc.exposition.table import (
-    CLOUD,
-    LINK,
-    MISSION,
-    MISSION_OUTCOMES,
-    MISSION_STATES,
-    RELEASE_PERCENTILES,
-    STEP_PERCENTILES,
-    TELEOP,
-    WORLD,
-    Labels,
-    of_role,
+from cloudrc.exposition import table
+from cloudrc.exposition.parts import (
+    DatagramTally,
+    DelayJudge,
+    Histogram,
+    PredictionJudge,
+    Readings,
+    by_label,
+    per_axis,
+    unlabelled,
 )
-from cloudrc.records import UNDER_WAY, Counted, MissionEvent, Record
+from cloudrc.exposition.table import Labels, of_role
+from cloudrc.messages import NEVER_NS, GuardState
+from cloudrc.records import (
+    UNDER_WAY,
+    Arrival,
+    CommandApplied,
+    Contact,
+    Control,
+    Counted,
+    Fault,
+    GroundTruth,
+    GuardChange,
+    Lateness,
+    LinkChecked,
+    MissionEvent,
+    Record,
+    SessionOpened,
+    TelemetrySent,
+)
 
 COUNTS = {
     "cloudrc_sessions_refused_total": "busy",
@@ -49,8 +70,8 @@ COUNTS = {
 ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
 """Metrics that only the relay or only netem has: absent until counted."""
 PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
-    "cloudrc_link_release_error_seconds": ("release_error", RELEASE_PERCENTILES),
-    "cloudrc_link_step_lateness_seconds": ("step_lateness", STEP_PERCENTILES),
+    "cloudrc_link_release_error_seconds": ("release_error", table.RELEASE_PERCENTILES),
+    "cloudrc_link_step_lateness_seconds": ("step_lateness", table.STEP_PERCENTILES),
 }
 """Metric -> first part of its counts [ns], and label value -> name of the percentile."""
 
@@ -66,6 +87,295 @@ def read_counts(role: str, counts: Mapping[str, int]) -> Iterator[tuple[str, dic
             yield metric.name, {(): counts.get(pattern, 0)}
         else:
             yield metric.name, {(each,): counts.get(pattern.format(each), 0) for each in values}
+
+
+class LinkVerdict:
+    """The newest verdict on an end's incoming direction of the link."""
+
+    def __init__(self, direction: str) -> None:
+        """Set the direction, "uplink" or "downlink"; the verdict is "open"."""
+        self._direction = direction
+        self._newest: tuple[LinkChecked, ...] = ()
+
+    def see(self, record: LinkChecked) -> None:
+        """Store the verdict on one quantity, and drop the quantities of an older check."""
+        newest = [one for one in self._newest if one.stamp_ns == record.stamp_ns]
+        self._newest = (*newest, record)  # a new tuple: another thread may be reading the old one
+
+    @property
+    def verdict(self) -> str:
+        """Overall verdict: "ok", "off", or "open" while there are too few datagrams."""
+        verdicts = {record.verdict for record in self._newest} - {"told"}
+        return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
+
+    def text(self) -> str:
+        """Make the page /link.json: the overall verdict and a row per quantity."""
+        left_out = ("stamp_ns", "uplink")  # equal in all rows; unknown values are left out, too
+        rows = [
+            {
+                key: value
+                for key, value in record._asdict().items()
+                if key not in left_out and (isinstance(value, str) or isfinite(value))
+            }
+            for record in self._newest
+        ]
+        document = {"direction": self._direction, "verdict": self.verdict, "rows": rows}
+        return json.dumps(document, indent=2) + "\n"
+
+    def read(self) -> Readings:
+        """Return the current values; unknown values are absent."""
+        if self.verdict == "open":
+            return {}
+        return {"cloudrc_link_believed": {(self._direction,): float(self.verdict == "ok")}}
+
+
+CLOCK_SET = "wall_clock"
+"""Fault code of a step of the wall clock; `cloudrc.drivers.recording` detects steps."""
+SILENCE_NS = 2_000_000_000
+"""Time without a new datagram after which an end has no peer [ns]."""
+
+
+class End:
+    """Metrics that world and cloud share: session, datagrams, one-way delay, timing of the loop.
+
+    Attributes:
+        check: Verdict on the incoming direction of the link.
+    """
+
+    def __init__(self, role: str, counts: Mapping[str, int]) -> None:
+        """Set the role, "world" or "cloud", and the counts; there is no session."""
+        self._counts, self._stream = counts, DatagramTally()
+        self._outgoing, self._incoming = "uplink", "downlink"
+        others = table.ONLY_CLOUD
+        if role == table.CLOUD:
+            self._outgoing, self._incoming, others = "downlink", "uplink", table.ONLY_WORLD
+        self._outcomes = tuple(name for name in table.OUTCOMES[1:] if name not in others)
+        self.check = LinkVerdict(self._incoming)
+        self._histograms = {
+            metric.name: Histogram(metric.buckets) for metric in of_role(role) if metric.buckets
+        }
+        self._one_way = self._histograms[f"cloudrc_{self._incoming}_delay_seconds"]
+        self._age = self._histograms["cloudrc_age_of_information_seconds"]
+        self._gap = self._histograms["cloudrc_link_gap_seconds"]
+        self._period = self._histograms["cloudrc_loop_period_seconds"]
+        self._lateness = self._histograms["cloudrc_loop_lateness_seconds"]
+        self._busy, self._clock_steps = 0.0, 0
+        self._sessions, self._epoch, self._opened_ns = 0, 0, NEVER_NS
+        self._arrival_ns = self._woke_ns = self._deadline_ns = NEVER_NS
+        self._silent = True  # no telemetry or command has arrived in this session
+        # Arrival [ns] and one-way delay [s] of the newest used datagram: the age of information.
+        self._newest_ns, self._newest_delay = NEVER_NS, nan
+
+    @property
+    def has_peer(self) -> bool:
+        """Whether a new datagram of the other end has arrived in the last 2 s."""
+        return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
+
+    def _on_arrival(self, record: Arrival) -> None:
+        stamp_ns, _, epoch, counter, delay, used = record
+        if self._stream.take(epoch, counter):  # a replay is no sign of life: anybody can send it
+            if not self._silent:
+                self._gap.observe((stamp_ns - self._arrival_ns) * 1e-9)
+            self._arrival_ns, self._silent = stamp_ns, False
+        if delay == delay:  # not NaN: both ends share a clock
+            self._one_way.observe(delay)
+        if used:
+            self._newest_ns, self._newest_delay = stamp_ns, delay
+
+    def _on_check(self, record: LinkChecked) -> None:
+        self.check.see(record)
+
+    def _on_fault(self, record: Fault) -> None:
+        self._clock_steps += record.code == CLOCK_SET
+
+    def _on_session(self, record: SessionOpened) -> None:
+        self._sessions += 1
+        self._epoch = record.epoch
+        self._opened_ns = self._arrival_ns = record.stamp_ns
+        self._silent, self._newest_delay = True, nan
+
+    def _on_wake(self, record: Lateness) -> None:
+        stamp_ns, _, lateness, busy, slip_ns = record
+        now_ns = stamp_ns + slip_ns
+        if self._deadline_ns != NEVER_NS:
+            self._period.observe((now_ns - self._deadline_ns) * 1e-9)
+        self._deadline_ns, self._woke_ns = now_ns, stamp_ns
+        self._lateness.observe(lateness)
+        self._busy += busy
+
+    def _count_age(self, now_ns: int) -> None:
+        """Count the age of information at `now_ns` [ns, own clock], once per period."""
+        delay = self._newest_delay
+        if delay == delay:
+            self._age.observe(delay + (now_ns - self._newest_ns) * 1e-9)
+
+    def read(self) -> Readings:
+        """Return the current values; unknown values are absent."""
+        counts, stream, incoming = self._counts, self._stream, self._incoming
+        datagrams: dict[Labels, float] = {
+            (incoming, name): counts.get(name, 0) for name in self._outcomes
+        }
+        datagrams[self._outgoing, "sent"] = counts.get("sent", 0)
+        readings: Readings = {
+            **self._histograms,
+            **self.check.read(),
+            "cloudrc_session_epoch": unlabelled(self._epoch),
+            "cloudrc_sessions_opened_total": unlabelled(self._sessions),
+            "cloudrc_datagrams_total": datagrams,
+            "cloudrc_datagrams_expected_total": {(incoming,): stream.expected},
+            "cloudrc_datagrams_lost_total": {(incoming,): stream.lost},
+            "cloudrc_datagrams_reordered_total": {(incoming,): stream.reordered},
+            "cloudrc_loop_busy_seconds_total": unlabelled(self._busy),
+            "cloudrc_clock_steps_total": unlabelled(self._clock_steps),
+        }
+        if not self._one_way.cumulative()[-1]:  # unknown without a shared clock: absent, never zero
+            del readings[f"cloudrc_{incoming}_delay_seconds"]
+            del readings["cloudrc_age_of_information_seconds"]
+        return readings
+
+
+STEP_NS, STEPS = 1_000_000_000, 10
+"""The real-time factor: time between two samples [ns], and steps over which it is computed [1]."""
+ADMITTED = "cloud said hello"
+"""`SessionOpened.cause` of a session that world opens for a newly connected cloud."""
+
+
+class WorldEnd(End):
+    """Metrics of world: metrics of every end, the robot, guard, contacts, real-time factor."""
+
+    def __init__(self, counts: Mapping[str, int]) -> None:
+        """Set the counts and the guard's state GROUND."""
+        super().__init__(table.WORLD, counts)
+        self._truth: GroundTruth | None = None
+        self._guard = GuardState.GROUND
+        self._changes = dict.fromkeys(table.GUARD_STATES, 0)
+        self._contacts = dict.fromkeys(table.BODIES, 0)
+        self._slip_ns = self._admitted = 0
+        self._basis_ns = NEVER_NS
+        self._command_age = self._histograms["cloudrc_command_age_seconds"]
+        # Samples of world's clock and of the machine's clock [ns].
+        self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
+
+    @property
+    def has_peer(self) -> bool:
+        """Whether world receives datagrams from cloud.
+
+        Cloud sends nothing that these metrics see before its first command in a session. Until
+        that command, the session itself counts as a peer.
+        """
+        return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
+
+    def _on_session(self, record: SessionOpened) -> None:
+        super()._on_session(record)
+        self._admitted += record.cause == ADMITTED
+
+    def _on_truth(self, record: GroundTruth) -> None:
+        self._truth = record
+
+    def _on_command(self, record: CommandApplied) -> None:
+        self._basis_ns = record.basis_stamp_ns
+
+    def _on_telemetry(self, record: TelemetrySent) -> None:
+        self._count_age(record.stamp_ns)
+        if record.telemetry.guard is GuardState.TRACK:  # no other state uses commands
+            self._command_age.observe((record.stamp_ns - self._basis_ns) * 1e-9)
+
+    def _on_guard(self, record: GuardChange) -> None:
+        if record.state != self._guard or record.state is GuardState.GROUND:
+            # A touch-down repeats LAND, which is no change.
+            self._changes[table.GUARD_STATES[record.state]] += 1
+        self._guard = record.state
+
+    def _on_contact(self, record: Contact) -> None:
+        kind = record.body.rstrip("_0123456789")
+        self._contacts[kind if kind in self._contacts else "other"] += 1
+
+    def _on_wake(self, record: Lateness) -> None:
+        super()._on_wake(record)
+        self._slip_ns, now_ns = record.slip_ns, self._deadline_ns
+        if not self._instants or now_ns >= self._instants[-1][1] + STEP_NS:
+            self._instants.append((record.stamp_ns, now_ns))
+
+    def read(self) -> Readings:
+        """Return the current values; unknown values are absent."""
+        readings = super().read() | {
+            "cloudrc_clouds_admitted_total": unlabelled(self._admitted),
+            "cloudrc_guard_state": unlabelled(self._guard),
+            "cloudrc_guard_transitions_total": by_label(self._changes),
+            "cloudrc_contacts_total": by_label(self._contacts),
+            "cloudrc_world_slip_seconds_total": unlabelled(self._slip_ns * 1e-9),
+        }
+        if self._truth is not None:
+            readings["cloudrc_position_meters"] = per_axis(self._truth.odometry.position)
+            readings["cloudrc_tip_force_newtons"] = unlabelled(self._truth.tip_force)
+        instants = list(self._instants)
+        if len(instants) > 1:
+            (world_ns, machine_ns), (world_end_ns, machine_end_ns) = instants[0], instants[-1]
+            factor = (world_end_ns - world_ns) / (machine_end_ns - machine_ns)
+            readings["cloudrc_real_time_factor"] = unlabelled(factor)
+        return readings
+
+
+class CloudEnd(End):
+    """Metrics of cloud: metrics of every end, delays in the loop, prediction, control."""
+
+    def __init__(self, counts: Mapping[str, int]) -> None:
+        """Set the counts; there is no control period yet."""
+        super().__init__(table.CLOUD, counts)
+        self._rtt = self._histograms["cloudrc_rtt_seconds"]
+        self._loop = self._histograms["cloudrc_loop_delay_seconds"]
+        self._prediction, self._delay = PredictionJudge(), DelayJudge()
+        self._control: Control | None = None
+        self._loop_delay, self._used_count = nan, 0
+
+    def _on_session(self, record: SessionOpened) -> None:
+        super()._on_session(record)
+        self._prediction.reset()
+        self._delay.reset()
+
+    def _on_arrival(self, record: Arrival) -> None:
+        super()._on_arrival(record)
+        self._used_count += record.used
+
+    def _on_control(self, record: Control) -> None:
+        self._control = record
+        self._count_age(record.stamp_ns)
+        self._prediction.take(record)
+        loop_delay = record.loop_delay
+        if loop_delay != self._loop_delay and loop_delay == loop_delay:  # a new echo
+            self._loop_delay = loop_delay
+            self._loop.observe(loop_delay)
+            self._rtt.observe(record.rtt)
+            if self._used_count == 1:  # with two odometries, which one echoed is unknown
+                self._delay.echoed(record, self._newest_ns)
+        self._used_count = 0
+        self._delay.sent(record)
+
+    def read(self) -> Readings:
+        """Return the current values; unknown values are absent."""
+        prediction, control = self._prediction, self._control
+        readings = super().read() | {
+            "cloudrc_delay_estimate_error_seconds": unlabelled(self._delay.error),
+            "cloudrc_prediction_error_meters": per_axis(prediction.error),
+            "cloudrc_prediction_error_square_meters_total": unlabelled(prediction.square),
+            "cloudrc_predictions_judged_total": unlabelled(prediction.judged),
+        }
+        if control is None:
+            return readings
+        terms = control.proportional, control.integral, control.derivative
+        (sx, sy, sz), (mx, my, mz) = control.setpoint, control.measured
+        return readings | {
+            "cloudrc_delay_estimate_seconds": unlabelled(control.horizon),
+            "cloudrc_tracking_error_meters": per_axis((sx - mx, sy - my, sz - mz)),
+            "cloudrc_setpoint_meters": per_axis(control.setpoint),
+            "cloudrc_command_velocity_meters_per_second": per_axis(control.command),
+            "cloudrc_command_yaw_rate_radians_per_second": unlabelled(control.yaw_rate),
+            "cloudrc_pid_output": {
+                (axis, name): value
+                for name, term in zip(table.TERMS, terms, strict=True)
+                for axis, value in zip(table.AXES, term, strict=True)
+            },
+        }
 
 
 class Link:
@@ -127,11 +437,7 @@ class Mission:
         """
         self._shown = always
         self._state, self._waypoint, self._reached = "idle", NO_WAYPOINT, 0
-        self._ended = dict.fromkeys(MISSION_OUTCOMES, 0)
-
-    def handlers(self) -> Handlers:
-        """Map each class of records that this part uses to a handler."""
-        return {MissionEvent: self._on_event}
+        self._ended = dict.fromkeys(table.MISSION_OUTCOMES, 0)
 
     def _on_event(self, record: MissionEvent) -> None:
         self._shown = True
@@ -155,11 +461,29 @@ class Mission:
         if not self._shown:
             return {}
         return {
-            "cloudrc_mission_state": unlabelled(MISSION_STATES.index(self._state)),
+            "cloudrc_mission_state": unlabelled(table.MISSION_STATES.index(self._state)),
             "cloudrc_mission_waypoint": unlabelled(self._waypoint),
             "cloudrc_waypoints_reached_total": unlabelled(self._reached),
             "cloudrc_missions_total": by_label(self._ended),
         }
+
+
+HANDLERS: Mapping[type, str] = {
+    Arrival: "_on_arrival",
+    CommandApplied: "_on_command",
+    Contact: "_on_contact",
+    Control: "_on_control",
+    Counted: "_on_count",
+    Fault: "_on_fault",
+    GroundTruth: "_on_truth",
+    GuardChange: "_on_guard",
+    Lateness: "_on_wake",
+    LinkChecked: "_on_check",
+    MissionEvent: "_on_event",
+    SessionOpened: "_on_session",
+    TelemetrySent: "_on_telemetry",
+}
+"""Class of records -> method that handles it, in each part that has this method."""
 
 
 class LiveMetrics:
@@ -180,14 +504,18 @@ class LiveMetrics:
         """
         self._role = role
         self._counts: dict[str, int] = {}
-        ends: dict[str, type[WorldEnd | CloudEnd]] = {WORLD: WorldEnd, CLOUD: CloudEnd}
+        ends: dict[str, type[WorldEnd | CloudEnd]] = {table.WORLD: WorldEnd, table.CLOUD: CloudEnd}
         self.end: End | None = ends[role](self._counts) if role in ends else None
-        self.link = Link(self._counts) if role == LINK else None
-        mission = Mission(always=role == TELEOP) if missions and role in MISSION else None
+        self.link = Link(self._counts) if role == table.LINK else None
+        has_mission = missions and role in table.MISSION
+        mission = Mission(always=role == table.TELEOP) if has_mission else None
         self._parts = [part for part in (self.end, self.link, mission) if part is not None]
-        self._handlers: dict[type, Callable[[Any], None]] = {Counted: self._on_count}
-        for source in (self.end, mission):
-            self._handlers |= source.handlers() if source is not None else {}
+        self._handlers: dict[type, Callable[[Any], None]] = {
+            kind: getattr(part, name)
+            for part in (self, *self._parts)
+            for kind, name in HANDLERS.items()
+            if hasattr(part, name)
+        }
 
     def _on_count(self, record: Counted) -> None:
         self._counts[record.name] = record.total

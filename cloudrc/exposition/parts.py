@@ -8,11 +8,11 @@ scrape.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from heapq import heappop, heappush
 from itertools import accumulate
 from math import isnan, nan
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from cloudrc.exposition.table import AXES, Labels
 from cloudrc.messages import NEVER_NS, Vector
@@ -45,8 +45,6 @@ class Histogram:
         return list(accumulate(list(self._counts)))  # one atomic copy: the loop may count on
 
 
-Handlers: TypeAlias = Mapping[type, Callable[[Any], None]]
-"""Class of records -> function that processes a record."""
 Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 """Metric name -> value for each tuple of label values, or a histogram (without labels)."""
 
@@ -195,13 +193,12 @@ class DelayJudge:
     def reset(self) -> None:
         """Drop all commands at the start of a new session."""
         self._sent: dict[int, Control] = {}
-        self._sent_before: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:
         """Store a command that cloud sent."""
-        if len(self._sent) >= WAITING_MAX:
-            self._sent_before, self._sent = self._sent, {}
         self._sent[control.stamp_ns] = control
+        if len(self._sent) > WAITING_MAX:
+            del self._sent[next(iter(self._sent))]  # the oldest
 
     def echoed(self, control: Control, arrival_ns: int) -> None:
         """Compute the error of the command that this period's odometry echoed.
@@ -210,8 +207,7 @@ class DelayJudge:
             control: First control period after the echo.
             arrival_ns: Arrival of that odometry [ns], cloud's clock.
         """
-        stamp_ns = arrival_ns - round(control.loop_delay * 1e9)
-        sent = self._sent.get(stamp_ns) or self._sent_before.get(stamp_ns)
+        sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
         if sent is not None:
             applied_ns = control.basis_stamp_ns - round((control.loop_delay - control.rtt) * 1e9)
             self.error = sent.horizon - (applied_ns - sent.basis_stamp_ns) * 1e-9

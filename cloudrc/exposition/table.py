@@ -121,20 +121,6 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         """
         cloudrc_session_epoch: Epoch number of the current session.
         cloudrc_sessions_opened_total: Sessions opened since this process started.
-        """,
-    ),
-    (
-        (WORLD,),
-        """
-        cloudrc_clouds_admitted_total: Cloud processes that got a session: the first, one that
-            restarted, or another one.
-        cloudrc_sessions_refused_total: Session requests refused because another cloud controls
-            the robot.
-        """,
-    ),
-    (
-        ENDS,
-        """
         cloudrc_datagrams_total: Datagrams by outcome; updated once a second.
         cloudrc_datagrams_expected_total: Incoming telemetry or command datagrams whose fate is
             known: arrived or lost.
@@ -144,63 +130,32 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
             newer one.
         cloudrc_link_gap_seconds: Time between two arrivals: of telemetry at cloud, of commands at
             world.
-        """,
-    ),
-    (
-        (CLOUD,),
-        """
-        cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included;
-            absent unless both ends prove that they share a clock.
-        """,
-    ),
-    (
-        (WORLD,),
-        """
-        cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams
-            included; absent unless both ends prove that they share a clock.
-        """,
-    ),
-    (
-        ENDS,
-        """
         cloudrc_link_believed: 1 if the incoming direction of the link behaves as configured, 0 if
             it does not (/link.json on the same port says why); absent while there are too few
             datagrams to decide.
         cloudrc_age_of_information_seconds: Age of the newest datagram used, sampled every period:
             odometry in cloud, commands in world; absent unless both ends prove that they share a
             clock.
-        """,
-    ),
-    (
-        (CLOUD,),
-        """
-        cloudrc_rtt_seconds: Round trip of applied commands, without the hold time in world; one
-            sample per echo.
-        cloudrc_loop_delay_seconds: Time from a command's stamp to its echo, with the hold time in
-            world: the paper's tau.
-        cloudrc_delay_estimate_seconds: Delay estimate, clamped: the horizon over which the newest
-            odometry is predicted.
-        cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry
-            to the application of the command, for the newest echoed command.
-        cloudrc_prediction_error_meters: Newest prediction error: predicted minus measured
-            position at the same instant.
-        cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction
-            errors.
-        cloudrc_predictions_judged_total: Predictions compared with a measurement.
-        cloudrc_tracking_error_meters: Setpoint minus measured position, in the newest period.
-        cloudrc_setpoint_meters: Position setpoint, world frame.
-        cloudrc_pid_output: Terms of the controller's output [m/s], in the newest period.
-        cloudrc_command_velocity_meters_per_second: Commanded velocity, world frame.
-        cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
-        cloudrc_horizon_clamped_total: Delay estimates above 1 s or below 0, which were clamped.
-        cloudrc_commands_frozen_total: Zero-velocity commands sent because no echo arrives.
-        cloudrc_plugin_failures_total: Plug-in calls that raised an exception or returned a value
-            that is not finite.
+        cloudrc_loop_period_seconds: Time between two handled deadlines.
+        cloudrc_loop_lateness_seconds: Delay from a deadline to the wake of the loop.
+        cloudrc_loop_busy_seconds_total: Time spent handling deadlines.
+        cloudrc_recorder_dropped_records_total: Records that did not reach the recording.
+        cloudrc_recorder_sync_age_seconds: Time since the start of the newest completed sync of
+            the recording: the part that a power cut would lose; absent without a recording,
+            rising forever after recording failed.
+        cloudrc_clock_steps_total: Times that the wall clock was set, each recorded as a fault
+            with its size; flight does not depend on the wall clock.
         """,
     ),
     (
         (WORLD,),
         f"""
+        cloudrc_clouds_admitted_total: Cloud processes that got a session: the first, one that
+            restarted, or another one.
+        cloudrc_sessions_refused_total: Session requests refused because another cloud controls
+            the robot.
+        cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams
+            included; absent unless both ends prove that they share a clock.
         cloudrc_position_meters: True position of the base, world frame.
         cloudrc_tip_force_newtons: Force on the touch sensor at the arm's tip.
         cloudrc_command_age_seconds: Age of the current command, sampled every period in TRACK:
@@ -223,30 +178,35 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         """,
     ),
     (
-        ENDS,
-        """
-        cloudrc_loop_period_seconds: Time between two handled deadlines.
-        cloudrc_loop_lateness_seconds: Delay from a deadline to the wake of the loop.
-        cloudrc_loop_busy_seconds_total: Time spent handling deadlines.
-        """,
-    ),
-    (
         (CLOUD,),
         """
+        cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included;
+            absent unless both ends prove that they share a clock.
+        cloudrc_rtt_seconds: Round trip of applied commands, without the hold time in world; one
+            sample per echo.
+        cloudrc_loop_delay_seconds: Time from a command's stamp to its echo, with the hold time in
+            world: the paper's tau.
+        cloudrc_delay_estimate_seconds: Delay estimate, clamped: the horizon over which the newest
+            odometry is predicted.
+        cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry
+            to the application of the command, for the newest echoed command.
+        cloudrc_prediction_error_meters: Newest prediction error: predicted minus measured
+            position at the same instant.
+        cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction
+            errors.
+        cloudrc_predictions_judged_total: Predictions compared with a measurement.
+        cloudrc_tracking_error_meters: Setpoint minus measured position, in the newest period.
+        cloudrc_setpoint_meters: Position setpoint, world frame.
+        cloudrc_pid_output: Terms of the controller's output [m/s], in the newest period.
+        cloudrc_command_velocity_meters_per_second: Commanded velocity, world frame.
+        cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
+        cloudrc_horizon_clamped_total: Delay estimates above 1 s or below 0, which were clamped.
+        cloudrc_commands_frozen_total: Zero-velocity commands sent because no echo arrives.
+        cloudrc_plugin_failures_total: Plug-in calls that raised an exception or returned a value
+            that is not finite.
         cloudrc_words_dropped_total: Teleop messages dropped because they were for another session
             or no request number was left.
         cloudrc_loop_missed_periods_total: Commands that a late loop skipped.
-        """,
-    ),
-    (
-        ENDS,
-        """
-        cloudrc_recorder_dropped_records_total: Records that did not reach the recording.
-        cloudrc_recorder_sync_age_seconds: Time since the start of the newest completed sync of
-            the recording: the part that a power cut would lose; absent without a recording,
-            rising forever after recording failed.
-        cloudrc_clock_steps_total: Times that the wall clock was set, each recorded as a fault
-            with its size; flight does not depend on the wall clock.
         """,
     ),
     (

@@ -1,8 +1,7 @@
 """Compute metrics of a recorded flight: each is one number with a unit.
 
-A shipped metric is a function in `flight`, `control`, `link` or `mission`. The report prints its
-name, and the first line of its docstring as the meaning of the number. docs/plugins.md describes
-metrics of your own.
+A shipped metric is a row of the table in `flight`, `control`, `link` or `mission`. docs/plugins.md
+describes metrics of your own.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cloudrc.metrics.flight import Columns, Flight, mean, metric, percentile, rms
+from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentile, rms
 
 
 def round_trips(flight: Flight) -> Columns:
@@ -20,127 +20,90 @@ def round_trips(flight: Flight) -> Columns:
     return {name: column[new] for name, column in control.items()}
 
 
-@metric("s")
-def rtt_mean(flight: Flight) -> float | None:
-    """Mean round trip from command to echo, without the hold time in world.
-
-    Only applied commands have an echo, and these are the fast ones if the newest command wins.
-    """
-    return mean(round_trips(flight)["rtt"])
-
-
-@metric("s")
-def rtt_p95(flight: Flight) -> float | None:
-    """Round trip from command to echo, without the hold time in world: 95th percentile."""
-    return percentile(round_trips(flight)["rtt"], 95.0)
-
-
-@metric("s")
-def loop_delay_mean(flight: Flight) -> float | None:
-    """Mean round trip from command to echo, with the hold time in world: the paper's tau_n."""
-    return mean(round_trips(flight)["loop_delay"])
-
-
-@metric("s")
-def age_of_information_mean(flight: Flight) -> float | None:
-    """Mean age of cloud's newest odometry when it computes a command.
-
-    None unless both ends prove that they share a clock; only then one-way delays are recorded.
-    """
+def _age_of_information(flight: Flight) -> float | None:
+    """Average the age; only ends that prove that they share a clock record one-way delays."""
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
     return mean((flight.control["stamp_ns"] - flight.control["basis_stamp_ns"]) * 1e-9)
 
 
-@metric("1")
-def commands_applied(flight: Flight) -> float | None:
-    """Number of commands that reached the low-level controller."""
-    if flight.start_ns is None:
-        return None
-    return float(len(flight.during("/command_applied")["epoch"]))
+def _prediction_error(flight: Flight) -> float | None:
+    """Compare with the truth at the application, so the error of the delay estimate counts, too.
 
-
-@metric("m")
-def prediction_error_rms(flight: Flight) -> float | None:
-    """RMS distance from the predicted to the true position when each command was applied.
-
-    It contains the error of the delay estimate. Source: docs/reference/control.md, "Predictors".
+    Source: docs/reference/control.md, "Predictors".
     """
     applied = flight.applied
     return rms(applied["position"] - flight.true_position(applied["stamp_ns"]))
 
 
-@metric("m")
-def estimate_error_rms(flight: Flight) -> float | None:
-    """RMS distance from the predicted to the true position at the instant of the prediction.
-
-    This is the error of the predictor alone, even if the horizon is wrong.
-    """
+def _estimate_error(flight: Flight) -> float | None:
+    """Compare with the truth at the horizon: the error of the predictor alone."""
     control = flight.control
     target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return rms(control["position"] - flight.true_position(target_ns))
 
 
-@metric("s")
-def delay_estimate_error_rms(flight: Flight) -> float | None:
-    """RMS difference between the horizon and the true delay from odometry to applied command."""
+def _delay_error(flight: Flight) -> float | None:
     applied = flight.applied
     return rms(applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9)
 
 
-@metric("m")
-def tracking_rms_measured(flight: Flight) -> float | None:
-    """RMS distance between the setpoint and the measured position that cloud used."""
-    return rms(flight.control["setpoint"] - flight.control["measured"])
-
-
-@metric("m")
-def tracking_rms_estimated(flight: Flight) -> float | None:
-    """RMS distance between the setpoint and cloud's estimated position."""
-    return rms(flight.control["setpoint"] - flight.control["position"])
-
-
-def wakes(flight: Flight, end: str) -> Columns:
+def _wakes(flight: Flight, end: str) -> Columns:
     """Select the rows of /lateness that "world" or "cloud" recorded; none in virtual time."""
     columns = flight.during("/lateness")
     rows = columns["end"] == end
     return {name: column[rows] for name, column in columns.items()}
 
 
-@metric("s")
-def world_lateness_p99(flight: Flight) -> float | None:
-    """Lateness of world's wakes: 99th percentile; real time only."""
-    return percentile(wakes(flight, "world")["lateness"], 99.0)
-
-
-@metric("s")
-def cloud_lateness_p99(flight: Flight) -> float | None:
-    """Lateness of cloud's wakes: 99th percentile; real time only."""
-    return percentile(wakes(flight, "cloud")["lateness"], 99.0)
-
-
-@metric("s")
-def world_slip(flight: Flight) -> float | None:
-    """Time that world's clock lost on the machine's clock because the simulation was late."""
-    slips = wakes(flight, "world")["slip_ns"]
+def _slip(flight: Flight) -> float | None:
+    slips = _wakes(flight, "world")["slip_ns"]
     return float(slips[-1] - slips[0]) * 1e-9 if len(slips) else None
 
 
-@metric("1")
-def real_time_factor(flight: Flight) -> float | None:
-    """Simulated time divided by time on the machine's clock; real time only."""
-    slipped = world_slip(flight)
+def _real_time_factor(flight: Flight) -> float | None:
+    slipped = _slip(flight)
     if slipped is None or not flight.end_ns:
         return None
     simulated = float(flight.seconds(flight.end_ns))
     return simulated / (simulated + slipped) if simulated > 0 else None
 
 
-@metric("1")
-def missed_periods(flight: Flight) -> float | None:
-    """Number of 10 ms periods without a command because cloud was late; real time only."""
+def _missed_periods(flight: Flight) -> float | None:
     if not len(flight.recording["/lateness"]):
         return None
-    count = flight.recording["/count"]
-    missed = count["total"][count["name"] == "missed_periods"]
-    return float(missed[-1]) if len(missed) else 0.0
+    return flight.last_total("missed_periods") or 0.0
+
+
+add_metrics(
+    ("rtt_mean", "s", "Mean round trip from command to echo, without the hold time in world.",
+     lambda flight: mean(round_trips(flight)["rtt"])),
+    ("rtt_p95", "s", "Round trip from command to echo, without the hold time in world: 95th "
+     "percentile.", lambda flight: percentile(round_trips(flight)["rtt"], 95.0)),
+    ("loop_delay_mean", "s", "Mean round trip from command to echo, with the hold time in world: "
+     "the paper's tau_n.", lambda flight: mean(round_trips(flight)["loop_delay"])),
+    ("age_of_information_mean", "s", "Mean age of cloud's newest odometry when it computes a "
+     "command.", _age_of_information),
+    ("commands_applied", "1", "Number of commands that reached the low-level controller.",
+     lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
+    ("prediction_error_rms", "m", "RMS distance from the predicted to the true position when each "
+     "command was applied.", _prediction_error),
+    ("estimate_error_rms", "m", "RMS distance from the predicted to the true position at the "
+     "instant of the prediction.", _estimate_error),
+    ("delay_estimate_error_rms", "s", "RMS difference between the horizon and the true delay from "
+     "odometry to applied command.", _delay_error),
+    ("tracking_rms_measured", "m", "RMS distance between the setpoint and the measured position "
+     "that cloud used.",
+     lambda flight: rms(flight.control["setpoint"] - flight.control["measured"])),
+    ("tracking_rms_estimated", "m", "RMS distance between the setpoint and cloud's estimated "
+     "position.", lambda flight: rms(flight.control["setpoint"] - flight.control["position"])),
+    ("world_lateness_p99", "s", "Lateness of world's wakes: 99th percentile; real time only.",
+     lambda flight: percentile(_wakes(flight, "world")["lateness"], 99.0)),
+    ("cloud_lateness_p99", "s", "Lateness of cloud's wakes: 99th percentile; real time only.",
+     lambda flight: percentile(_wakes(flight, "cloud")["lateness"], 99.0)),
+    ("world_slip", "s", "Time that world's clock lost on the machine's clock because the "
+     "simulation was late.", _slip),
+    ("real_time_factor", "1", "Simulated time divided by time on the machine's clock; real time "
+     "only.", _real_time_factor),
+    ("missed_periods", "1", "Number of 10 ms periods without a command because cloud was late; "
+     "real time only.", _missed_periods),
+)  # fmt: skip

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -123,6 +123,16 @@ class Flight:
             return np.zeros(0, dtype=bool)
         return pipe_index(self.scene, self.truth["position"]) >= 0
 
+    def count(self, number: int) -> float | None:
+        """Return a number of events [1]; None if the robot never flew."""
+        return None if self.start_ns is None else float(number)
+
+    def last_total(self, name: str) -> float | None:
+        """Return the last total of a count of the ends or of the relay [1]; None without one."""
+        count = self.recording["/count"]
+        totals = count["total"][count["name"] == name]
+        return float(totals[-1]) if len(totals) else None
+
     @cached_property
     def pipes_flown(self) -> int:
         """Number of different pipes in which the base has been."""
@@ -181,23 +191,9 @@ SHIPPED: dict[str, Metric] = {}
 """Shipped metrics by name; complete once `cloudrc.metrics` is imported."""
 
 
-def add_metric(name: str, unit: str, meaning: str, measure: Measure) -> None:
-    """Add a shipped metric; the arguments are the attributes of a `Metric`."""
-    SHIPPED[name] = Metric(name, unit, meaning, measure)
-
-
-def metric(unit: str) -> Callable[[Measure], Measure]:
-    """Register the decorated function as a shipped metric with this unit.
-
-    The function's name is the metric's name; the first line of its docstring is the meaning.
-    """
-
-    def add(measure: Measure) -> Measure:
-        meaning = (measure.__doc__ or "").partition("\n")[0]
-        add_metric(measure.__name__, unit, meaning, measure)
-        return measure
-
-    return add
+def add_metrics(*rows: tuple[str, str, str, Measure]) -> None:
+    """Add shipped metrics; each row has the attributes of a `Metric`."""
+    SHIPPED.update({row[0]: Metric(*row) for row in rows})
 
 
 def mean(values: Array) -> float | None:
@@ -222,34 +218,28 @@ def rms(errors: Array) -> float | None:
     return None if square is None else float(np.sqrt(square))
 
 
-@metric("s")
-def duration(flight: Flight) -> float | None:
-    """Time from the start of the mission to its end."""
-    return None if flight.end_ns is None else float(flight.seconds(flight.end_ns))
+def _least_clearance(flight: Flight, *, inside: bool) -> float | None:
+    found = flight.clearance[flight.inside] if inside else flight.clearance
+    return float(found.min()) if len(found) else None
 
 
-@metric("m")
-def distance_flown(flight: Flight) -> float | None:
-    """Length of the path that the robot's base flew."""
+def _distance(flight: Flight) -> float | None:
     steps = np.diff(flight.truth["position"], axis=0)
     return float(np.linalg.norm(steps, axis=1).sum()) if len(steps) else None
 
 
-@metric("m/s")
-def speed_max(flight: Flight) -> float | None:
-    """Largest true speed of the robot's base."""
+def _speed_max(flight: Flight) -> float | None:
     speeds = np.linalg.norm(flight.truth["velocity"], axis=1)
     return float(speeds.max()) if len(speeds) else None
 
 
-@metric("m")
-def min_clearance(flight: Flight) -> float | None:
-    """Smallest distance between the robot and a pipe's wall while the base is inside a pipe."""
-    inside = flight.clearance[flight.inside]
-    return float(inside.min()) if len(inside) else None
-
-
-@metric("m")
-def min_clearance_flight(flight: Flight) -> float | None:
-    """Smallest distance between the robot and a pipe during the whole flight."""
-    return float(flight.clearance.min()) if len(flight.clearance) else None
+add_metrics(
+    ("duration", "s", "Time from the start of the mission to its end.",
+     lambda flight: None if flight.end_ns is None else float(flight.seconds(flight.end_ns))),
+    ("distance_flown", "m", "Length of the path that the robot's base flew.", _distance),
+    ("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
+    ("min_clearance", "m", "Smallest distance between the robot and a pipe's wall while the base "
+     "is inside a pipe.", partial(_least_clearance, inside=True)),
+    ("min_clearance_flight", "m", "Smallest distance between the robot and a pipe during the whole "
+     "flight.", partial(_least_clearance, inside=False)),
+)  # fmt: skip

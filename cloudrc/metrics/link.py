@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from cloudrc.metrics.flight import Flight, add_metric, mean
+from cloudrc.metrics.flight import Flight, add_metrics, mean
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
 """Direction -> description of the direction in the meaning of a metric."""
@@ -18,6 +18,12 @@ SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 SETTLING_NS = 2_000_000_000
 """Time after which a datagram that has not arrived counts as lost [ns]."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
+COUNTS = {
+    "relay_overflow": "that the relay dropped because its queue was full.",
+    # The release errors do not include this time.
+    "relay_stalled": "that waited 50 ms or more until the relay read them.",
+    "released_early": "that left before they were due; above 0 the relay has a bug.",
+}
 
 
 def _delay_mean(flight: Flight, way: str) -> float | None:
@@ -46,35 +52,28 @@ def loss(flight: Flight, way: str) -> float | None:
     return 1.0 - len(arrived) / len(keys) if keys else None
 
 
-def _relay_count(flight: Flight, name: str, scale: float = 1.0) -> float | None:
-    """Return the relay's last total of a count; None if no relay shaped the link."""
-    count = flight.recording["/count"]
-    totals = count["total"][count["name"] == name]
-    return int(totals[-1]) * scale if len(totals) else None
+def _add_direction(way: str, words: str) -> None:
+    """Add the metrics of one direction; without a relay its counts are unknown."""
+
+    def seconds(name: str, flight: Flight) -> float | None:
+        total = flight.last_total(f"{way}_release_error_{name}_ns")
+        return None if total is None else total * 1e-9
+
+    add_metrics(
+        (f"{way}_delay_mean", "s", f"Mean one-way delay {words} of all datagrams that arrived, "
+         "late ones included.", partial(_delay_mean, way=way)),
+        (f"late_{way}", "1", f"Share of the arrived datagrams {words} that were too late to be "
+         "used.", partial(_late, way=way)),
+        (f"loss_{way}", "1", f"Share of the datagrams {words} that never arrived.",
+         partial(loss, way=way)),
+        *((f"release_error_{name}_{way}", "s", f"Delay with which the relay released datagrams "
+           f"{words} after they were due: {which}.", partial(seconds, name))
+          for name, which in PERCENTILES.items()),
+        *((f"{name}_{way}", "1", f"Datagrams {words} {which}", partial(
+            Flight.last_total, name=f"{way}_{name.removeprefix('relay_')}"))
+          for name, which in COUNTS.items()),
+    )  # fmt: skip
 
 
 for _way, _words in WAYS.items():
-    _all = f"Mean one-way delay {_words} of all datagrams that arrived, late ones included."
-    add_metric(f"{_way}_delay_mean", "s", _all, partial(_delay_mean, way=_way))
-    for _name, _which, _measure in (
-        ("late", f"arrived datagrams {_words} that were too late to be used.", _late),
-        ("loss", f"datagrams {_words} that never arrived.", loss),
-    ):
-        add_metric(f"{_name}_{_way}", "1", f"Share of the {_which}", partial(_measure, way=_way))
-    for _name, _which in PERCENTILES.items():
-        add_metric(
-            f"release_error_{_name}_{_way}",
-            "s",
-            f"Delay with which the relay released datagrams {_words} after they were due: "
-            f"{_which}.",
-            partial(_relay_count, name=f"{_way}_release_error_{_name}_ns", scale=1e-9),
-        )
-    for _name, _which in (
-        ("relay_overflow", "that the relay dropped because its queue was full."),
-        # The release errors do not include this time.
-        ("relay_stalled", "that waited 50 ms or more until the relay read them."),
-        ("released_early", "that left before they were due; above 0 the relay has a bug."),
-    ):
-        _count = f"{_way}_{_name.removeprefix('relay_')}"
-        _last = partial(_relay_count, name=_count)
-        add_metric(f"{_name}_{_way}", "1", f"Datagrams {_words} {_which}", _last)
+    _add_direction(_way, _words)

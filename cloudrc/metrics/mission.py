@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from cloudrc.messages import GuardState
-from cloudrc.metrics.flight import Array, Flight, add_metric, mean, metric
+from cloudrc.metrics.flight import Array, Flight, add_metrics, mean
 
 BOARD = "board"
 """Name of the scene's body that the arm must touch."""
@@ -24,15 +24,6 @@ FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizo
 """Names of cloud's counters whose values are added to the number of faults."""
 
 
-@metric("1")
-def waypoints_reached(flight: Flight) -> float | None:
-    """Number of waypoints reached: the robot stayed within the tolerance for the dwell time."""
-    if flight.start_ns is None:
-        return None
-    mission = flight.during("/mission")
-    return float(len(np.unique(mission["waypoint"][mission["event"] == "reached"])))
-
-
 def first_touch(flight: Flight) -> dict[str, Array] | None:
     """Find the row of /contact at which the arm first touched the board; None without a touch."""
     contact = flight.during("/contact")
@@ -40,36 +31,42 @@ def first_touch(flight: Flight) -> dict[str, Array] | None:
     return {name: column[touches[0]] for name, column in contact.items()} if len(touches) else None
 
 
-@metric("s")
-def contact_time(flight: Flight) -> float | None:
-    """Time from the start of the mission to the arm's first touch of the board."""
+def holds(flight: Flight) -> list[tuple[int, int]]:
+    """List start and end of each interval in HOLD during the flight [ns], world's clock."""
+    if flight.end_ns is None:
+        return []
+    guard = flight.during("/guard")
+    ends = [*guard["stamp_ns"][1:], flight.end_ns]
+    return [
+        (int(start), int(end))
+        for start, end, state in zip(guard["stamp_ns"], ends, guard["state"], strict=True)
+        if state == GuardState.HOLD
+    ]
+
+
+def _waypoints_reached(flight: Flight) -> float | None:
+    mission = flight.during("/mission")
+    return flight.count(len(np.unique(mission["waypoint"][mission["event"] == "reached"])))
+
+
+def _contact_time(flight: Flight) -> float | None:
     touch = first_touch(flight)
     return None if touch is None else float(flight.seconds(touch["stamp_ns"]))
 
 
-@metric("m/s")
-def tip_speed(flight: Flight) -> float | None:
-    """Speed of the arm's tip just before it first touches the board."""
+def _tip_speed(flight: Flight) -> float | None:
     touch = first_touch(flight)
     return None if touch is None else float(np.linalg.norm(touch["tip_velocity"]))
 
 
-@metric("N")
-def peak_contact_force(flight: Flight) -> float | None:
-    """Largest force on the arm's tip, as sampled at 100 Hz.
-
-    It depends on the simulator's contact parameters: compare only flights in the same scene.
-    """
+def _peak_force(flight: Flight) -> float | None:
+    """Find the largest force: it depends on the simulator's contact parameters."""
     force = flight.during("/contact_force")["tip_force"]
     return None if first_touch(flight) is None or not len(force) else float(force.max())
 
 
-@metric("N")
-def steady_contact_force(flight: Flight) -> float | None:
-    """Mean force on the arm's tip over the last 2 s of the mission.
-
-    Unlike the peak at impact, it does not depend on the simulator's contact parameters.
-    """
+def _steady_force(flight: Flight) -> float | None:
+    """Average the force at the end: it does not depend on the simulator's contact parameters."""
     touch = first_touch(flight)
     if touch is None or flight.ending is None or flight.ending[1] != "done":
         return None
@@ -80,13 +77,11 @@ def steady_contact_force(flight: Flight) -> float | None:
     return mean(force["tip_force"][force["stamp_ns"] >= begin_ns])
 
 
-@metric("1")
-def pipe_contacts(flight: Flight) -> float | None:
-    """Number of contacts with a pipe."""
-    if flight.start_ns is None or not flight.scene.pipes:
+def _pipe_contacts(flight: Flight) -> float | None:
+    if not flight.scene.pipes:
         return None
     bodies = flight.during("/contact")["body"]
-    return float(np.sum([str(body).startswith("pipe") for body in bodies]))
+    return flight.count(sum(str(body).startswith("pipe") for body in bodies))
 
 
 def _steady_error(flight: Flight, axis: int) -> float | None:
@@ -109,62 +104,48 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
     return float(np.abs(flight.truth["position"][rows, axis] - still[-1, axis]).mean())
 
 
-for _axis, _name in enumerate("xyz"):
-    add_metric(
-        f"steady_error_{_name}",
-        "m",
-        f"Mean distance from the setpoint along {_name} over the last 5 s of a hover.",
-        partial(_steady_error, axis=_axis),
-    )
-
-
-def holds(flight: Flight) -> list[tuple[int, int]]:
-    """List start and end of each interval in HOLD during the flight [ns], world's clock."""
-    if flight.end_ns is None:
-        return []
-    guard = flight.during("/guard")
-    ends = [*guard["stamp_ns"][1:], flight.end_ns]
-    return [
-        (int(start), int(end))
-        for start, end, state in zip(guard["stamp_ns"], ends, guard["state"], strict=True)
-        if state == GuardState.HOLD
-    ]
-
-
-@metric("1")
-def hold_count(flight: Flight) -> float | None:
-    """Number of times that the guard went to HOLD because fresh commands were missing."""
-    return None if flight.start_ns is None else float(len(holds(flight)))
-
-
-@metric("s")
-def hold_time(flight: Flight) -> float | None:
-    """Total time in HOLD, in which the guard flies without commands."""
+def _hold_time(flight: Flight) -> float | None:
     if flight.start_ns is None:
         return None
     return sum(end - start for start, end in holds(flight)) * 1e-9
 
 
-@metric("1")
-def fault_count(flight: Flight) -> float | None:
-    """Number of faults that did not stop the flight, such as an exception in a predictor.
-
-    A failure that repeats has only one fault record; its counter contains every repetition.
-    """
-    if flight.start_ns is None:
-        return None
-    count = flight.recording["/count"]
+def _fault_count(flight: Flight) -> float | None:
+    """Count the faults; one that repeats has one record, and its counter has every repetition."""
     totals = dict.fromkeys(flight.recording["/fault"]["code"], 1)
-    for name, total in zip(count["name"], count["total"], strict=True):
-        if name in FAILURES:
+    for name in FAILURES:
+        if (total := flight.last_total(name)) is not None:
             totals[name] = max(totals.get(name, 0), int(total))
-    return float(sum(totals.values()))
+    return flight.count(sum(totals.values()))
 
 
-@metric("1")
-def recorder_dropped(flight: Flight) -> float | None:
-    """Number of records that the recorder dropped because the loop must not wait for a disk."""
+def _recorder_dropped(flight: Flight) -> float | None:
     count = flight.recording["/count"]
     rows = zip(count["end"], count["name"], count["total"], strict=True)
     last = {end: int(value) for end, name, value in rows if name == "recorder_dropped"}
     return float(sum(last.values())) if last else None
+
+
+add_metrics(
+    ("waypoints_reached", "1", "Number of waypoints reached: the robot stayed within the tolerance "
+     "for the dwell time.", _waypoints_reached),
+    ("contact_time", "s", "Time from the start of the mission to the arm's first touch of the "
+     "board.", _contact_time),
+    ("tip_speed", "m/s", "Speed of the arm's tip just before it first touches the board.",
+     _tip_speed),
+    ("peak_contact_force", "N", "Largest force on the arm's tip, as sampled at 100 Hz.",
+     _peak_force),
+    ("steady_contact_force", "N", "Mean force on the arm's tip over the last 2 s of the mission.",
+     _steady_force),
+    ("pipe_contacts", "1", "Number of contacts with a pipe.", _pipe_contacts),
+    *((f"steady_error_{name}", "m", f"Mean distance from the setpoint along {name} over the last "
+       "5 s of a hover.", partial(_steady_error, axis=axis)) for axis, name in enumerate("xyz")),
+    ("hold_count", "1", "Number of times that the guard went to HOLD because fresh commands were "
+     "missing.", lambda flight: flight.count(len(holds(flight)))),
+    ("hold_time", "s", "Total time in HOLD, in which the guard flies without commands.",
+     _hold_time),
+    ("fault_count", "1", "Number of faults that did not stop the flight, such as an exception in a "
+     "predictor.", _fault_count),
+    ("recorder_dropped", "1", "Number of records that the recorder dropped because the loop must "
+     "not wait for a disk.", _recorder_dropped),
+)  # fmt: skip

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,16 @@ from typing import Any
 import yaml
 
 from cloudrc.exposition.live import LiveMetrics
-from cloudrc.exposition.parts import Histogram, Readings
+from cloudrc.exposition.parts import Histogram
 from cloudrc.exposition.table import METRICS
 from cloudrc.faults import measures
-from cloudrc.faults.flight import Flight
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.records import Control, Counted
 
 MS = 1_000_000
 
 
-def period(stamp_ms: float, basis_ms: float, **fields: Any) -> Control:
+def period(stamp_ms, basis_ms, **fields):
     """Make a control period at `stamp_ms`, cloud's clock, from odometry of `basis_ms`, world's."""
     still: dict[str, Any] = dict.fromkeys(Control._fields, ZERO)
     still |= {"stamp_ns": round(stamp_ms * MS), "basis_stamp_ns": round(basis_ms * MS)}
@@ -40,7 +38,7 @@ AFTER = 11
 ROLES = ("world", "cloud", "teleop")
 
 
-def series(flight: Flight) -> list[dict[str, str]]:
+def series(flight):
     """Return every series of a flight, one value per scrape."""
     times = range(0, int(flight.now) + AFTER, PERIOD)
     values: dict[str, list[str]] = {}
@@ -51,7 +49,7 @@ def series(flight: Flight) -> list[dict[str, str]]:
     return [{"series": name, "values": " ".join(each)} for name, each in values.items()]
 
 
-def scrapes(flight: Flight, role: str, times: range) -> Iterator[Readings]:
+def scrapes(flight, role, times):
     """Yield the readings of a process at each time [s]."""
     live, seen, sent = LiveMetrics(role, missions=role != "cloud"), 0, 0
     for time in times:
@@ -70,7 +68,7 @@ def scrapes(flight: Flight, role: str, times: range) -> Iterator[Readings]:
         }
 
 
-def samples(role: str, readings: Readings) -> Iterator[tuple[str, float]]:
+def samples(role, readings):
     for name, reading in readings.items():
         if isinstance(reading, Histogram):
             yield f'{name}_sum{{instance="{role}"}}', reading.total
@@ -82,7 +80,7 @@ def samples(role: str, readings: Readings) -> Iterator[tuple[str, float]]:
             yield f"{name}{{{inside}}}", value
 
 
-def fired(flight: Flight, folder: Path) -> set[str]:
+def fired(flight, folder):
     """Return the alerts of the chart that a flight fires, evaluated by promtool."""
     expression = 'group by (alertname) (last_over_time(ALERTS{alertstate="firing"}[1d]))'
     test: dict[str, Any] = {

@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import Scenario
 from cloudrc.faults.scenarios import SCENARIOS
 from tests.exposition.conftest import RULES, fired
 
@@ -36,12 +35,12 @@ FLOWN = [
 ]
 
 
-def alerts() -> set[str]:
+def alerts():
     groups = yaml.safe_load(RULES.read_text(encoding="utf-8"))["groups"]
     return {rule["alert"] for group in groups for rule in group["rules"] if "alert" in rule}
 
 
-def test_every_alert_has_a_test_that_fires_it() -> None:
+def test_every_alert_has_a_test_that_fires_it():
     tried = [
         check for test in yaml.safe_load(MADE_UP)["tests"] for check in test["alert_rule_test"]
     ]
@@ -49,32 +48,30 @@ def test_every_alert_has_a_test_that_fires_it() -> None:
 
 
 @pytest.fixture
-def flights(monkeypatch: pytest.MonkeyPatch) -> list[Flight]:
+def flights(monkeypatch):
     """All flights of a test."""
     if shutil.which("promtool") is None:
         pytest.skip("needs promtool (Debian package prometheus)")
     made: list[Flight] = []
     init = Flight.__init__
 
-    def remember(self: Flight, *settings: str, **options: object) -> None:
+    def remember(self, *settings, **options):
         made.append(self)
-        init(self, *settings, **options)  # type: ignore[arg-type]
+        init(self, *settings, **options)
 
     monkeypatch.setattr(Flight, "__init__", remember)
     return made
 
 
 @pytest.mark.parametrize("scenario", FLOWN)
-def test_a_fault_fires_its_alerts_and_no_others(
-    scenario: Scenario, flights: list[Flight], tmp_path: Path
-) -> None:
+def test_a_fault_fires_its_alerts_and_no_others(scenario, flights, tmp_path):
     scenario.run(1)
     found = [fired(flight, tmp_path) for flight in flights if flight.of_world]
     assert sorted(set[str]().union(*found)) == FIRES.get(scenario.id, [])
 
 
 @pytest.mark.parametrize("profile", ["paper-p1", "paper-p3", "wifi"])
-def test_a_clean_flight_fires_none(profile: str, flights: list[Flight], tmp_path: Path) -> None:
+def test_a_clean_flight_fires_none(profile, flights, tmp_path):
     flight = Flight(f"link.profile={profile}").fly_mission()
     assert flight.mission.state == "done"
     assert flights == [flight]

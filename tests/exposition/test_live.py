@@ -9,8 +9,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
-from cloudrc.exposition.ends import LinkVerdict
-from cloudrc.exposition.live import ONE_SHAPER, LiveMetrics
+from cloudrc.exposition.live import ONE_SHAPER, LinkVerdict, LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.records import (
@@ -32,28 +31,28 @@ from tests.flights.conftest import records
 Flight = tuple[list[Record], list[Record]]
 
 
-def value(live: LiveMetrics, name: str, *label_values: str) -> float:
+def value(live, name, *label_values):
     reading = live.read()[name]
     assert isinstance(reading, dict)
     return reading[label_values]
 
 
-def histogram(live: LiveMetrics, name: str) -> Histogram:
+def histogram(live, name):
     reading = live.read()[name]
     assert isinstance(reading, Histogram)
     return reading
 
 
-def wake(at_ms: float, *, slip_ms: float = 0.0, lateness: float = 1e-4) -> Lateness:
+def wake(at_ms, *, slip_ms=0.0, lateness=1e-4):
     return Lateness(round((at_ms - slip_ms) * MS), "world", lateness, 2e-4, round(slip_ms * MS))
 
 
 @pytest.fixture(scope="module")
-def flight() -> Flight:
+def flight():
     return records(load_experiment("hover", ["link.profile=paper-p2"]))
 
 
-def test_a_bucket_includes_its_upper_bound() -> None:
+def test_a_bucket_includes_its_upper_bound():
     values = Histogram((0.01, 0.1))
     for each in (0.005, 0.01, 0.0101, 5.0):
         values.observe(each)
@@ -62,7 +61,7 @@ def test_a_bucket_includes_its_upper_bound() -> None:
 
 
 @pytest.mark.parametrize("role", table.ENDS)
-def test_one_way_delays_include_all_arrivals(flight: Flight, role: str) -> None:
+def test_one_way_delays_include_all_arrivals(flight, role):
     live, of_end = LiveMetrics(role), flight[role == "cloud"]
     live.see(of_end)
     delays = [r.delay for r in of_end if isinstance(r, Arrival)]
@@ -77,7 +76,7 @@ def test_one_way_delays_include_all_arrivals(flight: Flight, role: str) -> None:
 
 
 @pytest.mark.promise("unknown-is-absent")
-def test_without_a_shared_clock_one_way_delays_are_absent() -> None:
+def test_without_a_shared_clock_one_way_delays_are_absent():
     experiment = load_experiment("hover", ["link.profile=paper-p1"])
     both = records(experiment, offset_ns=7_000_000_000)
     for role, of_end in zip(table.ENDS, both, strict=True):
@@ -88,7 +87,7 @@ def test_without_a_shared_clock_one_way_delays_are_absent() -> None:
 
 
 @pytest.mark.parametrize("offset_ns", [0, 7_000_000_000])
-def test_command_age_is_that_of_its_odometry_in_track(offset_ns: int) -> None:
+def test_command_age_is_that_of_its_odometry_in_track(offset_ns):
     """It needs no shared clock; on the ground and in HOLD no command is in use."""
     of_world, _ = records(load_experiment("hover", ["link.profile=paper-p2"]), offset_ns=offset_ns)
     basis_ns, ages, others = 0, [], 0
@@ -107,7 +106,7 @@ def test_command_age_is_that_of_its_odometry_in_track(offset_ns: int) -> None:
     assert age.total == pytest.approx(sum(ages))
 
 
-def test_control_periods_give_delays_errors_and_terms() -> None:
+def test_control_periods_give_delays_errors_and_terms():
     live, seen = LiveMetrics("cloud"), {"setpoint": (1.0, 2.0, 3.0), "measured": (0.0, 2.5, 3.0)}
     for k, rtt in enumerate((math.nan, 0.04, 0.04, 0.04, 0.05)):
         at = {"rtt": rtt, "loop_delay": rtt + 0.005, "derivative": (0.0, 0.0, -0.7)}
@@ -120,7 +119,7 @@ def test_control_periods_give_delays_errors_and_terms() -> None:
     assert live.read()["cloudrc_prediction_error_meters"] == {}  # no prediction compared yet
 
 
-def counted(role: str, **totals: int) -> LiveMetrics:
+def counted(role, **totals):
     live = LiveMetrics(role)
     live.see([Counted(0, role, name, total) for name, total in totals.items()])
     return live
@@ -143,9 +142,7 @@ def counted(role: str, **totals: int) -> LiveMetrics:
         ("link", "unresolved", "cloudrc_dns_errors_total", ()),
     ],
 )
-def test_a_count_is_in_its_metric(
-    role: str, count: str, name: str, labels: tuple[str, ...]
-) -> None:
+def test_a_count_is_in_its_metric(role, count, name, labels):
     assert value(counted(role, **{count: 7}, unheard_of=9), name, *labels) == 7
     if name in ONE_SHAPER:
         assert name not in LiveMetrics(role).read()
@@ -153,7 +150,7 @@ def test_a_count_is_in_its_metric(
         assert value(LiveMetrics(role), name, *labels) == 0
 
 
-def test_guard_and_contacts_are_counted() -> None:
+def test_guard_and_contacts_are_counted():
     live = LiveMetrics("world")
     assert value(live, "cloudrc_guard_state") == GuardState.GROUND
     for state in (GuardState.TRACK, GuardState.HOLD):
@@ -166,7 +163,7 @@ def test_guard_and_contacts_are_counted() -> None:
     assert found == {"board": 1, "pipe": 2, "other": 1, "floor": 0}
 
 
-def test_the_real_time_factor_covers_the_last_ten_seconds() -> None:
+def test_the_real_time_factor_covers_the_last_ten_seconds():
     live = LiveMetrics("world")
     live.see([wake(0)])
     assert "cloudrc_real_time_factor" not in live.read()
@@ -182,23 +179,23 @@ def test_the_real_time_factor_covers_the_last_ten_seconds() -> None:
     assert value(live, "cloudrc_loop_busy_seconds_total") == pytest.approx(0.4)
 
 
-def heard(role: str, *seen: Record) -> bool:
+def heard(role, *seen):
     live = LiveMetrics(role)
     live.see(seen)
     assert live.end is not None
     return live.end.has_peer
 
 
-def opened(role: str, at_ms: int, epoch: int) -> SessionOpened:
+def opened(role, at_ms, epoch):
     return SessionOpened(at_ms * MS, role, epoch, "")
 
 
-def arrived(role: str, at_ms: int, counter: int = 0, epoch: int = 1) -> Arrival:
+def arrived(role, at_ms, counter=0, epoch=1):
     return Arrival(at_ms * MS, role == "cloud", epoch, counter, math.nan, True)
 
 
 @pytest.mark.parametrize("role", table.ENDS)
-def test_an_end_has_a_peer_while_datagrams_arrive(role: str) -> None:
+def test_an_end_has_a_peer_while_datagrams_arrive(role):
     session = opened(role, 0, 1)
     arrival = arrived(role, 1000)
     assert not heard(role)
@@ -213,7 +210,7 @@ def test_an_end_has_a_peer_while_datagrams_arrive(role: str) -> None:
 
 @pytest.mark.parametrize("role", table.ENDS)
 @pytest.mark.parametrize(("behind", "hears"), [(0, False), (1, True), (500, False)])
-def test_a_replayed_datagram_is_no_sign_of_life(role: str, behind: int, hears: bool) -> None:
+def test_a_replayed_datagram_is_no_sign_of_life(role, behind, hears):
     """Replaying a captured datagram needs no key; a late one that is new does count."""
     first, newest = (arrived(role, 100, counter) for counter in (0, 600))
     again = newest._replace(stamp_ns=2000 * MS, counter=600 - behind, used=False)
@@ -221,7 +218,7 @@ def test_a_replayed_datagram_is_no_sign_of_life(role: str, behind: int, hears: b
 
 
 @pytest.mark.parametrize("role", table.ENDS)
-def test_a_gap_is_between_arrivals_of_a_session_despite_replays(role: str) -> None:
+def test_a_gap_is_between_arrivals_of_a_session_despite_replays(role):
     live = LiveMetrics(role)
     live.see([opened(role, 0, 1)])
     for at_ms, counter in ((500, 0), (510, 2), (550, 1), (600, 2), (750, 3)):  # 2 is replayed
@@ -247,7 +244,7 @@ EVENTS = [
 """Event and its waypoint, then the state and the next waypoint."""
 
 
-def test_mission_metrics_follow_the_events() -> None:
+def test_mission_metrics_follow_the_events():
     live = LiveMetrics("teleop")
     for event, at, state, waypoint in EVENTS:
         live.see([MissionEvent(0, event, at, "")])
@@ -260,7 +257,7 @@ def test_mission_metrics_follow_the_events() -> None:
     assert not any("mission" in name for name in LiveMetrics("cloud").read())
 
 
-def test_the_newest_verdict_on_the_link_is_exposed() -> None:
+def test_the_newest_verdict_on_the_link_is_exposed():
     check = LinkVerdict("uplink")
     for stamp_ns, verdict, believed in ((1, "open", None), (2, "ok", 1.0), (2, "off", 0.0)):
         check.see(LinkChecked(stamp_ns, True, "mean", 0.04, math.nan, 0.03, 0.05, verdict, 900))

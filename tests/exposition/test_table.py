@@ -9,7 +9,7 @@ import pytest
 
 from cloudrc.exposition import table
 from cloudrc.exposition.live import COUNTS
-from cloudrc.exposition.table import METRICS, Kind, Metric, of_role
+from cloudrc.exposition.table import METRICS, Kind, of_role
 from cloudrc.messages import GuardState
 from cloudrc.teleop.wire import State
 from tools.docs import OPEN
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("metric", METRICS.values(), ids=lambda metric: metric.name)
-def test_a_metric_keeps_the_rules(metric: Metric) -> None:
+def test_a_metric_keeps_the_rules(metric):
     assert re.fullmatch(r"cloudrc(_[a-z]+)+", metric.name)
     assert metric.name.endswith("_total") == (metric.kind is Kind.COUNTER)
     assert metric.meaning.endswith(".")
@@ -30,7 +30,7 @@ def test_a_metric_keeps_the_rules(metric: Metric) -> None:
     assert not metric.labels.keys() & reserved, "promtool refuses them"
 
 
-def test_the_names_that_others_use_exist() -> None:
+def test_the_names_that_others_use_exist():
     wanted = {
         "cloudrc_rtt_seconds": (),
         "cloudrc_uplink_delay_seconds": (),
@@ -51,7 +51,7 @@ def test_the_names_that_others_use_exist() -> None:
         assert re.sub(r"(?<!_total)_(bucket|sum|count)$", "", name) in METRICS
 
 
-def test_states_and_bodies_are_those_of_the_robot() -> None:
+def test_states_and_bodies_are_those_of_the_robot():
     assert tuple(state.name.lower() for state in GuardState) == table.GUARD_STATES
     assert tuple(state.name.lower() for state in State) == table.MISSION_STATES
     scenes = (ROOT / "cloudrc" / "world" / "scenes").glob("*.xml")
@@ -62,7 +62,7 @@ def test_states_and_bodies_are_those_of_the_robot() -> None:
     assert {body.rstrip("_0123456789") for body in bodies} <= set(table.BODIES)
 
 
-def test_every_count_of_the_ends_is_a_metric() -> None:
+def test_every_count_of_the_ends_is_a_metric():
     found: set[str] = set()
     for part in ("world", "cloud", "tunnel"):
         for path in (ROOT / "cloudrc" / part).rglob("*.py"):

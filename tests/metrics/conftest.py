@@ -6,15 +6,14 @@ commands per second. The mission lasts from 10 s to 20 s on the shared clock of 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 
 from cloudrc.cli.run import assemble
-from cloudrc.config.load import ResolvedExperiment, load_experiment
+from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Criteria
 from cloudrc.geometry.scene import Board, Pipe, Scene
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry, Vector
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.metrics import Flight
 from cloudrc.record.columns import Recording
 from cloudrc.records import (
@@ -43,12 +42,12 @@ ONE_PIPE = Scene(
 )
 
 
-def at(seconds: float) -> int:
+def at(seconds):
     """Return the stamp of a time [s] after the start."""
     return START + round(seconds * SECOND)
 
 
-def straight(seconds: float) -> Vector:
+def straight(seconds):
     return (seconds, 0.0, 1.0)
 
 
@@ -59,7 +58,7 @@ class Log:
     world: list[Record] = field(default_factory=list)
     cloud: list[Record] = field(default_factory=list)
 
-    def change(self, kind: type, how: Callable[[int, Record], Record | None]) -> None:
+    def change(self, kind, how):
         """Replace the n-th record of a class by `how(n, record)`; None removes it."""
         for records in (self.world, self.cloud):
             found = [each for each in records if isinstance(each, kind)]
@@ -69,22 +68,22 @@ class Log:
 
     def flight(
         self,
-        scene: Scene = OPEN_AIR,
+        scene=OPEN_AIR,
         *,
-        contact: bool = False,
-        waypoints: int = 1,
-        time_limit: float = 60.0,
-    ) -> Flight:
+        contact=False,
+        waypoints=1,
+        time_limit=60.0,
+    ):
         criteria = Criteria(contact=contact, time_limit_s=time_limit)
         return Flight(Recording.from_records(*self.ends()), criteria, waypoints, scene)
 
-    def ends(self) -> tuple[list[Record], list[Record]]:
+    def ends(self):
         """Return the records of world and of cloud by stamp; equal stamps keep their order."""
         world, cloud = (sorted(r, key=lambda each: each.stamp_ns) for r in (self.world, self.cloud))
         return world, cloud
 
 
-def flown(path: Callable[[float], Vector] = straight) -> Log:
+def flown(path=straight):
     """Log a flight along `path`: position [m] as a function of time since the start [s]."""
     log = Log()
     log.world += [
@@ -104,7 +103,7 @@ def flown(path: Callable[[float], Vector] = straight) -> Log:
     return log
 
 
-def _step(log: Log, counter: int, stamp: int, path: Callable[[float], Vector]) -> None:
+def _step(log, counter, stamp, path):
     odometry = Odometry(stamp, path((stamp - START) / SECOND), UPRIGHT, (1.0, 0.0, 0.0), ZERO)
     telemetry = Telemetry(stamp, odometry, 0.0, 0, 0, 0, 1, GuardState.TRACK)
     arrival, applied = stamp + round(UPLINK * SECOND), stamp + round(DOWNLINK * SECOND)
@@ -131,24 +130,24 @@ def _step(log: Log, counter: int, stamp: int, path: Callable[[float], Vector]) -
 
 
 @cache
-def straight_flight() -> Flight:
+def straight_flight():
     """Return the flight through open air; tests must not change it."""
     return flown().flight()
 
 
-def touch(seconds: float, body: str = "board", *, tip: bool = True) -> Contact:
+def touch(seconds, body="board", *, tip=True):
     """Make a contact with the tip at 0.15 m/s."""
     return Contact(at(seconds), body, straight(seconds), ZERO, (0.12, 0.09, 0.0), tip)
 
 
-def good() -> Log:
+def good():
     """Log a flight whose tip touches the board slowly."""
     log = flown()
     log.world.append(touch(8))
     return log
 
 
-def pressing(log: Log, since: float, force: Callable[[int], float]) -> None:
+def pressing(log, since, force):
     """Apply a force to the tip from a time on [s since the start]."""
     log.change(
         GroundTruth,
@@ -157,13 +156,13 @@ def pressing(log: Log, since: float, force: Callable[[int], float]) -> None:
 
 
 @cache
-def paper() -> tuple[ResolvedExperiment, Recording]:
+def paper():
     """Fly the shipped experiment once in virtual time."""
     experiment = load_experiment("paper")
     _, cloud, run = assemble(experiment)
     records: tuple[list[Record], list[Record]] = ([], [])
 
-    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+    def sink(from_world, from_cloud):
         records[0].extend(from_world)
         records[1].extend(from_cloud)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import hypot, isfinite, nan
 
 import pytest
@@ -16,6 +15,7 @@ from cloudrc.record.topics import TOPICS
 from cloudrc.records import Arrival, Control, Counted, Fault, GuardChange, Lateness, MissionEvent
 from tests.metrics.conftest import (
     ONE_PIPE,
+    OPEN_AIR,
     PERIOD,
     SECOND,
     START,
@@ -47,7 +47,7 @@ PROMISED = {
 """Names that others use. Source: docs/reference/control.md, "Names that others use"."""
 
 
-def contact() -> Flight:
+def contact():
     log = flown()
     # Contacts of the floor, of a rotor, and later ones are not the tip's first touch.
     log.world += [touch(6, "floor"), touch(7, tip=False), touch(8), touch(9)]
@@ -56,52 +56,41 @@ def contact() -> Flight:
     return log.flight(ONE_PIPE, contact=True)
 
 
-def late_contact() -> Flight:
-    """The tip touches the board less than two seconds before the end."""
+def changed(kind, how, scene=OPEN_AIR):
+    """Make a flight of which the n-th record of a class is replaced by `how(n, record)`."""
     log = flown()
-    log.world.append(touch(9))
-    return log.flight(ONE_PIPE)
+    log.change(kind, how)
+    return log.flight(scene)
 
 
-def cancelled_contact() -> Flight:
+def plus(*records, scene=OPEN_AIR, waypoints=1):
+    """Make a flight in which world recorded more."""
+    log = flown()
+    log.world += records
+    return log.flight(scene, waypoints=waypoints)
+
+
+def cancelled_contact():
     log = flown()
     log.world.append(touch(2))
     log.change(MissionEvent, lambda n, event: event._replace(event="cancelled") if n > 1 else event)
     return log.flight(ONE_PIPE)
 
 
-def beside_the_axis_before_the_pipe() -> Flight:
-    """The pipe is from x = 2 m to 7 m."""
-    return flown(lambda t: (t, 0.1 if t < 2 else 0.0, 1.0)).flight(ONE_PIPE)
+def echo_twice(n, control):
+    """Give the flight's 251 periods two echoes; the first one fills half of the periods."""
+    rtt = 0.1 if control.stamp_ns <= at(5) else 0.3
+    return control._replace(rtt=rtt, loop_delay=rtt)
 
 
-def waypoint_reached_twice() -> Flight:
-    log = flown()
-    log.cloud += [MissionEvent(at(1 + n), "reached", w, "") for n, w in enumerate((0, 1, 1))]
-    log.cloud.append(MissionEvent(at(3), "paused", 0, "a new teleop goes on"))
-    return log.flight(waypoints=2)
-
-
-def repeated_echo() -> Flight:
-    """The first echo fills half of the flight's 251 periods, but it is one of two echoes."""
-
-    def silent(n: int, control: Control) -> Control:
-        rtt = 0.1 if control.stamp_ns <= at(5) else 0.3
-        return control._replace(rtt=rtt, loop_delay=rtt)
-
-    log = flown()
-    log.change(Control, silent)
-    return log.flight()
-
-
-def lost_and_late() -> Flight:
+def lost_and_late():
     log = flown()
     log.change(Arrival, lambda n, arrival: None if n % 10 == 0 else arrival)
     log.change(Arrival, lambda n, arrival: arrival._replace(used=n % 3 != 0))
     return log.flight()
 
 
-def lost_and_duplicated() -> Flight:
+def lost_and_duplicated():
     log = flown()
     log.change(Arrival, lambda n, a: a._replace(delay=0.08, used=False) if n % 4 == 1 else a)
     log.change(Arrival, lambda n, a: None if n % 2 == 0 else a)
@@ -109,23 +98,14 @@ def lost_and_duplicated() -> Flight:
     return log.flight()
 
 
-def without_a_shared_clock() -> Flight:
-    log = flown()
-    log.change(Arrival, lambda n, arrival: arrival._replace(delay=nan))
-    return log.flight()
+HOLDS = [
+    GuardChange(at(2.0), GuardState.HOLD, "command age"),
+    GuardChange(at(3.5), GuardState.TRACK, "not the start"),
+    GuardChange(at(9.5), GuardState.HOLD, "command age"),
+]
 
 
-def held() -> Flight:
-    log = flown()
-    log.world += [
-        GuardChange(at(2.0), GuardState.HOLD, "command age"),
-        GuardChange(at(3.5), GuardState.TRACK, "not the start"),
-        GuardChange(at(9.5), GuardState.HOLD, "command age"),
-    ]
-    return log.flight()
-
-
-def resting(*, moved: bool = False, touched: bool = False) -> Flight:
+def resting(*, moved=False, touched=False):
     log = flown(lambda t: (0.97, 0.0, 1.001))
     log.change(
         Control,
@@ -137,7 +117,7 @@ def resting(*, moved: bool = False, touched: bool = False) -> Flight:
     return log.flight()
 
 
-def slow_machine() -> Flight:
+def slow_machine():
     """World loses 0.5 s in 10 s; its wakes are 1 to 100 ms late, those of cloud half as much."""
     log = flown()
     for n in range(101):
@@ -149,7 +129,7 @@ def slow_machine() -> Flight:
     return log.flight()
 
 
-def faults_and_drops() -> Flight:
+def faults_and_drops():
     log = flown()
     # A repeated fault has one record, here before the mission, but its count includes each time.
     log.cloud += [Fault(START - PERIOD, "predictor_failed", "..."), Fault(at(1), "late", "...")]
@@ -159,22 +139,23 @@ def faults_and_drops() -> Flight:
     return log.flight()
 
 
-def counted_by_a_relay() -> Flight:
-    log = flown()
-    rows = [
+OF_A_RELAY = [
+    Counted(at(n), "link", f"uplink_{name}", total)
+    for n, name, total in (
         (1.0, "release_error_p99_ns", 90_000),
         (2.0, "release_error_p99_ns", 40_000),
         (2.0, "released_early", 0),
         (2.0, "overflow", 3),
-    ]
-    log.world += [Counted(at(n), "link", f"uplink_{name}", total) for n, name, total in rows]
-    return log.flight()
+    )
+]
+REACHED = [MissionEvent(at(1 + n), "reached", w, "") for n, w in enumerate((0, 1, 1))]
+REACHED.append(MissionEvent(at(3), "paused", 0, "a new teleop goes on"))
 
 
 approx = pytest.approx
 # On the axis the left rotor's upper rim is closest: .662 - |(.21 + .128, .05 + .0025)|.
 ON_AXIS = 0.662 - hypot(0.338, 0.0525)
-NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
+NUMBERS = {
     straight_flight: {
         "duration": 10.0,
         "waypoints_reached": 1.0,
@@ -209,16 +190,21 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
         "steady_contact_force": approx(0.2, abs=3e-3),
         "pipe_contacts": 1.0,
     },
-    late_contact: {"contact_time": approx(9.0), "steady_contact_force": None},
+    # The tip touches the board less than two seconds before the end.
+    lambda: plus(touch(9), scene=ONE_PIPE): {
+        "contact_time": approx(9.0),
+        "steady_contact_force": None,
+    },
     cancelled_contact: {"steady_contact_force": None},
-    # Just before the pipe the robot's front is inside it, with the rotor at y = .21 + .1.
-    beside_the_axis_before_the_pipe: {
+    # The pipe is from x = 2 m to 7 m. Just before it the robot's front is inside it, with the rotor
+    # at y = .21 + .1.
+    lambda: flown(lambda t: (t, 0.1 if t < 2 else 0.0, 1.0)).flight(ONE_PIPE): {
         "min_clearance": approx(ON_AXIS),
         "min_clearance_flight": approx(ON_AXIS - 0.1, abs=0.05),
         "pipe_contacts": 0.0,
     },
-    waypoint_reached_twice: {"waypoints_reached": 2.0, "duration": 10.0},
-    repeated_echo: {
+    lambda: plus(*REACHED, waypoints=2): {"waypoints_reached": 2.0, "duration": 10.0},
+    lambda: changed(Control, echo_twice): {
         "rtt_mean": approx(0.2),
         "rtt_p95": approx(0.29),
         "loop_delay_mean": approx(0.2),
@@ -232,13 +218,13 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
         "loss_uplink": approx(0.5, abs=6e-3),
         "uplink_delay_mean": approx(0.065, abs=1e-3),
     },
-    without_a_shared_clock: {
+    lambda: changed(Arrival, lambda n, arrival: arrival._replace(delay=nan)): {
         **{f"{way}_delay_mean": None for way in WAYS},
         "age_of_information_mean": None,
         "rtt_mean": approx(0.09),
     },
     # Time zero stays the first TRACK. The holds last 1.5 s, and 0.5 s to the end.
-    held: {"hold_count": 2.0, "hold_time": approx(2.0), "duration": 10.0},
+    lambda: plus(*HOLDS): {"hold_count": 2.0, "hold_time": approx(2.0), "duration": 10.0},
     resting: {
         "steady_error_x": approx(0.03),
         "steady_error_y": approx(0.0),
@@ -255,7 +241,7 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
         "missed_periods": 14.0,
     },
     faults_and_drops: {"fault_count": 15.0, "recorder_dropped": 22.0},
-    counted_by_a_relay: {
+    lambda: plus(*OF_A_RELAY): {
         "release_error_p99_uplink": approx(40e-6),
         "released_early_uplink": 0.0,
         "relay_overflow_uplink": 3.0,
@@ -265,16 +251,16 @@ NUMBERS: dict[Callable[[], Flight], dict[str, object]] = {
 
 
 @pytest.mark.parametrize(("fly", "expected"), NUMBERS.items())
-def test_numbers(fly: Callable[[], Flight], expected: dict[str, object]) -> None:
+def test_numbers(fly, expected):
     flight = fly()
     assert {name: SHIPPED[name].measure(flight) for name in expected} == expected
 
 
-def flight_of(recording: Recording) -> Flight:
+def flight_of(recording):
     return Flight(recording, Criteria(), 7, load_scene("pipes"))
 
 
-def test_the_paper_flight_has_all_numbers_of_virtual_flight() -> None:
+def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     numbers, notes = measure_all(flight_of(paper()[1]))
     assert (notes, list(numbers)) == ([], sorted(numbers))
     resting = {f"steady_error_{axis}" for axis in "xyz"}
@@ -287,12 +273,12 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight() -> None:
         assert isfinite(number.value), name
 
 
-def test_an_empty_recording_has_no_numbers() -> None:
+def test_an_empty_recording_has_no_numbers():
     assert measure_all(flight_of(Recording.from_records([]))) == ({}, [])
 
 
 @pytest.mark.parametrize("lost", sorted(TOPICS))
-def test_a_missing_topic_makes_no_metric_fail(lost: str) -> None:
+def test_a_missing_topic_makes_no_metric_fail(lost):
     recording = straight_flight().recording
     rows = {name: recording._rows[name] for name in TOPICS if name != lost}
     assert measure_all(Flight(Recording(rows), Criteria(), 1, ONE_PIPE))[1] == []

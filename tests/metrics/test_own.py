@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import sys
 from importlib.metadata import EntryPoint
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -36,7 +34,7 @@ SHORT = ["steps", "--mode", "virtual", "--set", "mission.steps.count=1"]
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "overshoot.py").write_text(OVERSHOOT)
     for name, body in BODIES.items():
@@ -46,11 +44,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def report_of(run: Path) -> dict[str, Any]:
+def report_of(run):
     return json.loads((run / "report.json").read_text())
 
 
-def test_a_later_report_measures_a_file_only_if_named(folder: Path) -> None:
+def test_a_later_report_measures_a_file_only_if_named(folder):
     run = folder / "run"
     asked = "report.metrics=[mine/overshoot.py, mine/raises.py]"
     assert main(["run", *SHORT, "--set", asked, "--out", "run"]) == 0
@@ -72,14 +70,14 @@ def test_a_later_report_measures_a_file_only_if_named(folder: Path) -> None:
     assert report_of(run) == first
 
 
-def test_a_sweep_measures_a_file(folder: Path) -> None:
+def test_a_sweep_measures_a_file(folder):
     line = ["run", *SHORT, "--seeds", "2", "--out", "sweep"]
     assert main([*line, "--set", "report.metrics=mine/overshoot.py"]) == 0
     numbers = json.loads((folder / "sweep" / "sweep.json").read_text())["numbers"]
     assert numbers["overshoot"]["count"] == 2
 
 
-def test_a_metric_that_fails_costs_only_its_own_number(folder: Path) -> None:
+def test_a_metric_that_fails_costs_only_its_own_number(folder):
     numbers, notes = measure_all(straight_flight(), sorted(map(str, folder.glob("mine/*.py"))))
     assert {"duration", "overshoot"} <= set(numbers)
     assert notes[:2] == [
@@ -100,9 +98,7 @@ def test_a_metric_that_fails_costs_only_its_own_number(folder: Path) -> None:
         (["overshoot"], "", "no metric named 'overshoot'; available: age_of_"),
     ],
 )
-def test_an_invalid_metric_is_refused_in_one_line(
-    folder: Path, capsys: pytest.CaptureFixture[str], names: list[str], text: str, reason: str
-) -> None:
+def test_an_invalid_metric_is_refused_in_one_line(folder, capsys, names, text, reason):
     if text:
         (folder / names[0]).write_text(text)
     for line in (
@@ -117,9 +113,7 @@ def test_an_invalid_metric_is_refused_in_one_line(
     assert not (folder / "runs").exists()
 
 
-def test_an_installed_metric_is_in_every_report(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_installed_metric_is_in_every_report(folder, monkeypatch):
     names = ("past", "duration")  # a shipped metric cannot be replaced
     entries = tuple(EntryPoint(name, "overshoot", "cloudrc.metrics") for name in names)
     monkeypatch.syspath_prepend(str(folder / "mine"))

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 
 from cloudrc.messages import GuardState
-from cloudrc.metrics import SHIPPED, Flight, Number
+from cloudrc.metrics import SHIPPED, Number
 from cloudrc.metrics.verdict import (
     EXIT_CODES,
     SLIP_MAX,
     Ending,
     Observations,
-    Verdict,
     flight_evidence,
     judge,
     operator_verdict,
@@ -27,15 +23,14 @@ from cloudrc.records import (
     GuardChange,
     Lateness,
     MissionEvent,
-    Record,
     SessionOpened,
 )
-from tests.metrics.conftest import ONE_PIPE, SECOND, Log, at, flown, good, touch
+from tests.metrics.conftest import ONE_PIPE, SECOND, at, flown, good, touch
 
 ZERO = (0.0, 0.0, 0.0)
 
 
-def measured(flight: Flight) -> dict[str, Number]:
+def measured(flight):
     return {
         name: Number(value, "", "")
         for name in ("waypoints_reached", "real_time_factor", "world_slip")
@@ -43,33 +38,33 @@ def measured(flight: Flight) -> dict[str, Number]:
     }
 
 
-def judged(flight: Flight, *, real_time: bool = False, interrupted: bool = False) -> Verdict:
+def judged(flight, *, real_time=False, interrupted=False):
     how = {"real_time": real_time, "interrupted": interrupted}
     return judge(flight_evidence(flight, measured(flight), **how))
 
 
-def codes(verdict: Verdict) -> list[str]:
+def codes(verdict):
     return [failure.code for failure in verdict.failures]
 
 
-def world(*records: Record, log: Callable[[], Log] = good) -> Log:
+def world(*records, log=good):
     logged = log()
     logged.world += records
     return logged
 
 
-def ended(event: str) -> Log:
+def ended(event):
     log = good()
     log.change(MissionEvent, lambda n, e: e._replace(event=event, text="why") if n == 2 else e)
     return log
 
 
-def without_end(log: Log) -> Log:
+def without_end(log):
     log.change(MissionEvent, lambda n, event: None if n else event)
     return log
 
 
-def met(speed: float) -> Log:
+def met(speed):
     return world(Contact(at(8), "board", ZERO, ZERO, (speed, 0.0, 0.0), True), log=flown)
 
 
@@ -96,9 +91,7 @@ def met(speed: float) -> Log:
         ),
     ],
 )
-def test_rules(
-    log: Callable[[], Log], limits: dict[str, Any], outcome: str, found: list[str]
-) -> None:
+def test_rules(log, limits, outcome, found):
     verdict = judged(log().flight(ONE_PIPE, **{"contact": True, **limits}))
     assert (verdict.outcome, codes(verdict)) == (outcome, found)
 
@@ -126,7 +119,7 @@ def test_rules(
         (ended("timed_out"), "timed_out", "why", 10.0),
     ],
 )
-def test_a_failure_says_what_when_and_where(log: Log, code: str, text: str, time: float) -> None:
+def test_a_failure_says_what_when_and_where(log, code, text, time):
     (failure,) = judged(log.flight(ONE_PIPE, contact=True)).failures
     assert failure.code == code
     assert text in failure.text
@@ -149,7 +142,7 @@ def test_a_failure_says_what_when_and_where(log: Log, code: str, text: str, time
         (Control, lambda n, c: None, "cloud computed no command"),
     ],
 )
-def test_why_the_robot_never_flew(kind: type, change: Callable[..., Any], words: str) -> None:
+def test_why_the_robot_never_flew(kind, change, words):
     log = flown()
     log.change(GuardChange, lambda n, change: None)
     log.change(kind, change)
@@ -158,7 +151,7 @@ def test_why_the_robot_never_flew(kind: type, change: Callable[..., Any], words:
     assert words in failure.text
 
 
-def test_an_interrupted_run_lists_only_certain_failures() -> None:
+def test_an_interrupted_run_lists_only_certain_failures():
     log = without_end(world(touch(3, "pipe_1"), log=flown))
     verdict = judged(log.flight(ONE_PIPE, contact=True), interrupted=True)
     assert verdict.outcome == "interrupted"
@@ -181,9 +174,7 @@ def test_an_interrupted_run_lists_only_certain_failures() -> None:
         (world(touch(9.99), log=flown), [], ["board_not_touched"]),
     ],
 )
-def test_the_operator_knows_what_had_arrived(
-    log: Log, report: list[str], operator: list[str]
-) -> None:
+def test_the_operator_knows_what_had_arrived(log, report, operator):
     flight = log.flight(ONE_PIPE, contact=True)
     numbers = measured(flight)
     evidence = flight_evidence(flight, numbers, real_time=True, interrupted=False)
@@ -199,7 +190,7 @@ def test_the_operator_knows_what_had_arrived(
         (0.1, REAL_TIME_FACTOR_MIN - 1e-6, "invalid"),
     ],
 )
-def test_real_time_is_kept_or_the_run_is_invalid(slip: float, factor: float, outcome: str) -> None:
+def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, outcome):
     values = {"waypoints_reached": 1.0, "world_slip": slip, "real_time_factor": factor}
     numbers = {name: Number(value, "", "") for name, value in values.items()}
     flight = good().flight(ONE_PIPE, contact=True)
@@ -211,7 +202,7 @@ def test_real_time_is_kept_or_the_run_is_invalid(slip: float, factor: float, out
     assert verdict.outcome == "success"
 
 
-def test_real_time_needs_proof() -> None:
+def test_real_time_needs_proof():
     log = good()
     unproven = judged(log.flight(ONE_PIPE, contact=True), real_time=True)
     assert (unproven.outcome, codes(unproven)) == ("invalid", ["not_real_time"])
@@ -242,23 +233,21 @@ LATE = Ending("timed_out", "mission not done within 60 s")
         ),
     ],
 )
-def test_the_same_rules_judge_what_telemetry_shows(
-    seen: Observations, known: dict[str, Any], outcome: str, found: list[str]
-) -> None:
+def test_the_same_rules_judge_what_telemetry_shows(seen, known, outcome, found):
     rules = {"waypoints": 3, "contact_speed_max": 0.25, "contact": False, "reached": 3}
     verdict = judge(seen.evidence(elapsed=30.0, **{"ending": DONE, **rules, **known}))
     assert (verdict.outcome, codes(verdict)) == (outcome, found)
     assert verdict.as_json()["exit_code"] == EXIT_CODES[outcome]
 
 
-def test_telemetry_names_neither_pipe_nor_waypoint() -> None:
+def test_telemetry_names_neither_pipe_nor_waypoint():
     rules = {"waypoints": 3, "contact_speed_max": 0.25, "contact": False, "reached": 1}
     verdict = judge(Observations(pipe_touches=1).evidence(DONE, 30.0, **rules))
     texts = [failure.text for failure in verdict.failures]
     assert texts == ["1 of 3 waypoints reached", "the robot touched a pipe"]
 
 
-def test_only_what_telemetry_shows_during_the_mission_counts() -> None:
+def test_only_what_telemetry_shows_during_the_mission_counts():
     seen = Observations.begin(3, 0.9, 5)
     assert seen.see(3, 0.9, 5) == seen
     after = seen.see(5, 0.1, 9).see(5, 0.4, 9)
@@ -268,7 +257,7 @@ def test_only_what_telemetry_shows_during_the_mission_counts() -> None:
     assert [event for event, _ in after.news(seen, 1.0)] == ["pipe_touched", "board_touched"]
 
 
-def test_slip_while_teleop_is_down_does_not_count() -> None:
+def test_slip_while_teleop_is_down_does_not_count():
     seen = Observations.begin(0, NAN, 5).see(0, NAN, 9)
     for shown in (1_000, 5_000):
         seen = seen.after_restart().see(0, NAN, shown)

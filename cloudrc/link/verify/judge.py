@@ -1,14 +1,14 @@
 """Predict what the datagrams of one direction measure, and judge what they did measure.
 
 Draws are counter-based, so the fate of each datagram on a relay is known. netem draws its own
-chance, so the model is flown with 200 other seeds and the band of each quantity is taken. A row is
-"ok" within that band, widened by a tolerance, and "off" beyond; "open" if chance could hide more
-than that; "told" is for information only.
+numbers, so 200 links with other seeds are simulated, which gives a band for each quantity. A row is
+"ok" within the band, widened by a tolerance, and otherwise "off". It is "open" if chance could hide
+a wrong link, and "told" if the profile asks for something that was not judged.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isnan, nan, sqrt
@@ -18,19 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
+from cloudrc.link.profile import DirectionProfile, Timeline
 
 Floats: TypeAlias = NDArray[np.float64]
 
 RUNS, RUN_LENGTH = 200, 1000
-"""Links that are flown for a band, and datagrams of each; for other numbers a band is scaled."""
+"""Simulated links for a band, and datagrams of each [1]; for other numbers a band is scaled."""
 TAIL = 1e-3
 """Share of honest links below a band, and share of them above it [1]."""
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
 """Least correlation with predicted delays, and share of predicted losses, of a known link [1]."""
 STILL, SHAPE_FLOOR = 1e-4, 2e-3
-"""Below these standard deviations delays tell nothing about draws, and the machine itself changes
-the shape of their distribution [s]."""
+"""Standard deviations of the delay [s]. Below the first, delays tell nothing about draws; below the
+second, the machine itself changes the shape of the distribution."""
 TOLERANCES = {
     "mean": (2e-3, 0.05),
     "round_trip": (2e-3, 0.05),
@@ -38,9 +38,10 @@ TOLERANCES = {
     "distribution": (0.05, 0.0),
     "rate": (0.0, 0.25),
 }
-"""Quantity -> how far it may be off: in its unit, and as a share of the requested value [1]."""
+"""Quantity -> how far it may be off: in its unit, and as a share of the requested value [1]. Where
+the draws are known, the share for the deviation is half of that."""
 SHARE_TOLERANCE = (0.02, 0.25)
-"""Likewise of loss, order and copies."""
+"""The same for loss, order and copies."""
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; that of a share is "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
@@ -56,12 +57,44 @@ class Flow(NamedTuple):
     size: int
 
 
+class Row(NamedTuple):
+    """One quantity of one direction; an unknown value is NaN.
+
+    The values asked, measured, low and high have the unit `unit`, so any unit.
+    """
+
+    name: str  # as in `Plan.quantities`, or "round_trip"
+    unit: str  # "s", "1" or "bit/s"
+    asked: float  # mean on links of the requested profile
+    measured: float
+    low: float  # lowest value that is believed
+    high: float  # highest value that is believed
+    verdict: str  # "ok", "off", "open" or "told"
+
+
 class Expected(NamedTuple):
     """What honest links measure; if their draws are known, chance has no part in it."""
 
     bands: dict[str, tuple[float, float, float]]  # mean, and what all but TAIL exceed
-    pooled: Floats  # delays about the requested ones, median 0, rising [s]
+    pooled: Floats  # delays minus the requested ones, median 0, rising [s]
     known: bool
+
+    def hidden(self, name: str) -> float:
+        """Return how much chance hides of a quantity, in tolerances [1]."""
+        mean, low, high = self.bands[name]
+        return 0.5 * (high - low) / tolerance(name, mean)
+
+    def judge(self, name: str, value: float) -> Row:
+        """Judge one value [unit of the quantity]."""
+        mean, low, high = self.bands[name]
+        slack, hidden = tolerance(name, mean), self.hidden(name)
+        if self.known and name == "deviation":
+            slack = max(TOLERANCES[name][0], 0.5 * slack)
+        low, high = max(0.0, low - slack), high + slack
+        verdict = "ok" if low <= value <= high else "off"
+        if isnan(value) or (verdict == "ok" and hidden > CHANCE_MAX):
+            verdict = "open"
+        return Row(name, UNITS.get(name, "1"), mean, value, low, high, verdict)
 
 
 @dataclass(frozen=True)
@@ -102,11 +135,14 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """Streams over links of other seeds, as netem realises the profile; RUN_LENGTH at most."""
+        """Streams over links of other seeds; at most RUN_LENGTH datagrams each.
+
+        netem realises almost no correlation, so these links have none.
+        """
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
-        made = replace(self, profile=netem_makes(self.profile))
+        made = replace(self, profile=replace(self.profile, correlation=0.0))
         return [replace(made, flow=self.flow._replace(seed=seed)).draw(sent) for seed in seeds]
 
     @cached_property
@@ -126,23 +162,29 @@ class Plan:
         }
         return self.chance._replace(bands=bands)
 
+    def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
+        """Judge a stream; tell what the profile asks for and the stream cannot show."""
+        expected = self.expected(measured, epoch, first)
+        found = self.quantities(measured, expected.pooled)
+        rows = [expected.judge(name, found[name]) for name in found if name in expected.bands]
+        if len(measured.sent) < FEWEST:
+            rows = [row._replace(verdict="open") for row in rows]
+        if not expected.known and self.profile.jitter and self.profile.correlation:
+            rows.append(told("correlation", self.profile.correlation))
+        if not self.train and self.profile.rate:
+            rows.append(told("rate", self.profile.rate))
+        return rows
+
     def needed(self) -> int:
         """Return how many datagrams it takes until chance hides no more than the tolerances."""
-        most = max(_hidden(name, self.chance) for name in self.chance.bands)
+        most = max(map(self.chance.hidden, self.chance.bands))
         return round(len(self.links[0].sent) * max(1.0, most**2))
-
-    def applied(self, profile: DirectionProfile | None) -> dict[str, float]:
-        """Compute the quantities on a link of another profile, if that and the own never change."""
-        if profile is None or Timeline(self.profile).only() is None:
-            return {}
-        other = replace(self, profile=profile)
-        return other.quantities(other.draw(self.sent), np.zeros(0))
 
     def quantities(self, stream: Stream, pooled: Floats) -> dict[str, float]:
         """Compute what is judged of a stream in one pass; an unknown value is NaN.
 
-        The deviation [s] is about the delay requested at each time, so it shows the jitter alone;
-        the "distribution" is the distance of Kolmogorov and Smirnov from `pooled` [1].
+        The deviation [s] is that from the delay requested at each time, so it shows the jitter
+        alone. The "distribution" is the distance of Kolmogorov and Smirnov from `pooled` [1].
         """
         singles = self._singles(stream)
         found, shape = numbers(singles), self._shape(singles)
@@ -188,7 +230,7 @@ class Plan:
         return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
 
     def _shape(self, stream: Stream) -> Floats:
-        """Compute the delays about those requested at their time, with median 0 [s]."""
+        """Compute the delays minus those requested at their time, with median 0 [s]."""
         delays = stream.delays - _requested_delay(self.profile, stream.sent)
         there: Floats = delays[np.isfinite(delays)]
         return there - np.median(there) if len(there) else there
@@ -208,71 +250,15 @@ class Plan:
 def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
     """Return the delay that a profile requests at each time since the link came up [s]."""
     timeline = Timeline(profile)
-    if timeline.period_ns is not None:
-        sent = np.where(sent > 0.0, sent % (timeline.period_ns * 1e-9), sent)
-    starts = np.array(timeline.pass_ns) * 1e-9
-    delays = np.array([piece.delay_ns for piece in timeline.pieces]) * 1e-9
-    found: Floats = delays[np.maximum(np.searchsorted(starts, sent, side="right") - 1, 0)]
-    return found
+    if len(timeline.pieces) == 1:
+        return np.full(len(sent), timeline.pieces[0].delay_ns * 1e-9)
+    times = np.rint(sent * 1e9).astype(np.int64).tolist()
+    return np.array([timeline.at(elapsed_ns).delay_ns for elapsed_ns in times]) * 1e-9
 
 
-def netem_makes(profile: DirectionProfile) -> DirectionProfile:
-    """Return the profile that an end meets behind netem, in the model's terms.
-
-    netem draws delays without correlation, loses either a packet or its copy, and sends the copy
-    through its losses once more. Source: Linux, net/sched/sch_netem.c.
-    """
-    loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
-    twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)
-    if isinstance(loss, GilbertElliott):
-        loss = replace(loss, loss_bad=single * loss.loss_bad, loss_good=single * loss.loss_good)
-    else:
-        loss *= single
-    return replace(profile, correlation=0.0, loss=loss, duplicate=twice)
-
-
-class Row(NamedTuple):
-    """One quantity of one direction; an unknown value is NaN.
-
-    The values asked, applied, measured, low and high have the unit `unit`, so any unit.
-    """
-
-    name: str  # as in `Plan.quantities`, or "round_trip"
-    unit: str  # "s", "1" or "bit/s"
-    asked: float  # mean on links of the requested profile
-    applied: float  # likewise of the profile that the shaper says is in force
-    measured: float
-    low: float  # lowest value that is believed
-    high: float  # highest value that is believed
-    verdict: str  # "ok", "off", "open" or "told"
-
-
-def judge(
-    plan: Plan, measured: Stream, expected: Expected, applied: Mapping[str, float]
-) -> list[Row]:
-    """Judge a stream by what honest links measure; `applied` has the values of the one in force."""
-    rows = [
-        judge_value(name, expected, value, applied.get(name, nan))
-        for name, value in plan.quantities(measured, expected.pooled).items()
-        if name in expected.bands
-    ]
-    enough = len(measured.sent) >= FEWEST
-    return rows if enough else [row._replace(verdict="open") for row in rows]
-
-
-def judge_value(name: str, expected: Expected, value: float, applied: float = nan) -> Row:
-    """Judge one value beside the `applied` one [any unit].
-
-    Where the draws are known, a jitter may be off by half as much.
-    """
-    mean, low, high = expected.bands[name]
-    half = expected.known and name == "deviation"
-    slack = max(TOLERANCES[name][0], 0.5 * tolerance(name, mean)) if half else tolerance(name, mean)
-    low, high = max(0.0, low - slack), high + slack
-    verdict = "ok" if low <= value <= high else "off"
-    if isnan(value) or (verdict == "ok" and _hidden(name, expected) > CHANCE_MAX):
-        verdict = "open"
-    return Row(name, UNITS.get(name, "1"), mean, applied, value, low, high, verdict)
+def told(name: str, asked: float, measured: float = nan) -> Row:
+    """Return a row that is not judged, with `asked` and `measured` values [any unit]."""
+    return Row(name, UNITS.get(name, "1"), asked, measured, nan, nan, "told")
 
 
 def tolerance(name: str, asked: float) -> float:
@@ -281,14 +267,8 @@ def tolerance(name: str, asked: float) -> float:
     return max(floor, share * asked)
 
 
-def _hidden(name: str, expected: Expected) -> float:
-    """Return how much chance hides of a quantity, in tolerances [1]."""
-    mean, low, high = expected.bands[name]
-    return 0.5 * (high - low) / tolerance(name, mean)
-
-
 def look_twice(first: Sequence[Row], second: Sequence[Row]) -> list[Row]:
-    """Combine two looks at a link: only what is off in both is off."""
+    """Combine two measurements of a link: only what is off in both is off."""
     again = {row.name: row for row in second}
     return [again.get(row.name, row) if row.verdict == "off" else row for row in first]
 

@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import hypot, inf, isinf, isnan, nan
+from math import inf, isinf, isnan, nan
 from pathlib import Path
 from typing import TypeAlias
 
@@ -28,12 +28,10 @@ from cloudrc.link.verify.judge import (
     RUN_LENGTH,
     TAIL,
     Expected,
-    Floats,
     Flow,
     Plan,
     Row,
-    judge,
-    judge_value,
+    told,
     verdict_of,
 )
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
@@ -48,16 +46,15 @@ ENDS = 2e-3
 """Largest delay that two punctual ends and a tick of the simulation add to a round trip [s]."""
 FOLLOW_PERIOD = 0.1
 """Time between two looks at the records and at the state file of the link [s]."""
-UNTIMED = ("loss", "reordered", "duplicated")
-TIMED = ("mean", "deviation", *UNTIMED)
-"""Quantities that are judged without and with a common clock; the ends' own wake-ups change the
-shape of the distribution."""
+UNJUDGED = {"distribution"}
+"""Quantity that is not judged in flight: the ends' own wake-ups change it."""
+DELAYS = {"mean", "deviation"}
+"""Quantities that need a common clock."""
 
 Asked: TypeAlias = tuple[DirectionProfile, DirectionProfile]
 """Profiles of uplink and downlink."""
 Load: TypeAlias = Callable[[object], Asked]
 """Reads the values of a profile's file; raises a CloudrcError."""
-_Heard: TypeAlias = tuple[int, int, float]  # arrival [ns], counter, one-way delay [s] or NaN
 
 
 class LinkMonitor:
@@ -66,11 +63,11 @@ class LinkMonitor:
     def __init__(self, *, uplink: bool, flow: Flow) -> None:
         """Set up for the end that receives a flow: cloud the uplink; then call `follow`."""
         self._uplink, self._flow = uplink, flow
-        self._arrivals = deque[_Heard](maxlen=KEPT)
+        self._arrivals = deque[Arrival](maxlen=KEPT)
         self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
         self._asked: Asked | None = None
         self._plans: list[Plan] = []  # of what is received, and of the other direction
-        self._epoch, self._trip, self._fresh, self._seen = -1, nan, True, ""
+        self._epoch, self._fresh, self._seen = -1, True, ""
         self._since_ns, self._due_ns = 0.0, 0
         self._suspects, self._complained = set[str](), False
         self._pause: Callable[[], None] = lambda: None
@@ -120,12 +117,12 @@ class LinkMonitor:
             for _ in range(self._inbox.qsize()):
                 records, now_ns = self._inbox.get()
                 try:
-                    told = self._see(records, now_ns)
+                    found = self._see(records, now_ns)
                 except Exception as error:  # the next look may do better
                     text = f"the monitor of the link failed ({describe_error(error)}); it goes on"
-                    told = [] if failed else [Fault(now_ns, "link_check", text)]
+                    found = [] if failed else [Fault(now_ns, "link_check", text)]
                     failed = True
-                for record in told:
+                for record in found:
                     self._outbox.put(record)
             threading.Event().wait(FOLLOW_PERIOD)
 
@@ -135,12 +132,12 @@ class LinkMonitor:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch
                 self._epoch = record.epoch
-                self._arrivals.append((record.stamp_ns, record.counter, record.delay))
+                self._arrivals.append(record)
             elif isinstance(record, Lateness):
                 self._lates.append(record.lateness + record.busy)
-            elif isinstance(record, Control) and not isnan(record.rtt) and record.rtt != self._trip:
-                self._trip = record.rtt
-                self._trips.append(record.rtt)
+            elif isinstance(record, Control) and not isnan(record.rtt):
+                if not self._trips or record.rtt != self._trips[-1]:  # a new echo
+                    self._trips.append(record.rtt)
         if self._asked is None:
             return []
         if self._fresh:  # a time line that runs is not judged: where it began is not known here
@@ -166,74 +163,76 @@ class LinkMonitor:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
             self._forget()
         self._suspects = off
-        told: list[Record] = [
+        found: list[Record] = [
             LinkChecked(now_ns, self._uplink, name, asked, measured, low, high, verdict, count)
-            for name, _, asked, _, measured, low, high, verdict in rows
+            for name, _, asked, measured, low, high, verdict in rows
         ]
         before, self._complained = self._complained, verdict_of(rows) == "off"
         if self._complained and not before:
             way = "uplink" if self._uplink else "downlink"
             wrong = ", ".join(describe(row) for row in rows if row.verdict == "off")
             text = f"the {way} is not what was asked for: {wrong}; see 'cloudrc link verify'"
-            told.append(Fault(now_ns, "link", text))
-        return told
+            found.append(Fault(now_ns, "link", text))
+        return found
 
     def _rows(self) -> list[Row]:
         """Judge by the link's own draws where they fit, otherwise by what netem makes."""
-        stream, first, timed = _in_order(list(self._arrivals))
-        plan, profile, rows = self._plans[0], self._plans[0].profile, list[Row]()
-        told: dict[str, tuple[float, float]] = {"datagrams": (FEWEST, len(stream.sent))}
+        stream, first, timed = _in_order(self._arrivals)
+        rows, skipped = list[Row](), UNJUDGED if timed else UNJUDGED | DELAYS
         if len(stream.sent) >= FEWEST:
-            expected = plan.expected(stream, self._epoch, first)
-            rows = judge(plan, stream, expected, {})
-            if not expected.known:
-                told["datagrams"] = (plan.needed(), len(stream.sent))
-                told |= {"correlation": (profile.correlation, 0)} if profile.correlation else {}
-        rows = [row for row in rows if row.name in (TIMED if timed else UNTIMED)]
+            rows = self._plans[0].judge(stream, self._epoch, first)
+        elif self._arrivals:  # of a new session or profile: an older verdict holds no more
+            rows = [told("loss", nan)._replace(verdict="open")]
+        rows = [row for row in rows if row.name not in skipped]
         if not timed and len(self._trips) >= FEWEST:
-            rows += self._round_trip()
-        rows = [_excused(row, np.array(self._lates)) for row in rows]
-        if profile.rate:
-            told["rate"] = (profile.rate, nan)
+            rows.append(self._round_trip())
+        rows = [self._excuse(row) for row in rows]
         timelines = [Timeline(one) for one in self._asked or ()]
         if any(one.only() is None for one in timelines):  # 1: it loops, and is never judged
-            told["time_line"] = (1, float(any(isinf(one.last_ns) for one in timelines)))
-        return rows + [
-            Row(name, "1", asked, nan, measured, nan, nan, "told")
-            for name, (asked, measured) in told.items()
-        ]
+            rows.append(told("time_line", 1, float(any(isinf(one.last_ns) for one in timelines))))
+        return rows
 
-    def _round_trip(self) -> list[Row]:
+    def _round_trip(self) -> Row:
         """Judge round trips: the newest wins, so datagrams that none overtook make them."""
         means = np.sum([[_first_come(link) for link in plan.links] for plan in self._plans], axis=0)
         low, high = np.quantile(means, (TAIL, 1.0 - TAIL)).tolist()
         bands = {"round_trip": (float(means.mean()), low, high + ENDS)}
-        drawn = Expected(bands, np.zeros(0), known=False)
-        return [judge_value("round_trip", drawn, float(np.mean(self._trips)))]
+        expected = Expected(bands, np.zeros(0), known=False)
+        return expected.judge("round_trip", float(np.mean(self._trips)))
+
+    def _excuse(self, row: Row) -> Row:
+        """Leave open a delay that ends that wake late may have added.
+
+        A stall of an end delays all datagrams that arrive meanwhile, hence the cubes.
+        """
+        late = np.array(self._lates or [0.0])
+        added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * PERIOD)) ** 0.5
+        slow = row.verdict == "off" and row.unit == "s" and row.measured > row.low
+        return row._replace(verdict="open") if slow and row.measured <= row.high + added else row
 
 
-def _in_order(arrivals: Sequence[_Heard]) -> tuple[Stream, int, bool]:
+def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
     """Order arrivals by their counters, with the lost ones between them.
 
     Returns also the first counter and whether the ends share a clock; if not, delays have an
     unknown offset.
     """
-    last = max((counter for _, counter, _ in arrivals), default=0) - FINAL
-    arrivals = [one for one in arrivals if last - KEPT < one[1] <= last]
-    first = arrivals[0][1] if arrivals else last + 1
-    arrivals = [one for one in arrivals if one[1] >= first]
+    last = max((one.counter for one in arrivals), default=0) - FINAL
+    arrivals = [one for one in arrivals if last - KEPT < one.counter <= last]
+    first = arrivals[0].counter if arrivals else last + 1
+    arrivals = [one for one in arrivals if one.counter >= first]
     count = last - first + 1
     delays, copies = np.full(count, nan), np.zeros(count, int)
     if not arrivals:
         return Stream(delays, delays, copies), first, False
-    begin_ns, timed = arrivals[0][0], not any(isnan(delay) for _, _, delay in arrivals)
+    begin_ns, timed = arrivals[0].stamp_ns, not any(isnan(one.delay) for one in arrivals)
     numbers, index, times = np.unique(  # the first copy comes first
-        [counter - first for _, counter, _ in arrivals], return_index=True, return_counts=True
+        [one.counter - first for one in arrivals], return_index=True, return_counts=True
     )
     # A nanosecond apart: what is read in one wake has the same time, but has not lost its order.
-    stamps_ns = [one[0] - begin_ns + place for place, one in enumerate(arrivals)]
+    stamps_ns = [one.stamp_ns - begin_ns + place for place, one in enumerate(arrivals)]
     stamps = np.array(stamps_ns)[index] * 1e-9
-    known = np.array([delay for _, _, delay in arrivals])[index]
+    known = np.array([one.delay for one in arrivals])[index]
     delays[numbers] = known if timed else stamps - numbers * PERIOD
     copies[numbers] = times
     sent = np.interp(np.arange(count), numbers, stamps - delays[numbers])
@@ -245,13 +244,3 @@ def _first_come(stream: Stream) -> float:
     arrival = np.where(np.isnan(stream.delays), inf, stream.sent + stream.delays)
     first = arrival <= np.minimum.accumulate(arrival[::-1])[::-1]
     return float(stream.delays[first & np.isfinite(arrival)].mean())
-
-
-def _excused(row: Row, lates: Floats) -> Row:
-    """Leave open what ends that wake late may have added; a long stall delays many datagrams."""
-    if row.verdict != "off" or not len(lates) or row.measured < row.low or row.unit != "s":
-        return row
-    waited = 2.0 * max(lates.mean(), (lates**2).mean() / (2.0 * PERIOD))
-    square = max((lates**2).mean(), (lates**3).mean() / (3.0 * PERIOD))
-    most = hypot(row.high, 2.0 * square**0.5) if row.name == "deviation" else row.high + waited
-    return row._replace(verdict="open") if row.measured <= most else row

@@ -27,7 +27,7 @@ PROBE = 254
 FIRST_PROBE = 1.0
 """Time from the start of the link to the first probe [s]."""
 COUNT = 1500
-"""Number of probes; more where chance hides more than a tolerance."""
+"""Number of probes; more where chance hides more than a tolerance [1]."""
 LONGEST, AFTER = 120.0, 5.0
 """Longest time to probe, and time to probe after the last change of a time line [s]."""
 RATE, LINK_SHARE = 200.0, 0.4
@@ -37,7 +37,7 @@ RATE_MAX = 1e8
 """Highest rate that this process can measure [bit/s]."""
 TRAIN_SIZE, TRAIN_SPAN = 1400, 0.06
 """UDP payload of a probe of a train [bytes], one Ethernet frame, and time of a train [s]."""
-_BUFFER, _DRAIN = 4_000_000, 64
+_BUFFER = 4_000_000
 
 
 def plan_probes(
@@ -62,10 +62,9 @@ def plan_probes(
         return Plan(profile, flow, (starts[:, None] + block).ravel(), train)
 
     last = timeline.last_ns * 1e-9
-    found = plan(seconds or max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
-    if drawn and not last and not seconds:
-        found = plan(max(COUNT * step, min(found.needed() * step, LONGEST)))
-    return found
+    if seconds or last or not drawn:
+        return plan(seconds or max(COUNT * step, min(last + AFTER, LONGEST) if last else 0.0))
+    return plan(max(COUNT * step, min(plan(COUNT * step).needed() * step, LONGEST)))
 
 
 class ProbeEnd:
@@ -77,60 +76,39 @@ class ProbeEnd:
         """Set up; `route` is where it sends, `origin_ns` when the link came up, wall clock [ns]."""
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         ask_for_stamps(own)
-        self.socket, self.plan, self._route, self._origin_ns = own, plan, route, origin_ns
-        late = max(0.0, (time.time_ns() - origin_ns) * 1e-9 + 0.05 - float(plan.sent[0]))
-        self._due_ns = (origin_ns + np.rint((plan.sent + late) * 1e9)).astype(np.int64).tolist()
-        self._stamps = Stamps()
-        self._sent_ns, self._arrivals = list[int](), list[tuple[int, int]]()
+        self.socket, self.route, self.plan, self.origin_ns = own, route, plan, origin_ns
+        count = len(plan.sent)
+        self.probes = [self._encode(number) for number in range(count)]
+        self._stamps, self._sent_ns = Stamps(), np.zeros(count, dtype=np.int64)
+        self._delays, self._copies = np.full(count, inf), np.zeros(count, int)
 
-    def data(self, number: int) -> bytes:
+    def _encode(self, number: int) -> bytes:
         """Encode a probe; its header fills all of it, so that damage shows."""
         _, uplink, kind, size = self.plan.flow
         way = Direction.UPLINK if uplink else Direction.DOWNLINK
         header = encode_header(kind, way, 1, number)
         return (header * (size // len(header) + 1))[:size]
 
-    def wait(self) -> float:
-        """Return the time until the next probe is due [s]; infinite after the last."""
-        number = len(self._sent_ns)
-        return (self._due_ns[number] - time.time_ns()) * 1e-9 if number < len(self._due_ns) else inf
+    def send(self, number: int) -> None:
+        """Send a probe; if the kernel refuses it, it does not arrive."""
+        self._sent_ns[number] = time.time_ns()
+        with suppress(OSError):
+            self.socket.sendto(self.probes[number], self.route)
 
-    def send(self) -> bool:
-        """Send the next probe; False if the kernel has no room for it yet."""
-        data = self.data(len(self._sent_ns))
-        self._sent_ns.append(time.time_ns())
-        try:
-            self.socket.sendto(data, self._route)
-        except BlockingIOError:
-            self._sent_ns.pop()
-            return False
-        except OSError:  # then it does not arrive
-            pass
-        return True
-
-    def receive(self, own: socket.socket) -> None:
-        """Note the probes of this end that wait in the other end's socket, nothing else."""
-        for _ in range(_DRAIN):
-            try:
-                data, ancillary, _, _ = own.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
-            except BlockingIOError:
-                return
-            except OSError:  # an earlier probe found nobody listening
-                continue
-            at_ns = self._stamps.wall_ns(ancillary) or time.time_ns()
-            with suppress(ValueError):
-                number = peek(data)[2]
-                if number < len(self._sent_ns) and data == self.data(number):
-                    self._arrivals.append((number, at_ns))
+    def receive(self, far: socket.socket) -> None:
+        """Note a probe of this end that waits in the other end's socket, and nothing else."""
+        with suppress(OSError, ValueError):  # nobody listened to an earlier probe; foreign data
+            data, ancillary, _, _ = far.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
+            at_ns, number = self._stamps.wall_ns(ancillary) or time.time_ns(), peek(data)[2]
+            if number < len(self.probes) and data == self.probes[number]:
+                delay = (at_ns - int(self._sent_ns[number])) * 1e-9
+                self._delays[number] = min(self._delays[number], delay)
+                self._copies[number] += 1
 
     def stream(self) -> Stream:
         """Return what was measured."""
-        delays, copies = np.full(len(self._sent_ns), np.inf), np.zeros(len(self._sent_ns), int)
-        for number, at_ns in self._arrivals:
-            delays[number] = min(delays[number], (at_ns - self._sent_ns[number]) * 1e-9)
-            copies[number] += 1
-        sent = (np.array(self._sent_ns, dtype=np.int64) - self._origin_ns) * 1e-9
-        return Stream(sent, np.where(copies, delays, np.nan), copies)
+        delays = np.where(self._copies, self._delays, np.nan)
+        return Stream((self._sent_ns - self.origin_ns) * 1e-9, delays, self._copies)
 
 
 def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
@@ -139,21 +117,27 @@ def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
     What the first end sends the second receives, and the other way round.
     """
     heard = {end.socket: other for end, other in zip(ends, reversed(ends), strict=True)}
-    drawn = [end.plan.draw(end.plan.sent).delays for end in ends]
-    quiet = 0.5 + 2.0 * max(float(np.max(one, initial=0.0, where=one > 0.0)) for one in drawn)
+    drawn = np.concatenate([end.plan.draw(end.plan.sent).delays for end in ends])
+    quiet = 0.5 + 2.0 * float(np.max(drawn, initial=0.0, where=drawn > 0.0))
+    late = max((time.time_ns() - end.origin_ns) * 1e-9 + 0.05 - FIRST_PROBE for end in ends)
+    schedule = sorted(
+        (end.origin_ns + round((at + max(0.0, late)) * 1e9), place, number)
+        for place, end in enumerate(ends)
+        for number, at in enumerate(end.plan.sent.tolist())
+    )
+
+    def listen(until_ns: int) -> None:
+        while (left_ns := until_ns - time.time_ns()) > 0:
+            for far in select.select(list(heard), (), (), left_ns * 1e-9)[0]:
+                heard[far].receive(far)
+
     gc.collect()
     gc.disable()  # a collection takes milliseconds
-    last = time.monotonic()
     try:
-        while (wait := min(end.wait() for end in ends)) < inf or time.monotonic() - last < quiet:
-            readable, _, _ = select.select(list(heard), (), (), min(max(wait, 0.0), 0.05))
-            for own in readable:
-                heard[own].receive(own)
-            for end in ends:
-                while end.wait() <= 0.0 and end.send():
-                    pass
-            if readable or wait < inf:
-                last = time.monotonic()
+        for due_ns, place, number in schedule:
+            listen(due_ns)
+            ends[place].send(number)
+        listen(time.time_ns() + round(quiet * 1e9))
     finally:
         gc.enable()
     return [end.stream() for end in ends]

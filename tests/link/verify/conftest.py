@@ -6,7 +6,6 @@ Source: Linux, net/sched/sch_netem.c: get_crandom, tabledist, loss_gilb_ell, net
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -16,12 +15,12 @@ from cloudrc.config.load import load_profile
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection, Stream
 from cloudrc.link.netem import check, stretch, table
-from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Timeline
-from cloudrc.link.verify.causes import Evidence, Findings
-from cloudrc.link.verify.judge import Flow, Plan, Row, judge
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline
+from cloudrc.link.verify.causes import Findings
+from cloudrc.link.verify.judge import Flow
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.link.verify.probe import PROBE, plan_probes
-from cloudrc.records import Arrival, Fault, LinkChecked, Record
+from cloudrc.records import Arrival, Fault, LinkChecked
 
 _WORDS, _ONE = 1 << 32, 8192
 _HEADERS = 28
@@ -31,7 +30,7 @@ _IN_ORDER = 100e9
 class VirtualNetem:
     """Shape one direction as `sch_netem.c` does; used like `LinkDirection`."""
 
-    def __init__(self, profile: DirectionProfile, seed: int) -> None:
+    def __init__(self, profile, seed):
         check(profile)
         self._profile, self._timeline = profile, Timeline(profile)
         self._chance = random.Random(seed)
@@ -42,12 +41,12 @@ class VirtualNetem:
         distribution = profile.distribution
         self._table = None if distribution == "table" else table(distribution)
 
-    def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> list[int]:
+    def send(self, epoch, kind, counter, size, now_ns):
         """Return when the copies of a packet arrive [ns]."""
         now = self._timeline.at(now_ns)
         return [at_ns for at_ns in self._enqueue(now, size, now_ns, copies=True) if at_ns >= 0]
 
-    def _enqueue(self, now: Conditions, size: int, now_ns: int, copies: bool) -> list[int]:
+    def _enqueue(self, now, size, now_ns, copies):
         profile, count, found = self._profile, 1, list[int]()
         if copies and self._chance.random() < profile.duplicate:
             count += 1
@@ -67,7 +66,7 @@ class VirtualNetem:
             self._last_ns = at_ns
         return [*found, -1 if damaged else max(now_ns, at_ns)]
 
-    def _loses(self, now: Conditions) -> bool:
+    def _loses(self, now):
         loss = 1.0 if now.blackout else now.loss
         if not isinstance(loss, GilbertElliott):
             return self._chance.random() < loss
@@ -76,7 +75,7 @@ class VirtualNetem:
             self._bad = not self._bad
         return self._chance.random() < share
 
-    def _delay_ns(self, now: Conditions) -> int:
+    def _delay_ns(self, now):
         if not now.jitter:
             return now.delay_ns
         drawn = self._draw()
@@ -84,7 +83,7 @@ class VirtualNetem:
         sigma = now.jitter * stretch(self._profile) * 1e9
         return round(now.delay_ns + sigma * self._table[drawn % len(self._table)] / _ONE)
 
-    def _draw(self) -> int:
+    def _draw(self):
         """Draw a number of which only the high bits are correlated."""
         drawn = self._chance.getrandbits(32)
         if self._rho:
@@ -94,7 +93,7 @@ class VirtualNetem:
         return drawn
 
 
-def can(profile: DirectionProfile) -> bool:
+def can(profile):
     """Whether netem can do it at all."""
     try:
         check(profile)
@@ -103,7 +102,7 @@ def can(profile: DirectionProfile) -> bool:
     return True
 
 
-def asked(name: str, way: str) -> DirectionProfile:
+def asked(name, way):
     """Return one direction of a shipped profile."""
     return link_profile(getattr(load_profile(name), way))
 
@@ -115,13 +114,12 @@ OVERHEAD = 8e-5
 
 
 def rows_of(
-    profile: DirectionProfile,
-    real: DirectionProfile | VirtualNetem,
-    evidence: Evidence = Evidence(),  # noqa: B008  # frozen
+    profile,
+    real,
     *,
-    stall: float = 0.0,
-    seconds: float | None = None,
-) -> list[Row]:
+    stall=0.0,
+    seconds=None,
+):
     """Probe a link; a relay without CPU delays 30 % of the probes by up to `stall` [s]."""
     netem = isinstance(real, VirtualNetem)
     plan = plan_probes(profile, Flow(SEED, True, PROBE, 203), seconds, drawn=netem)
@@ -129,10 +127,10 @@ def rows_of(
     rng = np.random.default_rng(SEED)
     late = stall * rng.random(len(stream.sent)) * (rng.random(len(stream.sent)) < 0.3)
     stream = replace(stream, delays=stream.delays + OVERHEAD + late)
-    return judge(plan, stream, plan.expected(stream), plan.applied(evidence.applied))
+    return plan.judge(stream)
 
 
-def meet(plan: Plan, real: DirectionProfile | VirtualNetem) -> Stream:
+def meet(plan, real):
     """Return what a link does to the datagrams of a plan."""
     if not isinstance(real, VirtualNetem):
         return replace(plan, profile=real).draw(plan.sent)
@@ -143,23 +141,21 @@ def meet(plan: Plan, real: DirectionProfile | VirtualNetem) -> Stream:
     return Stream(plan.sent, np.array(delays), np.array([len(fate) for fate in fates]))
 
 
-def verify(
-    profile: DirectionProfile, up: DirectionProfile, down: DirectionProfile, known: Evidence
-) -> dict[str, Findings]:
+def verify(profile, up, down, known):
     """Request a profile both ways and find another one in each."""
     ways = {"uplink": up, "downlink": down}
-    return {way: Findings(rows_of(profile, one, known), known) for way, one in ways.items()}
+    return {way: Findings(rows_of(profile, one), known) for way, one in ways.items()}
 
 
 def arrivals(
-    profile: DirectionProfile,
-    seconds: float = 60.0,
+    profile,
+    seconds=60.0,
     *,
-    seed: int = SEED,
-    overhead: float = 5e-4,
-    uplink: bool = False,
-    netem: bool = False,
-) -> list[Arrival]:
+    seed=SEED,
+    overhead=5e-4,
+    uplink=False,
+    netem=False,
+):
     """Return what cloud (`uplink`) or world notes of a flight of some seconds.
 
     The ends add `overhead` [s]; NaN: they share no clock. The experiment's seed is 1.
@@ -179,7 +175,7 @@ def arrivals(
     return sorted(found)
 
 
-def hearing(up: DirectionProfile, down: DirectionProfile, *, uplink: bool = False) -> LinkMonitor:
+def hearing(up, down, *, uplink=False):
     """Return the monitor of the end that receives a direction."""
     flow = Flow(SEED, uplink, KINDS[uplink], SIZES[uplink])
     monitor = LinkMonitor(uplink=uplink, flow=flow)
@@ -187,9 +183,7 @@ def hearing(up: DirectionProfile, down: DirectionProfile, *, uplink: bool = Fals
     return monitor
 
 
-def checked(
-    monitor: LinkMonitor, records: Iterable[Record], since_ns: int = 0
-) -> tuple[list[dict[str, LinkChecked]], list[Fault]]:
+def checked(monitor, records, since_ns=0):
     """Pass records one by one; return the rows of each verdict by quantity, and the faults."""
     moments, faults = list[dict[str, LinkChecked]](), list[Fault]()
     for record in records:
@@ -200,17 +194,17 @@ def checked(
     return moments, faults
 
 
-def is_believed(moment: dict[str, LinkChecked]) -> bool:
+def is_believed(moment):
     return {row.verdict for row in moment.values()} - {"told"} == {"ok"}
 
 
-def random_profile(rng: np.random.Generator) -> DirectionProfile:
+def random_profile(rng):
     """Draw a profile that a user might write."""
     delay = float(rng.uniform(5e-3, 0.15))
     profile = DirectionProfile(
         delay,
         min(0.03, float(rng.uniform(0.0, 0.4)) * delay),
-        str(rng.choice(["uniform", "normal", "pareto"])),  # type: ignore[arg-type]
+        str(rng.choice(["uniform", "normal", "pareto"])),
     )
     if rng.random() < 0.3:
         profile = replace(profile, correlation=float(rng.uniform(0.1, 0.6)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from cloudrc.config.shipped import names
 from cloudrc.link.netem import check
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
-from cloudrc.link.verify.judge import Flow, Row, look_twice, netem_makes, verdict_of
+from cloudrc.link.verify.judge import Flow, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from tests.link.verify.conftest import (
     VirtualNetem,
@@ -31,12 +30,12 @@ NARROW = DirectionProfile(0.020, 0.002, rate=2e6, queue_packets=200, keep_order=
 NOTHING = DirectionProfile()
 
 
-def doubts(rows: list[Row]) -> list[tuple[str, str]]:
-    return [(row.name, row.verdict) for row in rows if row.verdict != "ok"]
+def doubts(rows):
+    return [(row.name, row.verdict) for row in rows if row.verdict not in ("ok", "told")]
 
 
 @pytest.mark.promise("verify-tells-the-link")
-def test_200_honest_links_of_200_are_believed(figure: Callable[..., None]) -> None:
+def test_200_honest_links_of_200_are_believed(figure):
     rng = np.random.default_rng(1)
     links = [asked(name, way) for name in names("profile") for way in ("uplink", "downlink")]
     links += [random_profile(rng) for _ in range(200 - len(links))]
@@ -46,25 +45,25 @@ def test_200_honest_links_of_200_are_believed(figure: Callable[..., None]) -> No
     assert found == {}
 
 
-def netem(**facts: object) -> Evidence:
-    return Evidence(**{"shaper": "netem", "layers": 1, **facts})  # type: ignore[arg-type]
+def netem(**facts):
+    return Evidence(**{"shaper": "netem", "layers": 1, **facts})
 
 
 # Requested, found on the uplink, found on the downlink, reported by the machine.
 FAULTS: dict[str, tuple[DirectionProfile, DirectionProfile, DirectionProfile, Evidence]] = {
     "no_qdisc": (PAPER, NOTHING, NOTHING, Evidence("none", interface="eth0")),
     "wrong_interface": (PAPER, NOTHING, NOTHING, Evidence("none", elsewhere=("eth1",))),
-    "doubled_delay": (PAPER, *[replace(PAPER, delay=0.090)] * 2, netem(applied=PAPER)),
+    "doubled_delay": (PAPER, *[replace(PAPER, delay=0.090)] * 2, netem()),
     "halved_delay": (PAPER, *[replace(PAPER, delay=0.0225, jitter=0.0125)] * 2, netem()),
     "one_direction": (PAPER, PAPER, NOTHING, netem()),
-    "wrong_jitter": (PAPER, *[replace(PAPER, jitter=0.0225)] * 2, netem(applied=PAPER)),
-    "no_loss": (LOSING, *[replace(LOSING, loss=0.0)] * 2, netem(applied=LOSING)),
-    "more_loss": (LOSING, *[replace(LOSING, loss=0.15)] * 2, netem(applied=LOSING)),
-    "bypassed": (PAPER, NOTHING, NOTHING, netem(applied=PAPER, sent=3000, passed=3)),
-    "order_kept": (PAPER, *[replace(PAPER, keep_order=True)] * 2, netem(applied=PAPER)),
-    "rate_ignored": (NARROW, *[replace(NARROW, rate=None)] * 2, netem(applied=NARROW)),
+    "wrong_jitter": (PAPER, *[replace(PAPER, jitter=0.0225)] * 2, netem()),
+    "no_loss": (LOSING, *[replace(LOSING, loss=0.0)] * 2, netem()),
+    "more_loss": (LOSING, *[replace(LOSING, loss=0.15)] * 2, netem()),
+    "bypassed": (PAPER, NOTHING, NOTHING, netem(sent=3000, passed=3)),
+    "order_kept": (PAPER, *[replace(PAPER, keep_order=True)] * 2, netem()),
+    "rate_ignored": (NARROW, *[replace(NARROW, rate=None)] * 2, netem()),
     "no_sch_netem": (PAPER, NOTHING, NOTHING, Evidence("none", "this kernel has no sch_netem")),
-    "shaped_twice": (PAPER, *[replace(PAPER, delay=0.090)] * 2, replace(netem(), layers=2)),
+    "shaped_twice": (PAPER, *[replace(PAPER, delay=0.090)] * 2, netem(layers=2)),
     "order_broken": (NARROW, *[replace(NARROW, keep_order=False, jitter=0.015)] * 2, netem()),
     "wrong_duplicates": (PAPER, *[replace(PAPER, duplicate=0.1)] * 2, netem()),
 }
@@ -72,7 +71,7 @@ FAULTS: dict[str, tuple[DirectionProfile, DirectionProfile, DirectionProfile, Ev
 
 @pytest.mark.promise("verify-tells-the-link")
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_seeded_fault_is_named(fault: str, figure: Callable[..., None]) -> None:
+def test_a_seeded_fault_is_named(fault, figure):
     causes = {cause.code for cause in find_causes(verify(*FAULTS[fault]))}
     figure("seeded faults of the link: not named", int(causes != {fault}), "==", 0)
     assert causes == {fault}
@@ -101,9 +100,9 @@ OFF = {
 
 
 @pytest.mark.parametrize("name", OFF)
-def test_a_link_beyond_its_tolerance_is_off(name: str) -> None:
+def test_a_link_beyond_its_tolerance_is_off(name):
     profile, values, quantity = OFF[name]
-    assert (quantity, "off") in doubts(rows_of(profile, replace(profile, **values)))  # type: ignore[arg-type]
+    assert (quantity, "off") in doubts(rows_of(profile, replace(profile, **values)))
 
 
 @pytest.mark.parametrize(
@@ -113,7 +112,7 @@ def test_a_link_beyond_its_tolerance_is_off(name: str) -> None:
         for name in names("profile")
     ],
 )
-def test_an_honest_netem_is_believed(name: str) -> None:
+def test_an_honest_netem_is_believed(name):
     for way in ("uplink", "downlink"):
         profile = asked(name, way)
         if can(profile):
@@ -124,13 +123,10 @@ def test_an_honest_netem_is_believed(name: str) -> None:
     ("values", "quantity"),
     [({"delay": 0.09}, "mean"), ({"jitter": 0.026}, "deviation"), ({"loss": 0.05}, "loss")],
 )
-def test_a_wrong_netem_is_off(values: dict[str, float], quantity: str) -> None:
+def test_a_wrong_netem_is_off(values, quantity):
     profile = DirectionProfile(0.08, 0.02, correlation=0.9)
-    rows = rows_of(profile, VirtualNetem(replace(profile, **values), 7))  # type: ignore[arg-type]
+    rows = rows_of(profile, VirtualNetem(replace(profile, **values), 7))
     assert (quantity, "off") in doubts(rows)
-
-
-BURSTS = GilbertElliott(0.02, 0.2, 0.9, 0.02)
 
 
 @pytest.mark.parametrize(
@@ -138,15 +134,13 @@ BURSTS = GilbertElliott(0.02, 0.2, 0.9, 0.02)
     [
         DirectionProfile(0.08, 0.02, correlation=0.9),
         DirectionProfile(0.08, 0.02, "pareto", 0.5, keep_order=True),
-        DirectionProfile(0.045, 0.01, loss=0.2, duplicate=0.3),
-        DirectionProfile(0.045, 0.01, loss=BURSTS, duplicate=0.4),
         DirectionProfile(0.045, 0.0, loss=0.1, corrupt=0.1),
     ],
 )
-def test_what_netem_makes_is_what_the_kernel_draws(profile: DirectionProfile) -> None:
+def test_the_model_without_correlation_is_what_the_kernel_draws(profile):
     check(profile)
     plan = plan_probes(profile, Flow(1, True, PROBE, 203), 300.0)
-    made = replace(plan, profile=netem_makes(profile))
+    made = replace(plan, profile=replace(profile, correlation=0.0))
     ours, theirs = (
         plan.quantities(one, np.zeros(0))
         for one in (made.draw(plan.sent), meet(plan, VirtualNetem(profile, 7)))
@@ -155,7 +149,7 @@ def test_what_netem_makes_is_what_the_kernel_draws(profile: DirectionProfile) ->
         assert ours[name] == pytest.approx(value, rel=0.05, abs=0.015), name
 
 
-def test_a_draw_of_the_model_is_predicted_exactly() -> None:
+def test_a_draw_of_the_model_is_predicted_exactly():
     profile = replace(asked("lossy", "uplink"), duplicate=0.1, corrupt=0.1)
     plan = plan_probes(profile, Flow(1, True, PROBE, 203))
     first, again = plan.draw(plan.sent), plan.draw(plan.sent[500:], 1, 500)
@@ -164,57 +158,53 @@ def test_a_draw_of_the_model_is_predicted_exactly() -> None:
     assert not plan.expected(replace(plan, flow=plan.flow._replace(seed=2)).draw(plan.sent)).known
 
 
-def causes_of(rows: list[Row], known: Evidence) -> list[str]:
+def causes_of(rows, known):
     return [cause.code for cause in find_causes({"uplink": Findings(rows, known)})]
 
 
+STARVED = Evidence("relay", starved="500 datagrams not read in time")
+
+
 @pytest.mark.parametrize(
-    "known",
-    [{"late": 0.039}, {"sent": 3000, "passed": 2500, "unread": 500}, {"throttled": 0.4}],
+    ("real", "causes"),
+    [
+        ({}, ["throttled", "wrong_delay"]),
+        ({"delay": 1.06 * PAPER.delay, "loss": 0.3}, ["throttled", "wrong_delay"]),
+        ({"delay": PAPER.delay / 3, "keep_order": True}, ["order_kept"]),
+    ],
 )
-def test_a_relay_that_lacks_cpu_is_named_beside_other_faults(known: dict[str, float]) -> None:
-    late = Evidence("relay", layers=1, applied=PAPER, **known)  # type: ignore[arg-type]
-    assert causes_of(rows_of(PAPER, PAPER, stall=0.04), late) == ["throttled"]
-    losing = rows_of(PAPER, replace(PAPER, loss=0.3), stall=0.04)
-    assert causes_of(losing, late) == ["throttled", "more_loss"], "500 unread are not 900 lost"
-
-
-@pytest.mark.parametrize("fault", ["order_kept", "rate_ignored", "halved_delay", "no_loss"])
-def test_a_lack_of_cpu_hides_no_fault_that_it_cannot_cause(fault: str) -> None:
-    profile, real, _, _ = FAULTS[fault]
-    deaf = Evidence("relay", layers=1, sent=2000, unread=99)
-    assert fault in causes_of(rows_of(profile, real), deaf)
+def test_a_lack_of_cpu_is_named_beside_other_faults(real, causes):
+    """It is not named where nothing is slower than requested."""
+    stall = 0.0 if "keep_order" in real else 0.04
+    rows = rows_of(PAPER, replace(PAPER, **real), stall=stall)
+    assert [one.code for one in find_causes({"uplink": Findings(rows, STARVED)})] == causes
 
 
 SLOW = replace(PAPER, delay=0.090)
-TOLD_SO = netem(applied=SLOW)
 
 
 @pytest.mark.parametrize(
-    ("up", "down", "known", "causes", "told_so"),
+    ("up", "down", "known", "causes"),
     [
-        (PAPER, PAPER, netem(), [], False),
-        (PAPER, replace(PAPER, loss=0.2), netem(), [("more_loss", "downlink")], False),
-        (SLOW, SLOW, TOLD_SO, [("doubled_delay", "both")], True),
-        (SLOW, SLOW, netem(applied=PAPER), [("doubled_delay", "both")], False),
-        # Rare throttling does not double a delay.
-        (SLOW, PAPER, netem(throttled=0.02), [("doubled_delay", "uplink")], False),
-        (NOTHING, PAPER, netem(restored=1), [("no_qdisc", "uplink")], False),
-        (*[replace(PAPER, loss=1.0)] * 2, Evidence(), [("nothing_arrives", "both")], False),
+        (PAPER, PAPER, netem(), []),
+        (PAPER, replace(PAPER, loss=0.2), netem(), [("more_loss", "downlink")]),
+        (SLOW, SLOW, netem(), [("doubled_delay", "both")]),
+        (SLOW, PAPER, netem(), [("doubled_delay", "uplink")]),
+        (NOTHING, PAPER, netem(restored=1), [("no_qdisc", "uplink")]),
+        (*[replace(PAPER, loss=1.0)] * 2, Evidence(), [("nothing_arrives", "both")]),
     ],
 )
-def test_directions_and_the_shapers_word_are_told_apart(up, down, known, causes, told_so) -> None:
+def test_directions_are_told_apart(up, down, known, causes):
     found = find_causes(verify(PAPER, up, down, known))
     assert [(cause.code, cause.way) for cause in found] == causes
-    assert ["it was told so" in cause.text for cause in found] == [told_so] * len(causes)
 
 
-def test_too_few_or_dead_probes_decide_nothing() -> None:
+def test_too_few_or_dead_probes_decide_nothing():
     assert verdict_of(rows_of(PAPER, PAPER, seconds=1.0)) == "open"
     assert ("mean", "open") in doubts(rows_of(PAPER, replace(PAPER, loss=1.0)))
 
 
-def test_only_what_is_off_twice_is_off() -> None:
+def test_only_what_is_off_twice_is_off():
     good, slow, lossy = (
         rows_of(PAPER, replace(PAPER, **values))
         for values in ({}, {"delay": 0.09}, {"delay": 0.09, "loss": 0.5})

@@ -6,7 +6,6 @@ import json
 import time
 from dataclasses import replace
 from math import isnan, nan
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ import pytest
 from cloudrc.config.shipped import names
 from cloudrc.link.profile import DirectionProfile, Trace
 from cloudrc.link.state import STATE_MAX
-from cloudrc.link.verify.monitor import KEPT, Asked, LinkMonitor
+from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 from tests.link.verify.conftest import (
     PERIOD_NS,
@@ -39,7 +38,7 @@ NETEMS = [
 
 
 @pytest.mark.parametrize(("name", "netem"), RELAYS + NETEMS)
-def test_an_honest_link_is_believed_and_never_faulted(name: str, netem: bool) -> None:
+def test_an_honest_link_is_believed_and_never_faulted(name, netem):
     profile = asked(name, "uplink")
     seconds = 60.0 if netem or name == "handover" else 15.0
     heard = arrivals(profile, seconds, seed=3 if netem else 1, uplink=True, netem=netem)
@@ -62,7 +61,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("overhead", [5e-4, nan], ids=["one clock", "two clocks"])
 @pytest.mark.parametrize("quantity", FAULTS)
-def test_a_wrong_link_is_a_fault_after_a_second_look(quantity: str, overhead: float) -> None:
+def test_a_wrong_link_is_a_fault_after_a_second_look(quantity, overhead):
     moments, faults = checked(hearing(PAPER, PAPER), arrivals(FAULTS[quantity], overhead=overhead))
     if isnan(overhead) and quantity in ("mean", "deviation"):
         assert quantity not in moments[-1], "nobody knows one-way delays"
@@ -74,7 +73,18 @@ def test_a_wrong_link_is_a_fault_after_a_second_look(quantity: str, overhead: fl
     assert faults[0].text.startswith("the downlink is not what was asked for: ")
 
 
-def test_one_bad_window_is_no_fault() -> None:
+def test_a_new_session_starts_undecided():
+    monitor = hearing(PAPER, PAPER)
+    assert is_believed(checked(monitor, arrivals(PAPER, 20.0))[0][-1])
+    (few,) = [one._replace(epoch=2, stamp_ns=one.stamp_ns + 20_000_000_000)
+              for one in arrivals(PAPER, 0.01)]  # fmt: skip
+    monitor.after([few], few.stamp_ns)
+    later_ns = few.stamp_ns + 7_000_000_000
+    (row,) = monitor.after([few._replace(counter=1, stamp_ns=later_ns)], later_ns)
+    assert (row.quantity, row.verdict) == ("loss", "open")
+
+
+def test_one_bad_window_is_no_fault():
     dead = range(300, 700)
     heard = [one for one in arrivals(PAPER, 40.0) if one.counter not in dead]
     moments, faults = checked(hearing(PAPER, PAPER), heard)
@@ -82,7 +92,7 @@ def test_one_bad_window_is_no_fault() -> None:
     assert is_believed(moments[-1])
 
 
-def test_ends_that_wake_late_are_not_the_links_fault() -> None:
+def test_ends_that_wake_late_are_not_the_links_fault():
     slow = arrivals(replace(PAPER, delay=PAPER.delay + 0.0045))
     assert checked(hearing(PAPER, PAPER), slow)[1], "of punctual ends it is"
     heard: list[Record] = []
@@ -93,7 +103,7 @@ def test_ends_that_wake_late_are_not_the_links_fault() -> None:
     assert moments[-1]["mean"].verdict == "open"
 
 
-def test_one_long_stall_of_an_end_is_not_the_links_fault() -> None:
+def test_one_long_stall_of_an_end_is_not_the_links_fault():
     heard: list[Record] = []
     begin_ns, end_ns = 20_000_000_000, 20_500_000_000
     for arrival in arrivals(P1, 32.0):
@@ -106,7 +116,7 @@ def test_one_long_stall_of_an_end_is_not_the_links_fault() -> None:
     assert checked(hearing(P1, P1), heard)[1] == []
 
 
-def test_order_survives_that_an_end_reads_several_datagrams_at_once() -> None:
+def test_order_survives_that_an_end_reads_several_datagrams_at_once():
     period_ns = 15_000_000
     heard = [
         one._replace(stamp_ns=late_ns, delay=one.delay + (late_ns - one.stamp_ns) * 1e-9)
@@ -117,7 +127,7 @@ def test_order_survives_that_an_end_reads_several_datagrams_at_once() -> None:
     assert moments[-1]["reordered"].verdict == "ok"
 
 
-def control(stamp_ns: int, rtt: float) -> Control:
+def control(stamp_ns, rtt):
     return Control(
         stamp_ns, 1, 0, 0, 0.0, rtt, rtt, ZERO, ZERO, (1.0, *ZERO), ZERO, ZERO, 0, ZERO, 0.0,
         ZERO, ZERO, ZERO,
@@ -125,7 +135,7 @@ def control(stamp_ns: int, rtt: float) -> Control:
 
 
 @pytest.mark.parametrize(("slower", "verdict"), [(0.001, "ok"), (0.030, "off")])
-def test_cloud_judges_round_trips_without_a_common_clock(slower: float, verdict: str) -> None:
+def test_cloud_judges_round_trips_without_a_common_clock(slower, verdict):
     up, down = DirectionProfile(0.040), DirectionProfile(0.080)
     heard: list[Record] = []
     for arrival in arrivals(up, overhead=nan, uplink=True):
@@ -135,7 +145,7 @@ def test_cloud_judges_round_trips_without_a_common_clock(slower: float, verdict:
     assert (trip.asked, trip.verdict) == (pytest.approx(0.120, abs=1e-4), verdict)
 
 
-def test_a_new_profile_is_judged_from_then_on() -> None:
+def test_a_new_profile_is_judged_from_then_on():
     monitor, slow = hearing(PAPER, PAPER), replace(PAPER, delay=0.120)
     assert checked(monitor, arrivals(PAPER, 20.0))[1] == []
     monitor.follow((slow, slow))
@@ -148,27 +158,27 @@ def test_a_new_profile_is_judged_from_then_on() -> None:
     assert moments[-1]["mean"].asked == pytest.approx(0.120, abs=1e-3)
 
 
-def test_a_time_line_that_loops_is_not_judged_after_an_hour_either() -> None:
+def test_a_time_line_that_loops_is_not_judged_after_an_hour_either():
     looping = replace(PAPER, trace=Trace((0.0, 1.0), (0.040, 0.120), loop=True))
     monitor = hearing(looping, looping)
     hour = [one._replace(stamp_ns=one.stamp_ns + 3_700_000_000_000) for one in arrivals(PAPER)]
     moments, faults = checked(monitor, [*arrivals(PAPER, 1.0), *hour])
     assert faults == []
     assert moments
-    assert set(moments[-1]) == {"datagrams", "time_line"}
+    assert set(moments[-1]) == {"time_line"}
     assert moments[-1]["time_line"].measured == 1.0, "so that nobody waits for a verdict"
 
 
 @pytest.mark.parametrize("gap", [20_000, 10**6, 10**18])
-def test_a_counter_that_jumps_costs_no_memory(gap: int) -> None:
+def test_a_counter_that_jumps_costs_no_memory(gap):
     heard = [
         Arrival(n * PERIOD_NS, False, 1, n + gap * (n >= 1500), 0.070, True) for n in range(3000)
     ]
     moments, _ = checked(hearing(*[DirectionProfile(0.070)] * 2), heard)
-    assert moments[-1]["datagrams"].measured <= KEPT
+    assert is_believed(moments[-1]), "only what came after the jump counts"
 
 
-def run(monitor: LinkMonitor, records: list[Arrival]) -> list[Record]:
+def run(monitor, records):
     """Pass records to a monitor with a thread; return what it says first."""
     told, deadline = list[Record](), time.monotonic() + 20.0
     for one in records:
@@ -179,15 +189,15 @@ def run(monitor: LinkMonitor, records: list[Arrival]) -> list[Record]:
     return told
 
 
-def state(profile: object) -> str:
+def state(profile):
     found: dict[str, Any] = dict.fromkeys(("reason", "mode", "direction", "since"), "")
     return json.dumps(found | {"shaper": "relay", "since_ns": 0, "profile": profile})
 
 
-def test_the_state_file_is_followed_past_nonsense(tmp_path: Path) -> None:
+def test_the_state_file_is_followed_past_nonsense(tmp_path):
     path, slow = tmp_path / "link.json", DirectionProfile(0.070)
 
-    def load(values: object) -> Asked:
+    def load(values):
         if values == "nonsense":
             raise OverflowError
         return slow, slow
@@ -203,8 +213,8 @@ def test_the_state_file_is_followed_past_nonsense(tmp_path: Path) -> None:
     assert checked(monitor, arrivals(FAULTS["mean"], 20.0)) == ([], []), "nothing is known"
 
 
-def test_a_failure_is_told_once_and_the_monitor_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(self: LinkMonitor) -> None:
+def test_a_failure_is_told_once_and_the_monitor_goes_on(monkeypatch):
+    def fails(self):
         raise MemoryError("no\nroom")
 
     monkeypatch.setattr(LinkMonitor, "_rows", fails)
@@ -217,8 +227,8 @@ def test_a_failure_is_told_once_and_the_monitor_goes_on(monkeypatch: pytest.Monk
     ]
 
 
-def test_the_thread_judges_like_the_loop() -> None:
+def test_the_thread_judges_like_the_loop():
     monitor = hearing(PAPER, PAPER)
     monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
     told = run(monitor, arrivals(PAPER, 12.0))
-    assert {one.verdict for one in told if isinstance(one, LinkChecked)} == {"ok", "told"}
+    assert {one.verdict for one in told if isinstance(one, LinkChecked)} == {"ok"}

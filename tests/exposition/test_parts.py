@@ -1,21 +1,70 @@
-"""Errors of predictions and delay estimates: computed by hand, and from a flight's ground truth."""
+"""Losses, reordering, and errors of predictions and delay estimates.
 
-from __future__ import annotations
+They are computed by hand, by a full count, and from a flight's ground truth.
+"""
 
 import math
-from collections.abc import Iterator
+import random
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition.live import LiveMetrics
-from cloudrc.exposition.parts import DelayJudge, PredictionJudge
+from cloudrc.exposition.parts import WINDOW, DatagramTally, DelayJudge, PredictionJudge
 from cloudrc.records import CommandApplied, Control
 from tests.exposition.conftest import MS, period
 from tests.flights.conftest import records
 
 
-def flying_along_x(predicted_lead: float, *, every_ms: int = 10) -> Iterator[Control]:
+def taken(counters, epoch=1):
+    stream = DatagramTally()
+    for counter in counters:
+        stream.take(epoch, counter)
+    return stream
+
+
+@pytest.mark.parametrize(
+    ("counters", "expected", "lost", "reordered"),
+    [
+        ([0, 2, *range(3, WINDOW + 1)], 1, 0, 0),  # only number 0 has left the window
+        ([0, 2, *range(3, WINDOW + 2)], 2, 1, 0),
+        ([0, 2, 1, *range(3, 2 * WINDOW)], WINDOW, 0, 1),
+        ([0, 1, 1, 0, 2], 0, 0, 0),
+        ([0, 1000, *range(1001, 1001 + WINDOW)], 1001, 999, 0),
+    ],
+    ids=["in the window", "left it", "late", "repeated", "a long silence"],
+)
+def test_losses_are_counted(counters, expected, lost, reordered):
+    stream = taken(counters)
+    assert (stream.expected, stream.lost, stream.reordered) == (expected, lost, reordered)
+
+
+def test_a_new_epoch_starts_at_its_first_arrival():
+    stream = taken(range(2 * WINDOW))
+    for counter in range(1000, 1000 + WINDOW):
+        stream.take(2, counter)
+    assert (stream.expected, stream.lost) == (WINDOW, 0)
+
+
+@given(seed=st.integers(0, 10_000), loss=st.floats(0, 0.9), jitter=st.integers(0, 60))
+@settings(max_examples=40, deadline=None)
+def test_counts_match_the_true_loss_and_reordering(seed, loss, jitter):
+    rng, count = random.Random(seed), 400
+    sent = [0] + [n for n in range(1, count) if rng.random() >= loss]
+    sent[1:] = sorted(sent[1:], key=lambda n: n + rng.random() * jitter)
+    stream = taken([*sent, *range(count, count + WINDOW)])
+    newest, late = -1, 0
+    for counter in sent:
+        late += counter < newest
+        newest = max(newest, counter)
+    assert stream.expected == count
+    assert stream.lost == count - len(sent)
+    assert stream.reordered == late
+
+
+def flying_along_x(predicted_lead, *, every_ms=10):
     """Yield a flight at 1 m/s along x, predicted 25 ms ahead with an error `predicted_lead` [m]."""
     for at in range(0, 400, every_ms):
         x = at * 1e-3
@@ -24,9 +73,7 @@ def flying_along_x(predicted_lead: float, *, every_ms: int = 10) -> Iterator[Con
 
 
 @pytest.mark.parametrize(("lead", "every_ms", "judged"), [(0.01, 10, 37), (0, 10, 37), (1, 60, 0)])
-def test_a_prediction_is_compared_at_its_own_instant(
-    lead: float, every_ms: int, judged: int
-) -> None:
+def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
     """The last three wait for a measurement 25 ms later; none is compared across a gap."""
     judge = PredictionJudge()
     for control in flying_along_x(lead, every_ms=every_ms):
@@ -36,7 +83,7 @@ def test_a_prediction_is_compared_at_its_own_instant(
     assert judge.error == pytest.approx((lead, 0, 0) if judged else (math.nan,) * 3, nan_ok=True)
 
 
-def test_predictions_of_other_sessions_and_older_odometry_do_not_count() -> None:
+def test_predictions_of_other_sessions_and_older_odometry_do_not_count():
     judge = PredictionJudge()
     judge.take(period(0, 0, horizon=0.01, position=(9.0, 9.0, 9.0)))
     judge.reset()
@@ -50,7 +97,7 @@ def test_predictions_of_other_sessions_and_older_odometry_do_not_count() -> None
 
 
 @pytest.mark.parametrize(("loop_delay", "error"), [(0.145, -0.02), (0.144, math.nan)])
-def test_a_delay_estimate_is_compared_with_the_true_delay(loop_delay: float, error: float) -> None:
+def test_a_delay_estimate_is_compared_with_the_true_delay(loop_delay, error):
     """An echo of an unknown command is ignored."""
     judge = DelayJudge()
     judge.sent(period(1000, 500, horizon=0.08))  # a command from odometry of 500 ms
@@ -60,7 +107,7 @@ def test_a_delay_estimate_is_compared_with_the_true_delay(loop_delay: float, err
 
 
 @pytest.mark.parametrize("offset_ns", [0, 5_000_000_000])
-def test_delay_errors_of_a_flight_match_its_ground_truth(offset_ns: int) -> None:
+def test_delay_errors_of_a_flight_match_its_ground_truth(offset_ns):
     experiment = load_experiment("hover", ["link.profile=paper-p2"])
     world, cloud = records(experiment, offset_ns=offset_ns)
     controls = {(c.epoch, c.counter): c for c in cloud if isinstance(c, Control)}
