@@ -27,16 +27,11 @@ from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD
 
 AGE_MAX = 0.252 + 1e-9
 """Largest age of a command's basis at a HOLD [s]: `command_age_max` and one tick."""
-SOON = 5.0
-"""Time within which a fault has to show in its metric [s]."""
-STANDS = 0.05
-"""Speed up to which the robot stands [m/s]."""
-SAMPLE = 0.01
-"""Time between two records of the ground truth [s]."""
-WINDOW_NS = 1_000_000_000
-"""Window in which changes of the guard are counted [ns]."""
-ENDED = Cause.ENDED.words
-"""Cause of a HOLD that the operator has requested."""
+SOON = 5.0  # time within which a fault has to show in its metric [s]
+STANDS = 0.05  # speed up to which the robot stands [m/s]
+SAMPLE = 0.01  # time between two records of the ground truth [s]
+WINDOW_NS = 1_000_000_000  # window in which changes of the guard are counted [ns]
+ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:

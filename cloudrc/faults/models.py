@@ -29,8 +29,7 @@ from cloudrc.teleop.wire import Outcome, Output, RobotStatus
 
 T = TypeVar("T")
 FAR_NS = 1 << 62
-CFS_PERIOD = 0.1
-"""Period of the kernel's CPU quota [s]."""
+CFS_PERIOD = 0.1  # period of the kernel's CPU quota [s]
 SOCKET_MAX = 256
 """Number of datagrams that wait in the socket of a frozen process; Linux' default buffer."""
 UNIX_SOCKET_MAX = 11

@@ -15,8 +15,7 @@ import numpy as np
 
 Relation: TypeAlias = Literal["<=", ">=", "=="]
 _COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
-YES = "yes"
-"""Unit of a check that is a question: its value is 1 for yes, 0 for no."""
+YES = "yes"  # unit of a check that is a question: its value is 1 for yes, 0 for no
 
 
 def generator(seed: int, use: int) -> np.random.Generator:

@@ -64,10 +64,8 @@ KINDS = {
 SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "teleop_shut_down",
           "pod_shut_down")  # fmt: skip
 """Kinds whose value is a share, in [0, 1]."""
-DURATION_MAX = 86_400.0
-"""Longest flight [s]."""
-OFFSET_MAX = 1e6
-"""Largest difference of the two clocks [s]."""
+DURATION_MAX = 86_400.0  # longest flight [s]
+OFFSET_MAX = 1e6  # largest difference of the two clocks [s]
 _CONFIG = ConfigDict(extra="forbid")
 Time = Annotated[float, Field(ge=0.0, le=DURATION_MAX)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -213,17 +211,13 @@ def load(path: Path) -> Schedule:
     raise BadInputError(f"{path}: is no schedule of faults: {text}")
 
 
-CALM = 45.0
-"""Time from which on there are no faults, so that the robot has to recover [s]."""
-DURATION = 60.0
-"""Duration of a flight [s]."""
+CALM = 45.0  # time from which on there are no faults, so that the robot has to recover [s]
+DURATION = 60.0  # duration of a flight [s]
 PROFILES = ("ideal", "wifi", "lte", "5g", "lossy", "paper-p1", "paper-p2", "paper-p3")
 PAPER = PROFILES[-3:]
-HOLDS = 0.8, 3.0
-"""Shortest and longest `hold_max` that is drawn [s]; to fly on takes 0.75 s."""
+HOLDS = 0.8, 3.0  # shortest and longest `hold_max` that is drawn [s]; to fly on takes 0.75 s
 HOLD_MAX = Schedule(0).hold_max
-ONCE = ("second_cloud", "key_rotated")
-"""Kinds of which a flight has one at most."""
+ONCE = ("second_cloud", "key_rotated")  # kinds of which a flight has one at most
 
 
 def compose(seed: int) -> Schedule:

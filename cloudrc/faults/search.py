@@ -19,10 +19,8 @@ from cloudrc.faults.trial import INVARIANTS, Finding, checked_in, fly
 
 KINDS: dict[str, Callable[[int], Schedule]] = {"random": compose, "adversarial": choose}
 """Kinds of searches: random faults, and hostile clouds with or without random faults."""
-CHUNK = 500
-"""Number of seeds that are handed to the pool at once."""
-SHRINK_MAX = 120.0
-"""Longest time to shrink one schedule [s]."""
+CHUNK = 500  # number of seeds that are handed to the pool at once
+SHRINK_MAX = 120.0  # longest time to shrink one schedule [s]
 
 Job: TypeAlias = tuple[str, int]
 Map: TypeAlias = Callable[[Callable[[Job], Finding], Sequence[Job], int], Iterator[Finding]]

@@ -49,18 +49,14 @@ INVARIANTS = {
 }
 SOMETIMES = {"collision", "obeyed", "waypoint", "stuck", "alarm"}
 """Invariants that are not checked in every flight."""
-BACK = 10.0
-"""Time of calm in which the robot must have flown [s]."""
+BACK = 10.0  # time of calm in which the robot must have flown [s]
 FORGETFUL = ("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down")
 """Faults after which there is another robot, or a teleop that need not know of a stop."""
-PATIENCE_NS = 1_000_000_000
-"""Shortest time between two actions of the operator [ns]."""
-CAPTURED = 2_000
-"""Number of datagrams that an intruder keeps."""
+PATIENCE_NS = 1_000_000_000  # shortest time between two actions of the operator [ns]
+CAPTURED = 2_000  # number of datagrams that an intruder keeps
 NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)
 WRONG_KEY = KeySet(Key(b"a key that world has never read!"))
-BUGS = ("values_invalid", "values_huge")
-"""Faults of an honest cloud whose controller has a bug."""
+BUGS = ("values_invalid", "values_huge")  # faults of an honest cloud whose controller has a bug
 IMPOSSIBLE = (nan, inf, -inf)
 
 

@@ -22,8 +22,7 @@ REFUSED = ("tag", "malformed", "version", "direction", "old_epoch", "repeated")
 """Counts of refused datagrams."""
 GREETED = ("hello", "unanswered", "accept_ignored")
 """Counts of captured greetings; a challenge is the only answer."""
-FLOOD = 100
-"""Datagrams of garbage per honest one: 10,000 in a second."""
+FLOOD = 100  # datagrams of garbage per honest one: 10,000 in a second
 SETTLED = 2.0
 """Time at which a new flight has its session [s]; an answered greeting could open it earlier."""
 

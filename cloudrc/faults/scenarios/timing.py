@@ -12,8 +12,7 @@ from cloudrc.link.profile import Change
 from cloudrc.records import Arrival, Control
 
 HOUR_NS = 3_600_000_000_000
-AGE = "command_age_seconds"
-"""Metric of the age of the command in use, on world's clock."""
+AGE = "command_age_seconds"  # metric of the age of the command in use, on world's clock
 
 
 @scenario(
