@@ -67,8 +67,9 @@ class Flight:
         *settings: str,  # of the experiment `paper`, as `--set` takes them
         seed: int = 1,
         cloud_clock: Clock | None = None,  # None if the two ends share a clock
-        uplink: Shape = replace,  # changes the link from world to cloud; by default nothing
-        downlink: Shape = replace,  # changes the link from cloud to world
+        link: Shape = replace,  # changes both directions of the link; by default nothing
+        uplink: Shape = replace,  # changes the link from world to cloud, too
+        downlink: Shape = replace,  # changes the link from cloud to world, too
         honest: bool = True,  # whether a contact is a breach
         keep: bool = True,  # whether all records are kept and hashed
         start: bool = True,  # whether the experiment's mission is ordered at once
@@ -98,8 +99,8 @@ class Flight:
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock, "cloud")
         self.teleop.run_on(self.cloud)
-        self.uplink = self._make_link(uplink, up=True)
-        self.downlink = self._make_link(downlink, up=False)
+        self.uplink = self._make_link(link, uplink, up=True)
+        self.downlink = self._make_link(link, downlink, up=False)
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
 
     @property
@@ -208,9 +209,10 @@ class Flight:
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
 
-    def _make_link(self, shape: Shape, *, up: bool) -> LinkDirection:
-        resolved = self.experiment.uplink if up else self.experiment.downlink
-        profile = shape(assembly.link_profile(resolved))
+    def _make_link(self, *shapes: Shape, up: bool) -> LinkDirection:
+        profile = assembly.link_profile(self.experiment.uplink if up else self.experiment.downlink)
+        for shape in shapes:
+            profile = shape(profile)
         return LinkDirection(profile, self.experiment.seed, uplink=up)
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:

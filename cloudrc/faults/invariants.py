@@ -246,7 +246,7 @@ class RobotInvariants:
     def _check_fence(
         self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
     ) -> None:
-        """Check where the base is, and that a robot that fell takes off only where it lies still."""
+        """Check where the base is; a robot that fell takes off only where it lies still."""
         self._falls = self._falls or (self._was in FLOWN and state is ESTOP)
         if self._falls and state in FLOWN:
             self._falls, speed = False, hypot(*velocity)
