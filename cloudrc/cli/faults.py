@@ -127,12 +127,12 @@ def print_faults(options: argparse.Namespace) -> int:
     """Print the list of faults."""
     from cloudrc.faults.scenarios import SCENARIOS
 
-    names = ("id", "name", "injects", "expects", "loses", "shows")
+    names = ("id", "name", "injects", "expects")
     faults = [{name: getattr(each, name) for name in names} for each in SCENARIOS]
     if options.output != "table":
         print(format_document({"schemaVersion": 1, "faults": faults}, options.output))
     else:
-        rows = [tuple(each[name] for name in names[:4]) for each in faults]
+        rows = [tuple(each.values()) for each in faults]
         print(table([("fault", "name", "injection", "expected reaction"), *rows]))
     return 0
 

@@ -126,8 +126,7 @@ CHOICES = {
     GuardState.ESTOP: LATCHED,
 }
 """Probability of each request, by the state of the guard that cloud knows of [1]."""
-PATIENCE_NS = 5_000_000_000
-"""Longest wait for the robot to come near a face of the fence [ns]."""
+PATIENCE_NS = 5_000_000_000  # longest wait for the robot to come near a face of the fence [ns]
 REACHED = (0, 1, 7, MISSION_OVER)
 
 
@@ -181,11 +180,9 @@ def choose(seed: int) -> Schedule:
 
 # Policies: each draws its parameters and returns its lie.
 
-FAST = 6.0
-"""Largest speed that the guard lets a cloud fly [m/s]."""
+FAST = 6.0  # largest speed that the guard lets a cloud fly [m/s]
 STRANGE = (nan, inf, -inf, 1e308, -1e308, 5e-324, -0.0, 1e3, FAST, -FAST, 0.0)
-NONSENSE_NS = 80_000_000
-"""Duration of impossible commands that makes the guard land [ns]."""
+NONSENSE_NS = 80_000_000  # duration of impossible commands that makes the guard land [ns]
 
 
 def _fly(command: Command, velocity: Sequence[float], **others: Any) -> Command:

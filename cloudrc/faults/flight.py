@@ -24,9 +24,8 @@ from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.models import (
     Clock,
     EndpointGroup,
-    InProcessTeleop,
     RestartableEndpoint,
-    SeparateTeleop,
+    TeleopModel,
 )
 from cloudrc.faults.scenario import generator
 from cloudrc.link.model import LinkDirection
@@ -68,8 +67,9 @@ class Flight:
         *settings: str,  # of the experiment `paper`, as `--set` takes them
         seed: int = 1,
         cloud_clock: Clock | None = None,  # None if the two ends share a clock
-        uplink: Shape = replace,  # changes the link from world to cloud; by default nothing
-        downlink: Shape = replace,  # changes the link from cloud to world
+        link: Shape = replace,  # changes both directions of the link; by default nothing
+        uplink: Shape = replace,  # changes the link from world to cloud, too
+        downlink: Shape = replace,  # changes the link from cloud to world, too
         honest: bool = True,  # whether a contact is a breach
         keep: bool = True,  # whether all records are kept and hashed
         start: bool = True,  # whether the experiment's mission is ordered at once
@@ -90,21 +90,18 @@ class Flight:
         self.of_world, self.of_cloud = list[Record](), list[Record]()
         self.changes, self.world_starts_ns = list[GuardChange](), list[int]()
         self._hash, self.watch = RecordHash(), Watch(Limits.of(self.experiment.guard))
-        self.teleop = self._make_teleop(separate, start)
+        limit, phase_ns = self.experiment.criteria.contact_speed_max_mps, None
+        if separate:
+            phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
+        self.teleop = TeleopModel(limit, phase_ns=phase_ns)
+        if start:
+            self.teleop.order(self.make_order(), self._clock.at(0))
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock, "cloud")
         self.teleop.run_on(self.cloud)
-        self.uplink = self._make_link(uplink, up=True)
-        self.downlink = self._make_link(downlink, up=False)
+        self.uplink = self._make_link(link, uplink, up=True)
+        self.downlink = self._make_link(link, downlink, up=False)
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
-
-    def _make_teleop(self, separate: bool, start: bool) -> InProcessTeleop:
-        limit = self.experiment.criteria.contact_speed_max_mps
-        phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
-        teleop = SeparateTeleop(limit, phase_ns) if separate else InProcessTeleop(limit)
-        if start:
-            teleop.order(self.make_order(), self._clock.at(0))
-        return teleop
 
     @property
     def robot(self) -> Robot:
@@ -144,9 +141,9 @@ class Flight:
 
     def restart_pod(self, now_ns: int, down: float) -> None:
         """Kill cloud and teleop at `now_ns` [ns]; new ones start after `down` [s]."""
-        self.teleop.kill()
+        self.teleop.kill(now_ns)
         self.cloud.restart(now_ns, down)
-        self.cloud.at(now_ns * 1e-9 + down, lambda _: self.teleop.start())
+        self.cloud.at(now_ns * 1e-9 + down, self.teleop.start)
 
     def replace_key(self, end: str, keys: KeySet) -> None:
         """Write an end's key file; a process that is down reads it later."""
@@ -185,14 +182,14 @@ class Flight:
         return self.robot.guard.state, self.robot.guard.cause.words
 
     def _build_world(self, start_ns: int) -> WorldEndpoint:
-        identity = Identity(SHARED, *self._begin("world"))
+        identity = self._begin("world", SHARED)
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self.watch.attach(world.robot, start_ns, honest=self._honest)
         self.world_starts_ns.append(start_ns)
         return world
 
     def _build_cloud(self, start_ns: int) -> Endpoint:
-        identity = Identity(self._clock_id, *self._begin("cloud"))
+        identity = self._begin("cloud", self._clock_id)
         teleop: Operator = self.teleop.join(start_ns)
         if self._words is not None:
             teleop = HostileOperator(teleop, self._words)
@@ -207,29 +204,29 @@ class Flight:
 
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build another cloud with the same key, which wants to fly the same mission."""
-        teleop = InProcessTeleop(self.experiment.criteria.contact_speed_max_mps, name=b"rival")
+        teleop = TeleopModel(self.experiment.criteria.contact_speed_max_mps, name=b"rival")
         teleop.order(Order(assembly.build_plan(self.experiment)), start_ns)
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
 
-    def _make_link(self, shape: Shape, *, up: bool) -> LinkDirection:
-        resolved = self.experiment.uplink if up else self.experiment.downlink
-        profile = shape(assembly.link_profile(resolved))
+    def _make_link(self, *shapes: Shape, up: bool) -> LinkDirection:
+        profile = assembly.link_profile(self.experiment.uplink if up else self.experiment.downlink)
+        for shape in shapes:
+            profile = shape(profile)
         return LinkDirection(profile, self.experiment.seed, uplink=up)
 
-    def _begin(self, end: str) -> tuple[bytes, KeyRing]:
-        """Return the nonce and the keys of an end's new process."""
+    def _begin(self, end: str, clock_id: bytes) -> Identity:
+        """Begin a new process of an end, with its own nonce and the keys of its file."""
         self.generations[end] += 1
         self.rings[end] = KeyRing(self.secrets[end])
         nonce = f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)
-        return nonce, self.rings[end]
+        return Identity(clock_id, nonce, self.rings[end])
 
     def _sink(self, of_world: list[Record], of_cloud: list[Record]) -> None:
         if self._keep:
             self.of_world += of_world
             self.of_cloud += of_cloud
-            self._hash.update(of_world)
-            self._hash.update(of_cloud)
+            self._hash.update([*of_world, *of_cloud])
         self.changes += [record for record in of_world if isinstance(record, GuardChange)]
         for listen in self.listeners:
             listen(of_world, self.run.now_ns)

@@ -48,38 +48,29 @@ from cloudrc.world.rotors import STOPPED
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 FLOWN, LATCHED = (TRACK, HOLD, LAND), (LAND, ESTOP)
-REPORTED = 5
-"""Number of breaches of each kind that are kept."""
-SLACK = 1e-9
-"""Tolerance for rounding [m/s]."""
+REPORTED = 5  # number of breaches of each kind that are kept
+SLACK = 1e-9  # tolerance for rounding [m/s]
 STILL = 0.12
 """Speed below which a robot lies still [m/s]: the guard's 0.1, plus one tick of free fall."""
-STANDS = 0.2
-"""Speed per axis up to which a robot stands when its rotors stop [m/s]."""
+STANDS = 0.2  # speed per axis up to which a robot stands when its rotors stop [m/s]
 FALL = 1.0
 """Speed of a robot that fell after its rotors stopped [m/s]; a drop from 0.02 m reaches 0.7."""
 REST = 0.5
 """Length added to the stopping distance without commands [m]: it swings back by up to 0.2."""
-FALL_MAX = 1.5
-"""Distance from the fence at which people are safe [m]."""
-BRAKE_NS = 200_000_000
-"""Time in which a descent that the operator has acknowledged is stopped [ns]."""
-REELS_NS = 1_000_000_000
-"""Time after a hit in which the hit explains the robot's motion [ns]."""
-THROWN_NS = 3_000_000_000
-"""Time after a hit in which the robot may be thrown out of the fence [ns]."""
+FALL_MAX = 1.5  # distance from the fence at which people are safe [m]
+BRAKE_NS = 200_000_000  # time in which a descent that the operator has acknowledged is stopped [ns]
+REELS_NS = 1_000_000_000  # time after a hit in which the hit explains the robot's motion [ns]
+THROWN_NS = 3_000_000_000  # time after a hit in which the robot may be thrown out of the fence [ns]
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
 """So many fresh commands within this time end a HOLD [ns]."""
 SETTLE_NS = 1_000_000_000
 """Shortest time from one TRACK to the next, and from one HOLD to the next [ns]."""
 INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
 """So many impossible commands within this time make the robot land [ns]."""
-INVALID = ("range", "future")
-"""Reasons for which the guard rejects impossible commands."""
+INVALID = ("range", "future")  # reasons for which the guard rejects impossible commands
 GROUND_NS = 10_000_000_000
 """Shortest time for which a robot on the ground waits for a mission's first command [ns]."""
-RAMP = 3.0
-"""Largest growth of the reference after a HOLD [m/s^2]."""
+RAMP = 3.0  # largest growth of the reference after a HOLD [m/s^2]
 RAMP_MIN = 1.0
 """Shortest time for which the reference grows slowly [s]; it is longer if the cap is higher."""
 
@@ -122,7 +113,6 @@ class Watch:
         self.counts: Counter[str] = Counter()  # of breaches, by kind
         self.margin = 9.0  # smallest distance of the base to the fence, the floor excepted [m]
         self.speed = 0.0  # largest reference [m/s]
-        self.landed_on: set[str] = set()  # what it touched while landing, the floor excepted
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
         """Check every step of a robot from `start_ns` [ns] on; if `honest`, a hit is a breach."""
@@ -147,12 +137,12 @@ class RobotInvariants:
         self._newest_ns = -1  # basis of the accepted commands
         # Motion: after a stop or a hit, and after TRACK.
         self._comes_down = False  # whether it lands, or fell after an emergency stop
-        self._falls = self._hit = False  # outside of flight: after a stop; after a hit
+        self._falls = False  # after a stop or a hit, until it flies again
         self._landed_ns = -2 * BRAKE_NS
         self._left, self._way = ZERO, inf  # where TRACK ended, and how far the robot may go
         # Contacts and rotors.
         self._touches, self._seen = robot.simulator.touches, 0
-        self._touched: tuple[int, str] | None = None
+        self._touched_ns = -THROWN_NS
         self._is_thrown = False  # by a hit, and not yet back inside the fence
         self._turned = self._halted = self._is_asked = False
         # The operator, and the wait for commands.
@@ -178,9 +168,8 @@ class RobotInvariants:
         if state is not was:
             self._check_change(was, state, now_ns)
         self._check_wait(state, now_ns)
-        self._check_rotors(was, state, readings, rotor_speeds, now_ns)
-        self._check_falls(was, state, readings, now_ns)
-        self._check_fence(position, now_ns)
+        self._check_rotors(state, readings.velocity, rotor_speeds, now_ns)
+        self._check_fence(state, position, readings.velocity, now_ns)
         if was is TRACK and state is not TRACK:
             self._leave_track(readings, now_ns)
         if state in FLOWN:
@@ -240,7 +229,7 @@ class RobotInvariants:
             case Request.ESTOP:
                 self._armed, self._is_asked = False, True
                 self._falls = self._falls or self._state in FLOWN
-                self._comes_down = self._comes_down or self._falls
+                self._comes_down = self._comes_down or self._state in FLOWN
             case Request.END:
                 self._armed = False
             case Request.ACKNOWLEDGE:
@@ -254,37 +243,30 @@ class RobotInvariants:
 
     # Where the robot is, and the reference that it flies.
 
-    def _check_falls(
-        self, was: GuardState, state: GuardState, readings: Readings, now_ns: int
+    def _check_fence(
+        self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
     ) -> None:
-        """Note a hit in flight; rotors that have stopped turn again only where it lies still."""
-        self._hit = self._hit or (was in FLOWN and state is ESTOP and not self._falls)
-        if (self._falls or self._hit) and state in FLOWN:
-            self._falls = self._hit = False
-            position, speed = readings.position, hypot(*readings.velocity)
+        """Check where the base is; a robot that fell takes off only where it lies still."""
+        self._falls = self._falls or (self._was in FLOWN and state is ESTOP)
+        if self._falls and state in FLOWN:
+            self._falls, speed = False, hypot(*velocity)
             if speed > STILL or not inside(position):
                 text = f"took off after a stop, base at {_show(position)} at {speed:.2f} m/s"
                 self._note(now_ns, "fence", text)
-
-    def _check_fence(self, position: Vector, now_ns: int) -> None:
         watch, (x, y, z) = self._watch, position
         (xl, yl, zl), (xh, yh, zh) = LOW, HIGH
         margin = min(x - xl, xh - x, y - yl, yh - y, zh - z)
         if z < zl:
             self._note(now_ns, "fence", f"base at {_show(position)}, below the floor")
-        if self._is_thrown and margin >= 0.0 and self._touched is not None:
-            self._is_thrown = now_ns - self._touched[0] < THROWN_NS
-        if self._falls or self._hit or (self._is_thrown and margin < 0.0):
+        if self._is_thrown and margin >= 0.0:
+            self._is_thrown = now_ns - self._touched_ns < THROWN_NS
+        if self._falls or (self._is_thrown and margin < 0.0):
             if margin < -FALL_MAX:
                 self._note(now_ns, "fence", f"base fell to {_show(position)}")
         elif margin < watch.margin:
             watch.margin = margin
             if margin < 0.0:
-                text = f"base at {_show(position)}"
-                if self._touched is not None:
-                    since = (now_ns - self._touched[0]) * 1e-9
-                    text += f", {since:.2f} s after it hit {self._touched[1]}"
-                self._note(now_ns, "fence", text)
+                self._note(now_ns, "fence", f"base at {_show(position)}")
 
     def _check_stop(self, position: Vector, reference: Vector, lands: bool, now_ns: int) -> None:
         (x, y, z), (vx, vy, vz) = position, reference
@@ -314,7 +296,7 @@ class RobotInvariants:
         """From now on the robot may move only as far as it needs to stop."""
         speed = max(hypot(*readings.velocity), hypot(*self._before))
         self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
-        if self._touched is not None and now_ns - self._touched[0] < REELS_NS:
+        if now_ns - self._touched_ns < REELS_NS:
             self._way = inf
 
     def _check_rest(self, position: Vector, now_ns: int) -> None:
@@ -330,26 +312,20 @@ class RobotInvariants:
         if touches is not self._touches:
             self._touches, self._seen = touches, 0
         for body, tip, *_ in touches[self._seen :]:
-            self._touched, self._way, self._is_thrown = (now_ns, body), inf, True
+            self._touched_ns, self._way, self._is_thrown = now_ns, inf, True
             # Acknowledged right above a pipe, a robot that lands cannot stop in time.
             lands = state is LAND or (state is HOLD and now_ns - self._landed_ns <= BRAKE_NS)
             low = lands or state not in FLOWN
-            if not self._honest or (body == "board" and tip) or (low and body == "floor"):
-                continue
-            if low and (lands or self._comes_down):
-                self._watch.landed_on.add(body)
-            else:
+            allowed = (body == "board" and tip) or (
+                low and (lands or self._comes_down or body == "floor")
+            )
+            if self._honest and not allowed:
                 part = "tip" if tip else "body"
                 self._note(now_ns, "collision", f"{part} touched {body} in {state.name}")
         self._seen = len(touches)
 
     def _check_rotors(
-        self,
-        was: GuardState,
-        state: GuardState,
-        readings: Readings,
-        rotor_speeds: RotorSpeeds,
-        now_ns: int,
+        self, state: GuardState, velocity: Vector, rotor_speeds: RotorSpeeds, now_ns: int
     ) -> None:
         """Check how the rotors stop: on a request, after a hit, or where the robot stands.
 
@@ -357,18 +333,17 @@ class RobotInvariants:
         Therefore the check looks for the constant `STOPPED`, which only a stop gives the simulator.
         """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
-        if state is ESTOP and was is not ESTOP and self._honest and not asked:
-            if not self._just_touched:
-                text = "stopped by a hit although nothing was touched"
-                self._note(now_ns, "collision", text)
+        is_hit = state is ESTOP and self._was is not ESTOP and not asked
+        if is_hit and self._honest and not self._just_touched:
+            self._note(now_ns, "collision", "stopped by a hit although nothing was touched")
         if self._turned and not turns:
             self._halted = not asked and state is not ESTOP
-            fastest = max(map(abs, readings.velocity))
+            fastest = max(map(abs, velocity))
             if self._halted and not fastest <= STANDS:
                 self._note(now_ns, "rest", f"rotors stopped in {state.name} at {fastest:.2f} m/s")
         elif self._halted:
             self._halted = not turns and not asked
-            if self._halted and readings.velocity[2] < -FALL and not self._just_touched:
+            if self._halted and velocity[2] < -FALL and not self._just_touched:
                 self._note(now_ns, "rest", f"falls in {state.name}, its rotors stopped in the air")
                 self._halted = False
         self._turned, self._is_asked = turns, False
@@ -388,9 +363,18 @@ class RobotInvariants:
         self._armed = self._armed and state not in LATCHED
         self._ramp_until_ns = -1
         if state is TRACK:
-            self._check_track(was, now_ns)
+            self._tracked_ns = self._check_settled("TRACK", self._tracked_ns, now_ns)
+            if was is HOLD and not self._is_reset:
+                self._ramp_until_ns = now_ns + self._ramp_ns
+                fresh_ns = self._fresh_ns
+                if len(fresh_ns) < RESUME_COMMANDS or fresh_ns[-1] - fresh_ns[0] > RESUME_NS:
+                    text = f"HOLD left for TRACK on {len(fresh_ns)} fresh commands"
+                    self._note(now_ns, "stale", text)
         elif state is HOLD or (was is TRACK and state is GROUND and not self._is_reset):
-            self._check_hold(state, now_ns)  # perhaps it has not left the ground yet
+            # In GROUND it had not left the ground yet.
+            if state is HOLD and self._guard.cause is Cause.SILENCE and not self._goes_back:
+                self._check_settled("HOLD", self._held_ns, now_ns)
+            self._held_ns = self._alone_ns = now_ns
         elif state is LAND and not self._impossible:
             alone_ns = now_ns - self._alone_ns
             if was is TRACK or alone_ns <= self._wait_ns(was):
@@ -412,24 +396,11 @@ class RobotInvariants:
             self._note(now_ns, "hold", f"{state.name} for {alone_ns * 1e-9:.3f} s of a mission")
             self._alone_ns = now_ns
 
-    def _check_track(self, was: GuardState, now_ns: int) -> None:
-        fresh_ns, settled_ns = self._fresh_ns, now_ns - self._tracked_ns
-        self._tracked_ns = now_ns
-        if settled_ns < SETTLE_NS:
-            self._note(now_ns, "hold", f"TRACK again after {settled_ns * 1e-9:.3f} s")
-        if was is HOLD and not self._is_reset:
-            self._ramp_until_ns = now_ns + self._ramp_ns
-            took_ns = now_ns - fresh_ns[0] if fresh_ns else 0
-            if len(fresh_ns) < RESUME_COMMANDS or fresh_ns[-1] - fresh_ns[0] > RESUME_NS:
-                text = f"{len(fresh_ns)} fresh commands within {took_ns * 1e-9:.3f} s"
-                self._note(now_ns, "stale", f"HOLD left for TRACK on {text}")
-
-    def _check_hold(self, state: GuardState, now_ns: int) -> None:
-        settled_ns = now_ns - self._held_ns
-        self._held_ns = self._alone_ns = now_ns
-        silent = state is HOLD and self._guard.cause is Cause.SILENCE and not self._goes_back
-        if silent and settled_ns < SETTLE_NS:
-            self._note(now_ns, "hold", f"HOLD again after {settled_ns * 1e-9:.3f} s")
+    def _check_settled(self, name: str, last_ns: int, now_ns: int) -> int:
+        """Check that enough time has passed since the last TRACK or HOLD; return `now_ns` [ns]."""
+        if now_ns - last_ns < SETTLE_NS:
+            self._note(now_ns, "hold", f"{name} again after {(now_ns - last_ns) * 1e-9:.3f} s")
+        return now_ns
 
     def _wait_ns(self, state: GuardState) -> float:
         """Return how long a robot in a mission waits for its cloud [ns]."""

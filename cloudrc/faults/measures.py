@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from math import dist, hypot, inf, nan
+from math import dist, hypot, nan
 from typing import Any
 
 from cloudrc.exposition.live import LiveMetrics
@@ -27,16 +27,11 @@ from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD
 
 AGE_MAX = 0.252 + 1e-9
 """Largest age of a command's basis at a HOLD [s]: `command_age_max` and one tick."""
-SOON = 5.0
-"""Time within which a fault has to show in its metric [s]."""
-STANDS = 0.05
-"""Speed up to which the robot stands [m/s]."""
-SAMPLE = 0.01
-"""Time between two records of the ground truth [s]."""
-WINDOW_NS = 1_000_000_000
-"""Window in which changes of the guard are counted [ns]."""
-ENDED = Cause.ENDED.words
-"""Cause of a HOLD that the operator has requested."""
+SOON = 5.0  # time within which a fault has to show in its metric [s]
+STANDS = 0.05  # speed up to which the robot stands [m/s]
+SAMPLE = 0.01  # time between two records of the ground truth [s]
+WINDOW_NS = 1_000_000_000  # window in which changes of the guard are counted [ns]
+ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
@@ -72,8 +67,7 @@ def above(
     flight: Flight, role: str, name: str, bound: float, until: float | None = None
 ) -> tuple[int, float]:
     """Count a histogram's values above `bound` up to `until` [s]; return count and share [1]."""
-    shown = _read(flight, role, name, until)
-    assert isinstance(shown, Histogram)
+    shown: Histogram = _read(flight, role, name, until)
     counts = shown.cumulative()
     count = counts[-1] - counts[shown.bounds.index(bound)]
     return count, count / counts[-1] if counts[-1] else nan
@@ -86,38 +80,39 @@ def _read(flight: Flight, role: str, name: str, until: float | None) -> Any:
 
 
 def moves(
-    outcome: Outcome,
-    flight: Flight,
-    role: str,
-    name: str,
-    *labels: str,
-    since: float,
-    over: float | None = None,
+    outcome: Outcome, flight: Flight, *metrics: str, since: float, over: float | None = None
 ) -> None:
-    """Check that a metric changes within 5 s of a fault that begins at `since` [s].
+    """Check that metrics change within 5 s of a fault that begins at `since` [s].
 
     The time counts from the fault's end `over` [s] if that is given: a frozen process shows
-    nothing, and a loss is known when newer datagrams arrive.
+    nothing, and a loss is known when newer datagrams arrive. Each metric is a line of its role, its
+    name and its labels: "world guard_transitions_total hold".
     """
     last = (since if over is None else over) + SOON
-    before, after = (reading(flight, role, name, *labels, until=each) for each in (since, last))
-    moved = after == after and before != after  # absent before is as good as another value
     end = "" if over is None else " of its end"
-    outcome.true(f"metric {' '.join((name, *labels))} moves within {SOON:g} s{end}", moved)
+    for metric in metrics:
+        role, *name = metric.split()
+        before, after = (reading(flight, role, *name, until=each) for each in (since, last))
+        moved = after == after and before != after  # absent before is as good as another value
+        outcome.true(f"metric {' '.join(name)} moves within {SOON:g} s{end}", moved)
 
 
 # The guard.
 
 
-def changes_into(flight: Flight, state: GuardState, before: float = inf) -> list[float]:
-    """Return when the guard went into a state during a mission, before an instant [s]."""
-    changes = [c for c in flight.changes if c.state is state and c.cause != ENDED]
-    return [at for change in changes if (at := change.stamp_ns * 1e-9) < before]
+def changes_into(flight: Flight, state: GuardState) -> list[GuardChange]:
+    """Return the changes into a state of the guard; a mission's end is none."""
+    return [c for c in flight.changes if c.state is state and c.cause != ENDED]
+
+
+def first_into(flight: Flight, state: GuardState) -> float:
+    """Return when the guard first went into a state [s]; NaN if never."""
+    return next((c.stamp_ns * 1e-9 for c in changes_into(flight, state)), nan)
 
 
 def held(flight: Flight) -> list[GuardChange]:
     """Return the HOLDs that are not a mission's end."""
-    return [c for c in flight.changes if c.state is GuardState.HOLD and c.cause != ENDED]
+    return changes_into(flight, GuardState.HOLD)
 
 
 def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> None:
@@ -142,8 +137,8 @@ def _ages_at_hold(flight: Flight) -> list[tuple[GuardChange, float]]:
 
 def resumed_after(flight: Flight, back: float) -> float:
     """Return the delay [s] from the instant `back` [s] until the guard was in TRACK again."""
-    times = [time for time in changes_into(flight, GuardState.TRACK) if time >= back - 1e-9]
-    return times[0] - back if times else nan
+    delays = [c.stamp_ns * 1e-9 - back for c in changes_into(flight, GuardState.TRACK)]
+    return next((delay for delay in delays if delay >= -1e-9), nan)
 
 
 def busiest_second(changes: Sequence[GuardChange]) -> int:
@@ -174,8 +169,8 @@ def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
     texts = [(c.cause, f"command age {age:.3f} s above {limit:.3f} s") for c, age in ages]
     right = bool(texts) and all(cause == text for cause, text in texts)
     outcome.true(f"{what}each HOLD tells the age of its command, to 1 ms", right)
-    after = [c for c in flight.changes if ages and c.stamp_ns > ages[0][0].stamp_ns]
-    causes = [change.cause for change in after if change.state is GuardState.TRACK]
+    changes = changes_into(flight, GuardState.TRACK)
+    causes = [c.cause for c in changes if ages and c.stamp_ns > ages[0][0].stamp_ns]
     right = bool(causes) and all("fresh commands within" in cause for cause in causes)
     outcome.true(f"{what}each TRACK after it tells of fresh commands", right)
     sent = [r.telemetry for r in flight.of_world if isinstance(r, TelemetrySent)]
@@ -206,8 +201,7 @@ def silence_told(
         wrong = abs(shown["cloud_age_s"] - (0.0 if cloud else silent))
         outcome.most(f"{what}it says when cloud was heard last, off by", wrong, 0.25, "s")
         right = seen["next_step"] == (NOT_HEARD if cloud else NO_CLOUD)
-        who = "the robot, not cloud" if cloud else "cloud"
-        outcome.true(f"{what}its next step is to look after {who}", right)
+        outcome.true(f"{what}its next step is to look after the one that is silent", right)
 
     flight.cloud.at(at + silent, check)
 
@@ -226,11 +220,6 @@ def drift(flight: Flight, start: float, end: float) -> float:
     """Return the largest distance [m] from the place at `start`, until `end` [s]."""
     path = [r.odometry for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
     return max((dist(path[0].position, each.position) for each in path), default=nan)
-
-
-def same_path(one: Flight, other: Flight) -> bool:
-    """Tell whether two robots flew the same path, bit by bit."""
-    return one.trajectory() == other.trajectory()
 
 
 def number(flight: Flight, name: str) -> float:
@@ -262,10 +251,12 @@ def done(outcome: Outcome, flight: Flight) -> None:
     outcome.true("each waypoint reached once, in order", reached == list(range(len(reached))))
 
 
-def safe_and_done(outcome: Outcome, flight: Flight) -> None:
-    """Check `safe` and `done`."""
+def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight:
+    """Fly the mission, at most until `limit` [s]; check `safe` and `done`."""
+    flight.fly_mission(limit)
     safe(outcome, flight)
     done(outcome, flight)
+    return flight
 
 
 def safe(outcome: Outcome, flight: Flight) -> None:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from cloudrc.cloud.operator import Operator
 from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, UnixPeer, send, turn
@@ -27,9 +27,9 @@ from cloudrc.teleop.store import (
 )
 from cloudrc.teleop.wire import Outcome, Output, RobotStatus
 
+T = TypeVar("T")
 FAR_NS = 1 << 62
-CFS_PERIOD = 0.1
-"""Period of the kernel's CPU quota [s]."""
+CFS_PERIOD = 0.1  # period of the kernel's CPU quota [s]
 SOCKET_MAX = 256
 """Number of datagrams that wait in the socket of a frozen process; Linux' default buffer."""
 UNIX_SOCKET_MAX = 11
@@ -213,98 +213,6 @@ class EndpointGroup:
         return first
 
 
-class InProcessTeleop:
-    """Teleop inside cloud's process, with a disk that survives its restarts; an `Operator`."""
-
-    outcome: Outcome | None = None
-    settled = True
-
-    def __init__(self, contact_speed_max: float, name: bytes = b"desk") -> None:
-        """Start; `contact_speed_max` is the limit of the arm's tip at the board [m/s].
-
-        A `name` makes its mission numbers differ from those of another teleop.
-        """
-        self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
-        self._disk = b""  # the bytes of its database
-        self.events: list[MissionEvent] = []  # of all missions, oldest first
-        self.service: MissionService | None = None  # while teleop is down
-        self.outputs: Sequence[Output | Fault] = []
-        self.start()
-
-    def start(self) -> None:
-        """Start a new process, which knows only what is on the disk."""
-        self._starts += 1
-        salt = b"%s %d" % (self._name, self._starts)  # random in production
-        self._database = connect()
-        if self._disk:
-            self._database.deserialize(self._disk)
-        self.service = MissionService(self._contact_speed_max, MissionStore(self._database, salt))
-
-    def kill(self) -> None:
-        """Kill the process."""
-        if self.service is not None:
-            self._disk = self._database.serialize()
-            self._database.close()
-        self.service, self.outputs = None, []
-
-    def order(self, order: Order, now_ns: int) -> None:
-        """Order a mission at `now_ns` of cloud's clock [ns]; it starts at once."""
-        assert self.service is not None, "teleop is down"
-        self.service.create(order, now_ns)
-
-    def ask(self, call: Call, now_ns: int) -> None:
-        """Make a call of the API at `now_ns` of cloud's clock [ns]; a refusal is ignored."""
-        if self.service is not None:
-            with suppress(ConflictError, UnavailableError):
-                call(self.service, now_ns)
-
-    def stop_rotors(self, now_ns: int) -> None:
-        """Make an emergency stop at `now_ns` of cloud's clock [ns]."""
-        self.ask(MissionService.stop_rotors, now_ns)
-
-    def freeze(self, now_ns: int, duration: float) -> None:
-        """Do not stop for `duration` [s]: teleop inside cloud's process cannot stop alone."""
-
-    def run_on(self, host: RestartableEndpoint) -> None:
-        """Begin to run on the machine of `host`."""
-
-    def join(self, start_ns: int) -> Operator:
-        """Return the `Operator` of a cloud that starts at `start_ns` of its clock [ns]."""
-        return self
-
-    @property
-    def missions(self) -> list[Mission]:
-        """All missions, oldest first; none while teleop is down."""
-        return list(self.service.book.missions.values()) if self.service is not None else []
-
-    def hear(self, now_ns: int) -> None:
-        """Note that cloud runs."""
-        if self.service is not None:
-            self.service.hear(now_ns)
-
-    def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """See `Operator`."""
-        if self.service is not None:
-            self.service.see(seen, now_ns)
-            self._collect(self.service)
-
-    def handle_deadline(self, now_ns: int) -> None:
-        """See `Operator`."""
-        if self.service is not None:
-            self.service.handle_deadline(now_ns)
-            self._collect(self.service)
-
-    def take_outputs(self) -> Sequence[Output | Fault]:
-        """See `Operator`."""
-        outputs, self.outputs = self.outputs, []
-        return outputs
-
-    def _collect(self, service: MissionService) -> None:
-        if outputs := service.take_outputs():
-            self.events += [each for each in outputs if isinstance(each, MissionEvent)]
-            self.outputs = [*self.outputs, *outputs]
-
-
 class _Peer(UnixPeer):
     """A process's Unix datagram socket, joined to that of another one."""
 
@@ -314,8 +222,7 @@ class _Peer(UnixPeer):
 
     def receive(self) -> list[bytes]:
         """See `UnixPeer`."""
-        datagrams, self.waiting = self.waiting, []
-        return datagrams
+        return _take_all(self.waiting)
 
     def send(self, data: bytes) -> bool:
         """See `UnixPeer`; datagrams wait in the other socket while there is room."""
@@ -325,65 +232,141 @@ class _Peer(UnixPeer):
         return sent
 
 
-class SeparateTeleop(InProcessTeleop):
-    """Teleop as a process of its own, which wakes every 20 ms.
+class TeleopModel:
+    """Teleop with a disk that survives its restarts.
 
-    It is joined to cloud's end as in production, by two Unix sockets.
+    In cloud's process it is an `Operator`. As a process of its own it wakes every 20 ms, and two
+    Unix sockets join it to cloud's end, as in production.
+
+    Attributes:
+        service: Teleop itself; None while it is down.
+        events: Events of all missions, oldest first.
     """
 
-    def __init__(self, contact_speed_max: float, phase_ns: int) -> None:
-        """Start; `contact_speed_max` as above [m/s], the first wake at `phase_ns` [ns]."""
+    outcome: Outcome | None = None
+    settled = True
+
+    def __init__(
+        self, contact_speed_max: float, name: bytes = b"desk", phase_ns: int | None = None
+    ) -> None:
+        """Start teleop.
+
+        Args:
+            contact_speed_max: Limit of the speed of the arm's tip at the board [m/s].
+            name: Makes its mission numbers differ from those of another teleop.
+            phase_ns: Time of its first wake [ns, virtual time]; None if it runs in cloud's process.
+        """
+        self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
+        self._disk = b""  # the bytes of its database
+        self.events: list[MissionEvent] = []
+        self._phase_ns = phase_ns
         self._host: RestartableEndpoint | None = None
         self._peer = _Peer(lambda: self.service is not None)
         self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)
         self._peer.other, self._clouds.other = self._clouds, self._peer
-        self._phase_ns, self._free_ns = phase_ns, 0
-        super().__init__(contact_speed_max)
+        self.start()
 
-    def start(self) -> None:
-        """See `InProcessTeleop`; nothing waits for a new process."""
-        self._forget()
-        super().start()
+    def start(self, now_ns: int = 0) -> None:
+        """Start a new process; it knows only what is on the disk, and nothing waits for it."""
+        self._starts += 1
+        salt = b"%s %d" % (self._name, self._starts)  # random in production
+        self._database = connect()
+        if self._disk:
+            self._database.deserialize(self._disk)
+        self.service: MissionService | None = MissionService(
+            self._contact_speed_max, MissionStore(self._database, salt)
+        )
+        self.outputs: Sequence[Output | Fault] = []
+        self._peer.waiting.clear()
+        self._calls, self._stops = list[Action](), list[Action]()
+        self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
+        self._free_ns, self._turn_ns, self._blind = 0, NEVER_NS, 0
 
-    def kill(self) -> None:
-        """See `InProcessTeleop`."""
-        super().kill()
-        self._forget()
+    def kill(self, now_ns: int = 0) -> None:
+        """Kill the process."""
+        if self.service is not None:
+            self._disk = self._database.serialize()
+            self._database.close()
+        self.service, self.outputs = None, []
 
     def run_on(self, host: RestartableEndpoint) -> None:
-        """See `InProcessTeleop`; it wakes whatever happens to cloud's process."""
+        """Wake on the machine of `host`, whatever happens to cloud's process."""
         self._host = host
-        host.at(self._phase_ns * 1e-9, self._wake)
+        if self._phase_ns is not None:
+            host.at(self._phase_ns * 1e-9, self._wake)
 
     def join(self, start_ns: int) -> Operator:
-        """See `InProcessTeleop`; what waited for the cloud before is lost."""
-        self._clouds.waiting.clear()
+        """Return the `Operator` of a cloud that starts at `start_ns` of its clock [ns]."""
+        if self._phase_ns is None:
+            return self
+        self._clouds.waiting.clear()  # lost with the cloud before
         return RemoteTeleop(self._clouds, wire.encode, wire.decode, start_ns)
 
+    @property
+    def missions(self) -> list[Mission]:
+        """All missions, oldest first; none while teleop is down."""
+        return list(self.service.book.missions.values()) if self.service is not None else []
+
+    def order(self, order: Order, now_ns: int) -> None:
+        """Order a mission at `now_ns` of cloud's clock [ns]; it starts at once."""
+        assert self.service is not None, "teleop is down"
+        self.service.create(order, now_ns)
+
     def ask(self, call: Call, now_ns: int) -> None:
-        """See `InProcessTeleop`; the call is made in the next wake."""
-        if self.service is not None:
-            self._calls.append(partial(super().ask, call))
+        """Make a call of the API at `now_ns` of cloud's clock [ns]; a refusal is ignored.
+
+        A process of its own makes the call in its next wake.
+        """
+        if self.service is not None and self._phase_ns is not None:
+            self._calls.append(partial(self._call, call))
+        else:
+            self._call(call, now_ns)
 
     def stop_rotors(self, now_ns: int) -> None:
-        """See `InProcessTeleop`; its alarm goes to cloud at once, past teleop's loop."""
-        if self.service is not None:
-            self._stops.append(partial(super().ask, MissionService.stop_rotors))
+        """Make an emergency stop at `now_ns` of cloud's clock [ns].
+
+        The alarm of a process of its own goes to cloud at once, past teleop's loop.
+        """
+        if self.service is not None and self._phase_ns is not None:
+            self._stops.append(partial(self._call, MissionService.stop_rotors))
             self._peer.send(wire.encode(wire.ALARM))
+        else:
+            self._call(MissionService.stop_rotors, now_ns)
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """Stop the process as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
-        if self.service is not None and self._host is not None:
+        """Stop a process of its own as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
+        if self.service is not None and self._phase_ns is not None and self._host is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
             self._host.at(self._free_ns * 1e-9, self._turn)  # who is late wakes at once
 
-    def _forget(self) -> None:
-        self._peer.waiting.clear()
-        self._calls: list[Action] = []
-        self._stops: list[Action] = []
-        self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
-        self._free_ns = 0
-        self._turn_ns, self._blind = NEVER_NS, 0
+    # The `Operator` of a cloud in the same process.
+
+    def see(self, seen: RobotStatus, now_ns: int) -> None:
+        """See `Operator`."""
+        if self.service is not None:
+            self.service.see(seen, now_ns)
+            self.outputs = [*self.outputs, *self._take(self.service)]
+
+    def handle_deadline(self, now_ns: int) -> None:
+        """See `Operator`."""
+        if self.service is not None:
+            self.service.handle_deadline(now_ns)
+            self.outputs = [*self.outputs, *self._take(self.service)]
+
+    def take_outputs(self) -> Sequence[Output | Fault]:
+        """See `Operator`."""
+        outputs, self.outputs = self.outputs, []
+        return outputs
+
+    def _call(self, call: Call, now_ns: int) -> None:
+        if self.service is not None:
+            with suppress(ConflictError, UnavailableError):
+                call(self.service, now_ns)
+
+    def _take(self, service: MissionService) -> list[Output | Fault]:
+        outputs = service.take_outputs()
+        self.events += [each for each in outputs if isinstance(each, MissionEvent)]
+        return outputs
 
     def _wake(self, now_ns: int) -> None:
         assert self._host is not None
@@ -395,20 +378,20 @@ class SeparateTeleop(InProcessTeleop):
             return
         turned_ns, self._turn_ns = self._turn_ns, now_ns
         self._blind = turn(
-            self,
+            self.service,
             self._peer,
             wire.decode,
-            lambda: _take_all(self._calls),
-            stops=lambda: _take_all(self._stops),
+            partial(_take_all, self._calls),
+            stops=partial(_take_all, self._stops),
             blind=self._blind,
             late_ns=now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0,
             now_ns=self._host.clock.at(now_ns),
         )
         # Events wait for a cloud that is there; everything else is repeated.
-        send(self.take_outputs(), self._unsent, self._peer, wire.encode)
+        send(self._take(self.service), self._unsent, self._peer, wire.encode)
 
 
-def _take_all(calls: list[Action]) -> list[Action]:
-    taken = calls[:]
-    calls.clear()
+def _take_all(waiting: list[T]) -> list[T]:
+    taken = waiting[:]
+    waiting.clear()
     return taken

@@ -14,8 +14,7 @@ import numpy as np
 
 Relation: TypeAlias = Literal["<=", ">=", "=="]
 _COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
-YES = "yes"
-"""Unit of a check that is a question: its value is 1 for yes, 0 for no."""
+YES = "yes"  # unit of a check that is a question: its value is 1 for yes, 0 for no
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
@@ -94,8 +93,6 @@ class Scenario:
     name: str  # on the command line: cloud-killed
     injects: str
     expects: str  # what the robot does, and within what time
-    loses: str  # what may be lost
-    shows: str  # what the user sees, or which metric moves
     inject: Inject
 
     @property
@@ -110,11 +107,9 @@ class Scenario:
         return outcome
 
 
-def scenario(
-    number: int, name: str, *, injects: str, expects: str, loses: str = "none", shows: str
-) -> Callable[[Inject], Scenario]:
+def scenario(number: int, name: str, *, injects: str, expects: str) -> Callable[[Inject], Scenario]:
     """Make a `Scenario` of the function that injects the fault; the arguments are its fields."""
-    return partial(Scenario, number, name, injects, expects, loses, shows)
+    return partial(Scenario, number, name, injects, expects)
 
 
 class Result(NamedTuple):

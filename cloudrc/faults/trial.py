@@ -49,18 +49,14 @@ INVARIANTS = {
 }
 SOMETIMES = {"collision", "obeyed", "waypoint", "stuck", "alarm"}
 """Invariants that are not checked in every flight."""
-BACK = 10.0
-"""Time of calm in which the robot must have flown [s]."""
+BACK = 10.0  # time of calm in which the robot must have flown [s]
 FORGETFUL = ("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down")
 """Faults after which there is another robot, or a teleop that need not know of a stop."""
-PATIENCE_NS = 1_000_000_000
-"""Shortest time between two actions of the operator [ns]."""
-CAPTURED = 2_000
-"""Number of datagrams that an intruder keeps."""
+PATIENCE_NS = 1_000_000_000  # shortest time between two actions of the operator [ns]
+CAPTURED = 2_000  # number of datagrams that an intruder keeps
 NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)
 WRONG_KEY = KeySet(Key(b"a key that world has never read!"))
-BUGS = ("values_invalid", "values_huge")
-"""Faults of an honest cloud whose controller has a bug."""
+BUGS = ("values_invalid", "values_huge")  # faults of an honest cloud whose controller has a bug
 IMPOSSIBLE = (nan, inf, -inf)
 
 
@@ -73,7 +69,6 @@ class Finding:
     sha256: str = ""  # of all records, if they were kept
     margin: float = 9.0  # smallest distance of the base to the fence's walls and ceiling [m]
     speed: float = 0.0  # largest reference [m/s]
-    holds: int = 0  # during a mission
     missions: int = 0  # that were done
 
     @property
@@ -106,8 +101,7 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
     for kind in [kind for kind in checks if kind in checked_in(schedule)]:
         checks[kind]()
     sha256, done = flight.sha256() if keep else "", len(flight.events("done"))
-    breaches = tuple(watch.breaches)
-    return Finding(schedule, breaches, sha256, watch.margin, watch.speed, len(held(flight)), done)
+    return Finding(schedule, tuple(watch.breaches), sha256, watch.margin, watch.speed, done)
 
 
 def checked_in(schedule: Schedule) -> frozenset[str]:
@@ -281,18 +275,15 @@ def _actions(
         return lambda now_ns: flight.replace_key(end, keys or flight.secrets["world"])
 
     restart, freeze = partial(process.restart, down=lasts), partial(process.freeze, duration=lasts)
-    kill, start = lambda now_ns: teleop.kill(), lambda now_ns: teleop.start()
+    pause = ask(MissionService.pause)
     return {
         **dict.fromkeys(("cloud_killed", "world_killed"), ((at, restart),)),
         **dict.fromkeys(("cloud_paused", "world_paused"), ((at, freeze),)),
         "pod_killed": ((at, partial(flight.restart_pod, down=lasts)),),
-        "pod_shut_down": (
-            (at, ask(MissionService.pause)),
-            (gone, partial(flight.restart_pod, down=end - gone)),
-        ),
-        "teleop_killed": ((at, kill), (end, start)),
-        "teleop_shut_down": ((at, ask(MissionService.pause)), (gone, kill), (end, start)),
-        "teleop_paused": ((at, lambda now_ns: teleop.freeze(now_ns, lasts)),),
+        "pod_shut_down": ((at, pause), (gone, partial(flight.restart_pod, down=end - gone))),
+        "teleop_killed": ((at, teleop.kill), (end, teleop.start)),
+        "teleop_shut_down": ((at, pause), (gone, teleop.kill), (end, teleop.start)),
+        "teleop_paused": ((at, partial(teleop.freeze, duration=lasts)),),
         "second_cloud": ((end, lambda now_ns: flight.end_rival()),),
         "key_rotated": ((at, read("world", NEXT_KEY)), (end, read("cloud", NEXT_KEY))),
         "key_wrong": ((at, read("cloud", WRONG_KEY)), (end, read("cloud"))),

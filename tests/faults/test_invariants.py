@@ -11,7 +11,7 @@ import pytest
 
 from cloudrc.faults.invariants import ESTOP, GROUND, HOLD, LAND, RAMP, TRACK
 from cloudrc.messages import ZERO, Cause, GuardState, Request, Start, Vector
-from tests.faults.conftest import MS, FakeRobot
+from tests.faults.conftest import FakeRobot
 
 Deed: TypeAlias = Callable[[FakeRobot], object]
 step, offer, request, touch, put, skip = (
@@ -200,7 +200,6 @@ def test_a_mission_waits_for_its_cloud_as_long_as_configured(
     assert play(*wait(state, wait_ms + 2, LAND), hold_ms=hold_ms) == set()
 
 
-COMES_DOWN = (touch("pipe_3"), step(LAND), touch("pipe_2"), step(GROUND))
 FALLS = (step(TRACK), STOP, touch("pipe_3"), step(ESTOP), touch("pipe_2"), step(ESTOP))
 
 
@@ -214,7 +213,7 @@ FALLS = (step(TRACK), STOP, touch("pipe_3"), step(ESTOP), touch("pipe_2"), step(
         (set(), (IMPOSSIBLE, touch("floor"), step(LAND))),
         ({"collision"}, (touch("pipe_1"), step(GROUND))),
         # A robot that comes down may touch what is below, until it flies again.
-        (set(), (IMPOSSIBLE, *COMES_DOWN[:3], step(LAND))),
+        (set(), (IMPOSSIBLE, touch("pipe_3"), step(LAND), touch("pipe_2"), step(LAND))),
         (set(), FALLS),
         ({"collision"}, (*FALLS, *RELEASE, step(TRACK), touch("pipe_3"), step(TRACK))),
         # An acknowledged landing ends within a brake.
@@ -237,14 +236,3 @@ def test_an_honest_cloud_touches_only_the_board_and_only_by_the_tip(
 ) -> None:
     assert play(*story, honest=True) == kinds
     assert play(*story) == set(), "with a hostile one a contact is no breach"
-
-
-def test_what_the_robot_landed_on_is_kept() -> None:
-    robot = FakeRobot(honest=True)
-    for deed in (IMPOSSIBLE, *COMES_DOWN):
-        deed(robot)
-    robot.simulator.touches = []  # as after the telemetry
-    robot.step(GROUND)
-    assert robot.watch.landed_on == {"pipe_2", "pipe_3"}
-    assert robot.watch.counts.keys() == {"latch"}, "left LAND by itself"
-    assert robot.now_ns == 6 * MS

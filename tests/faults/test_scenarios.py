@@ -36,14 +36,9 @@ QUICK = ("F6", "F13", "F17", "F40")
     ids=lambda each: each.name,
 )
 def test_a_fault_passes_its_checks(scenario: Scenario) -> None:
-    """All metrics that the user is told of are among the checks."""
     outcome = scenario.run(2)
     assert [check.show() for check in outcome.checks if not check.passed] == []
     assert outcome.checks
-    asked = {name for check in outcome.checks for name in re.findall(r"metric (\w+)", check.text)}
-    named = set(re.findall(r"cloudrc_(\w+)", scenario.shows))
-    assert named <= asked
-    assert named or "no metric" in scenario.shows
 
 
 @pytest.mark.promise("one-seed-one-run")
@@ -77,7 +72,7 @@ def test_a_metric_that_moves_late_is_noticed(since: float, passed: bool) -> None
         of_world=[Counted(round(n * 1e9), "world", "late", n) for n in (1, 16)],
     )
     outcome = Outcome()
-    measures.moves(outcome, flight, "world", "datagrams_total", "downlink", "late", since=since)
+    measures.moves(outcome, flight, "world datagrams_total downlink late", since=since)
     assert outcome.passed is passed
 
 

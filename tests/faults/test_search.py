@@ -119,7 +119,7 @@ def find(
             if schedule.seed == INTERRUPTED:
                 os.kill(os.getpid(), signal.SIGTERM)
             breaches = (Breach(1.0, "stuck", "not flown"),) if schedule.seed == BAD else ()
-            return Finding(schedule, breaches, "", 1.0 / (1 + schedule.seed), 2.0, 1, 2)
+            return Finding(schedule, breaches, "", 1.0 / (1 + schedule.seed), 2.0, 2)
 
         clock = [0.0]
         monkeypatch.setattr("cloudrc.faults.search.fly", fly)

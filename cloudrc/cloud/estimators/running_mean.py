@@ -5,6 +5,8 @@ Source: the paper, eq. (1).
 
 from __future__ import annotations
 
+from math import inf
+
 from cloudrc.cloud.estimators import DelaySample, Estimator
 
 
@@ -15,16 +17,17 @@ class RunningMean(Estimator):
     delay.
     """
 
-    def __init__(self) -> None:
-        self._count = 0
-        self._mean = 0.0
+    def __init__(self, count_max: float = inf) -> None:
+        """Set the number of samples after which the gain stays at 1/count_max; by default never."""
+        self._count_max, self._count, self._mean = count_max, 0, 0.0
 
     def update(self, sample: DelaySample) -> None:
         """Add one loop delay [s] after k samples: mean += (sample - mean) / (k + 1).
 
         Source: the paper, eq. (1), as printed; tau_n is `loop_delay`, which includes the hold.
         """
-        self._count += 1
+        if self._count < self._count_max:
+            self._count += 1
         self._mean += (sample.loop_delay - self._mean) / self._count
 
     def horizon(self, age: float) -> float:

@@ -9,8 +9,7 @@ from cloudrc.plugins import suggest_name
 
 MODULES = (ends, intruder, losses, missions, timing)
 _FOUND = [each for part in MODULES for each in vars(part).values() if isinstance(each, Scenario)]
-SCENARIOS = tuple(sorted(_FOUND, key=lambda each: each.number))
-"""All scenarios, by number."""
+SCENARIOS = tuple(sorted(_FOUND, key=lambda each: each.number))  # all scenarios, by number
 
 
 def find(name: str) -> Scenario:

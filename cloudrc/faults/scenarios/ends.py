@@ -9,9 +9,9 @@ import numpy as np
 
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, silent
+from cloudrc.faults.measures import fly_safely, moves
 from cloudrc.faults.models import EndpointGroup
 from cloudrc.faults.scenario import Outcome, generator, scenario
-from cloudrc.messages import GuardState
 from cloudrc.records import CommandApplied, Fault
 from cloudrc.tunnel.handshake import BUSY_TEXT
 
@@ -21,24 +21,27 @@ from cloudrc.tunnel.handshake import BUSY_TEXT
     "cloud-killed",
     injects="SIGKILL of the cloud process, a new one 0.8 s later",
     expects="HOLD by 252 ms; the new process commands in <= 2 s; the same waypoint goes on",
-    loses="cloud's memory only",
-    shows="a new session, cloudrc_session_epoch",
 )
 def _cloud_killed(outcome: Outcome, seed: int) -> None:
     at, down = measures.instant(seed), 0.8
     flight = Flight(seed=seed)
     flight.cloud.at(at, partial(flight.cloud.restart, down=down))
-    flight.fly_mission()
-    measures.safe_and_done(outcome, flight)
+    fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     commands = [r.stamp_ns * 1e-9 - at for r in flight.of_world if isinstance(r, CommandApplied)]
     again = min((t for t in commands if t > down), default=nan)
     outcome.most("the new process commands after", again, 2.0, "s")
     outcome.most("TRACK again after its start", measures.resumed_after(flight, at + down), 1.0, "s")
+    opened = _check_epochs(outcome, flight)
+    moves(outcome, flight, "world session_epoch", since=at)
+    outcome.least("epochs opened", len(opened), 3)
+
+
+def _check_epochs(outcome: Outcome, flight: Flight) -> list[int]:
+    """Check that the epochs rise; return them."""
     opened = measures.epochs(flight)
     outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
-    measures.moves(outcome, flight, "world", "session_epoch", since=at)
-    outcome.least("epochs opened", len(opened), 3)
+    return opened
 
 
 @scenario(
@@ -46,23 +49,20 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     "cloud-paused",
     injects="SIGSTOP of the cloud process for 5 s",
     expects="HOLD; of what it computed before nothing is applied",
-    shows="guard HOLD with its cause; in the status: cloud not heard, nor the robot; "
-    "cloudrc_guard_transitions_total, then cloudrc_loop_missed_periods_total",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
     at, missed = measures.instant(seed), "loop_missed_periods_total"
     flight = Flight(seed=seed, separate=True)
     flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
     measures.silence_told(outcome, flight, at, 4.0, cloud=False)
-    flight.fly_mission()
-    measures.safe_and_done(outcome, flight)
+    fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     measures.causes_told(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
     outcome.same("commands applied that were too old", len(old), 0)
-    measures.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
-    measures.moves(outcome, flight, "cloud", missed, since=at, over=at + 5.0)
+    moves(outcome, flight, "world guard_transitions_total hold", since=at)
+    moves(outcome, flight, f"cloud {missed}", since=at, over=at + 5.0)
     outcome.least(f"metric {missed} at the end", measures.reading(flight, "cloud", missed), 490)
 
 
@@ -72,12 +72,10 @@ def _cloud_paused(outcome: Outcome, seed: int) -> None:
     injects="the world pod restarts within 2 s",
     expects="back on the ground, never airborne without power; a new epoch, commands of the old "
     "one are refused; nothing resumes alone",
-    loses="the flight in progress",
-    shows="mission failed: world_restarted; cloudrc_missions_total, cloudrc_session_epoch",
 )
 def _world_restarted(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
-    flight, back = Flight(seed=seed), at + 2.0
+    flight = Flight(seed=seed)
     flight.world.at(at, partial(flight.world.restart, down=2.0))
     flight.fly(at + 12.0)
     measures.safe(outcome, flight)
@@ -88,15 +86,13 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     outcome.most("speed on the ground", moved, 0.01, "m/s")
     raised = measures.drift(flight, at, flight.now)
     outcome.most("way from where it stood up", raised, 0.01, "m")
-    verdict = str(flight.mission.verdict)
     outcome.true("mission failed", flight.mission.state == "failed")
-    outcome.true("with the code world_restarted", "world_restarted" in verdict)
-    opened = measures.epochs(flight)
-    outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
-    # What cloud still says to the world before.
-    measures.moves(outcome, flight, "world", "datagrams_total", "downlink", "old_epoch", since=back)
-    measures.moves(outcome, flight, "world", "session_epoch", since=back)
-    measures.moves(outcome, flight, "cloud", "missions_total", "world_restarted", since=back)
+    coded = "world_restarted" in str(flight.mission.verdict)
+    outcome.true("with the code world_restarted", coded)
+    _check_epochs(outcome, flight)
+    refused = "world datagrams_total downlink old_epoch"  # what cloud says to the world before
+    failed = "cloud missions_total world_restarted"
+    moves(outcome, flight, refused, "world session_epoch", failed, since=at + 2.0)
 
 
 @scenario(
@@ -105,8 +101,6 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     injects="a second cloud with the same key; later the first one leaves",
     expects="the first keeps authority while fresh; after HOLD the second gets a higher epoch; "
     "commands never interleave",
-    shows="fault 'busy' in the second: another cloud controls the robot; "
-    "cloudrc_datagrams_total{outcome=busy}, cloudrc_sessions_refused_total",
 )
 def _two_clouds(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed, 4.0, 12.0)
@@ -117,13 +111,12 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     opened = max(measures.epochs(flight), default=-1)
     outcome.same("epochs while both are there", opened, 2)
     flight.fly(at + 6.0)
+    outcome.same("HOLDs while both are there", len(measures.held(flight)), 0)
     group.members = group.members[1:]  # the first leaves
     flight.fly(at + 14.0)
     measures.safe(outcome, flight)
-    held = measures.changes_into(flight, GuardState.HOLD, at + 6.0)
-    outcome.same("HOLDs while both are there", len(held), 0)
-    measures.moves(outcome, flight, "world", "datagrams_total", "downlink", "busy", since=at)
-    measures.moves(outcome, flight, "world", "sessions_refused_total", since=at)
+    refused = "world datagrams_total downlink busy", "world sessions_refused_total"
+    moves(outcome, flight, *refused, since=at)
     told = measures.told(group.others, "busy")
     outcome.true("the second says why it waits, once", [r.text for r in told] == [BUSY_TEXT])
     said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
@@ -142,11 +135,6 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     injects="uplink, downlink, cloud, world and teleop freeze one by one and return in random "
     "order",
     expects="always a safe state; the mission goes on",
-    loses="as above",
-    shows="guard HOLD with its cause, cloudrc_guard_transitions_total; of each that was frozen: "
-    "fault 'late' of both ends, "
-    "cloudrc_datagrams_lost_total both ways, cloudrc_loop_missed_periods_total, "
-    "cloudrc_world_slip_seconds_total, mission restarted",
 )
 def _swizzle(outcome: Outcome, seed: int) -> None:
     """A direction freezes before its sender, so that datagrams are lost.
@@ -162,20 +150,17 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     flight = Flight(limit, seed=seed, uplink=links[0], downlink=links[1])
     for process, (start, duration) in ((flight.cloud, cloud), (flight.world, world)):
         process.at(start, partial(process.freeze, duration=duration))
-    flight.cloud.at(teleop[0], lambda _: flight.teleop.kill())
-    flight.cloud.at(sum(teleop), lambda _: flight.teleop.start())
-    flight.fly_mission()
-    measures.safe_and_done(outcome, flight)
+    flight.cloud.at(teleop[0], flight.teleop.kill)
+    flight.cloud.at(sum(teleop), flight.teleop.start)
+    fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     measures.causes_told(outcome, flight)
-    for role, *metric in (
-        ("cloud", "datagrams_lost_total", "uplink"),
-        ("world", "datagrams_lost_total", "downlink"),
-        ("cloud", "loop_missed_periods_total"),
-        ("world", "world_slip_seconds_total"),
-        ("world", "guard_transitions_total", "hold"),
-    ):
-        measures.moves(outcome, flight, role, *metric, since=uplink[0], over=max(ends))
+    metrics = (
+        *("cloud datagrams_lost_total uplink", "world datagrams_lost_total downlink"),
+        *("cloud loop_missed_periods_total", "world world_slip_seconds_total"),
+        "world guard_transitions_total hold",
+    )
+    moves(outcome, flight, *metrics, since=uplink[0], over=max(ends))
     for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
         outcome.least(f"times that {end} tells: late", len(measures.told(records, "late")), 1)
     restarted = measures.events_of_missions(flight, "restarted")

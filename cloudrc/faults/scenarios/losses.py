@@ -6,9 +6,12 @@ from math import nan
 
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, conditions, silent
+from cloudrc.faults.measures import fly_safely, moves
 from cloudrc.faults.scenario import Outcome, scenario
 from cloudrc.link.profile import GilbertElliott
 from cloudrc.messages import Cause, GuardState
+
+HOLDS = "world guard_transitions_total hold"
 
 
 @scenario(
@@ -16,8 +19,6 @@ from cloudrc.messages import Cause, GuardState
     "short-blackout",
     injects="both directions silent for 0.1 s; one of them alone",
     expects="stays in TRACK, no step above the acceleration cap",
-    loses="at most 11 samples per direction, none in one that is not silent",
-    shows="cloudrc_link_gap_seconds and cloudrc_datagrams_lost_total of who hears nothing",
 )
 def _short_silence(outcome: Outcome, seed: int) -> None:
     """Without jitter a link has no other gaps."""
@@ -26,8 +27,7 @@ def _short_silence(outcome: Outcome, seed: int) -> None:
     cut = silent(at, 0.1, jitter=0.0)
     cases = {"both ways": (both, both), "up": (cut, steady), "down": (steady, cut)}
     for what, (up, down) in cases.items():
-        flight = Flight(seed=seed, uplink=up, downlink=down).fly_mission()
-        measures.safe_and_done(outcome, flight)
+        flight = fly_safely(outcome, Flight(seed=seed, uplink=up, downlink=down))
         outcome.same(f"silent {what}: HOLDs", len(measures.held(flight)), 0)
         ends = ("cloud", "uplink", flight.uplink, up), ("world", "downlink", flight.downlink, down)
         for role, way, link, shape in ends:
@@ -40,7 +40,7 @@ def _short_silence(outcome: Outcome, seed: int) -> None:
                 outcome.same(text, after - before, 0)
             else:
                 outcome.least(text, after - before, 1)
-                measures.moves(outcome, flight, role, "datagrams_lost_total", way, since=at)
+                moves(outcome, flight, f"{role} datagrams_lost_total {way}", since=at)
             lost, most = link.counts()["blackout"], 0 if shape is steady else 11
             outcome.most(f"silent {what}: datagrams lost, {way}", lost, most)
 
@@ -50,30 +50,25 @@ def _short_silence(outcome: Outcome, seed: int) -> None:
     "blackout",
     injects="both directions silent for 0.5, 3 and 20 s",
     expects="HOLD at 252 ms, below 0.05 m/s in 1 s, drift <= 0.10 m, resumes <= 1 s after return",
-    loses="samples in the gap",
-    shows="guard HOLD with its cause; in the status: robot not heard, cloud heard; "
-    "cloudrc_guard_transitions_total",
 )
 def _silence(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
     for duration in (0.5, 3.0, 20.0):
-        cut, back, what = silent(at, duration), at + duration, f"{duration:g} s of silence"
+        back, what = at + duration, f"{duration:g} s of silence"
         slow = ("guard.speed_max_mps=1.5", "criteria.time_limit_s=150")
-        flight = Flight(*slow, seed=seed, uplink=cut, downlink=cut, separate=True)
+        flight = Flight(*slow, seed=seed, link=silent(at, duration), separate=True)
         if duration >= 3.0:
             measures.silence_told(outcome, flight, at, 0.9 * duration, f"{what}: ", cloud=True)
-        flight.fly_mission(150.0)
-        measures.safe_and_done(outcome, flight)
-        began = next(iter(measures.changes_into(flight, GuardState.HOLD)), at)
+        fly_safely(outcome, flight, 150.0)
         measures.held_in_time(outcome, flight, f"{what}: HOLD after")
         measures.causes_told(outcome, flight, f"{what}: ")
         if duration >= 3.0:
+            began = measures.first_into(flight, GuardState.HOLD)
             calm = measures.calm_after(flight, began, back)
             outcome.most(f"{what}: below 0.05 m/s after", calm, 1.0, "s")
             drift = measures.drift(flight, began + 2.0, back)
             outcome.most(f"{what}: drift", drift, 0.10, "m")
-        measures.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=at)
-        measures.moves(outcome, flight, "cloud", "commands_frozen_total", since=at)
+        moves(outcome, flight, HOLDS, "cloud commands_frozen_total", since=at)
         outcome.most(f"{what}: resumed after", measures.resumed_after(flight, back), 1.0, "s")
 
 
@@ -82,9 +77,6 @@ def _silence(outcome: Outcome, seed: int) -> None:
     "long-blackout",
     injects="both directions silent for 75 s, over the floor and amid the pipes",
     expects="HOLD, LAND after 60 s at 0.5 m/s, rotors stop on what lies below, latched",
-    loses="the mission, which says so",
-    shows="guard LAND with its cause; in the status: robot not heard, cloud heard; "
-    "cloudrc_guard_state",
 )
 def _long_silence(outcome: Outcome, seed: int) -> None:
     """Cut the link over the free floor, and anywhere on the way through the pipes."""
@@ -92,37 +84,39 @@ def _long_silence(outcome: Outcome, seed: int) -> None:
     first, last = (flight.trajectory()[n].odometry.position for n in (0, -1))
     text = "over the floor: base above where it took off"
     outcome.most(text, abs(last[2] - first[2]), 0.02, "m")
-    flight = _landed(outcome, seed, measures.instant(seed, 8.0), "amid the pipes")
-    text = "amid the pipes: things other than the floor that it came down on, told and no collision"
-    outcome.most(text, len(flight.watch.landed_on), 1)
+    _landed(outcome, seed, measures.instant(seed, 8.0), "amid the pipes")
 
 
 def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     """Cut the link at `at` [s] for long: the robot lands and stops its rotors."""
-    cut = silent(at, 75.0)
-    flight = Flight("criteria.time_limit_s=200", seed=seed, uplink=cut, downlink=cut, separate=True)
+    limit = "criteria.time_limit_s=200"
+    flight = Flight(limit, seed=seed, link=silent(at, 75.0), separate=True)
     measures.silence_told(outcome, flight, at, 70.0, f"{where}: ", cloud=True)
     flight.fly(at + 80.0)
     measures.safe(outcome, flight)
-    held = next(iter(measures.changes_into(flight, GuardState.HOLD)), nan)
-    landed = next(iter(measures.changes_into(flight, GuardState.LAND)), nan)
+    held = measures.first_into(flight, GuardState.HOLD)
+    landed = measures.first_into(flight, GuardState.LAND)
     outcome.most(f"{where}: LAND 60 s after HOLD, off by", abs(landed - held - 60.0), 0.01, "s")
     fallen = [-r.odometry.velocity[2] for r in flight.trajectory() if r.stamp_ns >= landed * 1e9]
     fastest = max(fallen, default=nan)
     outcome.most(f"{where}: descent at 0.5 m/s, off by", abs(fastest - 0.5), 0.05, "m/s")
     rotor = max(flight.robot.simulator.rotor_speeds)
     outcome.most(f"{where}: fastest rotor", rotor, 1.0, "rad/s")
-    down = flight.changes[-1].cause == Cause.DOWN.words
-    outcome.true(f"{where}: it is down, and stays so until the operator acknowledges", down)
-    alone = [c.cause for c in flight.changes if c.state is GuardState.LAND]
-    outcome.true(f"{where}: LAND tells why", alone[:1] == ["held for 60 s without the cloud"])
-    failed, verdict = flight.mission.state == "failed", str(flight.mission.verdict)
-    text = f"guard went to LAND ({Cause.ALONE.words})"
-    outcome.true(f"{where}: the mission says why it failed", failed and text in verdict)
-    seen, shown = measures.status(flight)["seen"], ("LAND", Cause.ALONE.words)
-    right = (seen["guard"], seen["cause"]) == shown
-    outcome.true(f"{where}: the status says so, too: {', '.join(shown)}", right)
-    measures.moves(outcome, flight, "world", "guard_state", since=at)
+    seen, verdict = measures.status(flight)["seen"], str(flight.mission.verdict)
+    alone = [change.cause for change in measures.changes_into(flight, GuardState.LAND)]
+    for text, holds in {
+        "it is down, and stays so until the operator acknowledges": (
+            flight.changes[-1].cause == Cause.DOWN.words
+        ),
+        "LAND tells why": alone[:1] == ["held for 60 s without the cloud"],
+        "the mission says why it failed": flight.mission.state == "failed"
+        and f"guard went to LAND ({Cause.ALONE.words})" in verdict,
+        f"the status says so, too: LAND, {Cause.ALONE.words}": (
+            (seen["guard"], seen["cause"]) == ("LAND", Cause.ALONE.words)
+        ),
+    }.items():
+        outcome.true(f"{where}: {text}", holds)
+    moves(outcome, flight, "world guard_state", since=at)
     state = measures.reading(flight, "world", "guard_state")
     outcome.least(f"{where}: metric guard_state at the end", state, 3)
     return flight
@@ -133,17 +127,13 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     "random-loss",
     injects="30 % independent loss both ways",
     expects="TRACK, tracking error <= 1.5 times that without loss",
-    loses="30 % of the samples",
-    shows="cloudrc_datagrams_lost_total, loss in the report",
 )
 def _loss(outcome: Outcome, seed: int) -> None:
-    lossy, error = conditions(loss=0.3), "tracking_rms_measured"
     clean = Flight(seed=seed).fly_mission()
-    flight = Flight(seed=seed, uplink=lossy, downlink=lossy).fly_mission()
-    measures.safe_and_done(outcome, flight)
+    flight = fly_safely(outcome, Flight(seed=seed, link=conditions(loss=0.3)))
     outcome.same("HOLDs", len(measures.held(flight)), 0)
-    ratio = measures.number(flight, error) / measures.number(clean, error)
-    outcome.most("tracking error over that without loss", ratio, 1.5)
+    error, usual = (measures.number(each, "tracking_rms_measured") for each in (flight, clean))
+    outcome.most("tracking error over that without loss", error / usual, 1.5)
     for role, way in (("world", "downlink"), ("cloud", "uplink")):
         lost = measures.reading(flight, role, "datagrams_lost_total", way)
         outcome.least(f"metric datagrams_lost_total {way}", lost, 500)
@@ -155,21 +145,22 @@ def _loss(outcome: Outcome, seed: int) -> None:
     "burst-loss",
     injects="Gilbert-Elliott loss, mean bursts of 50, 200 and 500 ms",
     expects="TRACK and HOLD without chatter: <= 2 changes in any second",
-    loses="samples, in bursts; with those of 500 ms perhaps a mission, which says so",
-    shows="HOLDs in the report, cloudrc_guard_transitions_total",
 )
 def _bursts(outcome: Outcome, seed: int) -> None:
     for packets in (5, 20, 50):
         shape = conditions(loss=GilbertElliott(bad_start=1 / 200, bad_end=1 / packets))
-        flight = Flight("criteria.time_limit_s=150", seed=seed, uplink=shape, downlink=shape)
-        flight.fly_mission(150.0)
+        flight = Flight("criteria.time_limit_s=150", seed=seed, link=shape).fly_mission(150.0)
         measures.safe(outcome, flight)
         if packets < 50:  # else it hardly ever rests on the board for 4 s, and a leg may time out
             measures.done(outcome, flight)
         outcome.true("the mission has ended", flight.mission.ended)
         # Most bursts do nothing: the fault is the first one that is too long.
-        since = next(iter(measures.changes_into(flight, GuardState.HOLD)), nan) - measures.AGE_MAX
-        measures.moves(outcome, flight, "world", "guard_transitions_total", "hold", since=since)
+        moves(
+            outcome,
+            flight,
+            HOLDS,
+            since=measures.first_into(flight, GuardState.HOLD) - measures.AGE_MAX,
+        )
         text, busiest = f"bursts of {packets * 10} ms", measures.busiest_second(flight.changes)
         outcome.most(f"{text}: changes of the guard in any second", busiest, 2)
         told, held = measures.number(flight, "hold_count"), len(measures.held(flight))
