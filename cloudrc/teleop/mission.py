@@ -57,10 +57,6 @@ class LegWatch:
     """
 
     def __init__(self) -> None:
-        self.begin()
-
-    def begin(self) -> None:
-        """Begin a new leg."""
         self._flown_ns = 0
         self.pause()
 
@@ -124,7 +120,6 @@ class Teleop:
         self._expected: tuple[int, ...] = ()  # missions that may be on board; empty: any
         self._watch = LegWatch()
         self._setpoint: Setpoint | None = None
-        self._over = MISSION_OVER  # waypoints stored on board from which on the mission is over
         self._is_pending = False  # whether the mission's first setpoint has not been sent yet
         self._stays = False  # whether waypoints are ignored
 
@@ -142,15 +137,9 @@ class Teleop:
         outputs, self.outputs = self.outputs, []
         return outputs
 
-    def start(self, now_ns: int, plan: Plan, mission_id: int = 0, *, again: bool = False) -> None:
-        """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0.
-
-        With `again`, an earlier teleop may have flown it: if the robot reports the last waypoint,
-        the mission is over and does not begin at the spawn again.
-        """
+    def start(self, now_ns: int, plan: Plan, mission_id: int = 0) -> None:
+        """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0."""
         self._order(plan, mission_id, now_ns)
-        if again and plan.start is Start.SPAWN:
-            self._over = len(plan.legs)
         here = None if plan.start is Start.SPAWN else self._seen
         self._world = here.world if here else ANY_WORLD
         self._expected = (here.mission_id, mission_id) if here else ()
@@ -158,8 +147,6 @@ class Teleop:
         self.requests.ask(Request.START, plan.start, after=True)
         self._is_pending = True
         self._select_early()
-        if again and self._seen:
-            self.see(self._seen, now_ns)  # the mission may be over
 
     def continue_mission(self, now_ns: int, mission: Mission) -> None:
         """Take over a mission of an earlier teleop at its current waypoint; do not reset world."""
@@ -273,7 +260,7 @@ class Teleop:
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
             return "taken_over", "somebody else has started another mission"
-        if self._reached_on_board(seen) >= self._over:
+        if self._reached_on_board(seen) == MISSION_OVER:
             return END_LOST
         if seen.guard > WORST_GUARD:
             return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
@@ -306,13 +293,12 @@ class Teleop:
         """Store a new mission: its plan, its number, and the start of its time [ns]."""
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
-        self._continued, self._was_held, self._over = False, False, MISSION_OVER
+        self._continued = self._was_held = False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission after telemetry shows its start; start the times of mission and leg."""
         self.state, self._world, self._expected = FLYING, seen.world, (self._mission_id,)
-        self._over = MISSION_OVER
-        self._watch.begin()
+        self._watch = LegWatch()
         if not self._continued:
             self._began_ns = now_ns
             if self._is_pending:
@@ -334,7 +320,7 @@ class Teleop:
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
-            self._watch.begin()
+            self._watch = LegWatch()
             if self.state is FLYING and select:
                 self._select_leg(self.leg)
         else:
@@ -366,10 +352,14 @@ class Teleop:
         return seen.reached if seen.mission_id == self._mission_id != 0 else 0
 
     @property
+    def _from_spawn(self) -> bool:
+        """Whether the mission begins at the spawn."""
+        return self._plan.start is Start.SPAWN and not self._continued
+
+    @property
     def _may_move(self) -> bool:
         """Whether the robot may still fly an earlier mission while this one begins at the spawn."""
-        from_spawn = self._plan.start is Start.SPAWN and not self._continued
-        return from_spawn and not self.requests.waits
+        return self._from_spawn and not self.requests.waits
 
     def _select_early(self) -> None:
         """Select the waypoint before telemetry shows the start, so that the first command is right.
@@ -379,8 +369,7 @@ class Teleop:
         if not self._is_pending or self._seen is None or self._may_move:
             return
         self._is_pending = False
-        from_spawn = self._plan.start is Start.SPAWN and not self._continued
-        leg = 0 if from_spawn else max(self.leg, self._reached_on_board(self._seen))
+        leg = 0 if self._from_spawn else max(self.leg, self._reached_on_board(self._seen))
         if leg < len(self._plan.legs):
             self._select_leg(leg)
 

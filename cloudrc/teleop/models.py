@@ -7,12 +7,11 @@ file: the same code checks them and describes their problems.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from math import cos, radians, sin
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import PydanticCustomError, from_json
+from pydantic_core import PydanticCustomError
 
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem as ConfigProblem
@@ -21,7 +20,7 @@ from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeL
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
-from cloudrc.teleop.store import SHOWN, Order
+from cloudrc.teleop.store import FAILURES, SHOWN, Order
 from cloudrc.teleop.wire import Leg, Plan
 
 PROBLEMS_MAX = 50
@@ -29,7 +28,7 @@ PROBLEMS_MAX = 50
 
 
 def _printable(text: str) -> str:
-    """Refuse control characters, because they would control the terminals of readers."""
+    """Refuse control characters, which change the terminal of a user who lists the missions."""
     if not text.isprintable():
         raise PydanticCustomError("unprintable", "must be one line of printable characters")
     return text
@@ -52,12 +51,10 @@ class MissionRequest(Section):
         (), max_length=MAX_WAYPOINTS, description="Points, in order"
     )
     contact: bool | None = Field(
-        None, description="Whether the arm has to touch the board; "
-        "default: if the experiment asks for it and the waypoints lead there",
+        None, description="Whether the arm has to touch the board; default: as in the experiment, "
+        "if a waypoint is at the board",
     )  # fmt: skip
-    key: Text = Field(
-        "", description=f"A second mission under the same key is not made; {ONE_LINE}"
-    )
+    key: Text = Field("", description=f"Teleop makes one mission for each key; {ONE_LINE}")
     queue: bool = Field(False, description="Wait for the mission under way, if there is one")
 
 
@@ -83,7 +80,7 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
 
 
 def told(text: str) -> Any:
-    """Describe a field of an answer."""
+    """Describe a field of an answer in the OpenAPI document."""
     return Field(description=text)
 
 
@@ -119,10 +116,8 @@ class Event(_Answer):
     id: int = told("Rises with every event of all missions")
     mission: str = told("Whose")
     event: str = told(
-        "queued, starting, started, reached, held, resumed, goto, restarted, "
-        "new_session, board_touched, pipe_touched, paused; at the end done, cancelled, timed_out, "
-        "leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over or "
-        "end_lost"
+        "queued, starting, started, reached, held, resumed, goto, restarted, new_session, "
+        f"board_touched, pipe_touched, paused; at the end done, cancelled, {', '.join(FAILURES)}"
     )
     waypoint: int = told("Index of the waypoint concerned")
     text: str = told("The same in words")
@@ -135,13 +130,11 @@ class MissionSummary(_Answer):
     id: str = told("Given by teleop")
     name: str = told("Given by its sender")
     key: str = told("Likewise")
-    state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"] = told(
-        "Where it is"
-    )
-    waypoint: int = told("Index of the waypoint that is flown to, from 0")
-    waypoints: int = told("How many it has")
-    reached: list[Reached] = told("Those that were reached")
-    verdict: Verdict | None = told("Once it has ended")
+    state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"]
+    waypoint: int = told("Index of the waypoint to which the robot flies, from 0")
+    waypoints: int = told("Number of waypoints")
+    reached: list[Reached] = told("The waypoints that were reached")
+    verdict: Verdict | None = told("Null until the mission has ended")
 
 
 class MissionView(MissionSummary):
@@ -161,16 +154,13 @@ class Seen(_Answer):
     """The newest telemetry."""
 
     age_s: float = told("Since it arrived [s]")
-    epoch: int = told("Session that it belongs to")
-    world: str = told("Names world's process")
+    epoch: int = told("Number of the session between cloud and world")
+    world: str = told("Identifies world's process")
     position_m: list[float | None] = told("Of the base, measured [m], world frame")
     guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = told("State of the guard on board")
-    cause: str = told("Why it is in it; of a robot that has landed, why it landed")
-    guard_for_s: float | None = told(
-        "For how long it has been seen in this state [s]; null once it has not been "
-        "heard for 1 s: state, cause and all else are those of then"
-    )
-    next_step: str = told("What comes next, or what the operator has to do for it")
+    cause: str = told("Why the guard is in this state; after a landing, why the robot landed")
+    guard_for_s: float | None = told("Time in this state [s]; null if `age_s` is above 1 s")
+    next_step: str = told("What the robot does next, or what the operator has to do")
     pipe_contacts: int = told("How often a pipe has been touched so far")
     touch_speed_mps: float | None = told("Of the tip at the board [m/s]")
     horizon_s: float | None = told("How far cloud looks ahead [s]")
@@ -184,10 +174,9 @@ class StateView(_Answer):
     mission: MissionSummary | None = told("The one under way")
     queue: list[str] = told("Ids of those that wait")
     cloud_age_s: float | None = told(
-        "Since cloud was heard [s], which says at least every 0.2 s that it lives; "
-        "null if it never was"
+        "Age of the last message from cloud [s], which sends one every 0.2 s; null before the first"
     )
-    seen: Seen | None = told("Null until the robot has been seen")
+    seen: Seen | None = told("Null before the first telemetry")
 
 
 class Stopped(_Answer):
@@ -201,9 +190,8 @@ class Acknowledged(_Answer):
     """Answer to an acknowledgement, which is under way to the robot."""
 
     state: Literal["acknowledged"] = told(
-        "The next mission may fly; a landing low over the ground ends first, and "
-        "after a stop or a touch-down the robot takes off only once it has been still, 0.5 m "
-        "inside the fence"
+        "The next mission can fly. A landing near the ground ends first. The robot takes off again "
+        "only when it has stood still, 0.5 m inside the fence"
     )
 
 
@@ -248,12 +236,6 @@ def read_order(
     `time_limit` [s] and `contact` (the board has to be touched if the mission leads there) are for
     missions that do not say so; `plan` makes a plan from a mission and its time limit [s].
     """
-    with suppress(ValueError, TypeError, KeyError):  # which the model words
-        if (
-            count := len(from_json(body)["waypoints"])
-        ) > MAX_WAYPOINTS:  # fast, also if all are bad
-            reason = f"at most {MAX_WAYPOINTS}; split the mission"
-            raise RefusedError([ConfigProblem(("waypoints",), str(count), reason)])
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # an experiment's mission may have steps in their place
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
@@ -291,25 +273,20 @@ def leads_to_board(mission: Mission, scene: Scene) -> bool:
 
 def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:
     """Return a problem as the API shows it."""
-    path, index = problem.path, None
-    if path[:1] == ("waypoints",) and len(path) > 1:
-        index = int(path[1])
-    return {
-        "path": ".".join(path),
-        "index": index,
-        "value": problem.value,
-        "reason": problem.reason,
-    }
+    path = problem.path
+    index = int(path[1]) if path[:1] == ("waypoints",) and len(path) > 1 else None
+    shown = {"path": ".".join(path), "index": index}
+    return {**shown, "value": problem.value, "reason": problem.reason}
 
 
 def _parse(body: bytes, model: type[_Request]) -> _Request:
     try:
         return model.model_validate_json(body)
     except ValidationError as error:
-        first = error.errors()[0] if error.error_count() == 1 else None
-        if first is not None and first["type"] == "json_invalid":
+        first = error.errors()[0]
+        if first["type"] == "json_invalid":
             problems = [ConfigProblem((), "", f"not JSON: {first['ctx']['error']}")]
-        elif first is not None and not first["loc"]:
+        elif not first["loc"]:
             problems = [ConfigProblem((), "", "must be a mapping of keys")]
         else:
             problems = from_pydantic(error, model, limit=PROBLEMS_MAX)

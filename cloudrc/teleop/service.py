@@ -202,7 +202,7 @@ class MissionService:
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
         self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
-        if not self.book.kept:
+        if self.book.trouble:
             text = f"{mission.id} is cancelled, but waits again if teleop restarts"
             raise UnavailableError(f"{text}: {self.book.trouble}")
         return mission
@@ -276,7 +276,7 @@ class MissionService:
         self.book.catch_up(now_ns)
         if not self._ends:
             in_sight = self.sight.seen is not None
-            self._start_next(now_ns, queued=in_sight and self.book.kept and not self._blocked)
+            self._start_next(now_ns, queued=in_sight and not (self.book.trouble or self._blocked))
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -349,7 +349,7 @@ class MissionService:
         if self._current is None and (waiting := self.book.open()):
             if queued and waiting[0].state == QUEUED:
                 self._note(waiting[0], "starting", ASKED, now_ns)
-            if waiting[0].world or (waiting[0].state != QUEUED and self.book.kept):
+            if waiting[0].world or (waiting[0].state != QUEUED and not self.book.trouble):
                 self._take_over(waiting[0], now_ns)
         return self._current
 
@@ -357,7 +357,7 @@ class MissionService:
         """Fly a mission that this or an earlier teleop has begun."""
         self._current = mission
         if not mission.world:  # it has not started
-            self._teleop.start(now_ns, mission.order.plan, mission.number, again=True)
+            self._teleop.start(now_ns, mission.order.plan, mission.number)
         else:
             self._teleop.continue_mission(now_ns, mission)
             mission.witness = mission.witness.after_restart()

@@ -125,8 +125,6 @@ it continues before take-off: create 0.05 A GROUND mark restart see 0.3
   -> states=flying asked=START
 with a full disk the robot remembers: create 0.05 A full B 0.1 restart free away C 0.1
   -> states=done reached=0,1,2 failure=
-a flight never stored is not flown again: mute create full link 0.1 A B C 0.2 free restart mark 1
-  -> states=failed failure=end_lost asked=END guard=HOLD reached=
 nor is an end that the robot knows lost: create 0.05 A full B C 0.3 restart free away 0.3
   -> states=done reached=0,1,2 last=done
 nor does it fly before that: create 0.05 A full B C 0.3 mute restart free away 0.1
