@@ -1,8 +1,7 @@
 """Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
 
 After a restart of teleop, a mission under way continues at the same waypoint, if world has not
-restarted. An emergency stop survives, too: a new teleop that finds the robot in flight although the
-store says that its mission was stopped sends the stop again.
+restarted.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.placement import find_crossed_pipe
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import GuardState, Setpoint, Start
+from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.mission import Teleop
@@ -31,8 +30,8 @@ from cloudrc.teleop.store import (
 from cloudrc.teleop.wire import Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
-"""States of the guard that only an acknowledgement ends, and those in which rotors may turn."""
+LATCHED = LAND, ESTOP
+"""States of the guard that only an acknowledgement ends."""
 SILENCE = 1.0
 """Age above which telemetry or the last message of cloud counts as too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
@@ -100,29 +99,26 @@ class RobotView:
 
     def show(self, now_ns: int, mission: str | None) -> dict[str, Any]:
         """Return the state of robot and cloud for the API; `mission` is that of the mission."""
-        if self.heard_ns is None:
-            return {"cloud_age_s": None, "seen": None}
-        seen, age = self.seen, (now_ns - self._seen_ns) * 1e-9
-        cloud_age = (now_ns - self.heard_ns) * 1e-9
-        shown = (
-            None
-            if seen is None
-            else {
-                "age_s": age,
-                "epoch": seen.epoch,
-                "world": seen.world,
-                "position_m": [finite_or_none(value) for value in seen.position],
-                "guard": seen.guard.name,
-                "cause": seen.cause.words,
-                "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
-                "next_step": next_step(seen.guard, age, cloud_age, mission),
-                "pipe_contacts": seen.pipe_contacts,
-                "touch_speed_mps": finite_or_none(seen.touch_speed),
-                "horizon_s": finite_or_none(seen.horizon),
-                "rtt_s": finite_or_none(seen.rtt),
-                "loop_delay_s": finite_or_none(seen.loop_delay),
-            }
-        )
+        seen = self.seen
+        cloud_age = None if self.heard_ns is None else (now_ns - self.heard_ns) * 1e-9
+        if seen is None or cloud_age is None:
+            return {"cloud_age_s": cloud_age, "seen": None}
+        age = (now_ns - self._seen_ns) * 1e-9
+        shown = {
+            "age_s": age,
+            "epoch": seen.epoch,
+            "world": seen.world,
+            "position_m": [finite_or_none(value) for value in seen.position],
+            "guard": seen.guard.name,
+            "cause": seen.cause.words,
+            "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
+            "next_step": next_step(seen.guard, age, cloud_age, mission),
+            "pipe_contacts": seen.pipe_contacts,
+            "touch_speed_mps": finite_or_none(seen.touch_speed),
+            "horizon_s": finite_or_none(seen.horizon),
+            "rtt_s": finite_or_none(seen.rtt),
+            "loop_delay_s": finite_or_none(seen.loop_delay),
+        }
         return {"cloud_age_s": cloud_age, "seen": shown}
 
 
@@ -154,8 +150,6 @@ class MissionService:
         self._ends = False  # whether this process ends; the next one starts the queued missions
         self._teleop = Teleop(book.has_ended)
         self._trouble = ""  # of the store, as last reported
-        # Whether an earlier teleop may have sent a stop that the robot has not heard of.
-        self._inherits_stop = book.stopped() is not None
 
     @property
     def over(self) -> bool:
@@ -233,7 +227,6 @@ class MissionService:
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state; return the mission that this ends, if any."""
         mission = self._start_next(now_ns)
-        self._inherits_stop = False
         self._teleop.stop(now_ns)
         self._collect(now_ns)
         return mission
@@ -258,14 +251,12 @@ class MissionService:
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry."""
         mission = self._current
-        if self._inherits_stop:
-            self._inherits_stop, stopped = False, self.book.stopped()
-            same = stopped is not None and seen.mission_id == stopped.number
-            if same and seen.guard in AIRBORNE:  # it has not heard of the stop
-                self._teleop.stop(now_ns)
         is_new_session = self.sight.see(seen, now_ns)
         if mission is not None and mission.world and mission.world == seen.world:
-            self._note_contacts(mission, seen, now_ns)
+            before = mission.witness
+            mission.witness = before.see(*_contacts(seen))
+            for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
+                self._note(mission, event, text, now_ns)
             if is_new_session:
                 self._note(mission, "new_session", _describe_session(mission), now_ns)
         self._teleop.see(seen, now_ns)
@@ -275,8 +266,8 @@ class MissionService:
         """Start a waiting mission, check time limits, and repeat the messages that are due."""
         self.book.catch_up(now_ns)
         if not self._ends:
-            in_sight = self.sight.seen is not None
-            self._start_next(now_ns, queued=in_sight and not (self.book.trouble or self._blocked))
+            blocked = self.sight.seen is None or self.book.trouble or self._blocked
+            self._start_next(now_ns, queued=not blocked)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -300,7 +291,7 @@ class MissionService:
     @property
     def _blocked(self) -> str:
         """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
-        if self._teleop.stopping or self._inherits_stop:
+        if self._teleop.stopping:
             return "an emergency stop is on its way to the robot"
         seen = self.sight.seen
         if seen is None or seen.guard not in LATCHED:
@@ -320,14 +311,15 @@ class MissionService:
         seen, scene = self.sight.seen, self._scene
         if seen is None or scene is None:
             return
-        ways = np.array([seen.position]), np.array([leg.position])
-        through = int(find_crossed_pipe(scene, *ways)[0])
+        here, there = np.array([seen.position]), np.array([leg.position])
+        through = int(find_crossed_pipe(scene, here, there)[0])
         if through >= 0:
-            here, there = (f"[{', '.join(f'{v:.2f}' for v in way[0])}]" for way in ways)
-            text = f"the straight way from where the robot is, {here}, to {there} leads through "
-            text += f"the wall of {scene.pipes[through].name}"
-            mission_id = self._current.id if self._current else ""
-            raise ConflictError(f"{text}; go round it first, by 'cloudrc mission goto'", mission_id)
+            raise ConflictError(
+                f"the straight way from where the robot is, {_place(seen.position)}, to "
+                f"{_place(leg.position)} leads through the wall of {scene.pipes[through].name}; "
+                "go round it first, by 'cloudrc mission goto'",
+                self._current.id if self._current else "",
+            )
 
     def _operate(self, verb: Callable[[int], None], now_ns: int) -> Mission:
         mission = self._current
@@ -364,13 +356,6 @@ class MissionService:
             text = "teleop has restarted; the robot is asked to go on"
             self._note(mission, "restarted", text, now_ns)
         self._collect(now_ns)
-
-    def _note_contacts(self, mission: Mission, seen: RobotStatus, now_ns: int) -> None:
-        """Store new contacts of the robot at once."""
-        before = mission.witness
-        mission.witness = before.see(*_contacts(seen))
-        for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
-            self._note(mission, event, text, now_ns)
 
     def _collect(self, now_ns: int) -> None:
         for output in self._teleop.take_outputs():
@@ -412,6 +397,10 @@ class MissionService:
 
 def _busy(mission: Mission, advice: str) -> ConflictError:
     return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)
+
+
+def _place(position: Vector) -> str:
+    return f"[{', '.join(f'{value:.2f}' for value in position)}]"
 
 
 def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
