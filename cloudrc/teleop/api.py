@@ -48,8 +48,6 @@ ANSWER_LIMIT = 2.0
 """Time limit for the mission service to answer [s]."""
 BODY_MAX = 256 * 1024
 """Longest body of a request [bytes]."""
-HEAD_MAX = 4_096
-"""Longest head of a request [bytes]."""
 STOP_LIMIT = 1
 """Time limit for open requests when the server stops [s]."""
 STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
@@ -337,14 +335,9 @@ async def show_state(bridge: Bridged) -> Any:
     responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
 )
 async def stream_events(request: Request, bridge: Bridged, after: After = 0) -> StreamingResponse:
-    """Tell all events of missions, from the oldest that is known, as server-sent events.
-
-    Resume with the header Last-Event-ID, or with `?after=ID`.
-    """
-    known = request.headers.get("last-event-id", "")
-    number = max(after, int(known) if known.isdecimal() and len(known) < 16 else 0)
+    """Stream the events of all missions after number `after` as server-sent events."""
     await bridge.ask(lambda service, now_ns: None)  # refuse now what cannot be served
-    stream, headers = _stream(request, bridge, number), {"Cache-Control": "no-store"}
+    stream, headers = _stream(request, bridge, after), {"Cache-Control": "no-store"}
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
@@ -402,7 +395,6 @@ class ApiServer(uvicorn.Server):
                 server_header=False,
                 proxy_headers=False,  # the audit log names whoever connects
                 # No limit_concurrency: uvicorn would refuse an emergency stop, too.
-                h11_max_incomplete_event_size=HEAD_MAX,
                 timeout_graceful_shutdown=STOP_LIMIT,
             )
         )

@@ -229,10 +229,7 @@ class Teleop:
         elif self._is_pending:
             self._select_early()
         while self.leg < onboard and self.state in (FLYING, State.HELD):
-            # The robot kept what teleop lost. Only the last waypoint is selected, because cloud's
-            # socket might not have room for all setpoints at once.
-            how = "reached, as the robot reports,"
-            self._advance(how, now_ns, select=self.leg + 1 == onboard)
+            self._advance("reached, as the robot reports,", now_ns)  # teleop lost it
         while self.state is FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
         if new_session and last is self._setpoint:
@@ -313,15 +310,15 @@ class Teleop:
             text = f"resumed after a restart of teleop {self._where()}"
             self._report("resumed", self.leg, text, now_ns)
 
-    def _advance(self, how: str, now_ns: int, *, select: bool = True) -> None:
-        """Go on to the next waypoint or end the mission; with `select`, select the waypoint."""
+    def _advance(self, how: str, now_ns: int) -> None:
+        """Go on to the next waypoint, or end the mission."""
         text = f"{self._leg_name()} {how} at {self.elapsed(now_ns):.2f} s"
         self._report("reached", self.leg, text, now_ns)
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
             self._watch = LegWatch()
-            if self.state is FLYING and select:
+            if self.state is FLYING:
                 self._select_leg(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
