@@ -22,7 +22,19 @@ from cloudrc.geometry import fence
 from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start
 from cloudrc.records import MissionEvent
 from cloudrc.teleop.requests import REPEAT_NS, RequestSender
-from cloudrc.teleop.wire import ALARM, NO_PLAN, Leg, Outcome, Output, Plan, RobotStatus, State
+from cloudrc.teleop.wire import (
+    ALARM,
+    FLYING,
+    HELD,
+    NO_PLAN,
+    STARTING,
+    STATES,
+    Leg,
+    Outcome,
+    Output,
+    Plan,
+    RobotStatus,
+)
 
 if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
@@ -36,10 +48,8 @@ HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
 Source: docs/safety.md, "The guard"."""
 NO_WAYPOINT = -1
 """Waypoint index of a setpoint or event without a waypoint."""
-UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
+UNDER_WAY = FLYING, STARTING, HELD
 """States of a mission that has begun and not ended."""
-ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
-"""Code of an outcome -> state of the mission at its end; all other codes lead to FAILED."""
 END_LOST = "end_lost", "the robot reports that the mission is over, but its outcome is lost;"
 GAP_MAX_NS = 500_000_000
 """Limit of the time of flight that counts between two telemetry messages [ns]."""
@@ -47,7 +57,6 @@ UNSEEN_MAX_NS = 2_000_000_000
 """Longest gap between two telemetry messages [ns] that does not restart the dwell time."""
 # Looking up an enum's member is slow, and these are used in every period.
 GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
-FLYING, STARTING = State.FLYING, State.STARTING
 
 
 class LegWatch:
@@ -96,7 +105,7 @@ class Teleop:
     next one, within its session. All times `now_ns` are of the caller's clock [ns].
 
     Attributes:
-        state: State of the mission.
+        state: State of the mission; "idle" before the first.
         leg: Index of the current waypoint; the number of waypoints once all are reached.
         outcome: How the mission ended; None before the first mission and during a mission.
         requests: Requests to the robot.
@@ -106,7 +115,7 @@ class Teleop:
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
         """Begin without a mission; `ended` returns whether the mission with a number is over."""
-        self.state, self.leg = State.IDLE, 0
+        self.state, self.leg = "idle", 0
         self.outcome: Outcome | None = None
         self.outputs: list[Output] = []
         self.requests = RequestSender()
@@ -161,7 +170,7 @@ class Teleop:
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
         """Move the robot to a point; raise BadInputError unless the mission is held."""
-        self._check("goto", State.HELD)
+        self._check("goto", HELD)
         x, y, z = leg.position
         self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
         self._select(Setpoint(leg.position, leg.yaw, NO_WAYPOINT))
@@ -173,8 +182,7 @@ class Teleop:
 
     def resume(self, now_ns: int) -> None:
         """Continue the held leg; raise BadInputError unless the mission is held."""
-        self._check("resume", State.HELD)
-        self.state = FLYING
+        self._check("resume", HELD)
         self._watch.pause()
         self._select_leg(self.leg)
         self._report("resumed", self.leg, f"resumed {self._where()}", now_ns)
@@ -215,8 +223,8 @@ class Teleop:
             self.stopping = False
         new_session = not before or (before.epoch, before.world) != (seen.epoch, seen.world)
         last, onboard, legs = self._setpoint, self._reached_on_board(seen), self._plan.legs
-        started = self.requests.see(seen, now_ns) is Request.START and self.state is STARTING
-        if self.state is STARTING and not self._expected and self._plan.start is Start.HERE:
+        started = self.requests.see(seen, now_ns) is Request.START and self.state == STARTING
+        if self.state == STARTING and not self._expected and self._plan.start is Start.HERE:
             # The order came before the first telemetry.
             self._expected = (seen.mission_id, self._mission_id)
         if self.state not in UNDER_WAY:
@@ -228,9 +236,9 @@ class Teleop:
             self._begin(seen, now_ns)
         elif self._is_pending:
             self._select_early()
-        while self.leg < onboard and self.state in (FLYING, State.HELD):
+        while self.leg < onboard and self.state in (FLYING, HELD):
             self._advance("reached, as the robot reports,", now_ns)  # teleop lost it
-        while self.state is FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
+        while self.state == FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
         if new_session and last is self._setpoint:
             self._repeat_setpoint()
@@ -246,10 +254,9 @@ class Teleop:
         elif (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
 
-    def _check(self, verb: str, needed: State) -> None:
-        if self.state is not needed:
-            text = f"{verb}: the mission is {self.state.name}; it must be {needed.name.lower()}"
-            raise BadInputError(text)
+    def _check(self, verb: str, needed: str) -> None:
+        if self.state != needed:
+            raise BadInputError(f"{verb}: the mission is {self.state}; it must be {needed}")
 
     def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
         """Find a failure in telemetry that ends the mission; return its code and its text."""
@@ -266,11 +273,11 @@ class Teleop:
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
         """Find an exceeded time limit; return its code and its text."""
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
-        if self.elapsed(now_ns) >= limit and self.state is STARTING:
+        if self.elapsed(now_ns) >= limit and self.state == STARTING:
             return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
         if self.elapsed(now_ns) >= limit:
             return "timed_out", f"mission not done within {limit:g} s: {self._where()}"
-        if self._watch.flown >= leg_limit and self.state is FLYING:
+        if self._watch.flown >= leg_limit and self.state == FLYING:
             return "leg_timed_out", f"{self._leg_name()} not reached in {leg_limit:g} s"
         return None
 
@@ -294,7 +301,7 @@ class Teleop:
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission after telemetry shows its start; start the times of mission and leg."""
-        self.state, self._world, self._expected = FLYING, seen.world, (self._mission_id,)
+        self._world, self._expected = seen.world, (self._mission_id,)
         self._watch = LegWatch()
         if not self._continued:
             self._began_ns = now_ns
@@ -318,13 +325,12 @@ class Teleop:
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
             self._watch = LegWatch()
-            if self.state is FLYING:
+            if self.state == FLYING:
                 self._select_leg(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
 
     def _hold(self, now_ns: int) -> None:
-        self.state = State.HELD
         self._select_here()
         self._report("held", self.leg, f"held {self._where()}", now_ns)
 
@@ -332,7 +338,6 @@ class Teleop:
         """End the mission, and ask the robot to hold its position; `where` adds it to the text."""
         text = f"{text} {self._where()}" if where else text
         waypoint = min(self.leg, len(self._plan.legs) - 1)
-        self.state = ENDS.get(code, State.FAILED)
         self.outcome = Outcome(code, text, reached=self.leg)
         if code != "done" and self._mission_id:
             self.requests.report(self._mission_id, MISSION_OVER)
@@ -375,7 +380,7 @@ class Teleop:
 
         If the mission still waits for its start, a robot that may move has to stay where it is.
         """
-        if self.state is STARTING and self._may_move:
+        if self.state == STARTING and self._may_move:
             self._is_pending = True
             self._select_here()
         elif self._setpoint is not None:
@@ -399,6 +404,7 @@ class Teleop:
         self.outputs.append(self._setpoint)
 
     def _report(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
+        self.state = STATES.get(event, self.state)
         self.outputs.append(MissionEvent(now_ns, event, waypoint, text))
 
     def _where(self) -> str:

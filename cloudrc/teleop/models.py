@@ -7,11 +7,12 @@ file: the same code checks them and describes their problems.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from math import cos, radians, sin
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import PydanticCustomError
+from pydantic_core import PydanticCustomError, from_json
 
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem as ConfigProblem
@@ -20,8 +21,8 @@ from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeL
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
-from cloudrc.teleop.store import FAILURES, SHOWN, Order
-from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.teleop.store import SHOWN, Order
+from cloudrc.teleop.wire import FAILURES, Leg, Plan
 
 PROBLEMS_MAX = 50
 """Limit of the problems of one request that the answer describes."""
@@ -236,6 +237,11 @@ def read_order(
     `time_limit` [s] and `contact` (the board has to be touched if the mission leads there) are for
     missions that do not say so; `plan` makes a plan from a mission and its time limit [s].
     """
+    with suppress(ValueError, TypeError, KeyError):  # `_parse` describes these errors
+        count = len(from_json(body)["waypoints"])
+        if count > MAX_WAYPOINTS:  # pydantic would take seconds to describe as many errors
+            reason = f"at most {MAX_WAYPOINTS}; split the mission"
+            raise RefusedError([ConfigProblem(("waypoints",), str(count), reason)])
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # an experiment's mission may have steps in their place
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])

@@ -19,15 +19,13 @@ from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, fini
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import (
-    HELD,
-    QUEUED,
     ConflictError,
     Mission,
     MissionStore,
     Order,
     UnavailableError,
 )
-from cloudrc.teleop.wire import Leg, Output, Plan, RobotStatus
+from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED = LAND, ESTOP

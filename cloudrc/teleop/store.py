@@ -23,22 +23,10 @@ from pydantic import TypeAdapter
 
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics.verdict import Observations
-from cloudrc.teleop.wire import Plan
+from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, as the API shows it."""
-QUEUED, HELD = "queued", "held"
-ENDED = ("done", "failed", "cancelled")
-FAILURES = (
-    *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
-    *("taken_over", "end_lost"),
-)
-STATES = {
-    **{state: state for state in (QUEUED, "starting", HELD, "done", "cancelled")},
-    **dict.fromkeys(("started", "resumed"), "flying"),
-    **dict.fromkeys(FAILURES, "failed"),
-}
-"""State of a mission after an event; other events do not change the state."""
 SHOWN = 100
 """Limit of the events that are kept per mission; the newest are kept."""
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from enum import IntEnum
 from math import nan
 from typing import NamedTuple, TypeAlias
 
@@ -75,16 +74,21 @@ class RobotStatus(NamedTuple):
     cause: Cause = Cause.SPAWN  # of the guard's state
 
 
-class State(IntEnum):
-    """State of the mission; STARTING lasts until telemetry shows the start."""
-
-    IDLE = 0
-    STARTING = 1
-    FLYING = 2
-    HELD = 3
-    DONE = 4
-    FAILED = 5
-    CANCELLED = 6
+QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
+"""States of a mission that has not ended; STARTING lasts until telemetry shows the start."""
+ENDED = "done", "failed", "cancelled"
+"""States of a mission that has ended."""
+FAILURES = (
+    *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
+    *("taken_over", "end_lost"),
+)
+"""Events that end a mission as failed."""
+STATES = {
+    **{state: state for state in (QUEUED, STARTING, HELD, "done", "cancelled")},
+    **dict.fromkeys(("started", "resumed"), FLYING),
+    **dict.fromkeys(FAILURES, "failed"),
+}
+"""State of a mission after an event; other events do not change the state."""
 
 
 @dataclass(frozen=True, slots=True)

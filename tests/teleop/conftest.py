@@ -99,7 +99,7 @@ class Flight:
 
     @property
     def state(self):
-        return self.teleop.state.name
+        return self.teleop.state.upper()
 
     @property
     def requests(self):

@@ -15,8 +15,8 @@ from cloudrc.messages import Cause, GuardState, Request, Setpoint, Start
 from cloudrc.teleop import wire
 from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, SILENCE, next_step
-from cloudrc.teleop.store import ENDED, STATES, ConflictError, Order, UnavailableError
-from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.teleop.store import ConflictError, Order, UnavailableError
+from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
 from tests.teleop.conftest import (
     FROM_SPAWN,
     PLACES,
@@ -261,7 +261,7 @@ def test_what_follows_from_a_script(name, script, expected):
         ("create 0.05 A", "create", "m1 is flying; cancel it first, or queue the new one"),
         ("create 0.05 A", "goto", "m1 is flying; hold or cancel it first"),
         ("create 0.05 A", "ack", "m1 is flying; there is nothing to acknowledge"),
-        ("create 0.05 A", "resume", "resume: the mission is FLYING; it must be held"),
+        ("create 0.05 A", "resume", "resume: the mission is flying; it must be held"),
         ("create 0.05 cancel", "cancelm1", "mission m1 has ended: cancelled"),
         ("", "hold", "no mission is under way"),
         ("mute stop", "create", "an emergency stop is on its way to the robot; find the cause"),
