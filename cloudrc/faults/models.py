@@ -25,7 +25,7 @@ from cloudrc.teleop.store import (
     UnavailableError,
     connect,
 )
-from cloudrc.teleop.wire import Outcome, Output, RobotStatus
+from cloudrc.teleop.wire import Output, RobotStatus
 
 FAR_NS = 1 << 62
 CFS_PERIOD = 0.1
@@ -216,7 +216,7 @@ class EndpointGroup:
 class InProcessTeleop:
     """Teleop inside cloud's process, with a disk that survives its restarts; an `Operator`."""
 
-    outcome: Outcome | None = None
+    outcome: MissionEvent | None = None
     settled = True
 
     def __init__(self, contact_speed_max: float, name: bytes = b"desk") -> None:

@@ -30,7 +30,6 @@ from cloudrc.teleop.wire import (
     STARTING,
     STATES,
     Leg,
-    Outcome,
     Output,
     Plan,
     RobotStatus,
@@ -107,7 +106,7 @@ class Teleop:
     Attributes:
         state: State of the mission; "idle" before the first.
         leg: Index of the current waypoint; the number of waypoints once all are reached.
-        outcome: How the mission ended; None before the first mission and during a mission.
+        outcome: Last event of the mission; None before the first mission and during a mission.
         requests: Requests to the robot.
         stopping: Whether an emergency stop is pending: telemetry does not show it yet.
         outputs: Messages since the last `take_outputs`.
@@ -116,7 +115,7 @@ class Teleop:
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
         """Begin without a mission; `ended` returns whether the mission with a number is over."""
         self.state, self.leg = "idle", 0
-        self.outcome: Outcome | None = None
+        self.outcome: MissionEvent | None = None
         self.outputs: list[Output] = []
         self.requests = RequestSender()
         self.stopping, self._stop_ns = False, 0
@@ -185,7 +184,7 @@ class Teleop:
         self._check("resume", HELD)
         self._watch.pause()
         self._select_leg(self.leg)
-        self._report("resumed", self.leg, f"resumed {self._where()}", now_ns)
+        self._report("resumed", self.leg, f"resumed {self.where}", now_ns)
 
     def cancel(self, now_ns: int) -> None:
         """End the mission under way."""
@@ -211,7 +210,7 @@ class Teleop:
 
     def pause(self, now_ns: int) -> None:
         """Ask the robot to hold until the next teleop continues the mission."""
-        self._report("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
+        self._report("paused", self.leg, f"paused by shutdown {self.where}", now_ns)
         self.requests.ask(Request.END)
         self._select_here()  # cloud keeps this setpoint if the request is lost
         self._stays = True
@@ -276,9 +275,9 @@ class Teleop:
         if self.elapsed(now_ns) >= limit and self.state == STARTING:
             return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
         if self.elapsed(now_ns) >= limit:
-            return "timed_out", f"mission not done within {limit:g} s: {self._where()}"
+            return "timed_out", f"mission not done within {limit:g} s: {self.where}"
         if self._watch.flown >= leg_limit and self.state == FLYING:
-            return "leg_timed_out", f"{self._leg_name()} not reached in {leg_limit:g} s"
+            return "leg_timed_out", f"{self._leg_name} not reached in {leg_limit:g} s"
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
@@ -314,12 +313,12 @@ class Teleop:
         elif self._was_held:
             self._hold(now_ns)
         else:
-            text = f"resumed after a restart of teleop {self._where()}"
+            text = f"resumed after a restart of teleop {self.where}"
             self._report("resumed", self.leg, text, now_ns)
 
     def _advance(self, how: str, now_ns: int) -> None:
         """Go on to the next waypoint, or end the mission."""
-        text = f"{self._leg_name()} {how} at {self.elapsed(now_ns):.2f} s"
+        text = f"{self._leg_name} {how} at {self.elapsed(now_ns):.2f} s"
         self._report("reached", self.leg, text, now_ns)
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
@@ -332,13 +331,12 @@ class Teleop:
 
     def _hold(self, now_ns: int) -> None:
         self._select_here()
-        self._report("held", self.leg, f"held {self._where()}", now_ns)
+        self._report("held", self.leg, f"held {self.where}", now_ns)
 
     def _end(self, code: str, text: str, now_ns: int, *, where: bool = False) -> None:
         """End the mission, and ask the robot to hold its position; `where` adds it to the text."""
-        text = f"{text} {self._where()}" if where else text
+        text = f"{text} {self.where}" if where else text
         waypoint = min(self.leg, len(self._plan.legs) - 1)
-        self.outcome = Outcome(code, text, reached=self.leg)
         if code != "done" and self._mission_id:
             self.requests.report(self._mission_id, MISSION_OVER)
         on_ground = self._seen is not None and self._seen.guard is GROUND
@@ -347,7 +345,7 @@ class Teleop:
         else:
             self.requests.forget()  # another teleop's mission must not be ended
         self._select_here()
-        self._report(code, waypoint, text, now_ns)
+        self.outcome = self._report(code, waypoint, text, now_ns)
 
     def _reached_on_board(self, seen: RobotStatus) -> int:
         """Return how many waypoints of the mission the robot has stored as reached."""
@@ -403,12 +401,17 @@ class Teleop:
         self._setpoint = setpoint._replace(epoch=epoch)
         self.outputs.append(self._setpoint)
 
-    def _report(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
-        self.state = STATES.get(event, self.state)
-        self.outputs.append(MissionEvent(now_ns, event, waypoint, text))
+    def _report(self, code: str, waypoint: int, text: str, now_ns: int) -> MissionEvent:
+        self.state = STATES.get(code, self.state)
+        event = MissionEvent(now_ns, code, waypoint, text)
+        self.outputs.append(event)
+        return event
 
-    def _where(self) -> str:
-        return f"on the way to {self._leg_name()}"
+    @property
+    def where(self) -> str:
+        """Place of the robot in the mission, in words."""
+        return f"on the way to {self._leg_name}"
 
+    @property
     def _leg_name(self) -> str:
         return f"waypoint {self.leg + 1} of {len(self._plan.legs)}"

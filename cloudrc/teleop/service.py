@@ -256,7 +256,9 @@ class MissionService:
             for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
                 self._note(mission, event, text, now_ns)
             if is_new_session:
-                self._note(mission, "new_session", _describe_session(mission), now_ns)
+                text = "the controller has a new session, as after a restart; the mission is"
+                text = f"{text} {mission.state} {self._teleop.where}"
+                self._note(mission, "new_session", text, now_ns)
         self._teleop.see(seen, now_ns)
         self._collect(now_ns)
 
@@ -372,13 +374,12 @@ class MissionService:
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
             changed |= {"world": seen.world, "witness": Observations.begin(*_contacts(seen))}
-        outcome = self._teleop.outcome
-        if outcome is not None and event.event == outcome.code:
+        if event == self._teleop.outcome:
             evidence = mission.witness.evidence(
-                Ending(outcome.code, outcome.text),
+                Ending(event.event, event.text),
                 self._teleop.elapsed(now_ns),
                 waypoints=len(mission.order.plan.legs),
-                reached=outcome.reached,
+                reached=len(mission.reached),
                 contact=mission.order.contact,
                 contact_speed_max=self._contact_speed_max,
             )
@@ -403,9 +404,3 @@ def _place(position: Vector) -> str:
 
 def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
     return seen.pipe_contacts, seen.touch_speed, seen.slip_ns
-
-
-def _describe_session(mission: Mission) -> str:
-    where = f"waypoint {mission.waypoint + 1} of {len(mission.order.plan.legs)}"
-    goes_on = f"is held on the way to {where}" if mission.state == HELD else f"goes on to {where}"
-    return f"the controller has a new session, as after a restart; the mission {goes_on}"

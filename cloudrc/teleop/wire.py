@@ -91,15 +91,6 @@ STATES = {
 """State of a mission after an event; other events do not change the state."""
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a mission ended: its last event, the same in words, and how many waypoints it reached."""
-
-    code: str
-    text: str
-    reached: int
-
-
 Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 """Messages from teleop to cloud."""
 Message: TypeAlias = RobotStatus | Output
