@@ -38,10 +38,6 @@ from cloudrc.teleop.wire import (
 if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
 
-WORST_GUARD = GuardState.HOLD
-"""Last state of the guard, in the order of `GuardState`, in which a mission continues."""
-ANY_WORLD = ""
-"""World of a mission that has not started yet: the mission may start in any world."""
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
 """Lowest height of a hold setpoint [m]; at lower heights the robot would scrape along the floor.
 Source: docs/safety.md, "The guard"."""
@@ -49,7 +45,6 @@ NO_WAYPOINT = -1
 """Waypoint index of a setpoint or event without a waypoint."""
 UNDER_WAY = FLYING, STARTING, HELD
 """States of a mission that has begun and not ended."""
-END_LOST = "end_lost", "the robot reports that the mission is over, but its outcome is lost;"
 GAP_MAX_NS = 500_000_000
 """Limit of the time of flight that counts between two telemetry messages [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
@@ -124,7 +119,7 @@ class Teleop:
         self._seen: RobotStatus | None = None
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
         self._continued = self._was_held = False  # whether an earlier teleop began or held it
-        self._world = ANY_WORLD  # in which it was started
+        self._world = ""  # in which the mission started; "": any
         self._expected: tuple[int, ...] = ()  # missions that may be on board; empty: any
         self._watch = LegWatch()
         self._setpoint: Setpoint | None = None
@@ -149,7 +144,7 @@ class Teleop:
         """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0."""
         self._order(plan, mission_id, now_ns)
         here = None if plan.start is Start.SPAWN else self._seen
-        self._world = here.world if here else ANY_WORLD
+        self._world = here.world if here else ""
         self._expected = (here.mission_id, mission_id) if here else ()
         self.requests.report(mission_id, 0)
         self.requests.ask(Request.START, plan.start, after=True)
@@ -259,13 +254,14 @@ class Teleop:
 
     def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
         """Find a failure in telemetry that ends the mission; return its code and its text."""
-        if self._world not in (ANY_WORLD, seen.world):
+        if self._world not in ("", seen.world):
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
             return "taken_over", "somebody else has started another mission"
         if self._reached_on_board(seen) == MISSION_OVER:
-            return END_LOST
-        if seen.guard > WORST_GUARD:
+            text = "the robot reports that the mission is over, but its outcome is lost;"
+            return "end_lost", text
+        if seen.guard > HOLD:
             return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
         return None
 
