@@ -32,12 +32,6 @@ A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 emergency_stop = pytest.mark.promise("emergency-stop-gets-through")
 
 
-def fly(api, mission=MISSION):
-    _, view = api.post("/v1/missions", mission)
-    api.until(lambda: api.state_of(view["id"]) == "flying")
-    return view["id"]
-
-
 def finish(api, mission_id):
     for count, point in enumerate((A, B, C), 1):
         api.flight.position = point
@@ -74,7 +68,7 @@ def test_a_mission_from_post_to_verdict(api):
 
 def test_the_operator_steers_and_a_conflict_names_its_mission(api):
     assert api.post("/v1/resume")[0] == 409
-    mission_id, point = fly(api), {"position_m": [0.5, 0.0, 1.0]}
+    mission_id, point = api.fly(MISSION), {"position_m": [0.5, 0.0, 1.0]}
     for path, body in (("missions", MISSION), ("goto", point)):
         status, refusal = api.post(f"/v1/{path}", body)
         assert (status, refusal["id"], mission_id in refusal["detail"]) == (409, mission_id, True)
@@ -96,7 +90,7 @@ def test_only_a_mission_to_the_board_must_touch_it(api):
 
 
 def test_requests_and_refusals_become_metrics(api):
-    fly(api)
+    api.fly(MISSION)
     far = {"position_m": [100.0, 0.0, 1.0]}
     refused = [("/v1/missions", {"waypoints": [far]}), ("/v1/goto", far), ("/v1/missions", b"{")]
     assert [api.post(*order)[0] for order in refused] == [422, 422, 422]
@@ -140,7 +134,7 @@ def read_events(api, count, after=0):
 def test_events_are_streamed_and_resumed_where_one_left(api):
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         arrived = pool.submit(read_events, api, 6)
-        finish(api, fly(api))
+        finish(api, api.fly(MISSION))
         numbers, events = arrived.result()
     for event in events:
         models.Event.model_validate(event)
@@ -211,7 +205,7 @@ def test_a_full_api_still_serves_stop_and_hold(api):
 def test_a_stop_is_made_however_late_teleop_answers(api, monkeypatch):
     """Of other calls only those are made whose client still waits."""
     monkeypatch.setattr(api_module, "ANSWER_LIMIT", 0.1)
-    mission_id = fly(api)
+    mission_id = api.fly(MISSION)
     with api.stalled():
         assert api.post(f"/v1/missions/{mission_id}/cancel")[0] == 503
         assert api.post("/v1/estop")[0] == 503
@@ -260,7 +254,7 @@ def test_stop_and_hold_overtake_a_full_queue_of_calls():
 @pytest.mark.parametrize("overtaken", ["acknowledge", "resume", "goto", "missions"])
 def test_what_a_stop_or_a_hold_overtakes_does_not_move_the_robot(api, urgent, overtaken):
     if overtaken in ("resume", "goto"):
-        fly(api)
+        api.fly(MISSION)
         api.post("/v1/hold")
     api.bridge.overtakings = 0
     body = json.dumps(A_MISSION if overtaken == "missions" else A_MISSION["waypoints"][0]).encode()

@@ -71,14 +71,10 @@ a cancelled start: mute create 0.05 cancel link 0.15
   -> states=cancelled guard=HOLD asked=END,START
 world restarts: create 0.05 A world 0.05
   -> failure=world_restarted waypoint=-1
-world restarts in hold: create 0.05 A hold world 0.05
-  -> states=failed failure=world_restarted
 nothing starts: mute create 60
   -> failure=timed_out
 held too long: create 0.05 hold 60
   -> failure=timed_out guard=HOLD
-unseen too long: create 0.05 deaf 60
-  -> failure=timed_out
 the guard holds: create 0.05 A HOLD 20 TRACK B
   -> states=flying reached=0,1
 a stop by somebody else is not undone: create 0.05 A mark ESTOP 0.3
@@ -152,8 +148,6 @@ time goes on: create 0.05 A away 10 B deaf restart 50
 what waits waits until the robot is seen: create 0.05 A queue LAND away 0.2 restart due 0.2
   -> states=failed,queued failure=guard_stopped
 a landing without teleop: create 0.05 queue LAND restart see 0.2
-  -> states=failed,queued failure=guard_stopped
-a stop without teleop: mute create 0.05 queue ESTOP restart see 0.2
   -> states=failed,queued failure=guard_stopped
 
 # Restarts of cloud

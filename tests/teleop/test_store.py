@@ -5,7 +5,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -87,27 +87,20 @@ def overwrite(path, at, data):
         file.write(data)
 
 
-def scribble(path):
-    overwrite(path, 4096, os.urandom(9000))
+def execute(path, statement):
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute(statement)
 
 
-def empty_page(path):
-    overwrite(path, path.stat().st_size - 4096, bytes(4096))
-
-
-def bad_row(path):
-    with sqlite3.connect(path) as database:
-        database.execute("UPDATE mission SET status = '{'")
-    database.close()
-
-
-def bad_order(path):
-    with sqlite3.connect(path) as database:
-        database.execute("UPDATE mission SET plan = '[1, {}]'")
-    database.close()
-
-
-@pytest.mark.parametrize("damage", [scribble, empty_page, bad_row, bad_order])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: overwrite(path, 4096, os.urandom(9000)),
+        lambda path: overwrite(path, path.stat().st_size - 4096, bytes(4096)),
+        lambda path: execute(path, "UPDATE mission SET status = '{'"),
+        lambda path: execute(path, "UPDATE mission SET plan = '[1, {}]'"),
+    ],
+)
 def test_a_damaged_file_is_set_aside_and_named(path, damage):
     begun(path)
     damage(path)
@@ -138,13 +131,6 @@ def test_a_disk_that_fails_is_no_damage(path, monkeypatch):
     assert list(open_store(path, b"").missions) == ["m1"]
 
 
-def another_version(path):
-    begun(path)
-    with sqlite3.connect(path) as database:
-        database.execute("PRAGMA user_version = 2")
-    database.close()
-
-
 @pytest.mark.parametrize(
     ("make", "said"),
     [
@@ -153,8 +139,11 @@ def another_version(path):
         (lambda path: path.write_bytes(b"\x93CRJ\r\n\x1a\n" + bytes(40)), "is no journal"),
         (lambda path: path.mkdir(), "is not a file"),
         (lambda path: os.mkfifo(path), "is not a file"),
-        (another_version, "this version cannot read it"),
-        (lambda path: sqlite3.connect(path).execute("CREATE TABLE a (b)"), "cannot read it"),
+        (
+            lambda path: begun(path) and execute(path, "PRAGMA user_version = 2"),
+            "this version cannot read it",
+        ),
+        (lambda path: execute(path, "CREATE TABLE a (b)"), "this version cannot read it"),
         (lambda path: path.with_name("missions-wal").mkdir(), "disk I/O error"),
     ],
 )
