@@ -102,6 +102,7 @@ class Teleop:
         state: State of the mission; "idle" before the first.
         leg: Index of the current waypoint; the number of waypoints once all are reached.
         outcome: Last event of the mission; None before the first mission and during a mission.
+        seen: The newest telemetry; None before the first.
         requests: Requests to the robot.
         stopping: Whether an emergency stop is pending: telemetry does not show it yet.
         outputs: Messages since the last `take_outputs`.
@@ -116,7 +117,7 @@ class Teleop:
         self.stopping, self._stop_ns = False, 0
         self._stopped_before: tuple[int, int] | None = None  # see `stop`
         self._is_ended = ended
-        self._seen: RobotStatus | None = None
+        self.seen: RobotStatus | None = None
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
         self._continued = self._was_held = False  # whether an earlier teleop began or held it
         self._world = ""  # in which the mission started; "": any
@@ -143,7 +144,7 @@ class Teleop:
     def start(self, now_ns: int, plan: Plan, mission_id: int = 0) -> None:
         """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0."""
         self._order(plan, mission_id, now_ns)
-        here = None if plan.start is Start.SPAWN else self._seen
+        here = None if plan.start is Start.SPAWN else self.seen
         self._world = here.world if here else ""
         self._expected = (here.mission_id, mission_id) if here else ()
         self.requests.report(mission_id, 0)
@@ -159,8 +160,8 @@ class Teleop:
         self.requests.report(mission.number, self.leg)
         self.requests.ask(Request.START, Start.HERE)
         self._is_pending = not self._was_held
-        if self._seen:
-            self.see(self._seen, now_ns)  # the mission may be over, or the world another one
+        if self.seen:
+            self.see(self.seen, now_ns)  # the mission may be over, or the world another one
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
         """Move the robot to a point; raise BadInputError unless the mission is held."""
@@ -194,7 +195,7 @@ class Teleop:
         if self.state in UNDER_WAY:
             self._end("emergency_stopped", "emergency stop", now_ns, where=True)
         self.requests.forget()
-        seen = self._seen
+        seen = self.seen
         stopped = seen is not None and seen.guard is ESTOP
         self._stopped_before = (seen.epoch, seen.mission) if seen and stopped else None
         self.stopping, self._stop_ns = True, 0
@@ -212,7 +213,7 @@ class Teleop:
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at its arrival."""
-        before, self._seen = self._seen, seen
+        before, self.seen = self.seen, seen
         if seen.guard is ESTOP and (seen.epoch, seen.mission) != self._stopped_before:
             self.stopping = False
         new_session = not before or (before.epoch, before.world) != (seen.epoch, seen.world)
@@ -335,7 +336,7 @@ class Teleop:
         waypoint = min(self.leg, len(self._plan.legs) - 1)
         if code != "done" and self._mission_id:
             self.requests.report(self._mission_id, MISSION_OVER)
-        on_ground = self._seen is not None and self._seen.guard is GROUND
+        on_ground = self.seen is not None and self.seen.guard is GROUND
         if code != "taken_over" or on_ground:  # on the ground it would scrape along the floor
             self.requests.ask(Request.END)
         else:
@@ -362,10 +363,10 @@ class Teleop:
 
         Wait while the robot may move: it would fly to the waypoint at once.
         """
-        if not self._is_pending or self._seen is None or self._may_move:
+        if not self._is_pending or self.seen is None or self._may_move:
             return
         self._is_pending = False
-        leg = 0 if self._from_spawn else max(self.leg, self._reached_on_board(self._seen))
+        leg = 0 if self._from_spawn else max(self.leg, self._reached_on_board(self.seen))
         if leg < len(self._plan.legs):
             self._select_leg(leg)
 
@@ -387,13 +388,13 @@ class Teleop:
 
     def _select_here(self) -> None:
         """Select the robot's position, if telemetry has arrived."""
-        if self._seen is not None:
-            x, y, z = self._seen.position
+        if self.seen is not None:
+            x, y, z = self.seen.position
             yaw = 0.0 if self._setpoint is None else self._setpoint.yaw
             self._select(Setpoint((x, y, max(z, HELD_LOWEST)), yaw, NO_WAYPOINT))
 
     def _select(self, setpoint: Setpoint) -> None:
-        epoch = 0 if self._seen is None else self._seen.epoch
+        epoch = 0 if self.seen is None else self.seen.epoch
         self._setpoint = setpoint._replace(epoch=epoch)
         self.outputs.append(self._setpoint)
 

@@ -74,52 +74,6 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     return (ALONE if mission is None else IN_MISSION)[guard]
 
 
-class RobotView:
-    """The robot as shown by its newest telemetry.
-
-    Attributes:
-        seen: The newest telemetry; None before the first.
-        heard_ns: Time of the last message from cloud [ns]; None before the first.
-    """
-
-    def __init__(self) -> None:
-        self.seen: RobotStatus | None = None
-        self.heard_ns: int | None = None
-        self._seen_ns = self._guard_ns = 0
-
-    def see(self, seen: RobotStatus, now_ns: int) -> bool:
-        """Note telemetry; return whether it is the first of a new session with the same robot."""
-        before, self.seen, self._seen_ns, self.heard_ns = self.seen, seen, now_ns, now_ns
-        same = before is not None and before.world == seen.world
-        if before is None or not same or before.guard is not seen.guard:
-            self._guard_ns = now_ns
-        return before is not None and same and before.epoch != seen.epoch
-
-    def show(self, now_ns: int, mission: str | None) -> dict[str, Any]:
-        """Return the state of robot and cloud for the API; `mission` is that of the mission."""
-        seen = self.seen
-        cloud_age = None if self.heard_ns is None else (now_ns - self.heard_ns) * 1e-9
-        if seen is None or cloud_age is None:
-            return {"cloud_age_s": cloud_age, "seen": None}
-        age = (now_ns - self._seen_ns) * 1e-9
-        shown = {
-            "age_s": age,
-            "epoch": seen.epoch,
-            "world": seen.world,
-            "position_m": [finite_or_none(value) for value in seen.position],
-            "guard": seen.guard.name,
-            "cause": seen.cause.words,
-            "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
-            "next_step": next_step(seen.guard, age, cloud_age, mission),
-            "pipe_contacts": seen.pipe_contacts,
-            "touch_speed_mps": finite_or_none(seen.touch_speed),
-            "horizon_s": finite_or_none(seen.horizon),
-            "rtt_s": finite_or_none(seen.rtt),
-            "loop_delay_s": finite_or_none(seen.loop_delay),
-        }
-        return {"cloud_age_s": cloud_age, "seen": shown}
-
-
 class MissionService:
     """Keep and fly all missions of one robot, one after the other.
 
@@ -127,7 +81,6 @@ class MissionService:
     mission or robot forbids it, and UnavailableError if the store refuses or this process ends.
 
     Attributes:
-        sight: The robot's state.
         book: The missions.
     """
 
@@ -141,13 +94,19 @@ class MissionService:
         """
         self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
-        self.sight, self.book = RobotView(), book
+        self.book, self._teleop = book, Teleop(book.has_ended)
+        self._heard_ns: int | None = None  # when the last message from cloud came; None: never
+        self._seen_ns = self._guard_ns = 0  # times of telemetry and of the guard's last change
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next one starts the queued missions
-        self._teleop = Teleop(book.has_ended)
         self._trouble = ""  # of the store, as last reported
+
+    @property
+    def seen(self) -> RobotStatus | None:
+        """The newest telemetry; None before the first."""
+        return self._teleop.seen
 
     @property
     def over(self) -> bool:
@@ -244,18 +203,21 @@ class MissionService:
 
     def hear(self, now_ns: int) -> None:
         """Note a message from cloud."""
-        self.sight.heard_ns = now_ns
+        self._heard_ns = now_ns
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry."""
-        mission = self._current
-        is_new_session = self.sight.see(seen, now_ns)
+        before, mission = self.seen, self._current
+        self._heard_ns = self._seen_ns = now_ns
+        same_robot = before is not None and before.world == seen.world
+        if before is None or not same_robot or before.guard is not seen.guard:
+            self._guard_ns = now_ns
         if mission is not None and mission.world and mission.world == seen.world:
-            before = mission.witness
-            mission.witness = before.see(*_contacts(seen))
-            for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
+            known = mission.witness
+            mission.witness = known.see(*_contacts(seen))
+            for event, text in mission.witness.news(known, self._teleop.elapsed(now_ns)):
                 self._note(mission, event, text, now_ns)
-            if is_new_session:
+            if before is not None and same_robot and before.epoch != seen.epoch:
                 text = "the controller has a new session, as after a restart; the mission is"
                 text = f"{text} {mission.state} {self._teleop.where}"
                 self._note(mission, "new_session", text, now_ns)
@@ -266,7 +228,7 @@ class MissionService:
         """Start a waiting mission, check time limits, and repeat the messages that are due."""
         self.book.catch_up(now_ns)
         if not self._ends:
-            blocked = self.sight.seen is None or self.book.trouble or self._blocked
+            blocked = self.seen is None or self.book.trouble or self._blocked
             self._start_next(now_ns, queued=not blocked)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
@@ -281,19 +243,40 @@ class MissionService:
 
     def state(self, now_ns: int) -> dict[str, Any]:
         """Return the state of missions and robot for the API."""
-        mission = self._current
-        return {
+        mission, seen, heard_ns = self._current, self.seen, self._heard_ns
+        cloud_age = None if heard_ns is None else (now_ns - heard_ns) * 1e-9
+        shown = {
             "mission": mission.summary() if mission is not None else None,
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
-            **self.sight.show(now_ns, None if mission is None else mission.state),
+            "cloud_age_s": cloud_age,
+            "seen": None,
         }
+        if seen is None or cloud_age is None:
+            return shown
+        age, state = (now_ns - self._seen_ns) * 1e-9, mission.state if mission else None
+        robot = {
+            "age_s": age,
+            "epoch": seen.epoch,
+            "world": seen.world,
+            "position_m": [finite_or_none(value) for value in seen.position],
+            "guard": seen.guard.name,
+            "cause": seen.cause.words,
+            "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
+            "next_step": next_step(seen.guard, age, cloud_age, state),
+            "pipe_contacts": seen.pipe_contacts,
+            "touch_speed_mps": finite_or_none(seen.touch_speed),
+            "horizon_s": finite_or_none(seen.horizon),
+            "rtt_s": finite_or_none(seen.rtt),
+            "loop_delay_s": finite_or_none(seen.loop_delay),
+        }
+        return {**shown, "seen": robot}
 
     @property
     def _blocked(self) -> str:
         """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
         if self._teleop.stopping:
             return "an emergency stop is on its way to the robot"
-        seen = self.sight.seen
+        seen = self.seen
         if seen is None or seen.guard not in LATCHED:
             return ""
         return f"the guard is in {seen.guard.name} ({seen.cause.words}) and lets nothing fly"
@@ -308,7 +291,7 @@ class MissionService:
 
     def _check_way(self, leg: Leg) -> None:
         """Raise ConflictError if the straight way from the robot to a leg crosses a pipe's wall."""
-        seen, scene = self.sight.seen, self._scene
+        seen, scene = self.seen, self._scene
         if seen is None or scene is None:
             return
         here, there = np.array([seen.position]), np.array([leg.position])
@@ -369,7 +352,7 @@ class MissionService:
             self._outputs.append(Fault(now_ns, "journal", self._trouble))
 
     def _process_event(self, event: MissionEvent, now_ns: int) -> None:
-        mission, seen = self._current, self.sight.seen
+        mission, seen = self._current, self.seen
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
