@@ -37,6 +37,7 @@ SETPOINT_PERIOD_NS = 100_000_000
 QUEUE_MAX = 16
 """Limit of the missions that wait for the one under way."""
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
+RESTARTED = "teleop has restarted; the robot is asked to go on"
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
 BY_ITSELF = "without commands the robot holds its position, then lands, by itself"
 NOT_HEARD = f"cloud has no telemetry from the robot: check the link and world; {BY_ITSELF}"
@@ -321,24 +322,22 @@ class MissionService:
         If the mission has begun, it continues. If it waits, it starts only with `queued`, and
         once that is stored.
         """
-        if self._current is None and (waiting := self.book.open()):
-            if queued and waiting[0].state == QUEUED:
-                self._note(waiting[0], "starting", ASKED, now_ns)
-            if waiting[0].world or (waiting[0].state != QUEUED and not self.book.trouble):
-                self._take_over(waiting[0], now_ns)
-        return self._current
-
-    def _take_over(self, mission: Mission, now_ns: int) -> None:
-        """Fly a mission that this or an earlier teleop has begun."""
-        self._current = mission
-        if not mission.world:  # it has not started
-            self._teleop.start(now_ns, mission.order.plan, mission.number)
-        else:
+        waiting = self.book.open()
+        if self._current is not None or not waiting:
+            return self._current
+        mission = waiting[0]
+        if queued and mission.state == QUEUED:
+            self._note(mission, "starting", ASKED, now_ns)
+        if mission.world:  # an earlier teleop has begun it
+            self._current = mission
             self._teleop.continue_mission(now_ns, mission)
             mission.witness = mission.witness.after_restart()
-            text = "teleop has restarted; the robot is asked to go on"
-            self._note(mission, "restarted", text, now_ns)
+            self._note(mission, "restarted", RESTARTED, now_ns)
+        elif mission.state != QUEUED and not self.book.trouble:
+            self._current = mission
+            self._teleop.start(now_ns, mission.order.plan, mission.number)
         self._collect(now_ns)
+        return self._current
 
     def _collect(self, now_ns: int) -> None:
         for output in self._teleop.take_outputs():
