@@ -80,7 +80,7 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
 }
 
 
-def told(text: str) -> Any:
+def _field(text: str) -> Any:
     """Describe a field of an answer in the OpenAPI document."""
     return Field(description=text)
 
@@ -92,105 +92,107 @@ class _Answer(BaseModel):
 class Reached(_Answer):
     """Waypoint that was reached."""
 
-    waypoint: int = told("Its index, from 0")
-    time_s: float = told("When, since the mission began [s]")
+    waypoint: int = _field("Its index, from 0")
+    time_s: float = _field("When, since the mission began [s]")
 
 
 class Failure(_Answer):
     """A rule that was broken."""
 
-    code: str = told("One word, for programs")
-    text: str = told("The same for people")
+    code: str = _field("One word, for programs")
+    text: str = _field("The same for people")
 
 
 class Verdict(_Answer):
     """Result of a mission that has ended."""
 
-    outcome: Literal["success", "failure", "invalid", "interrupted"] = told("As in report.json")
-    exit_code: int = told("Of a Job that flew it: 0, 1, 6 or 130")
-    failures: list[Failure] = told("Every rule that was broken")
+    outcome: Literal["success", "failure", "invalid", "interrupted"] = _field("As in report.json")
+    exit_code: int = _field("Of a Job that flew it: 0, 1, 6 or 130")
+    failures: list[Failure] = _field("Every rule that was broken")
 
 
 class Event(_Answer):
     """An event of a mission."""
 
-    id: int = told("Rises with every event of all missions")
-    mission: str = told("Whose")
-    event: str = told(
+    id: int = _field("Rises with every event of all missions")
+    mission: str = _field("Whose")
+    event: str = _field(
         "queued, starting, started, reached, held, resumed, goto, restarted, new_session, "
         f"board_touched, pipe_touched, paused; at the end done, cancelled, {', '.join(FAILURES)}"
     )
-    waypoint: int = told("Index of the waypoint concerned")
-    text: str = told("The same in words")
-    time_s: float = told("Since the mission began [s]")
+    waypoint: int = _field("Index of the waypoint concerned")
+    text: str = _field("The same in words")
+    time_s: float = _field("Since the mission began [s]")
 
 
 class MissionSummary(_Answer):
     """A mission, without its events."""
 
-    id: str = told("Given by teleop")
-    name: str = told("Given by its sender")
-    key: str = told("Likewise")
+    id: str = _field("Given by teleop")
+    name: str = _field("Given by its sender")
+    key: str = _field("Likewise")
     state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"]
-    waypoint: int = told("Index of the waypoint to which the robot flies, from 0")
-    waypoints: int = told("Number of waypoints")
-    reached: list[Reached] = told("The waypoints that were reached")
-    verdict: Verdict | None = told("Null until the mission has ended")
+    waypoint: int = _field("Index of the waypoint to which the robot flies, from 0")
+    waypoints: int = _field("Number of waypoints")
+    reached: list[Reached] = _field("The waypoints that were reached")
+    verdict: Verdict | None = _field("Null until the mission has ended")
 
 
 class MissionView(MissionSummary):
     """A mission with its events."""
 
     events: list[Event] = Field(max_length=SHOWN, description="The newest of them, oldest first")
-    events_left_out: int = told("How many there were before those")
+    events_left_out: int = _field("How many there were before those")
 
 
 class MissionList(_Answer):
     """All known missions."""
 
-    missions: list[MissionSummary] = told("Oldest first")
+    missions: list[MissionSummary] = _field("Oldest first")
 
 
 class Seen(_Answer):
     """The newest telemetry."""
 
-    age_s: float = told("Since it arrived [s]")
-    epoch: int = told("Number of the session between cloud and world")
-    world: str = told("Identifies world's process")
-    position_m: list[float | None] = told("Of the base, measured [m], world frame")
-    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = told("State of the guard on board")
-    cause: str = told("Why the guard is in this state; after a landing, why the robot landed")
-    guard_for_s: float | None = told("Time in this state [s]; null if `age_s` is above 1 s")
-    next_step: str = told("What the robot does next, or what the operator has to do")
-    pipe_contacts: int = told("How often a pipe has been touched so far")
-    touch_speed_mps: float | None = told("Of the tip at the board [m/s]")
-    horizon_s: float | None = told("How far cloud looks ahead [s]")
-    rtt_s: float | None = told("Last round trip, hold excluded [s]")
-    loop_delay_s: float | None = told("The same, hold included [s]")
+    age_s: float = _field("Since it arrived [s]")
+    epoch: int = _field("Number of the session between cloud and world")
+    world: str = _field("Identifies world's process")
+    position_m: list[float | None] = _field("Of the base, measured [m], world frame")
+    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = _field(
+        "State of the guard on board"
+    )
+    cause: str = _field("Why the guard is in this state; after a landing, why the robot landed")
+    guard_for_s: float | None = _field("Time in this state [s]; null if `age_s` is above 1 s")
+    next_step: str = _field("What the robot does next, or what the operator has to do")
+    pipe_contacts: int = _field("How often a pipe has been touched so far")
+    touch_speed_mps: float | None = _field("Of the tip at the board [m/s]")
+    horizon_s: float | None = _field("How far cloud looks ahead [s]")
+    rtt_s: float | None = _field("Last round trip, hold excluded [s]")
+    loop_delay_s: float | None = _field("The same, hold included [s]")
 
 
 class StateView(_Answer):
     """The present state of missions and robot."""
 
-    mission: MissionSummary | None = told("The one under way")
-    queue: list[str] = told("Ids of those that wait")
-    cloud_age_s: float | None = told(
+    mission: MissionSummary | None = _field("The one under way")
+    queue: list[str] = _field("Ids of those that wait")
+    cloud_age_s: float | None = _field(
         "Age of the last message from cloud [s], which sends one every 0.2 s; null before the first"
     )
-    seen: Seen | None = told("Null before the first telemetry")
+    seen: Seen | None = _field("Null before the first telemetry")
 
 
 class Stopped(_Answer):
     """Answer to an emergency stop, which is under way to the robot."""
 
-    id: str | None = told("The mission that was under way and has failed")
-    state: Literal["stopping"] = told("Until the guard on board is in ESTOP")
+    id: str | None = _field("The mission that was under way and has failed")
+    state: Literal["stopping"] = _field("Until the guard on board is in ESTOP")
 
 
 class Acknowledged(_Answer):
     """Answer to an acknowledgement, which is under way to the robot."""
 
-    state: Literal["acknowledged"] = told(
+    state: Literal["acknowledged"] = _field(
         "The next mission can fly. A landing near the ground ends first. The robot takes off again "
         "only when it has stood still, 0.5 m inside the fence"
     )
@@ -199,16 +201,16 @@ class Acknowledged(_Answer):
 class Problem(_Answer):
     """One value that cannot be used."""
 
-    path: str = told("Keys down to the value, joined by dots")
-    index: int | None = told("Of the waypoint concerned; null if it is none")
-    value: str = told("In words; empty if it is not there")
-    reason: str = told("What it must be, and what to do")
+    path: str = _field("Keys down to the value, joined by dots")
+    index: int | None = _field("Of the waypoint concerned; null if it is none")
+    value: str = _field("In words; empty if it is not there")
+    reason: str = _field("What it must be, and what to do")
 
 
 class Refusal(_Answer):
     """Reason why a request is refused."""
 
-    detail: str = told("In words")
+    detail: str = _field("In words")
     id: str | None = Field(None, description="The mission that is in the way")
     problems: list[Problem] | None = Field(None, description="Every value that cannot be used")
 
