@@ -59,7 +59,6 @@ IN_MISSION = {
     "none arrive within guard.hold_max_s",
 }
 """State of the guard -> next step while a mission is under way."""
-OPERATOR_HOLDS = "the operator holds the mission; to continue: cloudrc mission resume"
 
 
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
@@ -71,7 +70,7 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
     if mission == HELD and guard is TRACK:
-        return OPERATOR_HOLDS
+        return "the operator holds the mission; to continue: cloudrc mission resume"
     return (ALONE if mission is None else IN_MISSION)[guard]
 
 
