@@ -115,7 +115,6 @@ class Teleop:
         self.outputs: list[Output] = []
         self.requests = RequestSender()
         self.stopping, self._stop_ns = False, 0
-        self._stopped_before: tuple[int, int] | None = None  # see `stop`
         self._is_ended = ended
         self.seen: RobotStatus | None = None
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
@@ -189,16 +188,14 @@ class Teleop:
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once in any state, and drop all earlier requests to the robot.
 
-        `ALARM` is sent until telemetry shows the stop. A robot that is already stopped may be about
-        to act on an acknowledgement: then telemetry has to show a new request, too.
+        `ALARM` is sent at least once, and until telemetry shows ESTOP. Cloud then repeats it until
+        the robot has acted on it, also if the robot was stopped before.
         """
         if self.state in UNDER_WAY:
             self._end("emergency_stopped", "emergency stop", now_ns, where=True)
         self.requests.forget()
-        seen = self.seen
-        stopped = seen is not None and seen.guard is ESTOP
-        self._stopped_before = (seen.epoch, seen.mission) if seen and stopped else None
-        self.stopping, self._stop_ns = True, 0
+        self.stopping, self._stop_ns = True, now_ns + REPEAT_NS
+        self.outputs.append(ALARM)
 
     def acknowledge(self, now_ns: int) -> None:
         """Allow the robot to fly again after a landing or a stop."""
@@ -214,7 +211,7 @@ class Teleop:
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at its arrival."""
         before, self.seen = self.seen, seen
-        if seen.guard is ESTOP and (seen.epoch, seen.mission) != self._stopped_before:
+        if seen.guard is ESTOP:
             self.stopping = False
         new_session = not before or (before.epoch, before.world) != (seen.epoch, seen.world)
         last, onboard, legs = self._setpoint, self._reached_on_board(seen), self._plan.legs
