@@ -119,6 +119,8 @@ a cancel right after it is one in flight: create 0.05 A restart cancel 0.3
 a cancel hides no failure: create 0.05 A world restart see !cancel -> failure=world_restarted
 an unstarted mission starts in a new world: 0.01 mute create 0.2 world restart link 0.05
   -> states=flying reached=
+the next one begins anew: create 0.05 A queue restart 0.05 B C 0.3
+  -> states=done,flying started=2
 held stays held: create 0.05 A hold restart due restart away -> states=held setpoint=away:-1
 and is resumed: create 0.05 A hold restart away 0.05 resume 0.01 -> states=flying waypoint=1
 time goes on: create 0.05 A away 10 B deaf restart 50 -> failure=timed_out
@@ -193,7 +195,7 @@ def outcome(flight):
         "waypoint": [str(flight.setpoints[-1].waypoint)],
         "onboard": [str(flight.onboard[1])],
         "last": names[-1:],
-        "started": [str(names.count("started"))],
+        "started": [str(sum(mission.happened["started"] for mission in missions))],
         "failure": [failure(flight)] if missions else [],
         "name": [missions[0].order.name] if missions else [],
     }
