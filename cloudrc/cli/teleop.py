@@ -194,7 +194,7 @@ def _fly(
 
     def is_over() -> bool:
         if exporter is not None:
-            exporter.ready(service.sight.seen is not None)
+            exporter.ready(service.seen is not None)
             counts = {"api_events_dropped": service.book.dropped}
             counts |= server.counts if server else {}
             exporter.see([Counted(0, "teleop", name, count) for name, count in counts.items()])

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Telemetry
-from cloudrc.records import Fault
-from cloudrc.teleop.wire import Outcome, Output, RobotStatus
+from cloudrc.records import Fault, MissionEvent
+from cloudrc.teleop.wire import Output, RobotStatus
 from cloudrc.tunnel.session import NO_EPOCH
 
 REPEAT_NS = 100_000_000
@@ -23,8 +23,8 @@ class Operator(Protocol):
         """Messages since the last call of `take_outputs`."""
 
     @property
-    def outcome(self) -> Outcome | None:
-        """How the mission ended; None while cloud has to continue."""
+    def outcome(self) -> MissionEvent | None:
+        """Last event of the mission; None while cloud has to continue."""
 
     @property
     def settled(self) -> bool:

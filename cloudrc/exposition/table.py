@@ -36,14 +36,14 @@ PLUGINS = ("estimator", "predictor", "controller")
 GUARD_STATES = ("ground", "track", "hold", "land", "estop")
 """States of the guard, in the order of `cloudrc.messages.GuardState`."""
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
-"""States of a mission, in the order of `cloudrc.teleop.wire.State`."""
+"""States of a mission."""
 MISSION_OUTCOMES = (
     *("done", "cancelled", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped"),
     *("emergency_stopped", "taken_over", "end_lost", "other"),
 )
-API_REFUSALS = ("token", "role", "busy", "slow")
+API_REFUSALS = ("token", "role", "busy")
 """Reasons for which the API rejects a request: no valid token; a reader's token for a request of an
-operator; too many requests at the same time; a body that arrives too slowly."""
+operator; too many requests at the same time."""
 ORDER_REFUSALS = ("invalid", "conflict")
 """Reasons for which the API refuses an order: a value is invalid; another mission is active."""
 BODIES = ("pipe", "board", "floor", "other")

@@ -25,7 +25,7 @@ from cloudrc.teleop.store import (
     UnavailableError,
     connect,
 )
-from cloudrc.teleop.wire import Outcome, Output, RobotStatus
+from cloudrc.teleop.wire import Output, RobotStatus
 
 T = TypeVar("T")
 FAR_NS = 1 << 62
@@ -243,7 +243,7 @@ class TeleopModel:
         events: Events of all missions, oldest first.
     """
 
-    outcome: Outcome | None = None
+    outcome: MissionEvent | None = None
     settled = True
 
     def __init__(

@@ -27,7 +27,7 @@ from cloudrc.faults.schedule import Event, Schedule, shaped
 from cloudrc.messages import Command, GuardState
 from cloudrc.records import CommandApplied, Control, GuardChange, Record, SessionOpened
 from cloudrc.teleop.service import MissionService
-from cloudrc.teleop.store import QUEUED
+from cloudrc.teleop.wire import QUEUED
 from cloudrc.tunnel.keys import Key, KeySet
 
 INVARIANTS = {

@@ -15,7 +15,7 @@ telemetry (`Observations`, for teleop), which arrives late and shows less.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from math import inf, isfinite
 from typing import Any, Literal, NamedTuple
 
@@ -338,10 +338,6 @@ class Observations:
             slow=_too_slow(1.0 - slipped / elapsed) if elapsed > 0 else "",
             **known,
         )
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the attributes in the form in which they are stored."""
-        return asdict(self)
 
 
 def finite_or_none(value: float) -> float | None:

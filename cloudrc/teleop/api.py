@@ -28,7 +28,7 @@ from cloudrc import __version__
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.teleop import models
-from cloudrc.teleop.auth import BEARER, IN_FLIGHT_MAX, Gate
+from cloudrc.teleop.auth import BEARER, REFUSED, Gate
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import (
     ConflictError,
@@ -46,28 +46,21 @@ ALIVE_PERIOD = 10.0
 """Time without an event after which the stream sends a comment [s]: no proxy closes it."""
 ANSWER_LIMIT = 2.0
 """Time limit for the mission service to answer [s]."""
-WAITING_MAX = 2 * IN_FLIGHT_MAX
-"""Limit of the calls that wait at the same time."""
-BODY_MAX, BODY_LIMIT = 256 * 1024, 5.0
-"""Longest body of a request [bytes], and time limit for it to arrive [s]."""
-HEAD_MAX = 4_096
-"""Longest head of a request [bytes]."""
+BODY_MAX = 256 * 1024
+"""Longest body of a request [bytes]."""
 STOP_LIMIT = 1
 """Time limit for open requests when the server stops [s]."""
 STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
 """Error -> HTTP status of the answer."""
 REASONS = {
-    401: "There is no valid token in the request",
-    403: "The token is a reader's",
+    **{status: text for status, (_, text) in REFUSED.items()},
     404: "There is no such mission",
-    408: f"The body did not arrive within {BODY_LIMIT:g} s",
     409: "The state does not allow it; `id` names the mission in the way",
     413: f"The body is longer than {BODY_MAX // 1024} KiB",
     422: "A value cannot be used; `problems` has every one",
-    429: "Too many requests at the same time; try again in a second",
-    503: "Not now: teleop starts or ends, another has the journal, it cannot be written, or "
-    "too much waits: try again. Or teleop did not answer within 2 s, and may do it yet: look. "
-    "An emergency stop is told all the same, unless another teleop flies the robot",
+    503: "Not now: teleop starts or ends, another teleop has the journal, or the disk refuses it. "
+    "Or teleop did not answer within 2 s; look at the state, because it may still act. Cloud "
+    "receives an emergency stop all the same, unless another teleop has the journal",
 }
 REFUSALS: dict[int | str, dict[str, Any]] = {
     code: {"model": models.Refusal, "description": text} for code, text in REASONS.items()
@@ -117,17 +110,15 @@ class Bridge:
             stops.popleft()[1].set_exception(UnavailableError(why))
 
     def submit(self, call: Call, urgent: Urgent = "") -> Future[Any]:
-        """Queue a call; an urgent one has a lane of its own, and always room.
+        """Queue a call; an urgent one has a lane of its own.
 
         While teleop starts, the bridge accepts only a stop.
 
         Raises:
-            UnavailableError: If no call is accepted, or if too many calls wait.
+            UnavailableError: If no call is accepted.
         """
         if self.closed and not (urgent == "stop" and self.closed == STARTING):
             raise UnavailableError(self.closed)
-        if not urgent and len(self._lanes[""]) >= WAITING_MAX:
-            raise UnavailableError(f"{WAITING_MAX} requests wait already; try again")
         self.overtakings += bool(urgent)
         future: Future[Any] = Future()
         self._lanes[urgent].append((call, future))
@@ -233,16 +224,12 @@ def _bridge(request: Request) -> Any:
 
 
 async def _body(request: Request) -> bytes:
-    """Read the body of a request; stop reading if the body is too long or arrives too slowly."""
+    """Read the body of a request; stop reading if the body is too long."""
     body = b""
-    try:
-        async with asyncio.timeout(BODY_LIMIT):
-            async for chunk in request.stream():
-                body += chunk
-                if len(body) > BODY_MAX:
-                    raise HTTPException(413, REASONS[413])
-    except TimeoutError:
-        raise HTTPException(408, REASONS[408]) from None
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > BODY_MAX:
+            raise HTTPException(413, REASONS[413])
     return body
 
 
@@ -348,14 +335,9 @@ async def show_state(bridge: Bridged) -> Any:
     responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
 )
 async def stream_events(request: Request, bridge: Bridged, after: After = 0) -> StreamingResponse:
-    """Tell all events of missions, from the oldest that is known, as server-sent events.
-
-    Resume with the header Last-Event-ID, or with `?after=ID`.
-    """
-    known = request.headers.get("last-event-id", "")
-    number = max(after, int(known) if known.isdecimal() and len(known) < 16 else 0)
+    """Stream the events of all missions after number `after` as server-sent events."""
     await bridge.ask(lambda service, now_ns: None)  # refuse now what cannot be served
-    stream, headers = _stream(request, bridge, number), {"Cache-Control": "no-store"}
+    stream, headers = _stream(request, bridge, after), {"Cache-Control": "no-store"}
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
@@ -413,7 +395,6 @@ class ApiServer(uvicorn.Server):
                 server_header=False,
                 proxy_headers=False,  # the audit log names whoever connects
                 # No limit_concurrency: uvicorn would refuse an emergency stop, too.
-                h11_max_incomplete_event_size=HEAD_MAX,
                 timeout_graceful_shutdown=STOP_LIMIT,
             )
         )
@@ -425,15 +406,12 @@ class ApiServer(uvicorn.Server):
     @property
     def counts(self) -> dict[str, int]:
         """Number of requests by outcome, and number of lost lines of the audit log."""
-        audit = self.gate.audit
-        counts = {**self.gate.counts, "audit_dropped": audit.dropped if audit else 0}
-        return {f"api_{name}": count for name, count in counts.items()}
+        lost = 0 if self.gate.audit is None else self.gate.audit.dropped
+        return {f"api_{name}": n for name, n in {**self.gate.counts, "audit_dropped": lost}.items()}
 
     def start(self) -> None:
         """Start serving."""
         self._thread.start()
-        if self.gate.tokens is not None:
-            threading.Thread(target=self.gate.tokens.follow, daemon=True).start()
 
     def stop(self) -> None:
         """Answer the open requests, end the streams, and stop."""

@@ -12,7 +12,6 @@ import os
 import queue
 import re
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -28,13 +27,11 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import read, readable_by_others
+from cloudrc.files import read, readable_by_others, version
 
 OPERATOR, READER = "operator", "reader"
 """Roles; the name of a token file is its role."""
 BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a reader's for GET")
-READ_PERIOD = 1.0
-"""Time after which the token files are read again [s]."""
 TOKEN_SIZE_MAX = 4096
 """Largest token file [bytes], including white space around the token."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
@@ -78,44 +75,42 @@ class Tokens:
         Raises:
             BadInputError: If a file cannot be used; the text does not contain the token.
         """
-        self._folder = folder
+        self._folder, self._paths = folder, [folder / role for role in (READER, OPERATOR)]
+        self._versions = [version(path) for path in self._paths]
         self._known = self._read()
-        for path in (folder / OPERATOR, folder / READER):
-            if readable_by_others(path):
-                warn(f"warning: {path} can be read by others: chmod 600 {path}")
-
-    def follow(self) -> None:
-        """Read the files again and again; an unusable file admits nobody."""
-        while True:
-            time.sleep(READ_PERIOD)
-            try:
-                self._known = self._read()
-            except BadInputError:
-                self._known = {}
+        for path in filter(readable_by_others, reversed(self._paths)):
+            warn(f"warning: {path} can be read by others: chmod 600 {path}")
 
     def caller(self, token: str) -> Caller | None:
-        """Return the caller with this token, or None."""
+        """Return the caller with this token, or None.
+
+        A file that has changed is read again. An unusable file admits nobody.
+        """
+        versions = [version(path) for path in self._paths]
+        if versions != self._versions:
+            self._versions, self._known = versions, {}
+            with suppress(BadInputError):
+                self._known = self._read()
         return self._known.get(hashlib.sha256(token.encode()).digest())
 
     def _read(self) -> dict[bytes, Caller]:
         known: dict[bytes, Caller] = {}
-        for role in (READER, OPERATOR):
-            path = self._folder / role
-            if role == OPERATOR or path.exists():
+        for path in self._paths:
+            if path.name == OPERATOR or path.exists():
                 digest = hashlib.sha256(_read_token(path)).digest()
                 if digest in known:  # readers would command
                     raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
-                known[digest] = Caller(role, f"{role}-{digest.hex()[:8]}")
+                known[digest] = Caller(path.name, f"{path.name}-{digest.hex()[:8]}")
         return known
 
 
 def _read_token(path: Path) -> bytes:
+    reason = "a token is 16 to 512 visible ASCII characters"
     try:
-        token, reason = read(path, TOKEN_SIZE_MAX).strip(), ""
+        token = read(path, TOKEN_SIZE_MAX).strip()
     except (OSError, ValueError) as error:
         token, reason = b"", getattr(error, "strerror", None) or str(error)
     if not _TOKEN.fullmatch(token):
-        reason = reason or "a token is 16 to 512 visible ASCII characters"
         make = f"(umask 077; openssl rand -hex 32 > {path})"
         raise BadInputError(f"--tokens: {path}: {reason}; make one: {make}")
     return token
@@ -138,10 +133,7 @@ class Audit(RotatingFileHandler):
 
     def note(self, caller: Caller, scope: Mapping[str, Any], answer: Mapping[str, Any]) -> None:
         """Queue a line about a command and the status and body of its answer."""
-        said: Any = None
-        with suppress(ValueError):
-            said = json.loads(answer.get("body", b""))
-        said = said if isinstance(said, dict) else {}
+        said = json.loads(answer.get("body") or b"{}")
         line = {
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "role": caller.role,
@@ -191,7 +183,7 @@ class Gate:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request; ignore a slash at the end of its path."""
         scope["path"] = scope["path"].rstrip("/") or "/"
-        # For a stream, which may outlive its token.
+        # An event stream calls this again, because it can last longer than its token is valid.
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)
         status = self._refusal(caller, scope)
         if caller is None or status:
@@ -211,7 +203,11 @@ class Gate:
             await self._app(scope, receive, keep)
         finally:
             self._in_flight[caller.role] -= 1
-            self._note(caller, scope, answer)
+            self.counts["served"] += 1
+            if scope["path"] in ORDERS and answer["status"] in COUNTED:
+                self.counts[COUNTED[answer["status"]]] += 1
+            if self.audit is not None and scope["method"] not in READS:
+                self.audit.note(caller, scope, answer)
 
     async def caller(self, scope: Scope) -> Caller | None:
         """Return the caller of a request; None if the caller is unknown."""
@@ -229,13 +225,3 @@ class Gate:
             return 403
         is_urgent = is_command and scope["path"] in URGENT
         return 429 if self._in_flight[caller.role] >= IN_FLIGHT_MAX and not is_urgent else 0
-
-    def _note(self, caller: Caller, scope: Scope, answer: Message) -> None:
-        """Count a request, and log it if it is a command."""
-        status = answer["status"]
-        self.counts["served"] += 1
-        self.counts["slow"] += status == 408
-        if scope["path"] in ORDERS and status in COUNTED:
-            self.counts[COUNTED[status]] += 1
-        if self.audit is not None and scope["method"] not in READS:
-            self.audit.note(caller, scope, answer)

@@ -22,32 +22,35 @@ from cloudrc.geometry import fence
 from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start
 from cloudrc.records import MissionEvent
 from cloudrc.teleop.requests import REPEAT_NS, RequestSender
-from cloudrc.teleop.wire import ALARM, NO_PLAN, Leg, Outcome, Output, Plan, RobotStatus, State
+from cloudrc.teleop.wire import (
+    ALARM,
+    FLYING,
+    HELD,
+    NO_PLAN,
+    STARTING,
+    STATES,
+    Leg,
+    Output,
+    Plan,
+    RobotStatus,
+)
 
 if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
 
-WORST_GUARD = GuardState.HOLD
-"""Last state of the guard, in the order of `GuardState`, in which a mission continues."""
-ANY_WORLD = ""
-"""World of a mission that has not started yet: the mission may start in any world."""
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
 """Lowest height of a hold setpoint [m]; at lower heights the robot would scrape along the floor.
 Source: docs/safety.md, "The guard"."""
 NO_WAYPOINT = -1
 """Waypoint index of a setpoint or event without a waypoint."""
-UNDER_WAY = (State.FLYING, State.STARTING, State.HELD)
+UNDER_WAY = FLYING, STARTING, HELD
 """States of a mission that has begun and not ended."""
-ENDS = {"done": State.DONE, "cancelled": State.CANCELLED}
-"""Code of an outcome -> state of the mission at its end; all other codes lead to FAILED."""
-END_LOST = "end_lost", "the robot reports that the mission is over, but its outcome is lost;"
 GAP_MAX_NS = 500_000_000
 """Limit of the time of flight that counts between two telemetry messages [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
 """Longest gap between two telemetry messages [ns] that does not restart the dwell time."""
 # Looking up an enum's member is slow, and these are used in every period.
 GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
-FLYING, STARTING = State.FLYING, State.STARTING
 
 
 class LegWatch:
@@ -57,10 +60,6 @@ class LegWatch:
     """
 
     def __init__(self) -> None:
-        self.begin()
-
-    def begin(self) -> None:
-        """Begin a new leg."""
         self._flown_ns = 0
         self.pause()
 
@@ -100,9 +99,10 @@ class Teleop:
     next one, within its session. All times `now_ns` are of the caller's clock [ns].
 
     Attributes:
-        state: State of the mission.
+        state: State of the mission; "idle" before the first.
         leg: Index of the current waypoint; the number of waypoints once all are reached.
-        outcome: How the mission ended; None before the first mission and during a mission.
+        outcome: Last event of the mission; None before the first mission and during a mission.
+        seen: The newest telemetry; None before the first.
         requests: Requests to the robot.
         stopping: Whether an emergency stop is pending: telemetry does not show it yet.
         outputs: Messages since the last `take_outputs`.
@@ -110,21 +110,19 @@ class Teleop:
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
         """Begin without a mission; `ended` returns whether the mission with a number is over."""
-        self.state, self.leg = State.IDLE, 0
-        self.outcome: Outcome | None = None
+        self.state, self.leg = "idle", 0
+        self.outcome: MissionEvent | None = None
         self.outputs: list[Output] = []
         self.requests = RequestSender()
         self.stopping, self._stop_ns = False, 0
-        self._stopped_before: tuple[int, int] | None = None  # see `stop`
         self._is_ended = ended
-        self._seen: RobotStatus | None = None
+        self.seen: RobotStatus | None = None
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
         self._continued = self._was_held = False  # whether an earlier teleop began or held it
-        self._world = ANY_WORLD  # in which it was started
+        self._world = ""  # in which the mission started; "": any
         self._expected: tuple[int, ...] = ()  # missions that may be on board; empty: any
         self._watch = LegWatch()
         self._setpoint: Setpoint | None = None
-        self._over = MISSION_OVER  # waypoints stored on board from which on the mission is over
         self._is_pending = False  # whether the mission's first setpoint has not been sent yet
         self._stays = False  # whether waypoints are ignored
 
@@ -142,24 +140,16 @@ class Teleop:
         outputs, self.outputs = self.outputs, []
         return outputs
 
-    def start(self, now_ns: int, plan: Plan, mission_id: int = 0, *, again: bool = False) -> None:
-        """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0.
-
-        With `again`, an earlier teleop may have flown it: if the robot reports the last waypoint,
-        the mission is over and does not begin at the spawn again.
-        """
+    def start(self, now_ns: int, plan: Plan, mission_id: int = 0) -> None:
+        """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0."""
         self._order(plan, mission_id, now_ns)
-        if again and plan.start is Start.SPAWN:
-            self._over = len(plan.legs)
-        here = None if plan.start is Start.SPAWN else self._seen
-        self._world = here.world if here else ANY_WORLD
+        here = None if plan.start is Start.SPAWN else self.seen
+        self._world = here.world if here else ""
         self._expected = (here.mission_id, mission_id) if here else ()
         self.requests.report(mission_id, 0)
         self.requests.ask(Request.START, plan.start, after=True)
         self._is_pending = True
         self._select_early()
-        if again and self._seen:
-            self.see(self._seen, now_ns)  # the mission may be over
 
     def continue_mission(self, now_ns: int, mission: Mission) -> None:
         """Take over a mission of an earlier teleop at its current waypoint; do not reset world."""
@@ -169,12 +159,12 @@ class Teleop:
         self.requests.report(mission.number, self.leg)
         self.requests.ask(Request.START, Start.HERE)
         self._is_pending = not self._was_held
-        if self._seen:
-            self.see(self._seen, now_ns)  # the mission may be over, or the world another one
+        if self.seen:
+            self.see(self.seen, now_ns)  # the mission may be over, or the world another one
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
         """Move the robot to a point; raise BadInputError unless the mission is held."""
-        self._check("goto", State.HELD)
+        self._check("goto", HELD)
         x, y, z = leg.position
         self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
         self._select(Setpoint(leg.position, leg.yaw, NO_WAYPOINT))
@@ -186,11 +176,10 @@ class Teleop:
 
     def resume(self, now_ns: int) -> None:
         """Continue the held leg; raise BadInputError unless the mission is held."""
-        self._check("resume", State.HELD)
-        self.state = FLYING
+        self._check("resume", HELD)
         self._watch.pause()
         self._select_leg(self.leg)
-        self._report("resumed", self.leg, f"resumed {self._where()}", now_ns)
+        self._report("resumed", self.leg, f"resumed {self.where}", now_ns)
 
     def cancel(self, now_ns: int) -> None:
         """End the mission under way."""
@@ -199,16 +188,14 @@ class Teleop:
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once in any state, and drop all earlier requests to the robot.
 
-        `ALARM` is sent until telemetry shows the stop. A robot that is already stopped may be about
-        to act on an acknowledgement: then telemetry has to show a new request, too.
+        `ALARM` is sent at least once, and until telemetry shows ESTOP. Cloud then repeats it until
+        the robot has acted on it, also if the robot was stopped before.
         """
         if self.state in UNDER_WAY:
             self._end("emergency_stopped", "emergency stop", now_ns, where=True)
         self.requests.forget()
-        seen = self._seen
-        stopped = seen is not None and seen.guard is ESTOP
-        self._stopped_before = (seen.epoch, seen.mission) if seen and stopped else None
-        self.stopping, self._stop_ns = True, 0
+        self.stopping, self._stop_ns = True, now_ns + REPEAT_NS
+        self.outputs.append(ALARM)
 
     def acknowledge(self, now_ns: int) -> None:
         """Allow the robot to fly again after a landing or a stop."""
@@ -216,20 +203,20 @@ class Teleop:
 
     def pause(self, now_ns: int) -> None:
         """Ask the robot to hold until the next teleop continues the mission."""
-        self._report("paused", self.leg, f"paused by shutdown {self._where()}", now_ns)
+        self._report("paused", self.leg, f"paused by shutdown {self.where}", now_ns)
         self.requests.ask(Request.END)
         self._select_here()  # cloud keeps this setpoint if the request is lost
         self._stays = True
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry at its arrival."""
-        before, self._seen = self._seen, seen
-        if seen.guard is ESTOP and (seen.epoch, seen.mission) != self._stopped_before:
+        before, self.seen = self.seen, seen
+        if seen.guard is ESTOP:
             self.stopping = False
         new_session = not before or (before.epoch, before.world) != (seen.epoch, seen.world)
         last, onboard, legs = self._setpoint, self._reached_on_board(seen), self._plan.legs
-        started = self.requests.see(seen, now_ns) is Request.START and self.state is STARTING
-        if self.state is STARTING and not self._expected and self._plan.start is Start.HERE:
+        started = self.requests.see(seen, now_ns) is Request.START and self.state == STARTING
+        if self.state == STARTING and not self._expected and self._plan.start is Start.HERE:
             # The order came before the first telemetry.
             self._expected = (seen.mission_id, self._mission_id)
         if self.state not in UNDER_WAY:
@@ -241,12 +228,9 @@ class Teleop:
             self._begin(seen, now_ns)
         elif self._is_pending:
             self._select_early()
-        while self.leg < onboard and self.state in (FLYING, State.HELD):
-            # The robot kept what teleop lost. Only the last waypoint is selected, because cloud's
-            # socket might not have room for all setpoints at once.
-            how = "reached, as the robot reports,"
-            self._advance(how, now_ns, select=self.leg + 1 == onboard)
-        while self.state is FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
+        while self.leg < onboard and self.state in (FLYING, HELD):
+            self._advance("reached, as the robot reports,", now_ns)  # teleop lost it
+        while self.state == FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
         if new_session and last is self._setpoint:
             self._repeat_setpoint()
@@ -262,32 +246,32 @@ class Teleop:
         elif (request := self.requests.due(now_ns)) is not None:
             self.outputs.append(request)
 
-    def _check(self, verb: str, needed: State) -> None:
-        if self.state is not needed:
-            text = f"{verb}: the mission is {self.state.name}; it must be {needed.name.lower()}"
-            raise BadInputError(text)
+    def _check(self, verb: str, needed: str) -> None:
+        if self.state != needed:
+            raise BadInputError(f"{verb}: the mission is {self.state}; it must be {needed}")
 
     def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
         """Find a failure in telemetry that ends the mission; return its code and its text."""
-        if self._world not in (ANY_WORLD, seen.world):
+        if self._world not in ("", seen.world):
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
             return "taken_over", "somebody else has started another mission"
-        if self._reached_on_board(seen) >= self._over:
-            return END_LOST
-        if seen.guard > WORST_GUARD:
+        if self._reached_on_board(seen) == MISSION_OVER:
+            text = "the robot reports that the mission is over, but its outcome is lost;"
+            return "end_lost", text
+        if seen.guard > HOLD:
             return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
         return None
 
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
         """Find an exceeded time limit; return its code and its text."""
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
-        if self.elapsed(now_ns) >= limit and self.state is STARTING:
+        if self.elapsed(now_ns) >= limit and self.state == STARTING:
             return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
         if self.elapsed(now_ns) >= limit:
-            return "timed_out", f"mission not done within {limit:g} s: {self._where()}"
-        if self._watch.flown >= leg_limit and self.state is FLYING:
-            return "leg_timed_out", f"{self._leg_name()} not reached in {leg_limit:g} s"
+            return "timed_out", f"mission not done within {limit:g} s: {self.where}"
+        if self._watch.flown >= leg_limit and self.state == FLYING:
+            return "leg_timed_out", f"{self._leg_name} not reached in {leg_limit:g} s"
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
@@ -306,13 +290,12 @@ class Teleop:
         """Store a new mission: its plan, its number, and the start of its time [ns]."""
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
-        self._continued, self._was_held, self._over = False, False, MISSION_OVER
+        self._continued = self._was_held = False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission after telemetry shows its start; start the times of mission and leg."""
-        self.state, self._world, self._expected = FLYING, seen.world, (self._mission_id,)
-        self._over = MISSION_OVER
-        self._watch.begin()
+        self._world, self._expected = seen.world, (self._mission_id,)
+        self._watch = LegWatch()
         if not self._continued:
             self._began_ns = now_ns
             if self._is_pending:
@@ -324,63 +307,63 @@ class Teleop:
         elif self._was_held:
             self._hold(now_ns)
         else:
-            text = f"resumed after a restart of teleop {self._where()}"
+            text = f"resumed after a restart of teleop {self.where}"
             self._report("resumed", self.leg, text, now_ns)
 
-    def _advance(self, how: str, now_ns: int, *, select: bool = True) -> None:
-        """Go on to the next waypoint or end the mission; with `select`, select the waypoint."""
-        text = f"{self._leg_name()} {how} at {self.elapsed(now_ns):.2f} s"
+    def _advance(self, how: str, now_ns: int) -> None:
+        """Go on to the next waypoint, or end the mission."""
+        text = f"{self._leg_name} {how} at {self.elapsed(now_ns):.2f} s"
         self._report("reached", self.leg, text, now_ns)
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
-            self._watch.begin()
-            if self.state is FLYING and select:
+            self._watch = LegWatch()
+            if self.state == FLYING:
                 self._select_leg(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
 
     def _hold(self, now_ns: int) -> None:
-        self.state = State.HELD
         self._select_here()
-        self._report("held", self.leg, f"held {self._where()}", now_ns)
+        self._report("held", self.leg, f"held {self.where}", now_ns)
 
     def _end(self, code: str, text: str, now_ns: int, *, where: bool = False) -> None:
         """End the mission, and ask the robot to hold its position; `where` adds it to the text."""
-        text = f"{text} {self._where()}" if where else text
+        text = f"{text} {self.where}" if where else text
         waypoint = min(self.leg, len(self._plan.legs) - 1)
-        self.state = ENDS.get(code, State.FAILED)
-        self.outcome = Outcome(code, text, reached=self.leg)
         if code != "done" and self._mission_id:
             self.requests.report(self._mission_id, MISSION_OVER)
-        on_ground = self._seen is not None and self._seen.guard is GROUND
+        on_ground = self.seen is not None and self.seen.guard is GROUND
         if code != "taken_over" or on_ground:  # on the ground it would scrape along the floor
             self.requests.ask(Request.END)
         else:
             self.requests.forget()  # another teleop's mission must not be ended
         self._select_here()
-        self._report(code, waypoint, text, now_ns)
+        self.outcome = self._report(code, waypoint, text, now_ns)
 
     def _reached_on_board(self, seen: RobotStatus) -> int:
         """Return how many waypoints of the mission the robot has stored as reached."""
         return seen.reached if seen.mission_id == self._mission_id != 0 else 0
 
     @property
+    def _from_spawn(self) -> bool:
+        """Whether the mission begins at the spawn."""
+        return self._plan.start is Start.SPAWN and not self._continued
+
+    @property
     def _may_move(self) -> bool:
         """Whether the robot may still fly an earlier mission while this one begins at the spawn."""
-        from_spawn = self._plan.start is Start.SPAWN and not self._continued
-        return from_spawn and not self.requests.waits
+        return self._from_spawn and not self.requests.waits
 
     def _select_early(self) -> None:
         """Select the waypoint before telemetry shows the start, so that the first command is right.
 
         Wait while the robot may move: it would fly to the waypoint at once.
         """
-        if not self._is_pending or self._seen is None or self._may_move:
+        if not self._is_pending or self.seen is None or self._may_move:
             return
         self._is_pending = False
-        from_spawn = self._plan.start is Start.SPAWN and not self._continued
-        leg = 0 if from_spawn else max(self.leg, self._reached_on_board(self._seen))
+        leg = 0 if self._from_spawn else max(self.leg, self._reached_on_board(self.seen))
         if leg < len(self._plan.legs):
             self._select_leg(leg)
 
@@ -389,7 +372,7 @@ class Teleop:
 
         If the mission still waits for its start, a robot that may move has to stay where it is.
         """
-        if self.state is STARTING and self._may_move:
+        if self.state == STARTING and self._may_move:
             self._is_pending = True
             self._select_here()
         elif self._setpoint is not None:
@@ -402,21 +385,27 @@ class Teleop:
 
     def _select_here(self) -> None:
         """Select the robot's position, if telemetry has arrived."""
-        if self._seen is not None:
-            x, y, z = self._seen.position
+        if self.seen is not None:
+            x, y, z = self.seen.position
             yaw = 0.0 if self._setpoint is None else self._setpoint.yaw
             self._select(Setpoint((x, y, max(z, HELD_LOWEST)), yaw, NO_WAYPOINT))
 
     def _select(self, setpoint: Setpoint) -> None:
-        epoch = 0 if self._seen is None else self._seen.epoch
+        epoch = 0 if self.seen is None else self.seen.epoch
         self._setpoint = setpoint._replace(epoch=epoch)
         self.outputs.append(self._setpoint)
 
-    def _report(self, event: str, waypoint: int, text: str, now_ns: int) -> None:
-        self.outputs.append(MissionEvent(now_ns, event, waypoint, text))
+    def _report(self, code: str, waypoint: int, text: str, now_ns: int) -> MissionEvent:
+        self.state = STATES.get(code, self.state)
+        event = MissionEvent(now_ns, code, waypoint, text)
+        self.outputs.append(event)
+        return event
 
-    def _where(self) -> str:
-        return f"on the way to {self._leg_name()}"
+    @property
+    def where(self) -> str:
+        """Place of the robot in the mission, in words."""
+        return f"on the way to {self._leg_name}"
 
+    @property
     def _leg_name(self) -> str:
         return f"waypoint {self.leg + 1} of {len(self._plan.legs)}"

@@ -22,14 +22,14 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
 from cloudrc.teleop.store import SHOWN, Order
-from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.teleop.wire import FAILURES, Leg, Plan
 
 PROBLEMS_MAX = 50
 """Limit of the problems of one request that the answer describes."""
 
 
 def _printable(text: str) -> str:
-    """Refuse control characters, because they would control the terminals of readers."""
+    """Refuse control characters, which change the terminal of a user who lists the missions."""
     if not text.isprintable():
         raise PydanticCustomError("unprintable", "must be one line of printable characters")
     return text
@@ -52,12 +52,10 @@ class MissionRequest(Section):
         (), max_length=MAX_WAYPOINTS, description="Points, in order"
     )
     contact: bool | None = Field(
-        None, description="Whether the arm has to touch the board; "
-        "default: if the experiment asks for it and the waypoints lead there",
+        None, description="Whether the arm has to touch the board; default: as in the experiment, "
+        "if a waypoint is at the board",
     )  # fmt: skip
-    key: Text = Field(
-        "", description=f"A second mission under the same key is not made; {ONE_LINE}"
-    )
+    key: Text = Field("", description=f"Teleop makes one mission for each key; {ONE_LINE}")
     queue: bool = Field(False, description="Wait for the mission under way, if there is one")
 
 
@@ -82,8 +80,8 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
 }
 
 
-def told(text: str) -> Any:
-    """Describe a field of an answer."""
+def _field(text: str) -> Any:
+    """Describe a field of an answer in the OpenAPI document."""
     return Field(description=text)
 
 
@@ -94,132 +92,125 @@ class _Answer(BaseModel):
 class Reached(_Answer):
     """Waypoint that was reached."""
 
-    waypoint: int = told("Its index, from 0")
-    time_s: float = told("When, since the mission began [s]")
+    waypoint: int = _field("Its index, from 0")
+    time_s: float = _field("When, since the mission began [s]")
 
 
 class Failure(_Answer):
     """A rule that was broken."""
 
-    code: str = told("One word, for programs")
-    text: str = told("The same for people")
+    code: str = _field("One word, for programs")
+    text: str = _field("The same for people")
 
 
 class Verdict(_Answer):
     """Result of a mission that has ended."""
 
-    outcome: Literal["success", "failure", "invalid", "interrupted"] = told("As in report.json")
-    exit_code: int = told("Of a Job that flew it: 0, 1, 6 or 130")
-    failures: list[Failure] = told("Every rule that was broken")
+    outcome: Literal["success", "failure", "invalid", "interrupted"] = _field("As in report.json")
+    exit_code: int = _field("Of a Job that flew it: 0, 1, 6 or 130")
+    failures: list[Failure] = _field("Every rule that was broken")
 
 
 class Event(_Answer):
     """An event of a mission."""
 
-    id: int = told("Rises with every event of all missions")
-    mission: str = told("Whose")
-    event: str = told(
-        "queued, starting, started, reached, held, resumed, goto, restarted, "
-        "new_session, board_touched, pipe_touched, paused; at the end done, cancelled, timed_out, "
-        "leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over or "
-        "end_lost"
+    id: int = _field("Rises with every event of all missions")
+    mission: str = _field("Whose")
+    event: str = _field(
+        "queued, starting, started, reached, held, resumed, goto, restarted, new_session, "
+        f"board_touched, pipe_touched, paused; at the end done, cancelled, {', '.join(FAILURES)}"
     )
-    waypoint: int = told("Index of the waypoint concerned")
-    text: str = told("The same in words")
-    time_s: float = told("Since the mission began [s]")
+    waypoint: int = _field("Index of the waypoint concerned")
+    text: str = _field("The same in words")
+    time_s: float = _field("Since the mission began [s]")
 
 
 class MissionSummary(_Answer):
     """A mission, without its events."""
 
-    id: str = told("Given by teleop")
-    name: str = told("Given by its sender")
-    key: str = told("Likewise")
-    state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"] = told(
-        "Where it is"
-    )
-    waypoint: int = told("Index of the waypoint that is flown to, from 0")
-    waypoints: int = told("How many it has")
-    reached: list[Reached] = told("Those that were reached")
-    verdict: Verdict | None = told("Once it has ended")
+    id: str = _field("Given by teleop")
+    name: str = _field("Given by its sender")
+    key: str = _field("Likewise")
+    state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"]
+    waypoint: int = _field("Index of the waypoint to which the robot flies, from 0")
+    waypoints: int = _field("Number of waypoints")
+    reached: list[Reached] = _field("The waypoints that were reached")
+    verdict: Verdict | None = _field("Null until the mission has ended")
 
 
 class MissionView(MissionSummary):
     """A mission with its events."""
 
     events: list[Event] = Field(max_length=SHOWN, description="The newest of them, oldest first")
-    events_left_out: int = told("How many there were before those")
+    events_left_out: int = _field("How many there were before those")
 
 
 class MissionList(_Answer):
     """All known missions."""
 
-    missions: list[MissionSummary] = told("Oldest first")
+    missions: list[MissionSummary] = _field("Oldest first")
 
 
 class Seen(_Answer):
     """The newest telemetry."""
 
-    age_s: float = told("Since it arrived [s]")
-    epoch: int = told("Session that it belongs to")
-    world: str = told("Names world's process")
-    position_m: list[float | None] = told("Of the base, measured [m], world frame")
-    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = told("State of the guard on board")
-    cause: str = told("Why it is in it; of a robot that has landed, why it landed")
-    guard_for_s: float | None = told(
-        "For how long it has been seen in this state [s]; null once it has not been "
-        "heard for 1 s: state, cause and all else are those of then"
+    age_s: float = _field("Since it arrived [s]")
+    epoch: int = _field("Number of the session between cloud and world")
+    world: str = _field("Identifies world's process")
+    position_m: list[float | None] = _field("Of the base, measured [m], world frame")
+    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = _field(
+        "State of the guard on board"
     )
-    next_step: str = told("What comes next, or what the operator has to do for it")
-    pipe_contacts: int = told("How often a pipe has been touched so far")
-    touch_speed_mps: float | None = told("Of the tip at the board [m/s]")
-    horizon_s: float | None = told("How far cloud looks ahead [s]")
-    rtt_s: float | None = told("Last round trip, hold excluded [s]")
-    loop_delay_s: float | None = told("The same, hold included [s]")
+    cause: str = _field("Why the guard is in this state; after a landing, why the robot landed")
+    guard_for_s: float | None = _field("Time in this state [s]; null if `age_s` is above 1 s")
+    next_step: str = _field("What the robot does next, or what the operator has to do")
+    pipe_contacts: int = _field("How often a pipe has been touched so far")
+    touch_speed_mps: float | None = _field("Of the tip at the board [m/s]")
+    horizon_s: float | None = _field("How far cloud looks ahead [s]")
+    rtt_s: float | None = _field("Last round trip, hold excluded [s]")
+    loop_delay_s: float | None = _field("The same, hold included [s]")
 
 
 class StateView(_Answer):
     """The present state of missions and robot."""
 
-    mission: MissionSummary | None = told("The one under way")
-    queue: list[str] = told("Ids of those that wait")
-    cloud_age_s: float | None = told(
-        "Since cloud was heard [s], which says at least every 0.2 s that it lives; "
-        "null if it never was"
+    mission: MissionSummary | None = _field("The one under way")
+    queue: list[str] = _field("Ids of those that wait")
+    cloud_age_s: float | None = _field(
+        "Age of the last message from cloud [s], which sends one every 0.2 s; null before the first"
     )
-    seen: Seen | None = told("Null until the robot has been seen")
+    seen: Seen | None = _field("Null before the first telemetry")
 
 
 class Stopped(_Answer):
     """Answer to an emergency stop, which is under way to the robot."""
 
-    id: str | None = told("The mission that was under way and has failed")
-    state: Literal["stopping"] = told("Until the guard on board is in ESTOP")
+    id: str | None = _field("The mission that was under way and has failed")
+    state: Literal["stopping"] = _field("Until the guard on board is in ESTOP")
 
 
 class Acknowledged(_Answer):
     """Answer to an acknowledgement, which is under way to the robot."""
 
-    state: Literal["acknowledged"] = told(
-        "The next mission may fly; a landing low over the ground ends first, and "
-        "after a stop or a touch-down the robot takes off only once it has been still, 0.5 m "
-        "inside the fence"
+    state: Literal["acknowledged"] = _field(
+        "The next mission can fly. A landing near the ground ends first. The robot takes off again "
+        "only when it has stood still, 0.5 m inside the fence"
     )
 
 
 class Problem(_Answer):
     """One value that cannot be used."""
 
-    path: str = told("Keys down to the value, joined by dots")
-    index: int | None = told("Of the waypoint concerned; null if it is none")
-    value: str = told("In words; empty if it is not there")
-    reason: str = told("What it must be, and what to do")
+    path: str = _field("Keys down to the value, joined by dots")
+    index: int | None = _field("Of the waypoint concerned; null if it is none")
+    value: str = _field("In words; empty if it is not there")
+    reason: str = _field("What it must be, and what to do")
 
 
 class Refusal(_Answer):
     """Reason why a request is refused."""
 
-    detail: str = told("In words")
+    detail: str = _field("In words")
     id: str | None = Field(None, description="The mission that is in the way")
     problems: list[Problem] | None = Field(None, description="Every value that cannot be used")
 
@@ -248,10 +239,9 @@ def read_order(
     `time_limit` [s] and `contact` (the board has to be touched if the mission leads there) are for
     missions that do not say so; `plan` makes a plan from a mission and its time limit [s].
     """
-    with suppress(ValueError, TypeError, KeyError):  # which the model words
-        if (
-            count := len(from_json(body)["waypoints"])
-        ) > MAX_WAYPOINTS:  # fast, also if all are bad
+    with suppress(ValueError, TypeError, KeyError):  # `_parse` describes these errors
+        count = len(from_json(body)["waypoints"])
+        if count > MAX_WAYPOINTS:  # pydantic would take seconds to describe as many errors
             reason = f"at most {MAX_WAYPOINTS}; split the mission"
             raise RefusedError([ConfigProblem(("waypoints",), str(count), reason)])
     request = _parse(body, MissionRequest)
@@ -291,25 +281,20 @@ def leads_to_board(mission: Mission, scene: Scene) -> bool:
 
 def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:
     """Return a problem as the API shows it."""
-    path, index = problem.path, None
-    if path[:1] == ("waypoints",) and len(path) > 1:
-        index = int(path[1])
-    return {
-        "path": ".".join(path),
-        "index": index,
-        "value": problem.value,
-        "reason": problem.reason,
-    }
+    path = problem.path
+    index = int(path[1]) if path[:1] == ("waypoints",) and len(path) > 1 else None
+    shown = {"path": ".".join(path), "index": index}
+    return {**shown, "value": problem.value, "reason": problem.reason}
 
 
 def _parse(body: bytes, model: type[_Request]) -> _Request:
     try:
         return model.model_validate_json(body)
     except ValidationError as error:
-        first = error.errors()[0] if error.error_count() == 1 else None
-        if first is not None and first["type"] == "json_invalid":
+        first = error.errors()[0]
+        if first["type"] == "json_invalid":
             problems = [ConfigProblem((), "", f"not JSON: {first['ctx']['error']}")]
-        elif first is not None and not first["loc"]:
+        elif not first["loc"]:
             problems = [ConfigProblem((), "", "must be a mapping of keys")]
         else:
             problems = from_pydantic(error, model, limit=PROBLEMS_MAX)

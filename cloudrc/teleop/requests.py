@@ -58,9 +58,6 @@ class RequestSender:
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
         """Begin to repeat a request; with `after`, once the robot has acted on the pending one."""
         asked = self._progress._replace(request=request, start=start)
-        self._is_started = False
-        if self._pending is not None and self._pending.request is Request.START:
-            self._ended = NOT_ENDED  # the robot may have acted on the start
         if self._pending is None or not after:
             self._pending, self._next = asked, None
         elif self._pending.request is not request:

@@ -1,8 +1,7 @@
 """Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
 
 After a restart of teleop, a mission under way continues at the same waypoint, if world has not
-restarted. An emergency stop survives, too: a new teleop that finds the robot in flight although the
-store says that its mission was stopped sends the stop again.
+restarted.
 """
 
 from __future__ import annotations
@@ -15,24 +14,22 @@ import numpy as np
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.placement import find_crossed_pipe
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import GuardState, Setpoint, Start
+from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import (
-    HELD,
-    QUEUED,
     ConflictError,
     Mission,
     MissionStore,
     Order,
     UnavailableError,
 )
-from cloudrc.teleop.wire import Leg, Output, Plan, RobotStatus
+from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
-"""States of the guard that only an acknowledgement ends, and those in which rotors may turn."""
+LATCHED = LAND, ESTOP
+"""States of the guard that only an acknowledgement ends."""
 SILENCE = 1.0
 """Age above which telemetry or the last message of cloud counts as too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
@@ -40,6 +37,7 @@ SETPOINT_PERIOD_NS = 100_000_000
 QUEUE_MAX = 16
 """Limit of the missions that wait for the one under way."""
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
+RESTARTED = "teleop has restarted; the robot is asked to go on"
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
 BY_ITSELF = "without commands the robot holds its position, then lands, by itself"
 NOT_HEARD = f"cloud has no telemetry from the robot: check the link and world; {BY_ITSELF}"
@@ -61,7 +59,6 @@ IN_MISSION = {
     "none arrive within guard.hold_max_s",
 }
 """State of the guard -> next step while a mission is under way."""
-OPERATOR_HOLDS = "the operator holds the mission; to continue: cloudrc mission resume"
 
 
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
@@ -73,57 +70,8 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
     if mission == HELD and guard is TRACK:
-        return OPERATOR_HOLDS
+        return "the operator holds the mission; to continue: cloudrc mission resume"
     return (ALONE if mission is None else IN_MISSION)[guard]
-
-
-class RobotView:
-    """The robot as shown by its newest telemetry.
-
-    Attributes:
-        seen: The newest telemetry; None before the first.
-        heard_ns: Time of the last message from cloud [ns]; None before the first.
-    """
-
-    def __init__(self) -> None:
-        self.seen: RobotStatus | None = None
-        self.heard_ns: int | None = None
-        self._seen_ns = self._guard_ns = 0
-
-    def see(self, seen: RobotStatus, now_ns: int) -> bool:
-        """Note telemetry; return whether it is the first of a new session with the same robot."""
-        before, self.seen, self._seen_ns, self.heard_ns = self.seen, seen, now_ns, now_ns
-        same = before is not None and before.world == seen.world
-        if before is None or not same or before.guard is not seen.guard:
-            self._guard_ns = now_ns
-        return before is not None and same and before.epoch != seen.epoch
-
-    def show(self, now_ns: int, mission: str | None) -> dict[str, Any]:
-        """Return the state of robot and cloud for the API; `mission` is that of the mission."""
-        if self.heard_ns is None:
-            return {"cloud_age_s": None, "seen": None}
-        seen, age = self.seen, (now_ns - self._seen_ns) * 1e-9
-        cloud_age = (now_ns - self.heard_ns) * 1e-9
-        shown = (
-            None
-            if seen is None
-            else {
-                "age_s": age,
-                "epoch": seen.epoch,
-                "world": seen.world,
-                "position_m": [finite_or_none(value) for value in seen.position],
-                "guard": seen.guard.name,
-                "cause": seen.cause.words,
-                "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
-                "next_step": next_step(seen.guard, age, cloud_age, mission),
-                "pipe_contacts": seen.pipe_contacts,
-                "touch_speed_mps": finite_or_none(seen.touch_speed),
-                "horizon_s": finite_or_none(seen.horizon),
-                "rtt_s": finite_or_none(seen.rtt),
-                "loop_delay_s": finite_or_none(seen.loop_delay),
-            }
-        )
-        return {"cloud_age_s": cloud_age, "seen": shown}
 
 
 class MissionService:
@@ -133,7 +81,6 @@ class MissionService:
     mission or robot forbids it, and UnavailableError if the store refuses or this process ends.
 
     Attributes:
-        sight: The robot's state.
         book: The missions.
     """
 
@@ -147,15 +94,19 @@ class MissionService:
         """
         self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
-        self.sight, self.book = RobotView(), book
+        self.book, self._teleop = book, Teleop(book.has_ended)
+        self._heard_ns: int | None = None  # when the last message from cloud came; None: never
+        self._seen_ns = self._guard_ns = 0  # times of telemetry and of the guard's last change
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next one starts the queued missions
-        self._teleop = Teleop(book.has_ended)
         self._trouble = ""  # of the store, as last reported
-        # Whether an earlier teleop may have sent a stop that the robot has not heard of.
-        self._inherits_stop = book.stopped() is not None
+
+    @property
+    def seen(self) -> RobotStatus | None:
+        """The newest telemetry; None before the first."""
+        return self._teleop.seen
 
     @property
     def over(self) -> bool:
@@ -202,7 +153,7 @@ class MissionService:
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
         self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
-        if not self.book.kept:
+        if self.book.trouble:
             text = f"{mission.id} is cancelled, but waits again if teleop restarts"
             raise UnavailableError(f"{text}: {self.book.trouble}")
         return mission
@@ -233,7 +184,6 @@ class MissionService:
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state; return the mission that this ends, if any."""
         mission = self._start_next(now_ns)
-        self._inherits_stop = False
         self._teleop.stop(now_ns)
         self._collect(now_ns)
         return mission
@@ -253,21 +203,24 @@ class MissionService:
 
     def hear(self, now_ns: int) -> None:
         """Note a message from cloud."""
-        self.sight.heard_ns = now_ns
+        self._heard_ns = now_ns
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry."""
-        mission = self._current
-        if self._inherits_stop:
-            self._inherits_stop, stopped = False, self.book.stopped()
-            same = stopped is not None and seen.mission_id == stopped.number
-            if same and seen.guard in AIRBORNE:  # it has not heard of the stop
-                self._teleop.stop(now_ns)
-        is_new_session = self.sight.see(seen, now_ns)
+        before, mission = self.seen, self._current
+        self._heard_ns = self._seen_ns = now_ns
+        same_robot = before is not None and before.world == seen.world
+        if before is None or not same_robot or before.guard is not seen.guard:
+            self._guard_ns = now_ns
         if mission is not None and mission.world and mission.world == seen.world:
-            self._note_contacts(mission, seen, now_ns)
-            if is_new_session:
-                self._note(mission, "new_session", _describe_session(mission), now_ns)
+            known = mission.witness
+            mission.witness = known.see(*_contacts(seen))
+            for event, text in mission.witness.news(known, self._teleop.elapsed(now_ns)):
+                self._note(mission, event, text, now_ns)
+            if before is not None and same_robot and before.epoch != seen.epoch:
+                text = "the controller has a new session, as after a restart; the mission is"
+                text = f"{text} {mission.state} {self._teleop.where}"
+                self._note(mission, "new_session", text, now_ns)
         self._teleop.see(seen, now_ns)
         self._collect(now_ns)
 
@@ -275,8 +228,8 @@ class MissionService:
         """Start a waiting mission, check time limits, and repeat the messages that are due."""
         self.book.catch_up(now_ns)
         if not self._ends:
-            in_sight = self.sight.seen is not None
-            self._start_next(now_ns, queued=in_sight and self.book.kept and not self._blocked)
+            blocked = self.seen is None or self.book.trouble or self._blocked
+            self._start_next(now_ns, queued=not blocked)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -290,19 +243,40 @@ class MissionService:
 
     def state(self, now_ns: int) -> dict[str, Any]:
         """Return the state of missions and robot for the API."""
-        mission = self._current
-        return {
+        mission, seen, heard_ns = self._current, self.seen, self._heard_ns
+        cloud_age = None if heard_ns is None else (now_ns - heard_ns) * 1e-9
+        shown = {
             "mission": mission.summary() if mission is not None else None,
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
-            **self.sight.show(now_ns, None if mission is None else mission.state),
+            "cloud_age_s": cloud_age,
+            "seen": None,
         }
+        if seen is None or cloud_age is None:
+            return shown
+        age, state = (now_ns - self._seen_ns) * 1e-9, mission.state if mission else None
+        robot = {
+            "age_s": age,
+            "epoch": seen.epoch,
+            "world": seen.world,
+            "position_m": [finite_or_none(value) for value in seen.position],
+            "guard": seen.guard.name,
+            "cause": seen.cause.words,
+            "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
+            "next_step": next_step(seen.guard, age, cloud_age, state),
+            "pipe_contacts": seen.pipe_contacts,
+            "touch_speed_mps": finite_or_none(seen.touch_speed),
+            "horizon_s": finite_or_none(seen.horizon),
+            "rtt_s": finite_or_none(seen.rtt),
+            "loop_delay_s": finite_or_none(seen.loop_delay),
+        }
+        return {**shown, "seen": robot}
 
     @property
     def _blocked(self) -> str:
         """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
-        if self._teleop.stopping or self._inherits_stop:
+        if self._teleop.stopping:
             return "an emergency stop is on its way to the robot"
-        seen = self.sight.seen
+        seen = self.seen
         if seen is None or seen.guard not in LATCHED:
             return ""
         return f"the guard is in {seen.guard.name} ({seen.cause.words}) and lets nothing fly"
@@ -317,17 +291,18 @@ class MissionService:
 
     def _check_way(self, leg: Leg) -> None:
         """Raise ConflictError if the straight way from the robot to a leg crosses a pipe's wall."""
-        seen, scene = self.sight.seen, self._scene
+        seen, scene = self.seen, self._scene
         if seen is None or scene is None:
             return
-        ways = np.array([seen.position]), np.array([leg.position])
-        through = int(find_crossed_pipe(scene, *ways)[0])
+        here, there = np.array([seen.position]), np.array([leg.position])
+        through = int(find_crossed_pipe(scene, here, there)[0])
         if through >= 0:
-            here, there = (f"[{', '.join(f'{v:.2f}' for v in way[0])}]" for way in ways)
-            text = f"the straight way from where the robot is, {here}, to {there} leads through "
-            text += f"the wall of {scene.pipes[through].name}"
-            mission_id = self._current.id if self._current else ""
-            raise ConflictError(f"{text}; go round it first, by 'cloudrc mission goto'", mission_id)
+            raise ConflictError(
+                f"the straight way from where the robot is, {_place(seen.position)}, to "
+                f"{_place(leg.position)} leads through the wall of {scene.pipes[through].name}; "
+                "go round it first, by 'cloudrc mission goto'",
+                self._current.id if self._current else "",
+            )
 
     def _operate(self, verb: Callable[[int], None], now_ns: int) -> Mission:
         mission = self._current
@@ -346,31 +321,22 @@ class MissionService:
         If the mission has begun, it continues. If it waits, it starts only with `queued`, and
         once that is stored.
         """
-        if self._current is None and (waiting := self.book.open()):
-            if queued and waiting[0].state == QUEUED:
-                self._note(waiting[0], "starting", ASKED, now_ns)
-            if waiting[0].world or (waiting[0].state != QUEUED and self.book.kept):
-                self._take_over(waiting[0], now_ns)
-        return self._current
-
-    def _take_over(self, mission: Mission, now_ns: int) -> None:
-        """Fly a mission that this or an earlier teleop has begun."""
-        self._current = mission
-        if not mission.world:  # it has not started
-            self._teleop.start(now_ns, mission.order.plan, mission.number, again=True)
-        else:
+        waiting = self.book.open()
+        if self._current is not None or not waiting:
+            return self._current
+        mission = waiting[0]
+        if queued and mission.state == QUEUED:
+            self._note(mission, "starting", ASKED, now_ns)
+        if mission.world:  # an earlier teleop has begun it
+            self._current = mission
             self._teleop.continue_mission(now_ns, mission)
             mission.witness = mission.witness.after_restart()
-            text = "teleop has restarted; the robot is asked to go on"
-            self._note(mission, "restarted", text, now_ns)
+            self._note(mission, "restarted", RESTARTED, now_ns)
+        elif mission.state != QUEUED and not self.book.trouble:
+            self._current = mission
+            self._teleop.start(now_ns, mission.order.plan, mission.number)
         self._collect(now_ns)
-
-    def _note_contacts(self, mission: Mission, seen: RobotStatus, now_ns: int) -> None:
-        """Store new contacts of the robot at once."""
-        before = mission.witness
-        mission.witness = before.see(*_contacts(seen))
-        for event, text in mission.witness.news(before, self._teleop.elapsed(now_ns)):
-            self._note(mission, event, text, now_ns)
+        return self._current
 
     def _collect(self, now_ns: int) -> None:
         for output in self._teleop.take_outputs():
@@ -384,18 +350,17 @@ class MissionService:
             self._outputs.append(Fault(now_ns, "journal", self._trouble))
 
     def _process_event(self, event: MissionEvent, now_ns: int) -> None:
-        mission, seen = self._current, self.sight.seen
+        mission, seen = self._current, self.seen
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
             changed |= {"world": seen.world, "witness": Observations.begin(*_contacts(seen))}
-        outcome = self._teleop.outcome
-        if outcome is not None and event.event == outcome.code:
+        if event == self._teleop.outcome:
             evidence = mission.witness.evidence(
-                Ending(outcome.code, outcome.text),
+                Ending(event.event, event.text),
                 self._teleop.elapsed(now_ns),
                 waypoints=len(mission.order.plan.legs),
-                reached=outcome.reached,
+                reached=len(mission.reached),
                 contact=mission.order.contact,
                 contact_speed_max=self._contact_speed_max,
             )
@@ -414,11 +379,9 @@ def _busy(mission: Mission, advice: str) -> ConflictError:
     return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)
 
 
+def _place(position: Vector) -> str:
+    return f"[{', '.join(f'{value:.2f}' for value in position)}]"
+
+
 def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
     return seen.pipe_contacts, seen.touch_speed, seen.slip_ns
-
-
-def _describe_session(mission: Mission) -> str:
-    where = f"waypoint {mission.waypoint + 1} of {len(mission.order.plan.legs)}"
-    goes_on = f"is held on the way to {where}" if mission.state == HELD else f"goes on to {where}"
-    return f"the controller has a new session, as after a restart; the mission {goes_on}"

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import sqlite3
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -24,73 +23,40 @@ from pydantic import TypeAdapter
 
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics.verdict import Observations
-from cloudrc.teleop.wire import Plan
+from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, as the API shows it."""
-QUEUED, HELD = "queued", "held"
-ENDED = ("done", "failed", "cancelled")
-FAILURES = (
-    *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
-    *("taken_over", "end_lost"),
-)
-STATES = {
-    **{state: state for state in (QUEUED, "starting", HELD, "done", "cancelled")},
-    **dict.fromkeys(("started", "resumed"), "flying"),
-    **dict.fromkeys(FAILURES, "failed"),
-}
-"""State of a mission after an event; other events do not change the state."""
 SHOWN = 100
 """Limit of the events that are kept per mission; the newest are kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Order of a mission.
-
-    Attributes:
-        plan: Checked plan.
-        name: Name for people.
-        key: Key of the request, or ""; a second order with the same key makes no second mission.
-        contact: Whether the arm has to touch the board.
-        queue: Whether the order may wait for the mission under way; otherwise it is refused.
-    """
+    """Order of a mission; its plan has been checked."""
 
     plan: Plan
-    name: str = ""
-    key: str = ""
-    contact: bool = False
-    queue: bool = False
+    name: str = ""  # for people
+    key: str = ""  # a second order with the same key, unless "", makes no second mission
+    contact: bool = False  # whether the arm has to touch the board
+    queue: bool = False  # whether the order waits for the mission under way; else it is refused
 
 
 @dataclass(slots=True)
 class Mission:
-    """A mission and its progress.
+    """A mission and its progress."""
 
-    Attributes:
-        id: Identifier, such as "m1".
-        number: Number of the mission on board; below 2^63.
-        state: One of the values of `STATES`.
-        world: World in which the mission was started; "" before the start.
-        elapsed: Duration of the mission at its last event [s].
-        reached: Index and time [s] of each reached waypoint.
-        events: The newest events.
-        happened: Count of each kind of event, including events that are no longer kept.
-        witness: What the robot has touched.
-        verdict: The verdict, as the API shows it; None until the mission has ended.
-    """
-
-    id: str
+    id: str  # such as "m1"
     order: Order
-    number: int = 0
-    state: str = QUEUED
-    world: str = ""
-    elapsed: float = 0.0
-    reached: list[dict[str, Any]] = field(default_factory=list)
-    events: deque[Event] = field(default_factory=lambda: deque(maxlen=SHOWN))
-    happened: Counter[str] = field(default_factory=Counter)
-    witness: Observations = field(default_factory=Observations)
-    verdict: dict[str, Any] | None = None
+    number: int  # of the mission on board; below 2^63
+    state: str = QUEUED  # one of the values of `STATES`
+    world: str = ""  # in which the mission was started; "" before the start
+    elapsed: float = 0.0  # duration of the mission at its last event [s]
+    reached: list[dict[str, Any]] = field(default_factory=list)  # waypoints with their times [s]
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=SHOWN))  # the newest
+    happened: Counter[str] = field(default_factory=Counter)  # number of events of each kind, ever
+    witness: Observations = field(default_factory=Observations)  # what the robot has touched
+    verdict: dict[str, Any] | None = None  # as the API shows it; None until the mission has ended
 
     @property
     def ended(self) -> bool:
@@ -119,9 +85,14 @@ class Mission:
     def summary(self) -> dict[str, Any]:
         """Return the fields that a list of missions shows."""
         return {
-            **{"id": self.id, "name": self.order.name, "key": self.order.key, "state": self.state},
-            **{"waypoint": self.waypoint, "waypoints": len(self.order.plan.legs)},
-            **{"reached": list(self.reached), "verdict": self.verdict},
+            "id": self.id,
+            "name": self.order.name,
+            "key": self.order.key,
+            "state": self.state,
+            "waypoint": self.waypoint,
+            "waypoints": len(self.order.plan.legs),
+            "reached": list(self.reached),
+            "verdict": self.verdict,
         }
 
     def as_json(self) -> dict[str, Any]:
@@ -163,14 +134,12 @@ PRAGMA application_id = {APPLICATION};
 PRAGMA user_version = {VERSION};
 COMMIT;
 """
-SQLITE, OLD_JOURNAL = b"SQLite format 3\0", b"\x93CRJ"
-"""First bytes of an SQLite file, and of a journal of cloudrc up to version 0.1."""
 
 
 def open_store(path: Path, salt: bytes) -> MissionStore:
     """Open the file of missions and lock it; make a new file if there is none.
 
-    A damaged file or a journal of an earlier version is renamed, and `MissionStore.notice` says so.
+    A damaged file is renamed, and `MissionStore.notice` says so.
 
     Raises:
         StoreLockedError: If another process has locked the file.
@@ -180,20 +149,22 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
     if path.exists() and not path.is_file():
         raise BadInputError(f"--journal {path}: is not a file; name another one")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), "rb") as file:
-        head = file.read(len(SQLITE))
-    if head and not head.startswith((SQLITE, OLD_JOURNAL)):
-        raise BadInputError(f"--journal {path}: is no journal; move it away, or name another file")
+    path.touch(0o600)
     try:
         return MissionStore(connect(path), salt)
-    except sqlite3.OperationalError as error:  # the disk fails, which is no damage of the content
-        if error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY:  # without its extension
+    except sqlite3.DatabaseError as error:
+        reason = " ".join(str(error).split())
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # without its extension
+        if code == sqlite3.SQLITE_BUSY:
             text = f"{path}: another teleop has this journal open; waiting until it ends"
             raise StoreLockedError(text) from None
-        text = f"--journal {path}: {error}; free or repair its volume, or name another"
-        raise BadInputError(text) from None
-    except sqlite3.DatabaseError as error:
-        aside, reason = path.with_name(f"{path.name}.damaged"), " ".join(str(error).split())
+        if code == sqlite3.SQLITE_NOTADB:
+            text = "is no journal; move it away, or name another file"
+            raise BadInputError(f"--journal {path}: {text}") from None
+        if isinstance(error, sqlite3.OperationalError):  # the disk fails; the content is intact
+            text = f"{reason}; free or repair its volume, or name another"
+            raise BadInputError(f"--journal {path}: {text}") from None
+    aside = path.with_name(f"{path.name}.damaged")
     for ending in ("", "-wal", "-shm", "-journal"):  # the files of one database
         with suppress(FileNotFoundError):
             Path(f"{path}{ending}").replace(f"{aside}{ending}")
@@ -236,7 +207,9 @@ KEPT = 100
 """Limit of the ended missions that the store keeps."""
 KEEP_PERIOD_NS = 1_000_000_000
 """Time between two attempts to write events that the disk has refused [ns]."""
-_ORDER = TypeAdapter(Order)
+_ORDER, _MISSION = TypeAdapter(Order), TypeAdapter(Mission)
+_STATUS = {"state", "world", "elapsed", "events", "happened", "witness", "verdict"}
+"""Attributes of a mission that change with its events; waypoints have a table of their own."""
 
 
 class MissionStore:
@@ -244,7 +217,7 @@ class MissionStore:
 
     Attributes:
         missions: Missions by id, oldest first.
-        trouble: Why the disk has refused the last event; "" if the disk has accepted it.
+        trouble: Why the disk has refused the last transaction; "" if everything is on the disk.
         dropped: Number of events that a reader has requested too late, after their removal.
         notice: What was wrong with an earlier file and where it is now; "" if nothing was wrong.
     """
@@ -267,20 +240,9 @@ class MissionStore:
                 raise
             raise sqlite3.DatabaseError(f"a row cannot be read: {error!r}") from error
 
-    @property
-    def kept(self) -> bool:
-        """Whether all events are on the disk."""
-        return not self._unsaved
-
     def open(self) -> list[Mission]:
         """Return the missions that have not ended; the first is the one to fly."""
         return [mission for mission in self.missions.values() if not mission.ended]
-
-    def stopped(self) -> Mission | None:
-        """Return the mission that was flown last, if it ended by an emergency stop."""
-        events = {"started", "emergency_stopped"}
-        flown = [each for each in self.missions.values() if each.happened.keys() & events]
-        return flown[-1] if flown and "emergency_stopped" in flown[-1].happened else None
 
     def find(self, mission_id: str) -> Mission:
         """Return a mission; raise UnknownMissionError if none has this id."""
@@ -326,7 +288,7 @@ class MissionStore:
 
     def catch_up(self, now_ns: int) -> None:
         """Try again to write events that the disk has refused, if due at `now_ns` [ns]."""
-        if self._unsaved and now_ns >= self._keep_ns:
+        if self.trouble and now_ns >= self._keep_ns:
             self._keep_ns = now_ns + KEEP_PERIOD_NS
             with suppress(UnavailableError):
                 self._commit()
@@ -382,13 +344,10 @@ class MissionStore:
 
     def _read(self) -> None:
         for row, ordered, status in self._db.execute("SELECT * FROM mission ORDER BY n"):
-            (number, order), rest = json.loads(ordered), json.loads(status)
-            mission = Mission(f"m{row}", _ORDER.validate_python(order), number)
-            mission.events = deque(rest.pop("events"), SHOWN)
-            mission.happened = Counter(rest.pop("happened"))
-            mission.witness = Observations(**rest.pop("witness"))
-            for name, value in rest.items():
-                setattr(mission, name, value)
+            number, order = json.loads(ordered)
+            known = {"id": f"m{row}", "number": number, "order": order, **json.loads(status)}
+            mission = _MISSION.validate_python(known)
+            mission.events = deque(mission.events, SHOWN)
             self._events = max(self._events, *(event["id"] for event in mission.events), 0)
             self.missions[mission.id] = mission
         for row, *reached in self._db.execute("SELECT * FROM reached ORDER BY mission, waypoint"):
@@ -397,7 +356,4 @@ class MissionStore:
 
 
 def _status(mission: Mission) -> str:
-    names = "state", "world", "elapsed", "happened", "verdict"
-    status = {name: getattr(mission, name) for name in names}
-    more = {"events": list(mission.events), "witness": mission.witness.as_json()}
-    return json.dumps(status | more)
+    return json.dumps(_MISSION.dump_python(mission, mode="json", include=_STATUS))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from enum import IntEnum
 from math import nan
 from typing import NamedTuple, TypeAlias
 
@@ -30,35 +29,23 @@ from cloudrc.records import MissionEvent
 class Leg:
     """One waypoint and the conditions for reaching it.
 
-    Attributes:
-        position: Waypoint [m], world frame, shape (3,).
-        yaw: Heading to hold [rad].
-        tolerance: Largest distance from the waypoint that counts as reached [m]. If it is infinite,
-            the leg always lasts `dwell`; missions of random steps use this.
-        dwell: Time to stay within the tolerance without interruption [s].
-        time_limit: Longest duration of the leg, without the time in which it is held [s].
+    With an infinite tolerance, the leg always lasts `dwell`; missions of random steps use this.
     """
 
-    position: Vector
-    yaw: float = 0.0
-    tolerance: float = 0.10
-    dwell: float = 0.5
-    time_limit: float = 60.0
+    position: Vector  # [m], world frame, shape (3,)
+    yaw: float = 0.0  # heading to hold [rad]
+    tolerance: float = 0.10  # largest distance from the waypoint that counts as reached [m]
+    dwell: float = 0.5  # time to stay within the tolerance without interruption [s]
+    time_limit: float = 60.0  # of the leg, without the time in which it is held [s]
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The plan of a mission.
+    """The plan of a mission."""
 
-    Attributes:
-        legs: Legs to fly, in order; at least one.
-        start: Place of the start: the spawn (world is reset), or the robot's position.
-        time_limit: Longest duration of the mission, including the time in which it is held [s].
-    """
-
-    legs: tuple[Leg, ...]
-    start: Start = Start.SPAWN
-    time_limit: float = 60.0
+    legs: tuple[Leg, ...]  # in order; at least one
+    start: Start = Start.SPAWN  # the spawn (world is reset), or the robot's position
+    time_limit: float = 60.0  # of the mission, including the time in which it is held [s]
 
 
 NO_PLAN = Plan((Leg(ZERO),))
@@ -68,59 +55,40 @@ NO_PLAN = Plan((Leg(ZERO),))
 class RobotStatus(NamedTuple):
     """The robot's status from the newest telemetry, sent from cloud to teleop.
 
-    Attributes:
-        epoch: Epoch of the session; a restart of cloud changes it.
-        position: Measured position of the base [m], world frame, shape (3,).
-        guard: State of the guard.
-        mission: Number of the last operator request that world has acted on; 0 if none.
-        world: Text that identifies world's process; a restart of world changes it.
-        pipe_contacts: Number of contacts with pipes so far.
-        touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before that.
-        slip_ns: Lag of world's clock behind its machine's clock [ns].
-        horizon: Prediction horizon of cloud [s]; NaN before its first command.
-        rtt: Last round trip without the hold time on board [s]; NaN before the first.
-        loop_delay: Last round trip with the hold time on board [s]; NaN before the first.
-        mission_id: Number of the mission of the last start request; 0 if none.
-        reached: Number of waypoints of this mission that world has stored as reached, or
-            `MISSION_OVER`.
-        cause: Cause of the guard's state.
+    Numbers that are not known yet are NaN.
     """
 
-    epoch: int
-    position: Vector
+    epoch: int  # of the session; a restart of cloud changes it
+    position: Vector  # measured position of the base [m], world frame, shape (3,)
     guard: GuardState
-    mission: int
-    world: str = ""
-    pipe_contacts: int = 0
-    touch_speed: float = nan
-    slip_ns: int = 0
-    horizon: float = nan
-    rtt: float = nan
-    loop_delay: float = nan
-    mission_id: int = 0
-    reached: int = 0
-    cause: Cause = Cause.SPAWN
+    mission: int  # number of the last operator request that world has acted on; 0 if none
+    world: str = ""  # identifies world's process; a restart of world changes it
+    pipe_contacts: int = 0  # number of contacts with pipes so far
+    touch_speed: float = nan  # of the arm's tip when it touched the board [m/s]
+    slip_ns: int = 0  # lag of world's clock behind its machine's clock [ns]
+    horizon: float = nan  # prediction horizon of cloud's last command [s]
+    rtt: float = nan  # last round trip without the hold time on board [s]
+    loop_delay: float = nan  # last round trip with the hold time on board [s]
+    mission_id: int = 0  # number of the mission of the last start request; 0 if none
+    reached: int = 0  # waypoints that world has stored as reached, or `MISSION_OVER`
+    cause: Cause = Cause.SPAWN  # of the guard's state
 
 
-class State(IntEnum):
-    """State of the mission; STARTING lasts until telemetry shows the start."""
-
-    IDLE = 0
-    STARTING = 1
-    FLYING = 2
-    HELD = 3
-    DONE = 4
-    FAILED = 5
-    CANCELLED = 6
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a mission ended: its last event, the same in words, and how many waypoints it reached."""
-
-    code: str
-    text: str
-    reached: int
+QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
+"""States of a mission that has not ended; STARTING lasts until telemetry shows the start."""
+ENDED = "done", "failed", "cancelled"
+"""States of a mission that has ended."""
+FAILURES = (
+    *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
+    *("taken_over", "end_lost"),
+)
+"""Events that end a mission as failed."""
+STATES = {
+    **{state: state for state in (QUEUED, STARTING, HELD, "done", "cancelled")},
+    **dict.fromkeys(("started", "resumed"), FLYING),
+    **dict.fromkeys(FAILURES, "failed"),
+}
+"""State of a mission after an event; other events do not change the state."""
 
 
 Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent

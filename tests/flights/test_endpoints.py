@@ -119,6 +119,6 @@ def test_one_mission_can_follow_another_from_here() -> None:
     assert states == [GuardState.GROUND, GuardState.TRACK, GuardState.HOLD]
     ends.cloud.teleop.start(ends.run.now_ns, Plan((Leg((0.5, 0.0, 1.0)),), Start.HERE))
     of_world, _ = fly_on(ends.run, 40_000 * MS, lambda: ends.cloud.mission_over)
-    assert ends.cloud.teleop.outcome.code == "done"
+    assert ends.cloud.teleop.outcome.event == "done"
     assert not [record for record in of_world if isinstance(record, SessionOpened | Contact)]
     assert abs(ends.world.robot.simulator.readings.position[0] - 0.5) < 0.2

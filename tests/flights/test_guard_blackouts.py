@@ -180,7 +180,7 @@ def test_a_lost_downlink_lands_the_robot_and_ends_the_run() -> None:
     changes = [r for r in of_world if isinstance(r, GuardChange)]
     assert [r.state.name for r in changes[-3:]] == ["HOLD", "LAND", "LAND"]
     assert changes[-1].cause == "touched down, rotors stopped"
-    assert ends.cloud.teleop.outcome.code == "guard_stopped"
+    assert ends.cloud.teleop.outcome.event == "guard_stopped"
     assert ends.run.now_ns < 30e9
 
 

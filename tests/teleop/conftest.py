@@ -99,7 +99,7 @@ class Flight:
 
     @property
     def state(self):
-        return self.teleop.state.name
+        return self.teleop.state.upper()
 
     @property
     def requests(self):
@@ -168,7 +168,7 @@ def flying(plan=PLAN):
 
 
 class KilledError(BaseException):
-    """The process is gone: nothing catches it."""
+    """The process is gone."""
 
 
 class Disk(sqlite3.Connection):
@@ -189,24 +189,17 @@ class Disk(sqlite3.Connection):
 
 
 class ServiceFlight(Flight):
-    """A flight with a service in the machine's place, which may be restarted.
-
-    Attributes:
-        images: What was on the disk after each commit.
-        full: Whether the disk refuses commits.
-        commits: Attempts to commit.
-        killed_before: Commit before which the process is killed; `killed_after` likewise.
-    """
+    """A flight with a service in the machine's place, which may be restarted."""
 
     def __init__(self, scene=None):
         super().__init__()
-        self.scene, self.images, self.full, self.commits = scene, [], False, 0
-        self.mark = 0
+        self.scene, self.full, self.mark = scene, False, 0
+        self.images, self.commits = [], 0  # the disk after each commit, and attempts to commit
         self.restart_teleop()
 
     def restart_teleop(self, image=None):
         """A new process, that has nothing but what is on the disk, or was at a commit."""
-        self.killed_before = self.killed_after = None
+        self.killed_before = self.killed_after = None  # number of a commit
         self.teleop = MissionService(0.25, self.stored(image), self.scene)
 
     def stored(self, image=None):
@@ -337,8 +330,7 @@ class Running:
         if ready:
             self.bridge.open(self.flight.teleop)
         self._thread.start()
-        if not unix:
-            self.until(self.answers)
+        self.until(lambda: self.server.started)
 
     def reset(self):
         """Begin again with another robot and service, and keep the server."""
@@ -364,15 +356,6 @@ class Running:
                 call(self.flight.now_ns)
             self.flight.step()
 
-    def answers(self):
-        try:
-            self.get("/v1/state")
-        except urllib.error.HTTPError:
-            return True
-        except OSError:
-            return False
-        return True
-
     def stop(self):
         self.server.stop()
         self._stopping.set()
@@ -380,13 +363,11 @@ class Running:
         self.folder.cleanup()
 
     def get(self, path):
-        with DIRECT.open(self.request(path), timeout=LIMIT) as answer:
-            return json.loads(answer.read())
+        return self.send(self.request(path))[1]
 
     def request(self, path, data=None, token=OPERATOR, method=None, headers=None):
-        headers = dict(headers or {})
-        if token is not None:
-            headers["Authorization"] = f"Bearer {token}"
+        said = {"Authorization": f"Bearer {token}"} if token else {}
+        headers = {**said, **(headers or {})}
         return urllib.request.Request(self.url + path, data, headers, method=method)
 
     def post(self, path, body=b"", token=OPERATOR):
@@ -417,6 +398,12 @@ class Running:
         while not condition():
             assert time.monotonic() < limit, "not in time"
             time.sleep(0.01)
+
+    def fly(self, mission):
+        """Post a mission and wait until it flies; return its id."""
+        _, view = self.post("/v1/missions", mission)
+        self.until(lambda: self.state_of(view["id"]) == "flying")
+        return view["id"]
 
     def state_of(self, mission_id):
         return self.get(f"/v1/missions/{mission_id}")["state"]

@@ -84,7 +84,7 @@ def test_time_in_hold_or_unseen_is_no_dwell():
 
 def assert_failed(flight, code, text):
     outcome = flight.teleop.outcome
-    assert (flight.state, outcome.code, outcome.text) == ("FAILED", code, text)
+    assert (flight.state, outcome.event, outcome.text) == ("FAILED", code, text)
     assert (flight.events[-1].event, flight.events[-1].text) == (code, text)
     assert flight.setpoints[-1].waypoint == -1
     flight.step(seconds=0.05)

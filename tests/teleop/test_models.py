@@ -91,12 +91,6 @@ def at(api, position):
     api.until(is_seen)
 
 
-def fly(api):
-    _, view = api.post("/v1/missions", waypoint(position_m=EAST))
-    api.until(lambda: api.state_of(view["id"]) == "flying")
-    return view["id"]
-
-
 @pytest.mark.parametrize(
     ("here", "there", "free"),
     [
@@ -110,7 +104,7 @@ def fly(api):
     ],
 )
 def test_nobody_is_sent_straight_through_a_pipe(api, here, there, free):
-    mission_id = fly(api)
+    mission_id = api.fly(waypoint(position_m=EAST))
     at(api, here)
     for path, body in (("goto", {"position_m": there}), ("resume", None)):
         assert "wall" not in api.post(f"/v1/{path}", body)[1]["detail"], "first hold the mission"
@@ -122,7 +116,7 @@ def test_nobody_is_sent_straight_through_a_pipe(api, here, there, free):
 
 @pytest.mark.parametrize(("here", "state"), [(BORE, "held"), ((0.5, 0.0, 2.0), "flying")])
 def test_nor_does_a_mission_go_on_through_its_wall(api, here, state):
-    mission_id = fly(api)
+    mission_id = api.fly(waypoint(position_m=EAST))
     api.post("/v1/hold")
     at(api, here)
     assert api.post("/v1/resume")[0] == (409 if state == "held" else 200)

@@ -147,10 +147,10 @@ class MissionMachine(RuleBasedStateMachine):
         if flight.state in UNDER_WAY | {"IDLE"}:
             assert outcome is None
             return
-        assert (outcome.code == "done") == (self.reached == len(self.plan.legs))
-        assert outcome.code == CODES.get(flight.state, outcome.code)
-        assert flight.state != "FAILED" or outcome.code in FAILURES
-        assert flight.events[-1].event == outcome.code
+        assert (outcome.event == "done") == (self.reached == len(self.plan.legs))
+        assert outcome.event == CODES.get(flight.state, outcome.event)
+        assert flight.state != "FAILED" or outcome.event in FAILURES
+        assert flight.events[-1] == outcome
 
     def check_the_last_setpoint(self):
         if self.flight.setpoints:
