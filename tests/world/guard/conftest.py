@@ -267,6 +267,24 @@ class Run:
         return solver.check() != z3.unsat
 
 
+class AtLeast:
+    """Any float from `bound` > 0 on, infinity included: z3 takes half a minute for a product of two.
+
+    A correctly rounded sum or product of such floats is monotonic: the result is at least that of
+    the bounds, and never NaN.
+    """
+
+    def __init__(self, bound):
+        assert bound > 0.0
+        self.bound = bound
+
+    def __add__(self, other):
+        return AtLeast(self.bound + other.bound)
+
+    def __mul__(self, other):
+        return AtLeast(self.bound * (other.bound if isinstance(other, AtLeast) else other))
+
+
 def root(x: Symbol | float, top: float = LARGEST) -> Symbol | float:
     """Return the square root of a finite x >= 0: a finite float >= 0.
 
