@@ -309,10 +309,10 @@ def _ended(name: str, code: int, log: str) -> CloudrcError:
 @contextlib.contextmanager
 def _open_loopback() -> Iterator[dict[str, Way]]:
     with bind((LOOPBACK, 0)) as up, bind((LOOPBACK, 0)) as down:
-        ports = zip(free_ports(2), free_ports(2, socket.SOCK_STREAM), strict=True)
+        ports = free_ports(4)
         yield {
-            "uplink": Way(up, down.getsockname(), next(ports)),
-            "downlink": Way(down, up.getsockname(), next(ports)),
+            "uplink": Way(up, down.getsockname(), (ports[0], ports[1])),
+            "downlink": Way(down, up.getsockname(), (ports[2], ports[3])),
         }
 
 

@@ -7,6 +7,7 @@ All datagrams of one wake get the same instant, as the endpoint's contract requi
 from __future__ import annotations
 
 import gc
+import random
 import select
 import socket
 import time
@@ -40,6 +41,8 @@ SINK_PERIOD_NS = 20_000_000
 """Longest time between two calls of the sink [ns]."""
 WAIT_MAX_NS = 100_000_000
 """Longest wait for a datagram [ns]; then the loop calls `stop` again."""
+PORTS = range(20_000, 30_000)
+"""Ports among which `free_ports` chooses."""
 ROUTE_PERIOD_NS = 500_000_000
 """Time between two checks of the route file [ns]."""
 
@@ -163,16 +166,21 @@ def bind(listen: Address) -> socket.socket:
     return udp
 
 
-def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[int]:
-    """Find unused ports on 127.0.0.1."""
-    sockets = [socket.socket(socket.AF_INET, kind) for _ in range(count)]
-    try:
-        for sock in sockets:
-            sock.bind(("127.0.0.1", 0))
-        return [int(sock.getsockname()[1]) for sock in sockets]
-    finally:
-        for sock in sockets:
-            sock.close()
+def free_ports(count: int) -> list[int]:
+    """Find ports on 127.0.0.1 that are unused for both UDP and TCP.
+
+    They are below the ports that the kernel gives to connections, which could take them meanwhile.
+    """
+    found: list[int] = []
+    for port in random.SystemRandom().sample(PORTS, 1000):
+        with socket.socket(type=socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
+            with suppress(OSError):
+                udp.bind(("127.0.0.1", port))
+                tcp.bind(("127.0.0.1", port))
+                found.append(port)
+        if len(found) == count:
+            break
+    return found
 
 
 def serve(

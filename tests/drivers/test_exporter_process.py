@@ -3,34 +3,19 @@
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import sys
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from cloudrc.config.load import dump, load_experiment
-
-
-def free_ports(count: int) -> list[int]:
-    """Find ports on 127.0.0.1 that are free for both UDP and TCP."""
-    ports: list[int] = []
-    with ExitStack() as held:
-        while len(ports) < count:
-            udp, tcp = socket.socket(type=socket.SOCK_DGRAM), socket.socket()
-            held.callback(udp.close)
-            held.callback(tcp.close)
-            udp.bind(("127.0.0.1", 0))
-            with suppress(OSError):  # free for UDP, but a TCP connection has just used it
-                tcp.bind(udp.getsockname())
-                ports.append(udp.getsockname()[1])
-    return ports
+from cloudrc.drivers.realtime import free_ports
 
 
 class Pods:

@@ -268,7 +268,7 @@ class Run:
 
 
 class AtLeast:
-    """Any float from `bound` > 0 on, infinity included: z3 takes half a minute for a product of two.
+    """Any float from `bound` > 0 on, infinity included; z3 takes half a minute for their product.
 
     A correctly rounded sum or product of such floats is monotonic: the result is at least that of
     the bounds, and never NaN.
