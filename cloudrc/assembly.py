@@ -45,9 +45,7 @@ FENCE_SPAN = dist(fence.LOW, fence.HIGH)
 
 
 def build_world(
-    experiment: ResolvedExperiment,
-    identity: Identity,
-    clock: Callable[[], int] = lambda: 0,
+    experiment: ResolvedExperiment, identity: Identity, clock: Callable[[], int] = lambda: 0
 ) -> WorldEndpoint:
     """Build world's end: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 

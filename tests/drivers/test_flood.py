@@ -1,14 +1,11 @@
 """A flood on world's port loses no valid datagram and does not delay the guard."""
 
-from __future__ import annotations
-
 import random
 import socket
 import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -40,7 +37,7 @@ flood(("127.0.0.1", {port}), {rate}, {seconds})
 """
 
 
-def garbage(count: int, seed: int) -> list[bytes]:
+def garbage(count, seed):
     """Make noise, valid headers with a wrong length, and valid lengths with a wrong tag."""
     rng, made = random.Random(seed), []
     for number in range(count):
@@ -53,7 +50,7 @@ def garbage(count: int, seed: int) -> list[bytes]:
     return made
 
 
-def flood(target: tuple[str, int], rate: int, seconds: float) -> None:
+def flood(target, rate, seconds):
     """Send `rate` datagrams a second, in bursts of one millisecond."""
     made, sent, start = garbage(5000, 1), 0, time.monotonic()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
@@ -81,7 +78,7 @@ class Hover(NamedTuple):
     sent: int
 
 
-def fly(folder: Path, *, flooded: bool) -> Hover:
+def fly(folder, *, flooded):
     """Fly a hover, with or without a flood."""
     command = [sys.executable, "-m", "cloudrc", "run", "hover", "--mode", "local"]
     for setting in ("mission.waypoints.0.dwell_s=23", "link.profile=ideal"):
@@ -105,7 +102,7 @@ def fly(folder: Path, *, flooded: bool) -> Hover:
     return Hover(Flight(recording, Criteria(), 1, load_scene("empty")), began_ns, ended_ns, sent)
 
 
-def port_of_world(parent: int) -> int:
+def port_of_world(parent):
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             words = path.read_text().split("\0")
@@ -118,7 +115,7 @@ def port_of_world(parent: int) -> int:
     raise AssertionError("no world")
 
 
-def done_p99(hover: Hover) -> float:
+def done_p99(hover):
     """Return the time from each deadline to the end of its handling [s]."""
     woken = wakes(hover.flight, "world")
     stamps = woken["stamp_ns"]
@@ -127,7 +124,7 @@ def done_p99(hover: Hover) -> float:
     return float(np.percentile((woken["lateness"] + woken["busy"])[meanwhile], 99.0))
 
 
-def refused(flight: Flight) -> int:
+def refused(flight):
     """Return the number of datagrams that world has rejected."""
     counts = flight.recording["/count"]
     rows = zip(counts["end"], counts["name"], counts["total"], strict=True)
@@ -135,14 +132,14 @@ def refused(flight: Flight) -> int:
     return sum(last.get(name, 0) for name in REFUSED)
 
 
-def honest(flight: Flight) -> int:
+def honest(flight):
     """Return the number of datagrams sent in both directions."""
     settled_ns = flight.recording["/telemetry"]["stamp_ns"][-1] - SETTLING_NS
     stamps = [flight.during(topic)["stamp_ns"] for topic in SENT.values()]
     return sum(int((one <= settled_ns).sum()) for one in stamps)
 
 
-def check_flood(folder: Path, figure: Callable[..., None]) -> float:
+def check_flood(folder, figure):
     """Fly one pair; check the losses; return the growth of the 99th percentile [s]."""
     calm, stormy = fly(folder / "calm", flooded=False), fly(folder / "stormy", flooded=True)
     flight, sent = stormy.flight, stormy.sent
@@ -162,9 +159,7 @@ def check_flood(folder: Path, figure: Callable[..., None]) -> float:
     return done_p99(stormy) - done_p99(calm)
 
 
-def test_ten_thousand_a_second_for_twenty_seconds(
-    tmp_path: Path, figure: Callable[..., None]
-) -> None:
+def test_ten_thousand_a_second_for_twenty_seconds(tmp_path, figure):
     grown = median(check_flood(tmp_path / f"pair {n + 1}", figure) for n in range(PAIRS))
     name = f"garbage flood, median of {PAIRS} pairs: guard tick done, p99 grows by"
     figure(name, grown * 1e3, "<=", 1.0, "ms", count=PAIRS)

@@ -30,9 +30,7 @@ extras.EXTRAS["api"] = ("fastapi_is_not_here",)
 """
 
 
-def start(
-    folder: Path, *settings: str, dwell: float = 20.0, command: list[str] = FAST
-) -> subprocess.Popen[str]:
+def start(folder, *settings, dwell=20.0, command=FAST):
     words = ["run", "hover", "--mode", "local", "--out", str(folder)]
     for setting in (f"mission.waypoints.0.dwell_s={dwell}", *settings):
         words += ["--set", setting]
@@ -42,7 +40,7 @@ def start(
     )
 
 
-def children(parent: int) -> dict[str, int]:
+def children(parent):
     """Return the process ids by role: relay, world, teleop, cloud."""
     found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
@@ -55,7 +53,7 @@ def children(parent: int) -> dict[str, int]:
     return found
 
 
-def wait_until_flying(run: subprocess.Popen[str]) -> dict[str, int]:
+def wait_until_flying(run):
     assert run.stdout is not None
     for line in run.stdout:
         if "mission started" in line:
@@ -63,11 +61,11 @@ def wait_until_flying(run: subprocess.Popen[str]) -> dict[str, int]:
     raise AssertionError(run.stderr.read() if run.stderr else "")
 
 
-def report(folder: Path) -> dict:
+def report(folder):
     return json.loads((folder / "report.json").read_text())
 
 
-def alive(pid: int) -> bool:
+def alive(pid):
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -75,7 +73,7 @@ def alive(pid: int) -> bool:
     return True
 
 
-def wait_until_ended(pids: dict[str, int], limit: float) -> None:
+def wait_until_ended(pids, limit):
     """Wait until all processes have ended, at most `limit` [s]."""
     until = time.monotonic() + limit
     while any(alive(pid) for pid in pids.values()):
@@ -199,16 +197,16 @@ EDGE = 0.01
 """Uncertainty of the start of a time line, which is the next datagram [s]."""
 
 
-def call(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def call(folder, *words):
     return subprocess.run([*COMMAND, *words, "--run", str(folder)], capture_output=True, text=True)
 
 
-def set_link(folder: Path, *words: str) -> float:
+def set_link(folder, *words):
     """Change the link; return how long it took to be in force [s]."""
     return json.loads(call(folder, "link", "set", *words, "-o", "json").stdout)["seconds"]
 
 
-def operate(folder: Path) -> None:
+def operate(folder):
     """Hold, move and resume the mission of a run, found by its folder and from anywhere."""
     assert call(folder, "mission", "run", "hover").returncode == 5  # a mission already flies
     assert "held" in call(folder, "mission", "hold").stdout
@@ -264,7 +262,7 @@ def test_an_operator_steers_a_run_and_sets_its_link(tmp_path, figure):
     assert "Triangles: the link was set in flight (1: downlink.delay_ms=120" in page
 
 
-def check_delays(recording: Recording) -> None:
+def check_delays(recording):
     """Check that the delays of the downlink follow its changes."""
     link, delays = recording["/link"], recording["/downlink_delay"]["delay"]
     told = {cause: stamp - age * 1e9 for cause, stamp, age, uplink in
@@ -300,7 +298,7 @@ def test_real_time_takes_as_long_as_virtual_time(tmp_path, attempt):
         assert local[name]["value"] > 0
 
 
-def private_memory(pid: int) -> int:
+def private_memory(pid):
     """Return the private memory of a process [bytes]."""
     status = Path(f"/proc/{pid}/status").read_text()
     return 1024 * int(status.partition("RssAnon:")[2].split()[0])

@@ -68,7 +68,7 @@ def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(told, ends, monkey
 
 
 @pytest.mark.process
-def test_it_ends_if_its_supervisor_was_killed_before_its_start(tmp_path: Path) -> None:
+def test_it_ends_if_its_supervisor_was_killed_before_its_start(tmp_path):
     (tmp_path / "config.yaml").write_text(CONFIG.read_text())
     command = [sys.executable, "-c", KILLED_AT_ONCE, str(tmp_path)]
     supervisor = subprocess.run(command, capture_output=True, text=True, timeout=60)

@@ -27,7 +27,7 @@ PERIOD = 0.010
 """Period of the control loop [s]."""
 
 
-def p99(folder: Path, began_ns: int, ended_ns: int):
+def p99(folder, began_ns, ended_ns):
     """Return the 99 % quantile of the control period's error within an interval [ms]."""
     messages = read_contents(folder / "cloud.mcap").messages
     stamps = np.array([stamp for topic, stamp, _ in messages if topic == "/cmd_vel"])
@@ -36,7 +36,7 @@ def p99(folder: Path, began_ns: int, ended_ns: int):
     return float(np.percentile(np.abs(np.diff(stamps) * 1e-9 - PERIOD), 99)) * 1e3
 
 
-def flood(folder: Path, seconds: float):
+def flood(folder, seconds):
     """Fly a calm and a flooded interval [s]; return the answers and the p99 in both [ms]."""
     folder.mkdir()
     release = Release(folder, "cloud")

@@ -54,7 +54,7 @@ requests = st.builds(
 )
 
 
-def datagram(kind: Kind, body: bytes) -> bytes:
+def datagram(kind, body):
     return codec.encode_header(kind, 0, 1, 2) + body + bytes(codec.TAG_SIZE)
 
 

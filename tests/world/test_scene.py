@@ -21,7 +21,7 @@ def pipes():
     return compile_model("pelican", "pipes")
 
 
-def facts(scene: str) -> dict[str, list[float]]:
+def facts(scene):
     """Return the scene as readers without MuJoCo see it."""
     root = ElementTree.parse(FOLDER / "scenes" / f"{scene}.xml").getroot()
     return {n.get("name"): [float(x) for x in n.get("data").split()] for n in root.iter("numeric")}
@@ -114,7 +114,7 @@ def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
     assert np.sum(directions, axis=0) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
-def touched_at(scene: str) -> set[str]:
+def touched_at(scene):
     """Return the bodies that the robot touches at its spawn, without the floor."""
     simulator = Simulator("pelican", scene)
     simulator.step(STOPPED)

@@ -7,10 +7,7 @@ bit by bit. Other divisions and square roots would take z3 minutes. They are rep
 correct rounding guarantees.
 """
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable
 from math import frexp, hypot, sqrt
 from random import Random
 
@@ -18,7 +15,7 @@ import pytest
 import z3
 
 from cloudrc.geometry import fence
-from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, Vector
+from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState
 from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
@@ -34,24 +31,24 @@ HERE = (1.0, 2.0, 1.3)
 LIMITS = Limits(fence.LOW, fence.HIGH)
 
 
-def command(velocity: Vector = (1.0, 0.0, 0.0), basis_ns: int = 0, yaw_rate: float = 0.0):
+def command(velocity=(1.0, 0.0, 0.0), basis_ns=0, yaw_rate=0.0):
     """Return a command that was computed from odometry of `basis_ns`."""
     return Command(0, basis_ns, 0, velocity, yaw_rate)
 
 
-def sensed(position: Vector = HERE, velocity: Vector = ZERO) -> Readings:
+def sensed(position=HERE, velocity=ZERO):
     """Return the readings of an upright robot."""
     return Readings.of((*position, *UPRIGHT), (*velocity, *ZERO))
 
 
-def armed(limits: Limits = LIMITS, now_ns: int = 0) -> Guard:
+def armed(limits=LIMITS, now_ns=0):
     """Return a guard in GROUND with a started mission."""
     guard = Guard(limits)
     guard.start_mission(now_ns)
     return guard
 
 
-def tracking(velocity: Vector = (1.0, 0.0, 0.0), limits: Limits = LIMITS) -> Guard:
+def tracking(velocity=(1.0, 0.0, 0.0), limits=LIMITS):
     """Return a guard in TRACK since 0 ns, by a command with a basis of 0 ns."""
     guard = armed(limits)
     assert guard.accept_command(command(velocity), 0) is None
@@ -76,7 +73,7 @@ def feed(guard, start_ns, count, velocity=(1.0, 0.0, 0.0), every_ns=10 * MS, pos
     return now_ns
 
 
-def holding(limits: Limits = LIMITS):
+def holding(limits=LIMITS):
     """Return a guard in HOLD in a mission, at rest, at 2 s."""
     guard = tracking(limits=limits)
     run(guard, 0, 2000 * MS)
@@ -84,7 +81,7 @@ def holding(limits: Limits = LIMITS):
     return guard
 
 
-def landing(limits: Limits = LIMITS):
+def landing(limits=LIMITS):
     """Return a guard in LAND after impossible commands, at 2 s."""
     guard = holding(limits)
     for _ in range(5):
@@ -169,13 +166,13 @@ LARGEST = sys.float_info.max
 class Symbol:
     """Any float that satisfies the path of its run."""
 
-    def __init__(self, run: Run, term: z3.FPRef) -> None:
+    def __init__(self, run, term):
         self.run, self.term = run, term
 
-    def _with(self, other: Symbol | float) -> z3.FPRef:
+    def _with(self, other):
         return other.term if isinstance(other, Symbol) else z3.FPVal(other, DOUBLE)
 
-    def _new(self, term: z3.FPRef) -> Symbol:
+    def _new(self, term):
         return Symbol(self.run, term)
 
     def __neg__(self):
@@ -230,21 +227,21 @@ class Symbol:
 class Run:
     """One path through the code."""
 
-    def __init__(self, decisions: list[bool]) -> None:
+    def __init__(self, decisions):
         self.decisions, self.taken = decisions, 0
         self.path: list[z3.BoolRef] = []
         self.names = 0
 
-    def fresh(self, name: str) -> Symbol:
+    def fresh(self, name):
         """Return a symbol for any float at all."""
         self.names += 1
         return Symbol(self, z3.FP(f"{name}_{self.names}", DOUBLE))
 
-    def learn(self, fact: z3.BoolRef) -> None:
+    def learn(self, fact):
         """Add a condition to the path."""
         self.path.append(fact)
 
-    def take(self, condition: z3.BoolRef) -> bool:
+    def take(self, condition):
         """Choose the branch of this run; another run takes the other branch."""
         if self.taken == len(self.decisions):
             self.decisions.append(True)
@@ -253,14 +250,14 @@ class Run:
         self.learn(condition if decision else z3.Not(condition))
         return decision
 
-    def prove(self, claim: z3.BoolRef) -> None:
+    def prove(self, claim):
         """Fail if there is a counterexample on this path."""
         solver = z3.Solver()
         solver.add(*self.path, z3.Not(claim))
         answer = solver.check()
         assert answer == z3.unsat, f"{answer}: {solver.model() if answer == z3.sat else claim}"
 
-    def is_possible(self) -> bool:
+    def is_possible(self):
         """Tell whether any float takes this path."""
         solver = z3.Solver()
         solver.add(*self.path)
@@ -285,7 +282,7 @@ class AtLeast:
         return AtLeast(self.bound * (other.bound if isinstance(other, AtLeast) else other))
 
 
-def root(x: Symbol | float, top: float = LARGEST) -> Symbol | float:
+def root(x, top=LARGEST):
     """Return the square root of a finite x >= 0: a finite float >= 0.
 
     For x up to `top` it is at most the root of `top`: a correctly rounded root is monotonic.
@@ -299,7 +296,7 @@ def root(x: Symbol | float, top: float = LARGEST) -> Symbol | float:
     return r
 
 
-def everywhere(check: Callable[[Run], None]) -> int:
+def everywhere(check):
     """Run `check` on every path; return the number of possible paths."""
     decisions: list[bool] = []
     paths = 0
