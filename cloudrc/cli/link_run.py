@@ -93,7 +93,7 @@ def execute(options: argparse.Namespace) -> int:
         programs = Programs(tables)
         sidecar = Sidecar(settings, _machine(options, programs, Path(tables)), profile, metrics)
         if exporter:
-            exporter.tells(LinkStatusSource(sidecar).text)
+            exporter.link.tell = LinkStatusSource(sidecar).text
         try:
             _start_watching(sidecar, profiles, options, metrics)
             sidecar.run(stop)
@@ -195,12 +195,12 @@ class Metrics:
 
     def shapes(self, shaper: str) -> None:
         """Export which shaper is in use, and report ready."""
-        self._exporter.shaped(shaper, self._direction, self._mode)
+        self._exporter.link.shaped(shaper, self._direction, self._mode)
         self._exporter.ready(True)
 
     def asked(self, delay: float) -> None:
         """Export the mean `delay` [s] that the profile requests."""
-        self._exporter.asked(self._direction, delay)
+        self._exporter.link.asked(self._direction, delay)
 
     def counted(self, stamp_ns: int, counts: dict[str, int]) -> None:
         """Export the counters of datagrams."""
