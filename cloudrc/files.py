@@ -21,10 +21,10 @@ class TooLongError(ValueError):
     """A file is larger than the reader's limit."""
 
 
-def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | None:
+def version(path: Path | str) -> tuple[int, int, int] | None:
     """Identify the version of a file with one system call; None if it does not exist."""
     try:
-        status = os.stat(path, follow_symlinks=follow)
+        status = os.stat(path)
     except OSError:
         return None
     return status.st_mtime_ns, status.st_ino, status.st_size

@@ -16,7 +16,7 @@ import pytest
 from cloudrc.drivers import local
 from cloudrc.record.columns import Recording
 from tests.conftest import nightly
-from tests.drivers.conftest import FAST, WITHOUT_PAGE
+from tests.drivers.conftest import WITHOUT_PAGE, start, wait_until_flying
 
 pytestmark = pytest.mark.process
 
@@ -28,37 +28,6 @@ WITHOUT_API = """
 from cloudrc.cli import extras
 extras.EXTRAS["api"] = ("fastapi_is_not_here",)
 """
-
-
-def start(folder, *settings, dwell=20.0, command=FAST):
-    words = ["run", "hover", "--mode", "local", "--out", str(folder)]
-    for setting in (f"mission.waypoints.0.dwell_s={dwell}", *settings):
-        words += ["--set", setting]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(
-        [*command, *words], stdout=pipe, stderr=pipe, text=True, start_new_session=True
-    )
-
-
-def children(parent):
-    """Return the process ids by role: relay, world, teleop, cloud."""
-    found = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            stat, line = path.read_text(), (path.parent / "cmdline").read_text().split("\0")
-        except OSError:
-            continue
-        if int(stat.rpartition(")")[2].split()[1]) == parent and "cloudrc" in line:
-            found[line[line.index("cloudrc") + 1]] = int(path.parent.name)
-    return found
-
-
-def wait_until_flying(run):
-    assert run.stdout is not None
-    for line in run.stdout:
-        if "mission started" in line:
-            return children(run.pid)
-    raise AssertionError(run.stderr.read() if run.stderr else "")
 
 
 def report(folder):
