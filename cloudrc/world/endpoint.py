@@ -43,7 +43,6 @@ from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import ServerHandshake
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.readings import Touch
 from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
@@ -76,7 +75,7 @@ class Orders:
         self.number = self.mission_id = self.reached = self.pipes = 0
         self.touch_speed = nan
 
-    def note_touch(self, touch: Touch) -> None:
+    def note_touch(self, touch: Contact) -> None:
         """Count a contact that has begun."""
         if touch.body.startswith("pipe"):
             self.pipes += 1
@@ -296,7 +295,7 @@ class WorldEndpoint(TunnelEnd):
             records += guard.take_changes()
         if simulator.touches:
             for touch in simulator.take_contacts():
-                records.append(Contact(now_ns, **touch._asdict()))
+                records.append(touch._replace(stamp_ns=now_ns))
                 orders.note_touch(touch)
         if epoch := self._session.epoch:
             known = (

@@ -62,21 +62,3 @@ class Readings(NamedTuple):
         )
         # One per physics step: the class's own constructor takes twice the time.
         return _new(cls, ((px, py, pz), (w, x, y, z), (vx, vy, vz), (p, q, r), axes))
-
-
-class Touch(NamedTuple):
-    """The beginning of a contact between robot and scene.
-
-    Attributes:
-        body: Name of the touched body of the scene: pipe_1, board, floor.
-        tip: True if the arm's tip touched the body, False if another part of the robot did.
-        position: Position of the base just before [m], world frame, shape (3,).
-        velocity: Velocity of the base just before [m/s], world frame, shape (3,).
-        tip_velocity: Velocity of the arm's tip just before [m/s], world frame, shape (3,).
-    """
-
-    body: str
-    tip: bool
-    position: Vector
-    velocity: Vector
-    tip_velocity: Vector
