@@ -140,7 +140,7 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether this process is ready; not for world and cloud, whose records show this."""
+        """Set whether this process is ready; the records of world and cloud show it for them."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,6 @@ TIP = (0.40, 0.0, 0.17)
 SHOWN = 6
 """Largest number of differences that one message lists."""
 FOLDER = Path(__file__).parent
-_NO_GL = {"", "disable", "disabled", "off", "false", "0"}
 
 
 def import_mujoco() -> Any:
@@ -46,10 +44,6 @@ def import_mujoco() -> Any:
         MissingPrerequisiteError: If the package is not installed.
     """
     wanted = os.environ.get("MUJOCO_GL")
-    if "mujoco" not in sys.modules and (wanted or "").lower() not in _NO_GL:
-        logging.getLogger(__name__).warning(
-            "MUJOCO_GL=%s ignored: a flight needs no OpenGL", wanted
-        )
     os.environ["MUJOCO_GL"] = "disable"
     try:
         import mujoco

@@ -28,19 +28,18 @@ def test_it_flies_without_the_requested_gl(tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stderr.splitlines() == ["MUJOCO_GL=egl ignored: a flight needs no OpenGL"]
+    assert done.stderr == ""
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("wanted", [None, "disable", "egl"])
-def test_the_variable_is_restored_and_nothing_logged_again(monkeypatch, caplog, wanted):
+def test_the_variable_is_restored(monkeypatch, wanted):
     if wanted is None:
         monkeypatch.delenv("MUJOCO_GL", raising=False)
     else:
         monkeypatch.setenv("MUJOCO_GL", wanted)
     import_mujoco()
     assert os.environ.get("MUJOCO_GL") == wanted
-    assert not caplog.records
 
 
 def test_without_the_package_the_extra_is_named(monkeypatch):
