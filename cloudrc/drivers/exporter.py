@@ -49,8 +49,7 @@ class Answer(NamedTuple):
 class _Server(socketserver.ThreadingTCPServer):
     """Serves pages by their paths until `close` is called.
 
-    `http.server.HTTPServer` may wait for a name server. The accept queue is long, so that a burst
-    of connections delays no probe of kubelet.
+    `http.server.HTTPServer` may wait for a name server. The accept queue is long, for bursts.
     """
 
     allow_reuse_address = True
@@ -170,8 +169,7 @@ class Exporter:
     def serve(self, address: tuple[str, int]) -> int:
         """Start to answer at a host and port; return the port, which port 0 leaves to the kernel.
 
-        Raises:
-            MissingPrerequisiteError: If the address cannot be bound.
+        An address that cannot be bound is a MissingPrerequisiteError.
         """
         pages = {"/metrics": self._page, "/healthz": self._liveness, "/readyz": self._readiness}
         end, link = self._live.end, self._live.link

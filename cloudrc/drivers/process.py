@@ -201,8 +201,8 @@ def _from_json(kind: Any, value: Any) -> Any:
 class LinkNotes:
     """Turns the state of an end's outgoing link into records.
 
-    The link's process publishes the state in a file, and a second file tells how late the relay's
-    datagrams left. The end does not trust that process: unreadable files are ignored.
+    The link's process, which the end does not trust, publishes the state in a file. A second file
+    tells how late the relay's datagrams left.
     """
 
     def __init__(self, path: Path, *, uplink: bool) -> None:

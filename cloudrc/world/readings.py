@@ -37,11 +37,10 @@ class Readings(NamedTuple):
 
     @classmethod
     def of(cls, pose: Iterable[float], twist: Iterable[float]) -> Readings:
-        """Make readings from the state of a free joint in MuJoCo.
+        """Make readings from the state of a free joint in MuJoCo, in the world frame.
 
-        Args:
-            pose: Position [m] and orientation (wxyz, unit) in the world frame, shape (7,).
-            twist: Velocity [m/s], world frame; angular velocity [rad/s], body frame; shape (6,).
+        `pose` is position [m] and orientation (wxyz, unit), shape (7,); `twist` is velocity [m/s]
+        and angular velocity [rad/s], body frame, shape (6,).
         """
         px, py, pz, w, x, y, z = pose
         vx, vy, vz, p, q, r = twist

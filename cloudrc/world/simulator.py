@@ -48,8 +48,7 @@ class Simulator:
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
-        Raises:
-            BadInputError: If a file is missing or does not suit the loop.
+        A file that is missing or does not suit the loop is a BadInputError.
         """
         self.model = model = compile_model(robot, scene)
         self.dt: float = model.opt.timestep

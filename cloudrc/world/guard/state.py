@@ -156,9 +156,8 @@ class Guard:
     def accept_command(self, command: Command, now_ns: int) -> str | None:
         """Accept or reject at `now_ns` [ns] a command, whose numbers may have any value, even NaN.
 
-        Returns:
-            None if the command is accepted, else the reason: "range" for a value that is too large
-            or NaN; "future" for a basis that is not yet measured; "stale" for one that is too old.
+        Return None, or the reason of the rejection: "range" for a value that is too large or NaN,
+        "future" for a basis that is not yet measured, "stale" for one that is too old.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
@@ -217,9 +216,8 @@ class Guard:
     def step(self, now_ns: int, readings: Readings, dt: float) -> Vector | None:
         """Advance by one tick of `dt` [s] at `now_ns` [ns].
 
-        Returns:
-            Velocity reference for the low-level controller [m/s], shape (3,); None while the rotors
-            are stopped.
+        Return the velocity reference for the low-level controller [m/s], shape (3,); None while the
+        rotors are stopped.
         """
         # The usual case: the same command as in the last tick, far from the fence.
         if now_ns <= self._steady_until_ns and self.reference is self._wanted:
