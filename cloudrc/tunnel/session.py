@@ -78,8 +78,8 @@ class Session:
     def begin(self, epoch: int, nonces: bytes = b"", key: Key | None = None) -> None:
         """Begin an epoch: derive new keys and restart the counters.
 
-        `nonces` are cloud's nonce, then world's; `key` is the pre-shared key of the handshake. Those
-        that are missing stay as in the previous epoch.
+        `nonces` are cloud's nonce, then world's; `key` is the pre-shared key of the handshake.
+        Those that are missing stay as in the previous epoch.
         """
         self.epoch = epoch
         self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)

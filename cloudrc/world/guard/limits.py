@@ -103,8 +103,8 @@ def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vec
 def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vector:
     """Slow a finite `velocity` [m/s], axis by axis, so that the robot can stop before the fence.
 
-    Near the floor the horizontal velocity is limited, too, because a rotor that touches the floor at
-    speed turns the robot over. `position` [m] is that of the base; `low` and `high` [m] are the
+    Near the floor the horizontal velocity is limited, too, because a rotor that touches the floor
+    at speed turns the robot over. `position` [m] is that of the base; `low` and `high` [m] are the
     corners of the fence, margins taken off; all are in the world frame, shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
