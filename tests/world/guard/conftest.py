@@ -83,9 +83,13 @@ def holding(limits=LIMITS):
 
 def landing(limits=LIMITS):
     """Return a guard in LAND after impossible commands, at 2 s."""
-    guard = holding(limits)
+    return bring_down(holding(limits), 2 * SECOND)
+
+
+def bring_down(guard, now_ns):
+    """Return the guard in LAND after five impossible commands."""
     for _ in range(5):
-        guard.accept_command(command((float("nan"), 0.0, 0.0)), 2000 * MS)
+        guard.accept_command(command((float("nan"), 0.0, 0.0), now_ns), now_ns)
     assert guard.state is GuardState.LAND
     return guard
 
@@ -163,39 +167,35 @@ DOUBLE, ROUND = z3.Float64(), z3.RNE()
 LARGEST = sys.float_info.max
 
 
+def arithmetic(operation):
+    return lambda self, other: Symbol(self.run, operation(ROUND, self.term, self.of(other)))
+
+
+def comparison(operation):
+    return lambda self, other: self.run.take(operation(self.term, self.of(other)))
+
+
 class Symbol:
     """Any float that satisfies the path of its run."""
 
     def __init__(self, run, term):
         self.run, self.term = run, term
 
-    def _with(self, other):
+    def of(self, other):
         return other.term if isinstance(other, Symbol) else z3.FPVal(other, DOUBLE)
 
-    def _new(self, term):
-        return Symbol(self.run, term)
-
     def __neg__(self):
-        return self._new(z3.fpNeg(self.term))
+        return Symbol(self.run, z3.fpNeg(self.term))
 
     def __abs__(self):
-        return self._new(z3.fpAbs(self.term))
+        return Symbol(self.run, z3.fpAbs(self.term))
 
-    def __add__(self, other):
-        return self._new(z3.fpAdd(ROUND, self.term, self._with(other)))
-
-    __radd__ = __add__
-
-    def __sub__(self, other):
-        return self._new(z3.fpSub(ROUND, self.term, self._with(other)))
-
-    def __rsub__(self, other):
-        return self._new(z3.fpSub(ROUND, self._with(other), self.term))
-
-    def __mul__(self, other):
-        return self._new(z3.fpMul(ROUND, self.term, self._with(other)))
-
-    __rmul__ = __mul__
+    __add__ = __radd__ = arithmetic(z3.fpAdd)
+    __sub__ = arithmetic(z3.fpSub)
+    __rsub__ = arithmetic(lambda rounding, a, b: z3.fpSub(rounding, b, a))
+    __mul__ = __rmul__ = arithmetic(z3.fpMul)
+    __lt__, __le__ = comparison(z3.fpLT), comparison(z3.fpLEQ)
+    __gt__, __ge__ = comparison(z3.fpGT), comparison(z3.fpGEQ)
 
     def __truediv__(self, other):
         """Divide n >= 0 by d >= 0.1, both finite: the quotient is any finite float >= 0.
@@ -204,33 +204,17 @@ class Symbol:
         """
         if isinstance(other, float) and frexp(other)[0] == 0.5:
             return self * (1.0 / other)
-        n, d, q = self.term, self._with(other), self.run.fresh("quotient").term
-        self.run.prove(z3.And(n >= 0.0, d >= 0.1, z3.Not(z3.fpIsInf(n)), z3.Not(z3.fpIsInf(d))))
-        bound = z3.FPVal(1e300, DOUBLE)
-        self.run.prove(n <= 1e299)
-        self.run.learn(z3.And(q >= 0.0, q <= bound))
-        return self._new(q)
-
-    def __lt__(self, other):
-        return self.run.take(z3.fpLT(self.term, self._with(other)))
-
-    def __le__(self, other):
-        return self.run.take(z3.fpLEQ(self.term, self._with(other)))
-
-    def __gt__(self, other):
-        return self.run.take(z3.fpGT(self.term, self._with(other)))
-
-    def __ge__(self, other):
-        return self.run.take(z3.fpGEQ(self.term, self._with(other)))
+        n, d, q = self.term, self.of(other), self.run.fresh("quotient").term
+        self.run.prove(z3.And(n >= 0.0, n <= 1e299, d >= 0.1, z3.Not(z3.fpIsInf(d))))
+        self.run.learn(z3.And(q >= 0.0, q <= 1e300))
+        return Symbol(self.run, q)
 
 
 class Run:
     """One path through the code."""
 
     def __init__(self, decisions):
-        self.decisions, self.taken = decisions, 0
-        self.path: list[z3.BoolRef] = []
-        self.names = 0
+        self.decisions, self.taken, self.path, self.names = decisions, 0, [], 0
 
     def fresh(self, name):
         """Return a symbol for any float at all."""
@@ -238,7 +222,6 @@ class Run:
         return Symbol(self, z3.FP(f"{name}_{self.names}", DOUBLE))
 
     def learn(self, fact):
-        """Add a condition to the path."""
         self.path.append(fact)
 
     def take(self, condition):
@@ -298,8 +281,7 @@ def root(x, top=LARGEST):
 
 def everywhere(check):
     """Run `check` on every path; return the number of possible paths."""
-    decisions: list[bool] = []
-    paths = 0
+    decisions, paths = [], 0
     while True:
         run = Run(decisions)
         check(run)

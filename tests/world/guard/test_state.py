@@ -18,6 +18,7 @@ from tests.world.guard.conftest import (
     SECOND,
     TICK,
     armed,
+    bring_down,
     command,
     feed,
     holding,
@@ -231,8 +232,7 @@ def test_a_low_speed_cap_holds_for_hold_and_land_too():
     run(guard, 0, 2 * SECOND)
     fastest = max(hypot(*r) for r in run(guard, 2 * SECOND, 4 * SECOND, (5.0, -2.0, 0.4)))
     assert fastest <= 0.2
-    for _ in range(5):
-        guard.accept_command(BAD, 4 * SECOND)
+    bring_down(guard, 4 * SECOND)
     down = run(guard, 4 * SECOND, 6 * SECOND, (5.0, -2.0, 0.4), (0.0, 0.0, -0.1))
     assert max(hypot(*r) for r in down) <= 0.2
 
@@ -452,9 +452,7 @@ def test_impossible_commands_now_and_then_only_count():
         guard.accept_command(BAD, now_ns)
         now_ns = feed(guard, now_ns, 26)
     assert guard.state is TRACK
-    for _ in range(5):
-        guard.accept_command(BAD, now_ns)
-    assert guard.state is LAND
+    bring_down(guard, now_ns)
     on_ground, at_rest = armed(), tracking()
     at_rest.end_mission(0)
     for guard, state in ((on_ground, GROUND), (at_rest, HOLD)):  # nor without a mission
@@ -507,8 +505,7 @@ def test_a_robot_that_moves_has_not_touched_down(climb, down_ms):
 def test_land_from_a_fast_descent_touches_down():
     guard = tracking((0.0, 0.0, -2.0))
     assert run(guard, 0, 100 * MS, (1.0, 2.0, 1.0))[-1][2] == pytest.approx(-LAND_SPEED)
-    for _ in range(5):
-        guard.accept_command(BAD, 100 * MS)
+    bring_down(guard, 100 * MS)
     stood = run(guard, 100 * MS, 2 * SECOND, (1.0, 2.0, 1.0))
     assert 400 * MS <= stood.index(None) * TICK < 1 * SECOND
 
@@ -526,8 +523,7 @@ def test_land_from_track_descends_where_the_robot_is():
     guard, elsewhere = holding(), (3.0, 2.0, 1.0)
     now_ns = feed(guard, 2 * SECOND, 20, ZERO, position=elsewhere)
     assert guard.state is TRACK
-    for _ in range(5):
-        guard.accept_command(BAD, now_ns)
+    bring_down(guard, now_ns)
     down = run(guard, now_ns, now_ns + 1 * SECOND, elsewhere, (0.0, 0.0, -LAND_SPEED))
     assert (guard.state, down[-1]) == (LAND, (0.0, 0.0, -LAND_SPEED))
 
