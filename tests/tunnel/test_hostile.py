@@ -55,7 +55,6 @@ def test_a_million_hostile_datagrams(target, figure):
     assert tried >= 1_000_000
     figure("hostile datagrams by chance: accepted", 0, "==", 0, count=tried)
     figure("hostile datagrams by chance: memory grown", grown, "<=", 2.0, "MiB")
-    assert grown < 2.0
 
 
 @pytest.mark.process
@@ -70,12 +69,10 @@ def test_coverage_guided_hostile_datagrams(runs, least, tmp_path, figure):
     command += [f"-atheris_runs={runs}", "-seed=1", "-max_len=256", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr[-3000:]
-    said = re.search(
-        r"hostile (\d+) accepted 0 memory \+?(-?[\d.]+) MiB", done.stdout + done.stderr
-    )
-    assert said, done.stderr[-3000:]
-    figure("hostile datagrams by coverage: accepted", 0, "==", 0, count=int(said.group(1)))
-    grown = float(said.group(2))
+    said = done.stdout + done.stderr
+    found = re.search(r"hostile (\d+) accepted 0 memory \+?(-?[\d.]+) MiB", said)
+    assert found, said[-3000:]
+    tried, grown = int(found.group(1)), float(found.group(2))
+    assert tried >= least
+    figure("hostile datagrams by coverage: accepted", 0, "==", 0, count=tried)
     figure("hostile datagrams by coverage: memory grown", grown, "<=", 20.0, "MiB")
-    assert int(said.group(1)) >= least
-    assert float(said.group(2)) < 20.0

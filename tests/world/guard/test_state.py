@@ -119,12 +119,6 @@ def test_the_yaw_rate_is_capped(asked, allowed):
     assert guard.yaw_rate == 0.0
 
 
-def test_the_reference_changes_within_the_acceleration_cap():
-    references = run(tracking((3.0, 4.0, 0.0)), 0, 200 * MS, position=(1.0, -3.0, 1.3))
-    assert references[0] == pytest.approx((12 * DT * 0.6, 12 * DT * 0.8, 0.0))
-    assert references[-1] == pytest.approx((1.44, 1.92, 0.0))  # 12 m/s^2 for 0.2 s
-
-
 def test_one_command_is_slowed_more_and_more_near_the_fence():
     guard = tracking((0.0, 2.0, 0.0))
     feed(guard, 0, 30, (0.0, 2.0, 0.0), position=(1.0, 0.0, 1.3))
