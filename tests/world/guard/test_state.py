@@ -547,18 +547,6 @@ def test_the_emergency_stop_works_from_everywhere_at_once(make):
     assert guard.take_changes() == []
 
 
-def test_an_acknowledged_stop_is_on_the_ground_and_arms_nothing():
-    guard = stopped(tracking())
-    guard.acknowledge(1 * SECOND)
-    assert (guard.state, guard.armed, guard.latched) == (GROUND, False, False)
-    feed(guard, 1 * SECOND, 20)
-    run(guard, 1 * SECOND, 2 * SECOND)
-    assert guard.state is GROUND
-    guard.start_mission(2 * SECOND)
-    feed(guard, 2 * SECOND, 1)
-    assert guard.state is TRACK
-
-
 @pytest.mark.parametrize(
     ("position", "velocity", "cause"),
     [
