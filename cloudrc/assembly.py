@@ -147,7 +147,7 @@ def mission_plan(
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
     """Convert one direction of a link profile to SI units, and read its trace and its table.
 
-    One that cannot be read, or is longer than `file_max` bytes, is a BadInputError.
+    Raise a BadInputError for a file that cannot be read or is longer than `file_max` bytes.
     """
     trace = read_trace(Path(direction.trace), file_max) if direction.trace else None
     table = direction.distribution == "table" and direction.table

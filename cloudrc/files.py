@@ -50,7 +50,7 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
 def open_file(path: Path) -> FileIO:
     """Open a file that another process has written, without a buffer and without waiting.
 
-    It raises an OSError, or a ValueError if `path` is not a regular file but, for example, a pipe.
+    Raise an OSError, or a ValueError if `path` is not a regular file but, for example, a pipe.
     """
     file = FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -79,7 +79,7 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
 
     `mode` are the permissions from its creation, minus the umask. Other users may write to the
     folder: a symbolic link at `path` is replaced, and nobody can guess the temporary name. If the
-    file cannot be written, an OSError is raised, and an existing file stays unchanged.
+    file cannot be written, raise an OSError; an existing file then stays unchanged.
     """
     new = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
     alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW

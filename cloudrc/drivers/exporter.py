@@ -169,7 +169,7 @@ class Exporter:
     def serve(self, address: tuple[str, int]) -> int:
         """Start to answer at a host and port; return the port, which port 0 leaves to the kernel.
 
-        An address that cannot be bound is a MissingPrerequisiteError.
+        Raise a MissingPrerequisiteError if the address cannot be bound.
         """
         pages = {"/metrics": self._page, "/healthz": self._liveness, "/readyz": self._readiness}
         end, link = self._live.end, self._live.link

@@ -53,7 +53,7 @@ class KeyFile:
 def read_keys(path: Path, named: str = "--key ") -> KeySet:
     """Read a key file without waiting, even if it is a pipe; `named` is the option that names it.
 
-    A BadInputError says why the file holds no key, without its content.
+    Raise a BadInputError if the file holds no key; its text has no part of the file.
     """
     try:
         return parse(read(path, SIZE_MAX))

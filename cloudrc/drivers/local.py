@@ -75,22 +75,24 @@ def announced(run: Path, api: str = "") -> Iterator[bool]:
     """
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), "api": api})
     with contextlib.ExitStack() as stack:
-        written = False
-        for place in places():
-            path = place / f"{os.getpid()}-{secrets.token_hex(4)}.json"
-            with contextlib.suppress(OSError):
-                place.mkdir(mode=0o700, parents=True, exist_ok=True)
-                if _is_private(place):
-                    new = path.with_suffix(".new")  # renamed once it is locked
-                    file = stack.enter_context(new.open("xb", buffering=0))
-                    for name in (path, new):
-                        stack.callback(name.unlink, missing_ok=True)
-                    fcntl.flock(file, fcntl.LOCK_EX)
-                    file.write(flight.encode())
-                    new.rename(path)
-                    written = True
-                    break
-        yield written
+        yield any(_write_flight(place, flight, stack) for place in places())
+
+
+def _write_flight(place: Path, flight: str, stack: contextlib.ExitStack) -> bool:
+    """Write a locked flight file, which `stack` removes; return whether the folder allows it."""
+    path = place / f"{os.getpid()}-{secrets.token_hex(4)}.json"
+    with contextlib.suppress(OSError):
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if _is_private(place):
+            new = path.with_suffix(".new")  # renamed once it is locked
+            file = stack.enter_context(new.open("xb", buffering=0))
+            for name in (path, new):
+                stack.callback(name.unlink, missing_ok=True)
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(flight.encode())
+            new.rename(path)
+            return True
+    return False
 
 
 def under_way() -> dict[Path, str]:
@@ -301,7 +303,7 @@ class LocalRun:
 def socket_folder() -> str:
     """Choose a folder for temporary files with a path that is short enough for Unix sockets.
 
-    If there is none, a BadInputError names TMPDIR.
+    Raise a BadInputError, which names TMPDIR, if there is no such folder.
     """
     given = tempfile.gettempdir()
     for folder in dict.fromkeys((given, os.environ.get("XDG_RUNTIME_DIR", ""), "/tmp")):

@@ -48,7 +48,7 @@ ROUTE_PERIOD_NS = 500_000_000
 
 
 def split_address(text: str) -> Address:
-    """Parse HOST:PORT, with an IPv6 address in brackets; other text is a ValueError."""
+    """Parse HOST:PORT, with an IPv6 address in brackets; raise a ValueError for other text."""
     host, _, port = text.strip().rpartition(":")
     bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
     if not bare or not port.isdecimal() or not 0 < int(port) < 65_536:

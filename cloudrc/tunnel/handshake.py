@@ -102,7 +102,7 @@ class ServerHandshake:
     def accept_once(self, kind: int, counter: int, now_ns: int) -> None:
         """Accept an ALIVE or OPERATOR datagram of the session once, at `now_ns` [ns].
 
-        A DecodeError is "malformed" for other kinds, and "repeated" for a counter that is not new.
+        Raise the DecodeError "malformed" for other kinds, "repeated" for a counter that is not new.
         """
         window = self._windows.get(kind)
         if window is None:

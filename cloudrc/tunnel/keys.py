@@ -90,7 +90,7 @@ class KeyRing:
 def parse(data: bytes) -> KeySet:
     """Parse a key file: 32 bytes, or the lines `current HEX` and optionally `previous HEX`.
 
-    A ValueError says why the file is invalid; it contains no part of the file.
+    Raise a ValueError if the file is invalid; its text has no part of the file.
     """
     if len(data) == KEY_SIZE:
         return KeySet(Key(data))

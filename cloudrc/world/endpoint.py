@@ -85,8 +85,8 @@ class Orders:
     def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
         """Carry out a request at `now_ns` [ns], world's clock; return whether a mission begins.
 
-        `waited`: the request may have waited in the socket during a stall. A start request is a
-        DecodeError if its stamp is too old ("stale") or in the future.
+        `waited`: the request may have waited in the socket during a stall. Raise a
+        DecodeError if the stamp of a start request is too old ("stale") or in the future.
         """
         kind, guard = request.request, self._guard
         starts = kind is Request.START

@@ -63,7 +63,7 @@ mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 def model_path(kind: str, name: str) -> Path:
     """Find a file of "robots" or "scenes" by its shipped name or the path of an .xml file.
 
-    If it does not exist, a BadInputError lists the shipped ones.
+    Raise a BadInputError, which lists the shipped files, if this one does not exist.
     """
     path = Path(name) if name.endswith(".xml") else FOLDER / kind / f"{name}.xml"
     if not path.is_file():
@@ -75,9 +75,10 @@ def model_path(kind: str, name: str) -> Path:
 def compile_model(robot: str, scene: str) -> Any:
     """Attach the robot to the scene's frame `spawn` and compile both into an `MjModel`.
 
-    Both arguments are names or paths of files; what does not fit is a BadInputError. The robot's
-    names begin with `robot/`. Static bodies are fused, which halves the time of a step but loses
-    the names of the bodies. Therefore each geom of the scene gets the name BODY/NUMBER.
+    Both arguments are names or paths of files. Raise a BadInputError if a file is missing, does not
+    compile or does not fit the onboard controller. The robot's names begin with `robot/`. Static
+    bodies are fused, which halves the time of a step but loses their names. Therefore each geom of
+    the scene gets the name BODY/NUMBER.
     """
     robot_path, scene_path = model_path("robots", robot), model_path("scenes", scene)
     try:

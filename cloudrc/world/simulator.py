@@ -48,7 +48,7 @@ class Simulator:
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
-        A file that is missing or does not suit the loop is a BadInputError.
+        Raise a BadInputError if a file is missing or does not suit the loop.
         """
         self.model = model = compile_model(robot, scene)
         self.dt: float = model.opt.timestep

@@ -220,10 +220,10 @@ class Limits:
     hold_max_ns: int = 60_000_000_000
 
     def __post_init__(self) -> None:
-        """Check the limits; a ValueError names the first that is wrong.
+        """Check the limits; raise a ValueError that names the first wrong one.
 
-        Each is finite and above 0, the robot can stop in time from `speed_max` with
-        `command_age_max_ns`, and the fence leaves room.
+        Each limit must be finite and above 0, the robot must be able to stop in time from
+        `speed_max` with `command_age_max_ns`, and the fence must leave room.
         """
         for name in self.__slots__[2:]:
             value = getattr(self, name)
