@@ -254,15 +254,6 @@ class Limits:
         """Return how long a robot in a mission waits for its cloud before LAND [ns]."""
         return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
 
-    def age_text(self, beyond_ns: int) -> str:
-        """Describe the age of a command that is too old by `beyond_ns` [ns]."""
-        age, limit = self.command_age_max_ns + beyond_ns, self.command_age_max_ns
-        return f"command age {age * 1e-9:.3f} s above {limit * 1e-9:.3f} s"
-
-    def wait_text(self, flies: bool) -> str:
-        """Describe how long the robot waited for its cloud."""
-        return f"held for {self.alone_max_ns(flies) * 1e-9:g} s without the cloud"
-
     def inner_corners(self) -> tuple[Vector, Vector]:
         """Return both corners of the fence, margins taken off [m], shape (3,) each."""
         (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high

@@ -263,9 +263,13 @@ class Guard:
         if state is TRACK and self._track_until_ns == NEVER_NS:
             self._enter(HOLD, now_ns, Cause.SESSION)
         elif state is TRACK:
-            self._enter(HOLD, now_ns, Cause.SILENCE, limits.age_text(now_ns - self._track_until_ns))
+            most_ns = limits.command_age_max_ns
+            age_ns = most_ns + now_ns - self._track_until_ns
+            text = f"command age {age_ns * 1e-9:.3f} s above {most_ns * 1e-9:.3f} s"
+            self._enter(HOLD, now_ns, Cause.SILENCE, text)
         elif self.armed and now_ns - self._alone_ns > limits.alone_max_ns(self._flies):
-            self._enter(LAND, now_ns, Cause.ALONE, limits.wait_text(self._flies))
+            text = f"held for {limits.alone_max_ns(self._flies) * 1e-9:g} s without the cloud"
+            self._enter(LAND, now_ns, Cause.ALONE, text)
             self._flies = state is HOLD  # not in GROUND
         elif state is LAND and self._flies:
             if self._descent.may_stop(readings):
