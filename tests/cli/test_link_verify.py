@@ -44,7 +44,7 @@ class Release:
         self.ends["cloud"].see([row])
 
     def shapes(self, way, told):
-        self.links[way].tells(lambda: write_told(told))
+        self.links[way].link.tell = lambda: write_told(told)
 
     def ask(self, limit=30.0):
         return verify_release("demo", self.pods, limit, lambda line: None)
@@ -65,8 +65,8 @@ def release(monkeypatch):
         (up, at_up), (down, at_down) = served("link"), served("link")
         pods = {"world": (at_world, at_up), "cloud": (at_cloud, at_down)}
         made = Release({"world": world, "cloud": cloud}, {"uplink": up, "downlink": down}, pods)
-        for way, link in made.links.items():
-            link.shaped("relay", way, "auto")
+        for way, exporter in made.links.items():
+            exporter.link.shaped("relay", way, "auto")
             made.shapes(way, Told("relay", "", APPLIED, Near("eth0", {})))
 
         def count(seconds):
@@ -93,7 +93,7 @@ def test_a_release_is_believed_once_both_ends_do(release):
     assert rows(said)["mean"]["applied"] == pytest.approx(0.0456, abs=1e-4)
     assert rows(said)["loss"]["applied"] == pytest.approx(0.02, abs=0.01)
     assert as_text(said).splitlines()[-1].startswith("BELIEVED")
-    release.links["uplink"].tells(lambda: "{}")
+    release.links["uplink"].link.tell = lambda: "{}"
     said = release.ask()
     assert said["verdict"] == "believed"
     assert all("applied" not in row for row in rows(said).values())
