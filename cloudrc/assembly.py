@@ -45,9 +45,7 @@ FENCE_SPAN = dist(fence.LOW, fence.HIGH)
 
 
 def build_world(
-    experiment: ResolvedExperiment,
-    identity: Identity,
-    clock: Callable[[], int] = lambda: 0,
+    experiment: ResolvedExperiment, identity: Identity, clock: Callable[[], int] = lambda: 0
 ) -> WorldEndpoint:
     """Build world's end: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 
@@ -133,10 +131,9 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
 def mission_plan(
     mission: schema.Mission, time_limit: float, seed: int = 0, *, speed_max: float = inf
 ) -> Plan:
-    """Turn a checked mission into legs.
+    """Turn a checked mission with a time limit [s] into legs.
 
-    `time_limit` [s] is that of the whole mission, `seed` that of random steps, `speed_max` [m/s]
-    the guard's cap.
+    `seed` is that of random steps, `speed_max` the guard's cap [m/s].
     """
     if mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
@@ -150,8 +147,7 @@ def mission_plan(
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
     """Convert one direction of a link profile to SI units, and read its trace and its table.
 
-    Raises:
-        BadInputError: If a trace or table cannot be read, or is longer than `file_max` bytes.
+    Raise a BadInputError for a file that cannot be read or is longer than `file_max` bytes.
     """
     trace = read_trace(Path(direction.trace), file_max) if direction.trace else None
     table = direction.distribution == "table" and direction.table

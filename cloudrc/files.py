@@ -21,10 +21,10 @@ class TooLongError(ValueError):
     """A file is larger than the reader's limit."""
 
 
-def version(path: Path | str, *, follow: bool = True) -> tuple[int, int, int] | None:
+def version(path: Path | str) -> tuple[int, int, int] | None:
     """Identify the version of a file with one system call; None if it does not exist."""
     try:
-        status = os.stat(path, follow_symlinks=follow)
+        status = os.stat(path)
     except OSError:
         return None
     return status.st_mtime_ns, status.st_ino, status.st_size
@@ -35,8 +35,7 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If `path` is not a regular file but, for example, a pipe.
-        TooLongError: If the file is larger than `size_max`.
+        ValueError: If `path` is not a regular file; a TooLongError if the file is larger.
     """
     with BufferedReader(open_file(path)) as file:
         status = os.fstat(file.fileno())
@@ -51,9 +50,7 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
 def open_file(path: Path) -> FileIO:
     """Open a file that another process has written, without a buffer and without waiting.
 
-    Raises:
-        OSError: If the file cannot be opened.
-        ValueError: If `path` is not a regular file but, for example, a pipe.
+    Raise an OSError, or a ValueError if `path` is not a regular file but, for example, a pipe.
     """
     file = FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -81,10 +78,8 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
     """Write a file under a temporary name, and rename the complete file to `path`.
 
     `mode` are the permissions from its creation, minus the umask. Other users may write to the
-    folder: a symbolic link at `path` is replaced, and nobody can guess the temporary name.
-
-    Raises:
-        OSError: If the file cannot be written; an existing file then stays unchanged.
+    folder: a symbolic link at `path` is replaced, and nobody can guess the temporary name. If the
+    file cannot be written, raise an OSError; an existing file then stays unchanged.
     """
     new = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
     alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW

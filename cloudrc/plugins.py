@@ -61,8 +61,7 @@ def signature(kind: str, name: str) -> inspect.Signature:
 def load(kind: str, name: str, **parameters: Any) -> Any:
     """Build a plug-in by the `parameters` of its `build`; see `find`.
 
-    Raises:
-        BadInputError: If the plug-in does not exist, or its `build` fails.
+    Raise a BadInputError if the plug-in does not exist, or if its `build` fails.
     """
     build = _build(kind, name)
     try:

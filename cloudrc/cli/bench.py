@@ -93,10 +93,10 @@ def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
     simulator = world.robot.simulator
     start, simulator.tape = simulator.state(), []
     run.fly(lambda: cloud.mission_over, LIMIT_NS, lambda of_world, of_cloud: None)
-    tape, end = np.array(simulator.tape), simulator.state().physics
+    tape, end = np.array(simulator.tape), simulator.state()[0]
 
     def play() -> int:
-        if (replay(simulator.model, start, tape) != end).any():
+        if (replay(simulator.model, *start, tape) != end).any():
             raise CloudrcError("the replay does not end in the state of the flight; report this")
         return len(tape)
 

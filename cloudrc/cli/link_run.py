@@ -103,7 +103,7 @@ def execute(options: argparse.Namespace) -> int:
                 exporter.unresolved(peer.failures)
 
         if exporter:
-            exporter.tells(LinkStatusSource(sidecar).text)
+            exporter.link.tell = LinkStatusSource(sidecar).text
         try:
             _repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
             _repeat(resolve_peer, *PEER_PAUSE)

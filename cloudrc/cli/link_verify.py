@@ -230,8 +230,8 @@ def run_link(
         for name in WAYS:
             with inside(names[name]):
                 own = stack.enter_context(bind((hosts[name], 0)))
-                ports = free_ports(1)[0], free_ports(1, socket.SOCK_STREAM)[0]
-            ways[name] = Way(own, ports, names[name], folder=folder / name)
+                listen, pages = free_ports(2)
+            ways[name] = Way(own, (listen, pages), names[name], folder=folder / name)
         for (name, way), other in zip(ways.items(), reversed(ways.values()), strict=True):
             way.peer = other.own.getsockname()
             way.folder.mkdir()

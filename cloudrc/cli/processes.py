@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from cloudrc.cli.output import print_line
 from cloudrc.drivers.process import EndProcess, Feed, StopSignal
-from cloudrc.drivers.realtime import Address, Peer, Route, bind, split_address
+from cloudrc.drivers.realtime import Address, Peer, bind, split_address
 from cloudrc.errors import BadInputError
 from cloudrc.files import readable_by_others
 from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
@@ -309,9 +309,9 @@ def open_end(
 def open_peer(options: argparse.Namespace) -> Peer:
     """Bind the socket of an end; the socket sends to the peer or to the address of the route."""
     if options.route is None:
-        target: Address | Route = resolve_address("--peer", options.peer, options.listen)
+        target: Address | Path = resolve_address("--peer", options.peer, options.listen)
     else:
-        target = Route(options.route)
+        target = options.route
         if not options.route.exists():
             print(f"cloudrc: sends nothing until {options.route} exists", file=sys.stderr)
     with _listening("--listen", options.listen):
@@ -392,13 +392,13 @@ def _run_relay(options: argparse.Namespace) -> int:
     if exporter is not None:
         should_stop = _counting(stop, relay, exporter)
         for way, loaded in read_profiles(experiment).items():
-            exporter.shaped("relay", way, "relay")
-            exporter.asked(way, summary(loaded.direction)["delay"] or 0.0)
+            exporter.link.shaped("relay", way, "relay")
+            exporter.link.asked(way, summary(loaded.direction)["delay"] or 0.0)
         exporter.runs(fingerprint(experiment))
         exporter.ready(True)
     feed = Feed.on_stdout(watched=options.feed)
     if options.link:
-        asked = exporter.asked if exporter else lambda way, delay: None
+        asked = exporter.link.asked if exporter else lambda way, delay: None
         control = RelayControl(options.link, links, read_profiles(experiment), asked, relay)
         threading.Thread(target=control.follow, name="link control", daemon=True).start()
         should_stop = control.stop_after(should_stop)

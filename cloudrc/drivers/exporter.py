@@ -6,9 +6,7 @@ import socket
 import socketserver
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from http.server import BaseHTTPRequestHandler
 from math import inf
 from pathlib import Path
@@ -29,9 +27,6 @@ TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """Content type of the text that `generate_latest` makes."""
 PATIENCE = 5.0
 """Longest wait for a client [s]; Prometheus' default scrape timeout is 10 s."""
-CONNECTIONS_MAX = 16
-"""Largest number of connections; one more closes the oldest, so that silent clients use up neither
-the files nor the threads of the process."""
 KEPT = 0.25
 """How long a page is reused [s]; making a page takes 1.4 ms and may delay the loop."""
 CONFIG_DIGITS = 12
@@ -39,9 +34,8 @@ CONFIG_DIGITS = 12
 STILL_MAX = 5.0
 """Time without a record after which a loop counts as standing still [s]; a healthy loop makes a
 record every second."""
-CGROUP = Path("/sys/fs/cgroup")
-CPU_COUNTS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
-"""Files with a container's CPU counts: cgroup version 2, then two mounts of version 1."""
+CPU_COUNTS = Path("/sys/fs/cgroup/cpu.stat")
+"""File with a container's CPU counts."""
 
 
 class Answer(NamedTuple):
@@ -55,8 +49,7 @@ class Answer(NamedTuple):
 class _Server(socketserver.ThreadingTCPServer):
     """Serves pages by their paths until `close` is called.
 
-    `http.server.HTTPServer` may wait for a name server. The accept queue is long, so that a burst
-    of connections delays no probe of kubelet.
+    `http.server.HTTPServer` may wait for a name server. The accept queue is long, for bursts.
     """
 
     allow_reuse_address = True
@@ -65,7 +58,7 @@ class _Server(socketserver.ThreadingTCPServer):
     request_queue_size = 1_024
 
     def __init__(self, address: tuple[str, int], pages: Mapping[str, Callable[[], Answer]]) -> None:
-        self.pages, self._newest = pages, deque[socket.socket]()
+        self.pages = pages
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, _Handler)
         threading.Thread(target=self.serve_forever, args=(0.25,), daemon=True).start()
@@ -75,14 +68,6 @@ class _Server(socketserver.ThreadingTCPServer):
         if self.address_family == socket.AF_INET6:
             self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         super().server_bind()
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer on a new thread; close the oldest connection if there are too many."""
-        self._newest.append(request)
-        if len(self._newest) > CONNECTIONS_MAX:
-            with suppress(OSError):  # it has been answered
-                self._newest.popleft().shutdown(socket.SHUT_RDWR)
-        super().process_request(request, client_address)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the errors of clients that disconnect early."""
@@ -109,28 +94,23 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing: a request comes every few seconds."""
 
 
-def read_throttling(root: Path = CGROUP) -> Readings:
+def read_throttling(path: Path = CPU_COUNTS) -> Readings:
     """Read how much the CPU limit has throttled this container; empty outside a container.
 
-    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
-    Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
+    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us).
     """
-    for name in CPU_COUNTS:
-        try:
-            words = (line.split() for line in (root / name).read_text().splitlines())
-        except OSError:
-            continue
-        counts = {key: int(number) for key, number in words}
-        if "nr_periods" in counts:
-            stopped = (
-                counts.get("throttled_usec", 0) * 1e-6 + counts.get("throttled_time", 0) * 1e-9
-            )
-            return {
-                "cloudrc_cpu_periods_total": unlabelled(counts["nr_periods"]),
-                "cloudrc_cpu_throttled_periods_total": unlabelled(counts["nr_throttled"]),
-                "cloudrc_cpu_throttled_seconds_total": unlabelled(stopped),
-            }
-    return {}
+    try:
+        words = (line.split() for line in path.read_text().splitlines())
+    except OSError:
+        return {}
+    counts = {key: int(number) for key, number in words}
+    if "nr_periods" not in counts:
+        return {}
+    return {
+        "cloudrc_cpu_periods_total": unlabelled(counts["nr_periods"]),
+        "cloudrc_cpu_throttled_periods_total": unlabelled(counts["nr_throttled"]),
+        "cloudrc_cpu_throttled_seconds_total": unlabelled(counts["throttled_usec"] * 1e-6),
+    }
 
 
 class Exporter:
@@ -159,7 +139,7 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether this process is ready; not for world and cloud, whose records show this."""
+        """Set whether this process is ready; the records of world and cloud show it for them."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -168,21 +148,18 @@ class Exporter:
         self._config = fingerprint[:CONFIG_DIGITS]
 
     @property
-    def _link(self) -> Link:
+    def link(self) -> Link:
+        """The metrics of the emulated link; only with the role "link"."""
         assert self._live.link is not None, "only a link is shaped"
         return self._live.link
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the shaper, "relay" or "netem", of a direction, and the mode that was asked for."""
-        self._link.shaped(shaper, direction, mode)
+        """Set the shaper of a direction from now on, and the requested mode."""
+        self.link.shaped(shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:
-        """Set the mean delay [s] of the profile in force."""
-        self._link.asked(direction, delay)
-
-    def tells(self, tell: Callable[[], str]) -> None:
-        """Set the function that makes the JSON of /link.json; only with the role "link"."""
-        self._link.tell = tell
+        """Set the mean delay [s] that the profile in force requests."""
+        self.link.asked(direction, delay)
 
     def unresolved(self, count: int) -> None:
         """Set the count of failed look-ups of the peer's name. Any thread may call this."""
@@ -200,8 +177,7 @@ class Exporter:
     def serve(self, address: tuple[str, int]) -> int:
         """Start to answer at a host and port; return the port, which port 0 leaves to the kernel.
 
-        Raises:
-            MissingPrerequisiteError: If the address cannot be bound.
+        Raise a MissingPrerequisiteError if the address cannot be bound.
         """
         pages = {"/metrics": self._page, "/healthz": self._liveness, "/readyz": self._readiness}
         end, link = self._live.end, self._live.link

@@ -27,8 +27,7 @@ class KeyFile:
     def follow(self, now_ns: int) -> list[Fault]:
         """Check the file for changes, if a check is due at `now_ns` [ns, monotonic clock].
 
-        Returns:
-            Records of a new key or of the reason to keep the old keys.
+        Return records of a new key or of the reason to keep the old keys.
         """
         if now_ns < self._due_ns:
             return []
@@ -54,8 +53,7 @@ class KeyFile:
 def read_keys(path: Path, named: str = "--key ") -> KeySet:
     """Read a key file without waiting, even if it is a pipe; `named` is the option that names it.
 
-    Raises:
-        BadInputError: If the file holds no key; the message never quotes the content.
+    Raise a BadInputError if the file holds no key; its text has no part of the file.
     """
     try:
         return parse(read(path, SIZE_MAX))

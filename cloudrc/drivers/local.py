@@ -71,36 +71,32 @@ def places() -> list[Path]:
 def announced(run: Path, api: str = "") -> Iterator[bool]:
     """Announce a flight while the block runs; yield whether its flight file could be written.
 
-    Args:
-        run: Folder of the run.
-        api: Address of the operator's API; "" without an API.
+    `run` is its folder, `api` the address of the operator's API ("" without one).
     """
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), "api": api})
     with contextlib.ExitStack() as stack:
-        written = False
-        for place in places():
-            path = place / f"{os.getpid()}-{secrets.token_hex(4)}.json"
-            with contextlib.suppress(OSError):
-                place.mkdir(mode=0o700, parents=True, exist_ok=True)
-                if _is_private(place):
-                    new = path.with_suffix(".new")  # renamed once it is locked
-                    file = stack.enter_context(new.open("xb", buffering=0))
-                    for name in (path, new):
-                        stack.callback(name.unlink, missing_ok=True)
-                    fcntl.flock(file, fcntl.LOCK_EX)
-                    file.write(flight.encode())
-                    new.rename(path)
-                    written = True
-                    break
-        yield written
+        yield any(_write_flight(place, flight, stack) for place in places())
+
+
+def _write_flight(place: Path, flight: str, stack: contextlib.ExitStack) -> bool:
+    """Write a locked flight file, which `stack` removes; return whether the folder allows it."""
+    path = place / f"{os.getpid()}-{secrets.token_hex(4)}.json"
+    with contextlib.suppress(OSError):
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if _is_private(place):
+            new = path.with_suffix(".new")  # renamed once it is locked
+            file = stack.enter_context(new.open("xb", buffering=0))
+            for name in (path, new):
+                stack.callback(name.unlink, missing_ok=True)
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(flight.encode())
+            new.rename(path)
+            return True
+    return False
 
 
 def under_way() -> dict[Path, str]:
-    """Find this user's current flights.
-
-    Returns:
-        Folder of the run -> address of the operator's API ("" without an API).
-    """
+    """Map the folder of each current flight of this user to the address of its API, or ""."""
     found = {}
     for path in (path for place in places() if _is_private(place) for path in place.glob("*.json")):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
@@ -159,22 +155,15 @@ class Child:
 
 
 class LocalRun:
-    """The four processes of one run.
-
-    Attributes:
-        notes: Notes on this run for the report, a sentence each.
-    """
+    """The four processes of one run; `notes` are for its report, a sentence each."""
 
     def __init__(
         self, folder: Path, see: Callable[[list[Record]], None], *, api: bool = True
     ) -> None:
-        """Prepare the run; no process is started yet.
+        """Prepare the run in `folder`, which must contain config.yaml; no process is started yet.
 
-        Args:
-            folder: Folder of the run. It must contain config.yaml; the run adds world.mcap,
-                cloud.mcap and four logs.
-            see: Gets the records of the processes' feeds.
-            api: Whether the operator gets an API during the flight.
+        The run adds world.mcap, cloud.mcap and four logs. `see` gets the records of the processes'
+        feeds; `api` tells whether the operator gets an API during the flight.
         """
         self._folder, self._see, self._api = folder, see, api
         self._children: list[Child] = []
@@ -314,8 +303,7 @@ class LocalRun:
 def socket_folder() -> str:
     """Choose a folder for temporary files with a path that is short enough for Unix sockets.
 
-    Raises:
-        BadInputError: If there is no such folder; the message names TMPDIR.
+    Raise a BadInputError, which names TMPDIR, if there is no such folder.
     """
     given = tempfile.gettempdir()
     for folder in dict.fromkeys((given, os.environ.get("XDG_RUNTIME_DIR", ""), "/tmp")):

@@ -34,8 +34,8 @@ def _boot_id() -> str:
 def interpreter(*words: str) -> list[str]:
     """Build a command that runs this Python interpreter, for example with `-m cloudrc relay`.
 
-    Python imports from the working folder first, which may be a run from somebody else. The new
-    process imports from there only if this process does, for example under `python -m`.
+    It imports from the working folder, which may hold a run from somebody else, only if this
+    process does, for example under `python -m`.
     """
     here = os.getcwd() in sys.path or "" in sys.path
     return [sys.executable, *(() if here else ("-P",)), *words]
@@ -51,12 +51,9 @@ class Deadline:
     def __init__(
         self, limit: float, turn_max: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Start the time limit.
+        """Start a time limit of `limit` [s] by a monotonic `clock` [s].
 
-        Args:
-            limit: Time until the limit has passed [s].
-            turn_max: Longest time between two calls of `passed` while this process runs [s].
-            clock: A monotonic clock [s].
+        `turn_max` [s] is the longest time between two calls of `passed` while this process runs.
         """
         self._left, self._turn_max, self._clock = limit, turn_max, clock
         self._before = clock()

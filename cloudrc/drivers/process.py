@@ -201,8 +201,8 @@ def _from_json(kind: Any, value: Any) -> Any:
 class LinkNotes:
     """Turns the state of an end's outgoing link into records.
 
-    The link's process publishes the state in a file, and a second file tells how late the relay's
-    datagrams left. The end does not trust that process: unreadable files are ignored.
+    The link's process, which the end does not trust, publishes the state in a file. A second file
+    tells how late the relay's datagrams left.
     """
 
     def __init__(self, path: Path, *, uplink: bool) -> None:
@@ -283,6 +283,10 @@ class EndProcess:
     link: Path | None = None
     check: LinkMonitor | None = None
 
+    def __post_init__(self) -> None:
+        self._notes = LinkNotes(self.link, uplink=self.end == "world") if self.link else None
+        self._trouble, self._dropped = "", 0
+
     def run(
         self,
         endpoint: Endpoint,
@@ -296,51 +300,44 @@ class EndProcess:
         """
         thread = RecordingThread(self.recorder)
         choose = FlightsOnly(flies) if self.flights_only else list
-        sink = _Sink(self, choose, slip_ns, thread.take_steps)
         if self.exporter is not None:
             self.exporter.recording(thread.sync_age)
+
+        def sink(records: list[Record]) -> None:
+            records = records + self.look_around(records, slip_ns(), thread.take_steps())
+            self.recorder.put(choose(records))
+            self.tell(records)
+
         thread.start()
         self.feed.ready()
         try:
             ends = self.feed.alive_while(stop)
             serve(endpoint, self.peer, end=self.end, sink=sink, stop=ends, slip_ns=slip_ns)
         finally:
-            self.recorder.put([sink.count_losses(time.monotonic_ns() - slip_ns())])
+            self.recorder.put([self._count_losses(time.monotonic_ns() - slip_ns())])
             thread.stop()
 
-
-class _Sink:
-    """Passes an end's records, and those of what happens around the end, on without waiting."""
-
-    def __init__(
-        self,
-        run: EndProcess,
-        choose: Callable[[list[Record]], list[Record]],
-        slip_ns: Callable[[], int],
-        clock_steps: Callable[[], list[float]],
-    ) -> None:
-        self._run, self._choose = run, choose
-        self._slip_ns, self._clock_steps = slip_ns, clock_steps
-        self._notes = LinkNotes(run.link, uplink=run.end == "world") if run.link else None
-        self._trouble, self._dropped = "", 0
-
-    def __call__(self, records: list[Record]) -> None:
-        run, recorder = self._run, self._run.recorder
-        records = records + self.look_around(records)
-        recorder.put(self._choose(records))
-        run.feed.tell(records)
+    def tell(self, records: list[Record]) -> None:
+        """Feed and export records, and the trouble and the losses of the recorder."""
+        recorder = self.recorder
+        self.feed.tell(records)
         if records and recorder.error != self._trouble:
             self._trouble = recorder.error
-            run.feed.tell([Fault(records[-1].stamp_ns, "recorder", self._trouble)])
-        if run.exporter is not None:
+            self.feed.tell([Fault(records[-1].stamp_ns, "recorder", self._trouble)])
+        if self.exporter is not None:
             if records and recorder.dropped != self._dropped:
                 self._dropped = recorder.dropped
-                records.append(self.count_losses(records[-1].stamp_ns))
-            run.exporter.see(records)
+                records = [*records, self._count_losses(records[-1].stamp_ns)]
+            self.exporter.see(records)
 
-    def look_around(self, records: list[Record]) -> list[Record]:
-        """Return records of steps of the wall clock, new keys and changes of the link."""
-        now_ns, slip_ns, run = time.monotonic_ns(), self._slip_ns(), self._run
+    def look_around(
+        self, records: list[Record], slip_ns: int, clock_steps: list[float]
+    ) -> list[Record]:
+        """Return records of steps of the wall clock [s], new keys and changes of the link.
+
+        They follow the `records` of the end; `slip_ns` is the lag of its clock [ns].
+        """
+        now_ns = time.monotonic_ns()
         noted: list[Record] = [
             Fault(
                 now_ns - slip_ns,
@@ -348,15 +345,14 @@ class _Sink:
                 f"wall clock stepped by {step:+.1f} s: the flight is not affected;"
                 " do not compare times of day before and after the step",
             )
-            for step in self._clock_steps()
+            for step in clock_steps
         ]
-        noted += run.keys.follow(now_ns)
+        noted += self.keys.follow(now_ns)
         if self._notes is not None:
             noted += self._notes.after(records, now_ns, slip_ns)
-        if run.check is not None:
-            noted += run.check.after([*records, *noted], now_ns - slip_ns)
+        if self.check is not None:
+            noted += self.check.after([*records, *noted], now_ns - slip_ns)
         return noted
 
-    def count_losses(self, stamp_ns: int) -> Counted:
-        """Return the number of records that were lost so far."""
-        return Counted(stamp_ns, self._run.end, "recorder_dropped", self._run.recorder.dropped)
+    def _count_losses(self, stamp_ns: int) -> Counted:
+        return Counted(stamp_ns, self.end, "recorder_dropped", self.recorder.dropped)

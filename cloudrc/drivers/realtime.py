@@ -7,6 +7,7 @@ All datagrams of one wake get the same instant, as the endpoint's contract requi
 from __future__ import annotations
 
 import gc
+import random
 import select
 import socket
 import time
@@ -40,16 +41,14 @@ SINK_PERIOD_NS = 20_000_000
 """Longest time between two calls of the sink [ns]."""
 WAIT_MAX_NS = 100_000_000
 """Longest wait for a datagram [ns]; then the loop calls `stop` again."""
+PORTS = range(20_000, 30_000)
+"""Ports among which `free_ports` chooses."""
 ROUTE_PERIOD_NS = 500_000_000
 """Time between two checks of the route file [ns]."""
 
 
 def split_address(text: str) -> Address:
-    """Parse HOST:PORT, with an IPv6 address in brackets.
-
-    Raises:
-        ValueError: If the text is something else.
-    """
+    """Parse HOST:PORT, with an IPv6 address in brackets; raise a ValueError for other text."""
     host, _, port = text.strip().rpartition(":")
     bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
     if not bare or not port.isdecimal() or not 0 < int(port) < 65_536:
@@ -59,35 +58,6 @@ def split_address(text: str) -> Address:
     return bare, int(port)
 
 
-class Route:
-    """Follows a route file, which holds the address of the other end of a pod as HOST:PORT.
-
-    The link's process writes the file when the link is up, and whenever the address changes.
-    """
-
-    def __init__(self, path: Path) -> None:
-        """Follow the file at `path`, which may appear later."""
-        self._path = path
-        self._seen: tuple[int, int, int] | None = None
-        self._address: Address | None = None
-
-    def look(self) -> Address | None:
-        """Return the address of the other end; None before the first readable file.
-
-        If the file is missing, half written or no numeric address (a query to a name server would
-        block the loop), the last address stays valid.
-        """
-        try:
-            seen = version(self._path)
-            if seen != self._seen:
-                address = split_address(read(self._path).decode("ascii"))
-                ip_address(address[0])
-                self._address, self._seen = address, seen
-        except (OSError, ValueError):
-            self._seen = None
-        return self._address
-
-
 @dataclass
 class Peer:
     """A UDP socket and the address of its peer.
@@ -95,27 +65,41 @@ class Peer:
     Attributes:
         socket: The socket, bound and not blocking.
         address: Address of the other end of the tunnel or of the relay; None while it is unknown.
-        route: Route file that holds the address; None if the address is fixed.
+        route: File with the address as HOST:PORT, which the link's process writes when the link is
+            up and whenever the address changes; None if the address is fixed.
     """
 
     socket: socket.socket
     address: Address | None
-    route: Route | None = None
+    route: Path | None = None
+    _seen: tuple[int, int, int] | None = field(default=None, init=False)
     _followed_ns: int = field(default=0, init=False)
 
     @classmethod
-    def bind(cls, listen: Address, where: Address | Route) -> Peer:
+    def bind(cls, listen: Address, where: Address | Path) -> Peer:
         """Bind a socket at `listen`; the peer's address is fixed or comes from a route file."""
         bound = bind(listen)
-        if isinstance(where, Route):
+        if isinstance(where, Path):
             return cls(bound, None, where)
         return cls(bound, _reachable(bound, where))
 
     def follow(self, now_ns: int) -> None:
-        """Update the address from the route file, if a check is due at `now_ns` [ns]."""
-        if self.route is not None and now_ns >= self._followed_ns:
-            self._followed_ns = now_ns + ROUTE_PERIOD_NS
-            self.address = _reachable(self.socket, self.route.look())
+        """Update the address from the route file, if a check is due at `now_ns` [ns].
+
+        If the file is missing, half written or no numeric address (a query to a name server would
+        block the loop), the last address stays valid.
+        """
+        if self.route is None or now_ns < self._followed_ns:
+            return
+        self._followed_ns = now_ns + ROUTE_PERIOD_NS
+        seen = version(self.route)
+        if seen == self._seen:
+            return
+        self._seen = None
+        with suppress(OSError, ValueError):
+            address = split_address(read(self.route).decode("ascii"))
+            ip_address(address[0])
+            self.address, self._seen = _reachable(self.socket, address), seen
 
     def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
         """Return at most `most` waiting datagrams.
@@ -140,9 +124,9 @@ class Peer:
                     self.socket.sendto(data, self.address)
 
 
-def _reachable(bound: socket.socket, address: Address | None) -> Address | None:
+def _reachable(bound: socket.socket, address: Address) -> Address:
     """Convert an IPv4 address to the form that an IPv6 socket needs."""
-    if address is None or bound.family != socket.AF_INET6 or ":" in address[0]:
+    if bound.family != socket.AF_INET6 or ":" in address[0]:
         return address
     return f"::ffff:{address[0]}", address[1]
 
@@ -163,16 +147,21 @@ def bind(listen: Address) -> socket.socket:
     return udp
 
 
-def free_ports(count: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[int]:
-    """Find unused ports on 127.0.0.1."""
-    sockets = [socket.socket(socket.AF_INET, kind) for _ in range(count)]
-    try:
-        for sock in sockets:
-            sock.bind(("127.0.0.1", 0))
-        return [int(sock.getsockname()[1]) for sock in sockets]
-    finally:
-        for sock in sockets:
-            sock.close()
+def free_ports(count: int) -> list[int]:
+    """Find ports on 127.0.0.1 that are unused for both UDP and TCP.
+
+    They are below the ports that the kernel gives to connections, which could take them meanwhile.
+    """
+    found: list[int] = []
+    for port in random.SystemRandom().sample(PORTS, 1000):
+        with socket.socket(type=socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
+            with suppress(OSError):
+                udp.bind(("127.0.0.1", port))
+                tcp.bind(("127.0.0.1", port))
+                found.append(port)
+        if len(found) == count:
+            break
+    return found
 
 
 def serve(

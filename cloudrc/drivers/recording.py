@@ -74,14 +74,12 @@ def _read_clocks() -> tuple[float, float]:
 class FlightsOnly:
     """Selects all records during a flight, and only events otherwise.
 
-    A pod outlives its missions: 100 samples a second of an idle robot would fill its volume within
-    hours.
+    Between missions, the samples of an idle robot would fill a pod's volume within hours.
     """
 
     def __init__(self, flies: Callable[[], bool]) -> None:
         """Store the function that tells whether the robot follows the commands of cloud."""
-        self._flies = flies
-        self._until_ns = 0
+        self._flies, self._until_ns = flies, 0
 
     def __call__(self, records: list[Record]) -> list[Record]:
         """Select the records to keep."""
@@ -109,9 +107,9 @@ class RecordingThread:
         self._wall, self._steps = WallClock(), deque[float]()
 
     def start(self) -> None:
-        """Start both threads."""
-        self._writing.start()
-        self._syncing.start()
+        """Start to write and to sync."""
+        for thread in (self._writing, self._syncing):
+            thread.start()
 
     def sync_age(self) -> float | None:
         """Return how much of the recording a power cut would destroy [s]; None before any sync."""

@@ -57,8 +57,7 @@ class UnixPeer:
     def __init__(self, own: Path, other: Path) -> None:
         """Bind `own` and replace a socket that an earlier process left there.
 
-        Raises:
-            BadInputError: If the path cannot be bound.
+        Raise a BadInputError if the path cannot be bound.
         """
         self._other = str(other)
         if len(bytes(own)) > PATH_MAX:

@@ -311,7 +311,7 @@ class RobotInvariants:
         touches = self._simulator.touches
         if touches is not self._touches:
             self._touches, self._seen = touches, 0
-        for body, tip, *_ in touches[self._seen :]:
+        for _, body, _, _, _, tip in touches[self._seen :]:
             self._touched_ns, self._way, self._is_thrown = now_ns, inf, True
             # Acknowledged right above a pipe, a robot that lands cannot stop in time.
             lands = state is LAND or (state is HOLD and now_ns - self._landed_ns <= BRAKE_NS)

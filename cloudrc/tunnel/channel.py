@@ -14,12 +14,10 @@ class Channel:
     """Track the received counters of one stream in one epoch."""
 
     def __init__(self, newest_wins: bool) -> None:
-        """Start empty.
+        """Start empty; with `newest_wins` a datagram older than the newest is late.
 
-        Args:
-            newest_wins: True: a datagram older than the newest is late. False: the last datagram to
-                arrive is used, even if it is older (the published code's policy). Repeats are
-                dropped in both cases.
+        Without it the last datagram to arrive is used, even if it is older (the published code's
+        policy). Repeats are dropped in both cases.
         """
         self._newest_wins = newest_wins
         self.reset()

@@ -122,9 +122,7 @@ def encode_header(kind: int, direction: int, epoch: int, counter: int) -> bytes:
 def check(data: bytes) -> Header:
     """Decode a datagram's header, which is not authenticated yet.
 
-    Raises:
-        DecodeError: "version" for a wrong version; "malformed" for a wrong direction, kind or
-            length.
+    Raise the DecodeError "version", or "malformed" for a wrong direction, kind or length.
     """
     size = len(data)
     if size < HEADER_SIZE:
@@ -140,8 +138,7 @@ def check(data: bytes) -> Header:
 def peek(data: bytes) -> tuple[int, int, int]:
     """Read kind, epoch and counter of a datagram in transit, without checks.
 
-    Raises:
-        DecodeError: "malformed" if the datagram is shorter than a header.
+    Raise the DecodeError "malformed" if the datagram is shorter than a header.
     """
     if len(data) < HEADER_SIZE:
         raise DecodeError("malformed")

@@ -102,8 +102,7 @@ class ServerHandshake:
     def accept_once(self, kind: int, counter: int, now_ns: int) -> None:
         """Accept an ALIVE or OPERATOR datagram of the session once, at `now_ns` [ns].
 
-        Raises:
-            DecodeError: "malformed" for other kinds; "repeated" if the counter is not new.
+        Raise the DecodeError "malformed" for other kinds, "repeated" for a counter that is not new.
         """
         window = self._windows.get(kind)
         if window is None:
@@ -123,7 +122,10 @@ class ServerHandshake:
             return HelloAnswer("hello", [session.greet(Kind.CHALLENGE, challenge, key)])
         if counter <= self._counters.get(hello.nonce, -1):
             return HelloAnswer(REPEATED, [])
-        self._remember(hello.nonce, counter)
+        self._counters.pop(hello.nonce, None)  # so that the nonce answered last is forgotten last
+        self._counters[hello.nonce] = counter
+        if len(self._counters) > CLOUDS_MAX:
+            del self._counters[next(iter(self._counters))]
         if hello.nonce == self._incumbent.nonce:
             if self._keeps_epoch(now_ns):  # cloud takes the answer's key as the key of the epoch
                 return HelloAnswer("hello", [self._accept()])
@@ -157,12 +159,6 @@ class ServerHandshake:
         self._repeated += 1
         is_heard = key == session.epoch_key and now_ns <= self._fresh_until_ns
         return is_heard or self._repeated <= REPEATS_MAX
-
-    def _remember(self, nonce: bytes, counter: int) -> None:
-        self._counters.pop(nonce, None)  # so that the nonce answered last is forgotten last
-        self._counters[nonce] = counter
-        if len(self._counters) > CLOUDS_MAX:
-            del self._counters[next(iter(self._counters))]
 
     def _begin(self, now_ns: int) -> None:
         self._epoch = self._epoch % EPOCH_MAX + 1

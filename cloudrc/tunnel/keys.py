@@ -90,10 +90,7 @@ class KeyRing:
 def parse(data: bytes) -> KeySet:
     """Parse a key file: 32 bytes, or the lines `current HEX` and optionally `previous HEX`.
 
-    The lines `overlap_s` and `previous_until_s` of older files are ignored.
-
-    Raises:
-        ValueError: If the file is invalid; the message contains no part of the file.
+    Raise a ValueError if the file is invalid; its text has no part of the file.
     """
     if len(data) == KEY_SIZE:
         return KeySet(Key(data))
@@ -103,10 +100,9 @@ def parse(data: bytes) -> KeySet:
         fields = {name: value for name, value in pairs}
     except ValueError:
         raise ValueError(f"neither {KEY_SIZE} bytes nor lines of 'name value'") from None
-    known = {"current", "previous", "overlap_s", "previous_until_s"}
-    if "current" not in fields or len(fields) != len(pairs) or fields.keys() - known:
+    if "current" not in fields or len(fields) != len(pairs) or fields.keys() - {*KeySet._fields}:
         raise ValueError("expected the line 'current' and optionally 'previous', each once")
-    return KeySet(*(_key(fields[name]) for name in ("current", "previous") if name in fields))
+    return KeySet(**{name: _key(text) for name, text in fields.items()})
 
 
 def write(keys: KeySet) -> str:

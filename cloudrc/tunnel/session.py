@@ -62,12 +62,9 @@ class Session:
     """
 
     def __init__(self, sends: Direction, ring: KeyRing | None) -> None:
-        """Start without a session.
+        """Start without a session; this end sends in the direction `sends` and opens the other one.
 
-        Args:
-            sends: Direction in which this end sends; it opens only datagrams of the other
-                direction.
-            ring: The pre-shared keys; None if both ends are in one process.
+        `ring` holds the pre-shared keys; it is None if both ends are in one process.
         """
         self.epoch, self.sealed = NO_EPOCH, ring is not None
         self.ring = ring or KeyRing(KeySet(Key(_PUBLIC_KEY)))
@@ -81,10 +78,8 @@ class Session:
     def begin(self, epoch: int, nonces: bytes = b"", key: Key | None = None) -> None:
         """Begin an epoch: derive new keys and restart the counters.
 
-        Args:
-            epoch: Number of the epoch.
-            nonces: Cloud's nonce, then world's nonce; empty to keep the previous epoch's nonces.
-            key: Pre-shared key of the handshake; None to keep the previous epoch's key.
+        `nonces` are cloud's nonce, then world's; `key` is the pre-shared key of the handshake.
+        Those that are missing stay as in the previous epoch.
         """
         self.epoch = epoch
         self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)

@@ -43,7 +43,6 @@ from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import ServerHandshake
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.readings import Touch
 from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
@@ -76,7 +75,7 @@ class Orders:
         self.number = self.mission_id = self.reached = self.pipes = 0
         self.touch_speed = nan
 
-    def note_touch(self, touch: Touch) -> None:
+    def note_touch(self, touch: Contact) -> None:
         """Count a contact that has begun."""
         if touch.body.startswith("pipe"):
             self.pipes += 1
@@ -84,15 +83,10 @@ class Orders:
             self.touch_speed = hypot(*touch.tip_velocity)
 
     def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
-        """Carry out a request; return whether the caller must begin a mission.
+        """Carry out a request at `now_ns` [ns], world's clock; return whether a mission begins.
 
-        Args:
-            request: The operator's request.
-            now_ns: World's clock [ns].
-            waited: Whether the request may have waited in the socket during a stall.
-
-        Raises:
-            DecodeError: If the stamp of a start request is too old ("stale") or in the future.
+        `waited`: the request may have waited in the socket during a stall. Raise a
+        DecodeError if the stamp of a start request is too old ("stale") or in the future.
         """
         kind, guard = request.request, self._guard
         starts = kind is Request.START
@@ -139,9 +133,7 @@ class PaceMonitor:
     def check(self, now_ns: int, slip_ns: int) -> list[Fault]:
         """Return a fault if world fell behind since the last call, about a second ago.
 
-        Args:
-            now_ns: World's clock [ns].
-            slip_ns: Lag of world's clock behind the machine's clock [ns].
+        `now_ns` is world's clock, `slip_ns` its lag behind the machine's clock [ns].
         """
         passed_ns, slipped_ns = now_ns - self._checked_ns, slip_ns - self._slip_ns
         is_first = self._checked_ns == NEVER_NS
@@ -181,15 +173,14 @@ class WorldEndpoint(TunnelEnd):
         command_age_max_ns: int,
         start_ns: int = 0,
     ) -> None:
-        """Connect the parts.
+        """Connect the parts; the guard of `robot` is in GROUND, `sensors` add noise to odometry.
 
         Args:
-            robot: The robot, its guard in GROUND.
-            sensors: The sensors that give odometry its noise.
+            robot: The robot.
+            sensors: The sensors.
             identity: The identity of this end.
             newest_wins: Whether late commands are dropped.
-            command_age_max_ns: Longest wait in the socket [ns]; a datagram that may have waited
-                longer is stale.
+            command_age_max_ns: Longest wait in the socket of a datagram that is not stale [ns].
             start_ns: The monotonic clock now [ns].
         """
         super().__init__(identity, Direction.UPLINK, newest_wins)
@@ -296,7 +287,7 @@ class WorldEndpoint(TunnelEnd):
             records += guard.take_changes()
         if simulator.touches:
             for touch in simulator.take_contacts():
-                records.append(Contact(now_ns, **touch._asdict()))
+                records.append(touch._replace(stamp_ns=now_ns))
                 orders.note_touch(touch)
         if epoch := self._session.epoch:
             known = (

@@ -37,11 +37,10 @@ class Readings(NamedTuple):
 
     @classmethod
     def of(cls, pose: Iterable[float], twist: Iterable[float]) -> Readings:
-        """Make readings from the state of a free joint in MuJoCo.
+        """Make readings from the state of a free joint in MuJoCo, in the world frame.
 
-        Args:
-            pose: Position [m] and orientation (wxyz, unit) in the world frame, shape (7,).
-            twist: Velocity [m/s], world frame; angular velocity [rad/s], body frame; shape (6,).
+        `pose` is position [m] and orientation (wxyz, unit), shape (7,); `twist` is velocity [m/s]
+        and angular velocity [rad/s], body frame, shape (6,).
         """
         px, py, pz, w, x, y, z = pose
         vx, vy, vz, p, q, r = twist
@@ -62,21 +61,3 @@ class Readings(NamedTuple):
         )
         # One per physics step: the class's own constructor takes twice the time.
         return _new(cls, ((px, py, pz), (w, x, y, z), (vx, vy, vz), (p, q, r), axes))
-
-
-class Touch(NamedTuple):
-    """The beginning of a contact between robot and scene.
-
-    Attributes:
-        body: Name of the touched body of the scene: pipe_1, board, floor.
-        tip: True if the arm's tip touched the body, False if another part of the robot did.
-        position: Position of the base just before [m], world frame, shape (3,).
-        velocity: Velocity of the base just before [m/s], world frame, shape (3,).
-        tip_velocity: Velocity of the arm's tip just before [m/s], world frame, shape (3,).
-    """
-
-    body: str
-    tip: bool
-    position: Vector
-    velocity: Vector
-    tip_velocity: Vector

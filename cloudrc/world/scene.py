@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,6 @@ TIP = (0.40, 0.0, 0.17)
 SHOWN = 6
 """Largest number of differences that one message lists."""
 FOLDER = Path(__file__).parent
-_NO_GL = {"", "disable", "disabled", "off", "false", "0"}
 
 
 def import_mujoco() -> Any:
@@ -41,15 +39,8 @@ def import_mujoco() -> Any:
 
     With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. Therefore MUJOCO_GL is `disable`
     during the import. Its value is restored afterwards, for a child process that renders.
-
-    Raises:
-        MissingPrerequisiteError: If the package is not installed.
     """
     wanted = os.environ.get("MUJOCO_GL")
-    if "mujoco" not in sys.modules and (wanted or "").lower() not in _NO_GL:
-        logging.getLogger(__name__).warning(
-            "MUJOCO_GL=%s ignored: a flight needs no OpenGL", wanted
-        )
     os.environ["MUJOCO_GL"] = "disable"
     try:
         import mujoco
@@ -70,14 +61,9 @@ mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 
 def model_path(kind: str, name: str) -> Path:
-    """Find the file of a robot or scene by its shipped name or the path of an .xml file.
+    """Find a file of "robots" or "scenes" by its shipped name or the path of an .xml file.
 
-    Args:
-        kind: "robots" or "scenes".
-        name: The name or path.
-
-    Raises:
-        BadInputError: If the file does not exist; the message lists the shipped ones.
+    Raise a BadInputError, which lists the shipped files, if this one does not exist.
     """
     path = Path(name) if name.endswith(".xml") else FOLDER / kind / f"{name}.xml"
     if not path.is_file():
@@ -89,13 +75,10 @@ def model_path(kind: str, name: str) -> Path:
 def compile_model(robot: str, scene: str) -> Any:
     """Attach the robot to the scene's frame `spawn` and compile both into an `MjModel`.
 
-    Static bodies are fused, which halves the time of a step but loses the names of the bodies.
-    Therefore each geom of the scene gets the name BODY/NUMBER, by which a contact finds its body.
-    The robot's names begin with `robot/`. Both arguments are names or paths of files.
-
-    Raises:
-        BadInputError: If a file is missing, cannot be read, does not compile or does not fit the
-            onboard controller.
+    Both arguments are names or paths of files. Raise a BadInputError if a file is missing, does not
+    compile or does not fit the onboard controller. The robot's names begin with `robot/`. Static
+    bodies are fused, which halves the time of a step but loses their names. Therefore each geom of
+    the scene gets the name BODY/NUMBER.
     """
     robot_path, scene_path = model_path("robots", robot), model_path("scenes", scene)
     try:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from math import dist
 from struct import Struct
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cloudrc.messages import Vector
-from cloudrc.world.readings import Readings, RotorSpeeds, Touch
+from cloudrc.records import Contact
+from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import STOPPED, Controls, Rotors
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
 
@@ -31,16 +32,6 @@ _unpack_pose, _unpack_twist = Struct("7d").unpack_from, Struct("6d").unpack_from
 _readings_of = Readings.of  # looking up a class method binds it anew each time
 
 
-class State(NamedTuple):
-    """The state of the physics, from which `replay` starts: `mjSTATE_FULLPHYSICS`, shape (n,).
-
-    `warmstart` are the accelerations that the contact solver starts from, shape (nv,).
-    """
-
-    physics: npt.NDArray[np.float64]
-    warmstart: npt.NDArray[np.float64]
-
-
 class Simulator:
     """The robot in its scene.
 
@@ -49,7 +40,7 @@ class Simulator:
         dt: Duration of a step [s].
         steps: Number of steps since the last reset.
         readings: State of the base after the last step.
-        touches: Contacts that began since the last call of `take_contacts`.
+        touches: Contacts that began since the last call of `take_contacts`, without stamps.
         tape: None, or a list to which every step since the last reset appends its controls, for
             `replay`.
     """
@@ -57,8 +48,7 @@ class Simulator:
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
-        Raises:
-            BadInputError: If a file is missing or does not suit the loop.
+        Raise a BadInputError if a file is missing or does not suit the loop.
         """
         self.model = model = compile_model(robot, scene)
         self.dt: float = model.opt.timestep
@@ -87,7 +77,7 @@ class Simulator:
         self.steps = self._contacts = 0
         if self.tape is not None:
             self.tape.clear()
-        self.touches: list[Touch] = []
+        self.touches: list[Contact] = []
         # The robot stands on the floor: a contact with it is new only after a flight.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
@@ -130,17 +120,20 @@ class Simulator:
         """Return the normal force on the arm's tip at the beginning of the last step [N]."""
         return self._sensors[self._tip_sensor]
 
-    def take_contacts(self) -> list[Touch]:
-        """Return the contacts that began since the last call, oldest first."""
+    def take_contacts(self) -> list[Contact]:
+        """Return the contacts that began since the last call, oldest first, without stamps."""
         touches, self.touches = self.touches, []
         return touches
 
-    def state(self) -> State:
-        """Return a copy of the state of the physics."""
+    def state(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return a copy of the state of the physics, `mjSTATE_FULLPHYSICS`, shape (n,).
+
+        The second array has the accelerations that the contact solver starts from, shape (nv,).
+        """
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
         mujoco.mj_getState(self.model, self._data, physics, spec)
-        return State(physics, self._data.qacc_warmstart.copy())
+        return physics, self._data.qacc_warmstart.copy()
 
     def _note_contacts(self, before: Readings) -> None:
         """Note the new contacts, which MuJoCo found in the state `before` the step."""
@@ -149,12 +142,12 @@ class Simulator:
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
         for (first, second), place in zip(pairs, places, strict=True):
             body = self._bodies[first] or self._bodies[second]
-            touched = (body, dist(place, tip) <= self._tip_radius)
-            last = self._last_touch.get(touched)
+            by_tip = dist(place, tip) <= self._tip_radius
+            last = self._last_touch.get((body, by_tip))
             if last is None or self.steps - last > self._gap_steps:
-                tip_velocity = _velocity_at(before, self._tip_offset)
-                self.touches.append(Touch(*touched, before.position, before.velocity, tip_velocity))
-            self._last_touch[touched] = self.steps
+                motion = before.position, before.velocity, _velocity_at(before, self._tip_offset)
+                self.touches.append(Contact(0, body, *motion, by_tip))
+            self._last_touch[body, by_tip] = self.steps
 
 
 def _velocity_at(readings: Readings, offset: Vector) -> Vector:
@@ -171,21 +164,23 @@ def _velocity_at(readings: Readings, offset: Vector) -> Vector:
     )
 
 
-def replay(model: Any, start: State, tape: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def replay(
+    model: Any, physics: npt.ArrayLike, warmstart: npt.ArrayLike, tape: npt.ArrayLike
+) -> npt.NDArray[np.float64]:
     """Replay a `Simulator.tape` without a reset at the speed of raw `mj_step`, for the benchmark.
 
-    Return the physics of `Simulator.state()` at the end, which are equal bit by bit, shape (n,).
+    It starts from `Simulator.state()`. Return the physics at the end, which are equal bit by bit.
     """
     from mujoco import rollout
 
     state = mujoco.mjtState
-    physics, _ = rollout.rollout(
+    states, _ = rollout.rollout(
         model,
         mujoco.MjData(model),
-        start.physics,
+        physics,
         np.asarray(tape),
         control_spec=state.mjSTATE_CTRL | state.mjSTATE_QFRC_APPLIED,
-        initial_warmstart=start.warmstart,
+        initial_warmstart=warmstart,
     )
-    end: npt.NDArray[np.float64] = physics[0, -1]
+    end: npt.NDArray[np.float64] = states[0, -1]
     return end

@@ -44,7 +44,7 @@ class Release:
         self.ends["cloud"].see([row])
 
     def shapes(self, way, told):
-        self.links[way].tells(lambda: write_told(told))
+        self.links[way].link.tell = lambda: write_told(told)
 
     def ask(self, limit=30.0):
         return verify_release("demo", self.pods, limit)
@@ -65,8 +65,8 @@ def release(monkeypatch):
         (up, at_up), (down, at_down) = served("link"), served("link")
         pods = {"world": (at_world, at_up), "cloud": (at_cloud, at_down)}
         made = Release({"world": world, "cloud": cloud}, {"uplink": up, "downlink": down}, pods)
-        for way, link in made.links.items():
-            link.shaped("relay", way, "auto")
+        for way, exporter in made.links.items():
+            exporter.link.shaped("relay", way, "auto")
             made.shapes(way, Told("relay", "", APPLIED, Near("eth0", {})))
 
         def count(seconds):
@@ -91,7 +91,7 @@ def test_a_release_is_believed_once_both_ends_do(release):
     assert (said["verdict"], said["shaper"]) == ("believed", "shaped by relay")
     assert rows(said)["mean"]["measured"] == pytest.approx(0.0451)
     assert as_text(said).splitlines()[-1].startswith("BELIEVED")
-    release.links["uplink"].tells(lambda: "{}")
+    release.links["uplink"].link.tell = lambda: "{}"
     assert release.ask()["verdict"] == "believed", "the link's page is not needed"
 
 

@@ -4,7 +4,6 @@ import argparse
 import os
 import signal
 import socket
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -25,6 +24,7 @@ from cloudrc.cli.processes import (
     show_address,
 )
 from cloudrc.config.load import load_experiment
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
@@ -50,15 +50,13 @@ def key(tmp_path):
 
 @pytest.fixture
 def taken():
-    """Yield an address with a UDP and a TCP socket; the port is free for both only at times."""
-    for _ in range(20):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
-            tcp.bind(("127.0.0.1", 0))
-            with suppress(OSError):
-                udp.bind(tcp.getsockname())
-                tcp.listen()
-                yield f"127.0.0.1:{tcp.getsockname()[1]}"
-                return
+    """Yield an address with a UDP and a TCP socket."""
+    address = "127.0.0.1", free_ports(1)[0]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
+        udp.bind(address)
+        tcp.bind(address)
+        tcp.listen()
+        yield f"127.0.0.1:{address[1]}"
 
 
 def run(command, key, *last):
@@ -166,9 +164,7 @@ def test_an_end_stopped_at_its_start_completes_its_recording(
     record = tmp_path / "end.mcap"
     (tmp_path / "key").chmod(0o644)
     route = [end, "--config", "hover", "--route", str(tmp_path / "route"), *key]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        listen = f"127.0.0.1:{probe.getsockname()[1]}"
+    listen = f"127.0.0.1:{free_ports(1)[0]}"
     assert main([*route, "--listen", listen, "--record", str(record)]) == 0
     assert record.read_bytes().endswith(MCAP_MAGIC)
     errors = capsys.readouterr().err

@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import pytest
-import yaml
 
 from cloudrc.cli.client import Api
 from cloudrc.config.load import dump, load_experiment
@@ -78,15 +77,41 @@ sys.exit(main(sys.argv[1:]))
 FAST = [sys.executable, "-c", WITHOUT_PAGE]
 """`cloudrc` that writes no page with figures, which takes longer than a short flight."""
 
+
+def start(folder, *settings, dwell=20.0, command=FAST):
+    """Start a local run of `hover`."""
+    words = ["run", "hover", "--mode", "local", "--out", str(folder)]
+    for setting in (f"mission.waypoints.0.dwell_s={dwell}", *settings):
+        words += ["--set", setting]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(
+        [*command, *words], stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
+
+
+def wait_until_flying(run):
+    """Return the process ids by role: relay, world, teleop, cloud."""
+    for line in run.stdout:
+        if "mission started" in line:
+            break
+    else:
+        raise AssertionError(run.stderr.read())
+    found = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            stat, line = path.read_text(), (path.parent / "cmdline").read_text().split("\0")
+        except OSError:
+            continue
+        if int(stat.rpartition(")")[2].split()[1]) == run.pid and "cloudrc" in line:
+            found[line[line.index("cloudrc") + 1]] = int(path.parent.name)
+    return found
+
+
 LIMIT = 30.0
 TOKEN = "operator-token-of-the-tests"
 KEY = bytes(range(100, 132))
-MISSION = """
-waypoints:
-  - {position_m: [0.5, 0.0, 0.7], tolerance_m: 0.2, dwell_s: 0.0}
-  - {position_m: [0.5, 3.6, 0.7], tolerance_m: 0.2, dwell_s: 0.0}
-  - {position_m: [0.5, 0.0, 0.7], tolerance_m: 0.2, dwell_s: 0.0}
-"""
+WAYPOINT = "  - {position_m: [0.5, %s, 0.7], tolerance_m: 0.2, dwell_s: 0.0}\n"
+MISSION = "waypoints:\n" + "".join(WAYPOINT % y for y in ("0.0", "3.6", "0.0"))
 
 
 class Release:
@@ -94,28 +119,28 @@ class Release:
 
     def __init__(self, folder, *recorded):
         self.folder, self.running, self.all = folder, {}, []
-        self.recorded = recorded
-        self.world, self.cloud = (f"127.0.0.1:{port}" for port in free_ports(2))
+        world, cloud = (f"127.0.0.1:{port}" for port in free_ports(2))
         (folder / "config.yaml").write_text(dump(load_experiment("paper")))
         (folder / "key").write_bytes(KEY)
         (folder / "mission.yaml").write_text(MISSION)
         (folder / "operator").write_text(TOKEN)
         (folder / "operator").chmod(0o600)
-        for name in ("world", "cloud", "teleop"):
+        self.flags = {
+            "world": ["--listen", world, "--peer", cloud, "--key", "key"],
+            "cloud": ["--listen", cloud, "--peer", world, "--key", "key", "--teleop", "."],
+            "teleop": ["--socket", ".", "--api", "0", "--api-file", "api.json", "--tokens", ".",
+                       "--audit", "audit.jsonl", "--journal", "journal/missions"],
+        }  # fmt: skip
+        for name in recorded:
+            self.flags[name] += ["--record", f"{name}.mcap"]
+        for name in self.flags:
             self.start(name)
         self.until(lambda: self.ask("/v1/state")["seen"] is not None)
 
     def start(self, name):
-        flags = {
-            "world": ["--listen", self.world, "--peer", self.cloud, "--key", "key"],
-            "cloud": ["--listen", self.cloud, "--peer", self.world, "--key", "key",
-                      "--teleop", "."],
-            "teleop": ["--socket", ".", "--api", "0", "--api-file", "api.json", "--tokens", ".",
-                       "--audit", "audit.jsonl", "--journal", "journal/missions"],
-        }  # fmt: skip
-        (self.folder / "api.json").unlink(missing_ok=True) if name == "teleop" else None
-        record = ["--record", f"{name}.mcap"] if name in self.recorded else []
-        self.running[name] = self.run(name, "--config", "config.yaml", *flags[name], *record)
+        if name == "teleop":
+            (self.folder / "api.json").unlink(missing_ok=True)
+        self.running[name] = self.run(name, "--config", "config.yaml", *self.flags[name])
 
     def run(self, *words):
         command = [sys.executable, "-m", "cloudrc", *words]
@@ -143,16 +168,18 @@ class Release:
             process.kill()
             process.communicate()
 
+    @property
+    def url(self):
+        return json.loads((self.folder / "api.json").read_text())["url"]
+
     def ask(self, path):
         try:
-            url = json.loads((self.folder / "api.json").read_text())["url"]
-            return Api(url, lambda: TOKEN).get(path)
+            return Api(self.url, lambda: TOKEN).get(path)
         except (OSError, ValueError, CloudrcError):
             return {"seen": None, "missions": []}
 
-    def post(self, path):
-        url = json.loads((self.folder / "api.json").read_text())["url"]
-        return Api(url, lambda: TOKEN).post(path)
+    def post(self, path, *body):
+        return Api(self.url, lambda: TOKEN).post(path, *body)
 
     def mission(self):
         """Return the newest mission, if there is one."""
@@ -165,24 +192,21 @@ class Release:
             assert time.monotonic() < limit, "not in time"
             time.sleep(0.05)
 
+    def until_guard(self, state):
+        self.until(lambda: self.ask("/v1/state")["seen"]["guard"] == state)
+
     def fly(self):
         """Start the command of a Job and wait for its first waypoint."""
-        url = json.loads((self.folder / "api.json").read_text())["url"]
         flags = ["--token-file", "operator", "--mission", "mission.yaml", "--key", "u"]
-        job = self.run("mission", "fly", "--api", url, *flags)
+        job = self.run("mission", "fly", "--api", self.url, *flags)
         self.until(lambda: len(self.mission()["reached"]) == 1)
         return job
 
-    def post_mission(self):
-        url = json.loads((self.folder / "api.json").read_text())["url"]
-        Api(url, lambda: TOKEN).post("/v1/missions", yaml.safe_load(
-            (self.folder / "mission.yaml").read_text()))  # fmt: skip
-
-    def stop(self):
-        took = {}
-        for name, process in self.running.items():
-            began = time.monotonic()
+    def stop(self, *names):
+        """End processes, by default all, at the same time; return their outputs."""
+        ended, asked = [self.running[name] for name in names or self.running], time.monotonic()
+        for process in ended:
             process.send_signal(signal.SIGTERM)
-            process.communicate(timeout=10)
-            took[name] = time.monotonic() - began
-        return took
+        said = [process.communicate(timeout=10)[0] for process in ended]
+        assert time.monotonic() - asked < (2.0 if names else 10.0)
+        return said

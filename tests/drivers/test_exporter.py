@@ -1,6 +1,5 @@
 """The exporter: valid text in bounds, probes on one port, hostile clients, CPU throttling."""
 
-import select
 import socket
 import threading
 import time
@@ -77,10 +76,10 @@ def exporter(role, flight, *, missions=True):
     if role in ENDS:
         made.recording(lambda: 0.3)
     if role == "link":
-        made.shaped("netem", "uplink", "auto")  # "relay" takes its place
+        made.link.shaped("netem", "uplink", "auto")  # "relay" takes its place
         for way in DIRECTIONS:
-            made.shaped("relay", way, "auto")
-        made.asked("uplink", 0.045)
+            made.link.shaped("relay", way, "auto")
+        made.link.asked("uplink", 0.045)
     return made
 
 
@@ -146,24 +145,20 @@ def test_a_record_costs_less_than_a_microsecond(end, flight):
 
 
 @pytest.mark.parametrize(
-    ("file", "text", "counts"),
+    ("text", "counts"),
     [
-        ("cpu.stat", "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n",
-         [120, 17, pytest.approx(1.25)]),
-        ("cpu,cpuacct/cpu.stat", "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n",
-         [4, 2, pytest.approx(0.5)]),
-        ("cpu.stat", "usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),
-        ("cpu.stat", "", []),
-        ("cpu.stat", None, []),
+        ("nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n", [120, 17, 1.25]),
+        ("usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),  # without a limit
+        ("", []),
+        (None, []),
     ],
-    ids=["limited", "version 1", "unlimited", "empty", "missing"],
-)  # fmt: skip
-def test_throttling_is_read_from_the_kernel(file, text, counts, tmp_path):
+)
+def test_throttling_is_read_from_the_kernel(text, counts, tmp_path):
     if text is not None:
-        (tmp_path / file).parent.mkdir(exist_ok=True)
-        (tmp_path / file).write_text(text)
-    read = read_throttling(tmp_path)
-    assert [value for reading in read.values() for value in dict(reading).values()] == counts
+        (tmp_path / "cpu.stat").write_text(text)
+    read = read_throttling(tmp_path / "cpu.stat")
+    values = [value for reading in read.values() for value in dict(reading).values()]
+    assert values == pytest.approx(counts)
 
 
 @pytest.fixture
@@ -245,9 +240,6 @@ def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
     for client in waiting[-2:]:
         client.sendall(b"GET /metr")
     assert get(served[1], "/healthz")[0] == 200
-    closed = select.select(waiting, [], [], 0)[0]  # the oldest ones
-    assert closed == waiting[: len(closed)]
-    assert len(closed) == len(waiting) + 1 - exporters.CONNECTIONS_MAX
     for client in waiting:
         client.close()
 

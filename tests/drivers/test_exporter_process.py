@@ -1,42 +1,23 @@
 """Metrics and routes of real processes: a whole flight, and names that cannot be resolved."""
 
-from __future__ import annotations
-
 import signal
-import socket
 import subprocess
 import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
-from contextlib import ExitStack, suppress
-from pathlib import Path
+from contextlib import suppress
 
 import pytest
 
 from cloudrc.config.load import dump, load_experiment
-
-
-def free_ports(count: int) -> list[int]:
-    """Find ports on 127.0.0.1 that are free for both UDP and TCP."""
-    ports: list[int] = []
-    with ExitStack() as held:
-        while len(ports) < count:
-            udp, tcp = socket.socket(type=socket.SOCK_DGRAM), socket.socket()
-            held.callback(udp.close)
-            held.callback(tcp.close)
-            udp.bind(("127.0.0.1", 0))
-            with suppress(OSError):  # free for UDP, but a TCP connection has just used it
-                tcp.bind(udp.getsockname())
-                ports.append(udp.getsockname()[1])
-    return ports
+from cloudrc.drivers.realtime import free_ports
 
 
 class Pods:
     """World and cloud with metrics, connected by two route files."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.folder = folder
         experiment = load_experiment("hover", ["mission.waypoints.0.dwell_s=60"])
         (folder / "experiment.yaml").write_text(dump(experiment))
@@ -46,7 +27,7 @@ class Pods:
         self.metrics = {"world": ports[2], "cloud": ports[3]}
         self.processes = {end: self.start(end) for end in ("world", "cloud")}
 
-    def start(self, end: str) -> subprocess.Popen[bytes]:
+    def start(self, end):
         command = [sys.executable, "-m", "cloudrc", end]
         command += ["--config", str(self.folder / "experiment.yaml")]
         command += ["--key", str(self.folder / "key")]
@@ -58,12 +39,12 @@ class Pods:
         with (self.folder / f"{end}.log").open("wb") as log:
             return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
 
-    def route(self, end: str, port: int) -> None:
+    def route(self, end, port):
         draft = self.folder / "draft"
         draft.write_text(f"127.0.0.1:{port}\n")
         draft.replace(self.folder / f"{end}.route")
 
-    def get(self, end: str, path: str) -> tuple[int, str]:
+    def get(self, end, path):
         url = f"http://127.0.0.1:{self.metrics[end]}{path}"
         try:
             with urllib.request.urlopen(url, timeout=5) as answer:
@@ -74,7 +55,7 @@ class Pods:
         except urllib.error.URLError:
             return 0, ""
 
-    def wait(self, end: str, path: str, *wanted: str, status: int = 200, limit: float = 15) -> None:
+    def wait(self, end, path, *wanted, status=200, limit=15):
         until = time.monotonic() + limit
         while True:
             got, text = self.get(end, path)
@@ -83,7 +64,7 @@ class Pods:
             assert time.monotonic() < until, (got, text, (self.folder / f"{end}.log").read_text())
             time.sleep(0.05)
 
-    def stop(self) -> None:
+    def stop(self):
         for process in self.processes.values():
             process.terminate()
         for process in self.processes.values():
@@ -91,14 +72,14 @@ class Pods:
 
 
 @pytest.fixture
-def pods(tmp_path: Path) -> Iterator[Pods]:
+def pods(tmp_path):
     made = Pods(tmp_path)
     yield made
     made.stop()
 
 
 @pytest.mark.process
-def test_ends_follow_their_route_and_are_ready_only_with_a_peer(pods: Pods) -> None:
+def test_ends_follow_their_route_and_are_ready_only_with_a_peer(pods):
     for end in pods.processes:
         pods.wait(end, "/healthz")
         assert pods.get(end, "/readyz")[0] == 503
@@ -123,7 +104,7 @@ def test_ends_follow_their_route_and_are_ready_only_with_a_peer(pods: Pods) -> N
 
 
 @pytest.mark.process
-def test_a_link_counts_unresolved_names_before_it_shapes(tmp_path: Path) -> None:
+def test_a_link_counts_unresolved_names_before_it_shapes(tmp_path):
     (tmp_path / "profile.yaml").write_text("uplink: {delay_ms: 1}\n")
     listen, metrics = free_ports(2)
     command = [sys.executable, "-m", "cloudrc", "link", "run", "--config", "hover"]

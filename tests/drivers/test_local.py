@@ -55,9 +55,7 @@ def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(tmp_path, places, m
 
 
 @pytest.mark.process
-def test_a_flight_that_is_killed_is_over_and_is_cleared_away(
-    tmp_path: Path, places: list[Path]
-) -> None:
+def test_a_flight_that_is_killed_is_over_and_is_cleared_away(tmp_path, places):
     ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
     assert ended.returncode == -signal.SIGKILL
     (left,) = places[0].glob("*.json")

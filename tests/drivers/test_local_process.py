@@ -16,7 +16,7 @@ import pytest
 from cloudrc.drivers import local
 from cloudrc.record.columns import Recording
 from tests.conftest import nightly
-from tests.drivers.conftest import FAST, WITHOUT_PAGE
+from tests.drivers.conftest import WITHOUT_PAGE, start, wait_until_flying
 
 pytestmark = pytest.mark.process
 
@@ -30,44 +30,11 @@ extras.EXTRAS["api"] = ("fastapi_is_not_here",)
 """
 
 
-def start(
-    folder: Path, *settings: str, dwell: float = 20.0, command: list[str] = FAST
-) -> subprocess.Popen[str]:
-    words = ["run", "hover", "--mode", "local", "--out", str(folder)]
-    for setting in (f"mission.waypoints.0.dwell_s={dwell}", *settings):
-        words += ["--set", setting]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(
-        [*command, *words], stdout=pipe, stderr=pipe, text=True, start_new_session=True
-    )
-
-
-def children(parent: int) -> dict[str, int]:
-    """Return the process ids by role: relay, world, teleop, cloud."""
-    found = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            stat, line = path.read_text(), (path.parent / "cmdline").read_text().split("\0")
-        except OSError:
-            continue
-        if int(stat.rpartition(")")[2].split()[1]) == parent and "cloudrc" in line:
-            found[line[line.index("cloudrc") + 1]] = int(path.parent.name)
-    return found
-
-
-def wait_until_flying(run: subprocess.Popen[str]) -> dict[str, int]:
-    assert run.stdout is not None
-    for line in run.stdout:
-        if "mission started" in line:
-            return children(run.pid)
-    raise AssertionError(run.stderr.read() if run.stderr else "")
-
-
-def report(folder: Path) -> dict:
+def report(folder):
     return json.loads((folder / "report.json").read_text())
 
 
-def alive(pid: int) -> bool:
+def alive(pid):
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -75,7 +42,7 @@ def alive(pid: int) -> bool:
     return True
 
 
-def wait_until_ended(pids: dict[str, int], limit: float) -> None:
+def wait_until_ended(pids, limit):
     """Wait until all processes have ended, at most `limit` [s]."""
     until = time.monotonic() + limit
     while any(alive(pid) for pid in pids.values()):
@@ -199,16 +166,16 @@ EDGE = 0.01
 """Uncertainty of the start of a time line, which is the next datagram [s]."""
 
 
-def call(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def call(folder, *words):
     return subprocess.run([*COMMAND, *words, "--run", str(folder)], capture_output=True, text=True)
 
 
-def set_link(folder: Path, *words: str) -> float:
+def set_link(folder, *words):
     """Change the link; return how long it took to be in force [s]."""
     return json.loads(call(folder, "link", "set", *words, "-o", "json").stdout)["seconds"]
 
 
-def operate(folder: Path) -> None:
+def operate(folder):
     """Hold, move and resume the mission of a run, found by its folder and from anywhere."""
     assert call(folder, "mission", "run", "hover").returncode == 5  # a mission already flies
     assert "held" in call(folder, "mission", "hold").stdout
@@ -264,7 +231,7 @@ def test_an_operator_steers_a_run_and_sets_its_link(tmp_path, figure):
     assert "Triangles: the link was set in flight (1: downlink.delay_ms=120" in page
 
 
-def check_delays(recording: Recording) -> None:
+def check_delays(recording):
     """Check that the delays of the downlink follow its changes."""
     link, delays = recording["/link"], recording["/downlink_delay"]["delay"]
     told = {cause: stamp - age * 1e9 for cause, stamp, age, uplink in
@@ -293,17 +260,16 @@ def test_real_time_takes_as_long_as_virtual_time(tmp_path, attempt):
         command = [sys.executable, "-m", "cloudrc", "run", "paper", "--mode", mode]
         subprocess.run([*command, "--out", str(folder)], check=True, capture_output=True)
         reports[mode] = report(folder)["numbers"]
-    local, virtual = reports["local"], reports["virtual"]
-    contact = "contact_time"
-    assert local[contact]["value"] == pytest.approx(virtual[contact]["value"], rel=0.05)
+    local, virtual = (reports[mode]["contact_time"]["value"] for mode in ("local", "virtual"))
+    assert local == pytest.approx(virtual, rel=0.05)
     for name in ("real_time_factor", "world_lateness_p99", "cloud_lateness_p99"):
-        assert local[name]["value"] > 0
+        assert reports["local"][name]["value"] > 0
 
 
-def private_memory(pid: int) -> int:
-    """Return the private memory of a process [bytes]."""
+def private_memory(pid):
+    """Return the private memory of a process [MB]."""
     status = Path(f"/proc/{pid}/status").read_text()
-    return 1024 * int(status.partition("RssAnon:")[2].split()[0])
+    return 1.024e-3 * int(status.partition("RssAnon:")[2].split()[0])
 
 
 @pytest.mark.full
@@ -320,4 +286,4 @@ def test_an_hour_of_recording_takes_below_a_megabyte(tmp_path, figure):
     run.communicate(timeout=60)
     for name in ENDS:
         grown = (memory[1][name] - memory[0][name]) * 2
-        figure(f"{name} with a recording: memory grown in an hour", grown * 1e-6, "<=", 1.0, "MB")
+        figure(f"{name} with a recording: memory grown in an hour", grown, "<=", 1.0, "MB")

@@ -17,10 +17,10 @@ from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.process import (
     PARENT,
     PERIOD_NS,
+    EndProcess,
     Feed,
     LinkNotes,
     StopSignal,
-    _Sink,
     from_line,
     in_words,
     to_line,
@@ -68,7 +68,7 @@ def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(told, ends, monkey
 
 
 @pytest.mark.process
-def test_it_ends_if_its_supervisor_was_killed_before_its_start(tmp_path: Path) -> None:
+def test_it_ends_if_its_supervisor_was_killed_before_its_start(tmp_path):
     (tmp_path / "config.yaml").write_text(CONFIG.read_text())
     command = [sys.executable, "-c", KILLED_AT_ONCE, str(tmp_path)]
     supervisor = subprocess.run(command, capture_output=True, text=True, timeout=60)
@@ -303,25 +303,19 @@ def test_a_change_of_the_other_direction_is_recorded_but_not_fed(path, pipe):
 
 
 def test_an_end_tells_of_its_clock_and_of_its_recorders_trouble(pipe):
-    put = []
-    recorder = SimpleNamespace(put=put.extend, error="", dropped=0)
+    recorder = SimpleNamespace(error="", dropped=0)
     keys, exporter = SimpleNamespace(follow=lambda now_ns: []), Exporter("world")
-    run = SimpleNamespace(
-        end="world", recorder=recorder, keys=keys, exporter=exporter, link=None, check=None,
-        feed=Feed(pipe[1], watched=False),
-    )  # fmt: skip
-    steps = [[60.0, -1.0], [], []]
+    run = EndProcess("world", None, recorder, keys, Feed(pipe[1], watched=False), exporter)
     slip_ns = 5_000_000_000
-    sink = _Sink(run, list, lambda: slip_ns, lambda: steps.pop(0))
     began_ns = time.monotonic_ns() - slip_ns
-    sink([])
-    assert [record.code for record in put] == ["wall_clock", "wall_clock"]
-    assert 0 <= put[0].stamp_ns - began_ns < 1_000_000_000
+    noted = run.look_around([], slip_ns, [60.0, -1.0])
+    assert [record.code for record in noted] == ["wall_clock", "wall_clock"]
+    assert 0 <= noted[0].stamp_ns - began_ns < 1_000_000_000
+    run.tell(noted)
     assert "cloudrc_clock_steps_total 2.0" in exporter.text()
     recorder.error, recorder.dropped = "recording stopped: the disk is full", 7
     for _ in range(2):
-        sink([EVENT])
-    assert put[2:] == [EVENT, EVENT]
+        run.tell([EVENT])
     assert "cloudrc_recorder_dropped_records_total 7.0" in exporter.text()
     said = os.read(pipe[0], 4096).decode()
     assert said.count("wall clock stepped by +60.0 s: ") == 1

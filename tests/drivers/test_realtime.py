@@ -16,7 +16,6 @@ from cloudrc.drivers.realtime import (
     STALL_AGAIN_NS,
     STALL_NS,
     Peer,
-    Route,
     bind,
     serve,
     split_address,
@@ -68,19 +67,27 @@ def write(path, text, moment_ns):
 def test_what_is_no_route_changes_nothing(tmp_path, make):
     path = tmp_path / "route"
     write(path, "127.0.0.1:7401\n", 1)
-    route = Route(path)
-    route.look()
-    path.unlink()
-    make(path)
-    assert [route.look(), route.look()] == [HERE, HERE]
-    path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
-    write(path, "10.1.2.3:7400", 2)
-    assert route.look() == THERE
+    peer, found = Peer(socket.socket(type=socket.SOCK_DGRAM), None, path), []
+
+    def look():
+        peer.follow(len(found) * ROUTE_PERIOD_NS)
+        found.append(peer.address)
+
+    with peer.socket:
+        look()
+        path.unlink()
+        make(path)
+        look()
+        look()
+        path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
+        write(path, "10.1.2.3:7400", 2)
+        look()
+    assert found == [HERE, HERE, HERE, THERE]
 
 
 def test_a_peer_follows_its_route_twice_a_second(tmp_path):
     path = tmp_path / "route"
-    peer = Peer.bind(("127.0.0.1", 0), Route(path))
+    peer = Peer.bind(("127.0.0.1", 0), path)
     with peer.socket, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there:
         there.bind(("127.0.0.1", 0))
         there.settimeout(5)

@@ -14,11 +14,8 @@ from tests.drivers.conftest import TOKEN, Release
 
 pytestmark = pytest.mark.process
 
-HOVER = """
-start: spawn
-waypoints:
-  - {position_m: [0.5, 0.0, 0.7], tolerance_m: 0.2, dwell_s: 55.0, time_limit_s: 60}
-"""
+POINT = {"position_m": [0.5, 0.0, 0.7], "tolerance_m": 0.2, "dwell_s": 55.0, "time_limit_s": 60}
+HOVER = {"start": "spawn", "waypoints": [POINT]}
 RATE = 1000
 """Requests in a second [1/s]."""
 TRIES = 3
@@ -27,7 +24,7 @@ PERIOD = 0.010
 """Period of the control loop [s]."""
 
 
-def p99(folder: Path, began_ns: int, ended_ns: int):
+def p99(folder, began_ns, ended_ns):
     """Return the 99 % quantile of the control period's error within an interval [ms]."""
     messages = read_contents(folder / "cloud.mcap").messages
     stamps = np.array([stamp for topic, stamp, _ in messages if topic == "/cmd_vel"])
@@ -36,25 +33,23 @@ def p99(folder: Path, began_ns: int, ended_ns: int):
     return float(np.percentile(np.abs(np.diff(stamps) * 1e-9 - PERIOD), 99)) * 1e3
 
 
-def flood(folder: Path, seconds: float):
+def flood(folder, seconds):
     """Fly a calm and a flooded interval [s]; return the answers and the p99 in both [ms]."""
     folder.mkdir()
     release = Release(folder, "cloud")
     try:
-        (folder / "mission.yaml").write_text(HOVER)
-        url = json.loads((folder / "api.json").read_text())["url"]
-        release.post_mission()
+        release.post("/v1/missions", HOVER)
         release.until(lambda: release.mission()["state"] == "flying")
         time.sleep(2.0)
         calm = time.monotonic_ns()
         time.sleep(seconds)
         began = time.monotonic_ns()
         script = str(Path(__file__).with_name("api_flood.py"))
-        command = [sys.executable, script, url, TOKEN, str(seconds), str(RATE)]
+        command = [sys.executable, script, release.url, TOKEN, str(seconds), str(RATE)]
         answers = json.loads(subprocess.check_output(command))
         ended = time.monotonic_ns()
         release.post("/v1/estop")
-        release.until(lambda: release.ask("/v1/state")["seen"]["guard"] == "ESTOP")
+        release.until_guard("ESTOP")
         release.stop()
     finally:
         release.end()

@@ -16,7 +16,7 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
-from cloudrc.world.readings import Touch
+from cloudrc.records import Contact
 from cloudrc.world.rotors import STOPPED
 
 MS = 1_000_000
@@ -57,7 +57,7 @@ class FakeRobot:
 
     def touch(self, body: str, *, tip: bool = False) -> None:
         """Let a contact begin in the next step."""
-        self.simulator.touches.append(Touch(body, tip, self.position, ZERO, ZERO))
+        self.simulator.touches.append(Contact(0, body, self.position, ZERO, ZERO, tip))
 
     def put(self, velocity: Vector = ZERO, touch_age: float = float("inf")) -> None:
         """Let the robot move [m/s], and have touched something some time ago [s]."""

@@ -18,6 +18,7 @@ import pytest
 
 from cloudrc.cluster.link import APPLY_SCRIPT
 from cloudrc.config.load import load_experiment
+from cloudrc.drivers.realtime import free_ports
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link import relay as module
 from cloudrc.link.follow import Handed, write_handed
@@ -429,10 +430,8 @@ class Pod:
         self.route.parent.mkdir()
         self.profile.write_text(profile)
         self.end, self.peer = bind_loopback(), bind_loopback()
-        with bind_loopback() as udp, socket.socket() as tcp:
-            tcp.bind(("127.0.0.1", 0))
-            self.listen = udp.getsockname()
-            self.metrics = f"127.0.0.1:{tcp.getsockname()[1]}"
+        listen, metrics = free_ports(2)
+        self.listen, self.metrics = ("127.0.0.1", listen), f"127.0.0.1:{metrics}"
         self.arrived = {}
         self.sent_ns = {}
         command = [sys.executable, "-m", "cloudrc", "link", "run", "--config", "paper"]

@@ -1,17 +1,7 @@
 """Share a world that answers hellos between the tests of the handshake."""
 
-from __future__ import annotations
-
-from typing import Any
-
 from cloudrc.tunnel.codec import Direction, Hello, Kind, decode_challenge
-from cloudrc.tunnel.handshake import (
-    CHALLENGE_NS,
-    COOKIE_NS,
-    NO_COOKIE,
-    HelloAnswer,
-    ServerHandshake,
-)
+from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, NO_COOKIE, ServerHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import NO_EPOCH, Session
 
@@ -27,21 +17,14 @@ OTHER = b"m" * 16
 class Doorstep:
     """World's side of the handshake, with a cloud that sends hellos."""
 
-    def __init__(self, nonce: bytes = WORLD, key: Key = KEY) -> None:
+    def __init__(self, nonce=WORLD, key=KEY):
         self.world = Session(Direction.UPLINK, KeyRing(KeySet(key)))
         self.cloud = Session(Direction.DOWNLINK, self.world.ring)
         self.door = ServerHandshake(self.world, nonce, CLOCK, 250 * MS)
         self.now_ns = 10 * COOKIE_NS
         self.counter = 0
 
-    def receive_hello(
-        self,
-        nonce: bytes = NONCE,
-        cookie: bytes | None = None,
-        counter: int | None = None,
-        key: Key | None = None,
-        epoch: int = NO_EPOCH,
-    ) -> HelloAnswer:
+    def receive_hello(self, nonce=NONCE, cookie=None, counter=None, key=None, epoch=NO_EPOCH):
         """Send a hello, by default with a valid cookie, the next counter and the newest key."""
         self.counter += 1
         counter = self.counter if counter is None else counter
@@ -50,13 +33,13 @@ class Doorstep:
         self.world.greeting_key = key or self.world.ring.keys.current
         return self.door.receive_hello(Hello(nonce, CLOCK, cookie, epoch), counter, self.now_ns)
 
-    def answer(self, *given: Any, **named: Any) -> tuple[int, int, bytes]:
+    def answer(self, *given, **named):
         """Return kind, epoch and body of the answer to a hello."""
         (data,) = self.receive_hello(*given, **named).datagrams
         kind, epoch, _, body = self.cloud.open(data)
         return kind, epoch, body
 
-    def cookie(self) -> bytes:
+    def cookie(self):
         """Return the cookie of a challenge, as soon as world may send one."""
         self.now_ns = max(self.now_ns, self.door._challenged_ns + CHALLENGE_NS)
         kind, _, body = self.answer(cookie=NO_COOKIE)

@@ -9,12 +9,9 @@ changed; one cut short or made longer; one sealed properly, with a key that is n
 then time passes, and both ends hear each other, or nothing but what was captured.
 """
 
-from __future__ import annotations
-
 import atexit
 import resource
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[2]))  # it is a program, too
@@ -36,7 +33,7 @@ DOWNLINK = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
 class Target:
     """A world and a cloud in a session, with every frame that was valid between them."""
 
-    def __init__(self, pace: int = 5_000) -> None:
+    def __init__(self, pace=5_000):
         """Begin a session; time passes after every `pace` datagrams."""
         self.pace, self.now_ns = pace, 0
         self.bare = Bare(ring())
@@ -63,16 +60,16 @@ class Target:
         self.before = self.state()
         self.tried = self.asked = self.told = 0
 
-    def drain(self) -> None:
+    def drain(self):
         for end in (self.world, self.cloud):
             end.take_records()
             end.take_datagrams()
 
-    def give(self, datagrams: Iterable[bytes], end: object) -> None:
+    def give(self, datagrams, end):
         for data in datagrams:
             end.receive_datagram(data, self.now_ns)
 
-    def state(self) -> tuple:
+    def state(self):
         """Return all state that an accepted datagram would change."""
         accepted = "used late repeated stale hello busy accept_ignored unanswered".split()
         ends = (self.world, self.cloud)
@@ -85,7 +82,7 @@ class Target:
             self.world._waiting,
         )
 
-    def try_one(self, program: bytes) -> None:
+    def try_one(self, program):
         """Make a hostile datagram from a fuzzer's bytes and give it to both ends."""
         data = self.make(program)
         if data in self.known:
@@ -100,7 +97,7 @@ class Target:
             self.pass_time(int.from_bytes(program[-2:], "little"))
             self.before = self.state()
 
-    def pass_time(self, choice: int) -> None:
+    def pass_time(self, choice):
         """Advance time; both ends then get each other's datagrams or captured ones."""
         self.asked = 0
         step, heard = divmod(choice, 2)
@@ -120,12 +117,12 @@ class Target:
             assert self.state()[1:] == before, "what was captured was let through again"
         self.drain()
 
-    def due(self, end: object) -> list[bytes]:
+    def due(self, end):
         """Return the datagrams that an end sends now."""
         end.handle_deadline(self.now_ns)
         return end.take_datagrams()
 
-    def check(self) -> None:
+    def check(self):
         assert self.state() == self.before, "a hostile datagram was let through"
         assert self.world.take_datagrams() == self.world.take_records() == []
         asked = [codec.peek(data)[0] for data in self.cloud.take_datagrams()]
@@ -139,7 +136,7 @@ class Target:
         assert self.told <= TOLD_MAX, "the user is told the same again"
         assert all(isinstance(one, Fault) and one.code in ("version", "key") for one in told)
 
-    def make(self, program: bytes) -> bytes:
+    def make(self, program):
         if len(program) < 4:
             return program
         way, which, rest = program[0] % 4, program[1] | program[2] << 8, program[3:]
@@ -160,13 +157,13 @@ class Target:
         return session.seal(kind, (rest * (1 + size // len(rest)))[:size])
 
 
-def memory() -> float:
+def memory():
     """Return this process's memory now [MiB]; the peak would hide a leak below it. Linux."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 2**20
 
 
-def main() -> None:
+def main():
     import atheris
 
     with atheris.instrument_imports(include=["cloudrc.tunnel", "cloudrc.world.endpoint",
@@ -178,13 +175,13 @@ def main() -> None:
     target = hostile.Target()
     begin: list[float] = []
 
-    def one(data: bytes) -> None:
+    def one(data):
         target.try_one(data)
         if target.tried == 100_000 and not begin:
             begin.append(memory())
 
     @atexit.register
-    def report() -> None:
+    def report():
         target.check()
         grown = memory() - begin[0] if begin else 0.0
         print(f"hostile {target.tried} accepted 0 memory {grown:+.1f} MiB", flush=True)

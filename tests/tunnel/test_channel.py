@@ -1,9 +1,5 @@
 """Channels, compared with a set that remembers every counter."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +7,7 @@ from hypothesis import strategies as st
 from cloudrc.tunnel.channel import LATE, REPEATED, USED, WINDOW, Channel
 
 
-def expected(counter: int, seen: set[int] | frozenset[int], newest_wins: bool) -> str:
+def expected(counter, seen, newest_wins):
     newest = max(seen, default=-1)
     if counter in seen or newest - counter >= WINDOW:
         return REPEATED
@@ -26,24 +22,24 @@ def expected(counter: int, seen: set[int] | frozenset[int], newest_wins: bool) -
         *((3, 3 + ahead, 3, 4, 3 + ahead) for ahead in (WINDOW - 1, WINDOW, WINDOW + 1, 2**64 - 4)),
     ],
 )
-def test_the_window_ends_where_it_says(counters: tuple[int, ...], newest_wins: bool) -> None:
+def test_the_window_ends_where_it_says(counters, newest_wins):
     compare(counters, newest_wins)
 
 
 @given(st.lists(st.integers(0, 40) | st.integers(900, 1100), max_size=60), st.booleans())
 @settings(max_examples=80, deadline=None)
-def test_the_window_agrees_with_a_set(counters: list[int], newest_wins: bool) -> None:
+def test_the_window_agrees_with_a_set(counters, newest_wins):
     compare(counters, newest_wins)
 
 
-def compare(counters: list[int] | tuple[int, ...], newest_wins: bool) -> None:
+def compare(counters, newest_wins):
     channel, seen = Channel(newest_wins), set[int]()
     for counter in counters:
         assert channel.take(counter) == expected(counter, seen, newest_wins)
         seen.add(counter)
 
 
-def test_more_that_is_repeated_than_sent_is_a_flood() -> None:
+def test_more_that_is_repeated_than_sent_is_a_flood():
     channel = Channel(newest_wins=True)
     flooded = []
     for counter in (0, 1, 0, 1, 0, 2, 2):  # a link that doubles everything, and more
@@ -59,11 +55,11 @@ STRIDES = (1, 93)
 """Steps between sixteen counters; the second spans more than the window: 15 * 93 > 1024."""
 
 
-def explore(depth: int, newest_wins: bool, stride: int) -> int:
+def explore(depth, newest_wins, stride):
     """Try every sequence of `depth` out of 16 counters, each prefix once; return their number."""
     channel, checked = Channel(newest_wins), 0
 
-    def step(level: int, seen: frozenset[int]) -> None:
+    def step(level, seen):
         nonlocal checked
         before = channel._newest, channel._seen
         for counter in range(0, 16 * stride, stride):
@@ -80,9 +76,7 @@ def explore(depth: int, newest_wins: bool, stride: int) -> int:
 
 @pytest.mark.parametrize("newest_wins", [True, False])
 @pytest.mark.parametrize("depth", [4, pytest.param(6, marks=pytest.mark.full)])
-def test_every_short_sequence_agrees_with_a_set(
-    newest_wins: bool, depth: int, figure: Callable[..., None]
-) -> None:
+def test_every_short_sequence_agrees_with_a_set(newest_wins, depth, figure):
     assert all(explore(depth, newest_wins, stride) == 16**depth for stride in STRIDES)
     text = f"replay window, sequences of {depth} of 16 counters: unlike a set"
     figure(text, 0, "==", 0, count=16**depth)

@@ -1,7 +1,5 @@
 """Cloud's side of the handshake, and the log of why there is no session."""
 
-from __future__ import annotations
-
 import pytest
 
 from cloudrc.records import Fault
@@ -27,24 +25,22 @@ STRANGER = KeyRing(KeySet(Key(b"x" * 32)))
 class Asking:
     """A cloud's handshake with short ways to try it."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.handshake = ClientHandshake(NONCE, CLOCK)
 
-    def hello(self) -> Hello:
+    def hello(self):
         return codec.decode_hello(self.handshake.make_hello())
 
-    def accepts(
-        self, epoch: int, world: bytes = WORLD, nonce: bytes = NONCE, *, asks: bool = True
-    ) -> bytes | None:
+    def accepts(self, epoch, world=WORLD, nonce=NONCE, *, asks=True):
         return self.handshake.receive_accept(epoch, Accept(nonce, world, CLOCK), asks=asks)
 
 
 @pytest.fixture
-def cloud() -> Asking:
+def cloud():
     return Asking()
 
 
-def test_a_hello_has_nonce_clock_cookie_and_newest_epoch(cloud: Asking) -> None:
+def test_a_hello_has_nonce_clock_cookie_and_newest_epoch(cloud):
     assert cloud.hello() == Hello(NONCE, CLOCK, NO_COOKIE, 0)
     assert cloud.accepts(3, nonce=b"m" * 16) is None
     assert cloud.accepts(3) == NONCE + WORLD
@@ -55,7 +51,7 @@ def test_a_hello_has_nonce_clock_cookie_and_newest_epoch(cloud: Asking) -> None:
     assert not cloud.handshake.is_refused(b"m" * 16)
 
 
-def test_repeated_challenges_get_a_limited_number_of_answers(cloud: Asking) -> None:
+def test_repeated_challenges_get_a_limited_number_of_answers(cloud):
     answer = cloud.handshake.answer_challenge
     assert answer(b"0" * 13) is None, "it has not asked"
     cloud.hello()
@@ -69,7 +65,7 @@ def test_repeated_challenges_get_a_limited_number_of_answers(cloud: Asking) -> N
     assert cloud.hello().cookie == b"1" * 13
 
 
-def test_the_memory_of_cookies_and_worlds_is_bounded(cloud: Asking) -> None:
+def test_the_memory_of_cookies_and_worlds_is_bounded(cloud):
     for number in range(COOKIES_MAX + 1):
         cloud.hello()
         cloud.handshake.answer_challenge(b"%013d" % number)
@@ -88,15 +84,13 @@ def test_the_memory_of_cookies_and_worlds_is_bounded(cloud: Asking) -> None:
         *((2**32 - 1, 2**32 - 2, False), (2**32 - 1, 1, True)),
     ],
 )
-def test_of_one_world_only_a_newer_epoch_counts(
-    cloud: Asking, known: int, epoch: int, counts: bool
-) -> None:
+def test_of_one_world_only_a_newer_epoch_counts(cloud, known, epoch, counts):
     cloud.handshake._world, cloud.handshake._epoch = WORLD, known
     assert (cloud.accepts(epoch) is not None) == counts
 
 
 @pytest.mark.promise("old-datagrams-do-nothing")
-def test_a_dead_world_does_not_come_back(cloud: Asking) -> None:
+def test_a_dead_world_does_not_come_back(cloud):
     cloud.accepts(3)
     assert cloud.accepts(1, NEXT_WORLD, asks=False) is None, "cloud hears its world"
     assert cloud.accepts(4, asks=False)
@@ -106,7 +100,7 @@ def test_a_dead_world_does_not_come_back(cloud: Asking) -> None:
     assert cloud.accepts(5, NEXT_WORLD, cloud.hello().nonce)
 
 
-def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(cloud: Asking) -> None:
+def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(cloud):
     """Cloud has accepted a late datagram of a dead world while it heard nobody."""
     cloud.accepts(3, NEXT_WORLD)
     cloud.accepts(9)
@@ -118,7 +112,7 @@ def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(cloud: Asking) -> N
     assert cloud.hello().nonce == nonce
 
 
-def test_another_version_or_key_is_logged_once() -> None:
+def test_another_version_or_key_is_logged_once():
     old = bytes([5]) + Bare(ring()).cloud("a").hello()[1:]
     stranger = BareCloud(b"a", STRANGER).hello()
     for data, code, text in (
@@ -139,7 +133,7 @@ def test_another_version_or_key_is_logged_once() -> None:
         assert bare.world._counts["tag"] + bare.world._counts["version"] == 4
 
 
-def test_a_text_is_logged_once_in_a_session() -> None:
+def test_a_text_is_logged_once_in_a_session():
     log = HandshakeLog()
     assert len(log.about("version", bytes(16), 7)) == 1
     (fault,) = log.about("version", bytes([4]) + bytes(15), 8)  # garbage does not hide the peer's

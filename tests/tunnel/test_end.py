@@ -1,13 +1,11 @@
 """The common part of both ends, at world's."""
 
-from __future__ import annotations
-
 from cloudrc.records import SessionOpened
 from cloudrc.tunnel.codec import Kind, peek
 from tests.flights.conftest import Bare, ring
 
 
-def test_an_end_gives_its_datagrams_and_records_once() -> None:
+def test_an_end_gives_its_datagrams_and_records_once():
     bare = Bare(ring())
     world = bare.world
     assert (world.sealed, world.epoch) == (True, 0)

@@ -1,7 +1,5 @@
 """World's side of the handshake: cookies, epochs, keys, and which cloud has authority."""
 
-from __future__ import annotations
-
 import pytest
 
 from cloudrc.tunnel import codec
@@ -16,21 +14,21 @@ from cloudrc.tunnel.handshake import (
     REPEATS_MAX,
     HelloAnswer,
 )
-from cloudrc.tunnel.keys import Key, KeySet
+from cloudrc.tunnel.keys import KeySet
 from tests.tunnel.conftest import CLOCK, KEY, MS, NEW, NONCE, OTHER, SECOND_NS, WORLD, Doorstep
 
 
 @pytest.fixture
-def step() -> Doorstep:
+def step():
     return Doorstep()
 
 
-def signed_by(key: Key, answer: HelloAnswer) -> bool:
+def signed_by(key, answer):
     (data,) = answer.datagrams
     return key.verifies(data[:-16], data[-16:])
 
 
-def test_a_hello_without_a_cookie_gets_one_and_changes_nothing(step: Doorstep) -> None:
+def test_a_hello_without_a_cookie_gets_one_and_changes_nothing(step):
     before = dict(vars(step.door))
     assert step.receive_hello(cookie=NO_COOKIE).outcome == "hello"
     del before["_challenged_ns"]
@@ -39,7 +37,7 @@ def test_a_hello_without_a_cookie_gets_one_and_changes_nothing(step: Doorstep) -
 
 
 @pytest.mark.parametrize("now_ns", [0, 10 * COOKIE_NS])
-def test_with_the_cookie_it_gets_a_session(step: Doorstep, now_ns: int) -> None:
+def test_with_the_cookie_it_gets_a_session(step, now_ns):
     step.now_ns = now_ns
     answer = step.receive_hello(cookie=step.cookie())
     assert (answer.outcome, answer.opened, step.world.epoch) == ("hello", True, 1)
@@ -48,7 +46,7 @@ def test_with_the_cookie_it_gets_a_session(step: Doorstep, now_ns: int) -> None:
     assert codec.decode_accept(body) == Accept(NONCE, WORLD, CLOCK)
 
 
-def test_a_wrong_cookie_is_as_good_as_none(step: Doorstep) -> None:
+def test_a_wrong_cookie_is_as_good_as_none(step):
     right = step.cookie()
     others = Doorstep(nonce=b"v" * 16), Doorstep(key=NEW)
     for cookie in (right[:-1] + bytes([right[-1] ^ 1]), *(other.cookie() for other in others)):
@@ -58,13 +56,13 @@ def test_a_wrong_cookie_is_as_good_as_none(step: Doorstep) -> None:
 
 
 @pytest.mark.parametrize(("slots", "opened"), [(0, True), (1, True), (2, False)])
-def test_a_cookie_lasts_its_slot_and_the_next(step: Doorstep, slots: int, opened: bool) -> None:
+def test_a_cookie_lasts_its_slot_and_the_next(step, slots, opened):
     cookie = step.cookie()
     step.now_ns += slots * COOKIE_NS
     assert step.receive_hello(cookie=cookie).opened == opened
 
 
-def test_challenges_are_at_most_100_ms_apart(step: Doorstep) -> None:
+def test_challenges_are_at_most_100_ms_apart(step):
     for _ in range(50):
         assert step.receive_hello(cookie=NO_COOKIE).datagrams
         step.now_ns += CHALLENGE_NS - 1
@@ -74,7 +72,7 @@ def test_challenges_are_at_most_100_ms_apart(step: Doorstep) -> None:
 
 
 @pytest.mark.promise("old-datagrams-do-nothing")
-def test_a_hello_with_a_cookie_is_answered_once(step: Doorstep) -> None:
+def test_a_hello_with_a_cookie_is_answered_once(step):
     cookie = step.cookie()
     assert step.receive_hello(cookie=cookie, counter=7).opened
     for counter in (7, 6, 0):  # captured while its cookie is valid, and repeated
@@ -87,7 +85,7 @@ def test_a_hello_with_a_cookie_is_answered_once(step: Doorstep) -> None:
     assert step.world.epoch == 2
 
 
-def test_the_memory_of_counters_is_bounded(step: Doorstep) -> None:
+def test_the_memory_of_counters_is_bounded(step):
     for number in range(CLOUDS_MAX):
         step.receive_hello(NONCE)
         step.receive_hello(b"%016d" % number)
@@ -95,7 +93,7 @@ def test_the_memory_of_counters_is_bounded(step: Doorstep) -> None:
     assert NONCE in step.door._counters, "the one answered last is forgotten last"
 
 
-def test_another_cloud_is_refused_while_the_incumbent_is_fresh(step: Doorstep) -> None:
+def test_another_cloud_is_refused_while_the_incumbent_is_fresh(step):
     step.receive_hello()
     step.door.hear(step.now_ns)
     step.now_ns += 250 * MS
@@ -108,7 +106,7 @@ def test_another_cloud_is_refused_while_the_incumbent_is_fresh(step: Doorstep) -
 
 
 @pytest.mark.parametrize("begins", ["session", "epoch"])
-def test_a_new_epoch_gives_its_cloud_time_to_be_heard(step: Doorstep, begins: str) -> None:
+def test_a_new_epoch_gives_its_cloud_time_to_be_heard(step, begins):
     step.receive_hello()
     if begins == "epoch":
         step.door.accept_once(Kind.OPERATOR, 0, step.now_ns)
@@ -122,7 +120,7 @@ def test_a_new_epoch_gives_its_cloud_time_to_be_heard(step: Doorstep, begins: st
     assert step.receive_hello(OTHER).opened
 
 
-def test_operator_and_alive_are_let_in_once(step: Doorstep) -> None:
+def test_operator_and_alive_are_let_in_once(step):
     step.receive_hello()
     for kind in (Kind.OPERATOR, Kind.ALIVE):
         step.door.accept_once(kind, 5, step.now_ns)
@@ -135,7 +133,7 @@ def test_operator_and_alive_are_let_in_once(step: Doorstep) -> None:
     assert step.receive_hello(OTHER).opened, "a repeat is no sign of life"
 
 
-def test_an_incumbent_that_asks_gets_its_epoch_again(step: Doorstep) -> None:
+def test_an_incumbent_that_asks_gets_its_epoch_again(step):
     """Until it has asked in vain: world cannot hear it, so a new epoch loses nothing."""
     step.receive_hello()
     for counter in range(2 * REPEATS_MAX):
@@ -164,16 +162,14 @@ def test_an_incumbent_that_asks_gets_its_epoch_again(step: Doorstep) -> None:
         (5, EPOCH_MAX, 6),  # behind, by the shorter way round
     ],
 )
-def test_epochs_rise_through_restarts_of_world(
-    step: Doorstep, last: int, known: int, epoch: int
-) -> None:
+def test_epochs_rise_through_restarts_of_world(step, last, known, epoch):
     step.door._epoch = last
     assert step.answer(epoch=known)[1] == step.world.epoch == epoch
     step.now_ns += 2 * SECOND_NS
     assert step.answer(OTHER, epoch=known)[1] == epoch + 1
 
 
-def test_a_session_rests_on_the_key_of_its_hello(step: Doorstep) -> None:
+def test_a_session_rests_on_the_key_of_its_hello(step):
     step.world.ring.keys = KeySet(NEW, KEY)
     for key in (KEY, NEW):
         for cookie in (NO_COOKIE, None):
@@ -184,7 +180,7 @@ def test_a_session_rests_on_the_key_of_its_hello(step: Doorstep) -> None:
         assert signed_by(key, HelloAnswer("", [step.door.begin_next_epoch(step.now_ns)]))
 
 
-def test_an_incumbent_with_the_newest_key_gets_a_new_epoch(step: Doorstep) -> None:
+def test_an_incumbent_with_the_newest_key_gets_a_new_epoch(step):
     step.receive_hello()
     step.world.ring.keys = KeySet(NEW, KEY)
     for key, epoch, opened in ((KEY, 1, False), (NEW, 2, True), (KEY, 2, False), (NEW, 2, False)):
@@ -196,9 +192,7 @@ def test_an_incumbent_with_the_newest_key_gets_a_new_epoch(step: Doorstep) -> No
 
 
 @pytest.mark.parametrize("heard", [(), (2,)])
-def test_a_cloud_without_the_key_of_its_epoch_gets_a_new_one(
-    step: Doorstep, heard: tuple[int, ...]
-) -> None:
+def test_a_cloud_without_the_key_of_its_epoch_gets_a_new_one(step, heard):
     """Cloud's key file was restored to an older version, world's was not."""
     step.world.ring.keys = KeySet(NEW, KEY)
     assert step.receive_hello().opened
@@ -213,7 +207,7 @@ def test_a_cloud_without_the_key_of_its_epoch_gets_a_new_one(
 
 
 @pytest.mark.promise("old-keys-end")
-def test_after_its_key_was_dropped_a_cloud_gets_a_new_epoch(step: Doorstep) -> None:
+def test_after_its_key_was_dropped_a_cloud_gets_a_new_epoch(step):
     step.receive_hello()
     step.world.ring.keys = KeySet(NEW)
     answer = step.receive_hello()

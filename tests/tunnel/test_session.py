@@ -1,9 +1,5 @@
 """Sessions: which datagrams are opened, and that nothing changes before a tag is verified."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,7 +15,7 @@ HELLO = bytes(codec.BODY_SIZES[Kind.HELLO])
 OLD, NEW = Key(b"p" * 32), Key(b"n" * 32)
 
 
-def refuses(session: Session, data: bytes, outcome: str = "tag") -> bool:
+def refuses(session, data, outcome="tag"):
     """Tell whether a session refuses a datagram for this reason, and is then as before."""
     before = state(session)
     try:
@@ -29,13 +25,13 @@ def refuses(session: Session, data: bytes, outcome: str = "tag") -> bool:
     return False
 
 
-def state(session: Session) -> dict[str, str]:
+def state(session):
     """Return all state that a datagram could change; ciphers by their addresses."""
     return {name: repr(value) for name, value in vars(session).items()}
 
 
 @pytest.mark.parametrize("secret", [b"p" * 32, None])
-def test_an_end_opens_what_the_other_one_sends(secret: bytes | None) -> None:
+def test_an_end_opens_what_the_other_one_sends(secret):
     world, cloud = pair(secret=secret)
     assert world.sealed == cloud.sealed == (secret is not None)
     cloud.seal(Kind.COMMAND, BODY)
@@ -50,11 +46,11 @@ def test_an_end_opens_what_the_other_one_sends(secret: bytes | None) -> None:
     assert refuses(world, data, "old_epoch")
 
 
-def test_a_sealed_end_opens_no_unsealed_datagram() -> None:
+def test_a_sealed_end_opens_no_unsealed_datagram():
     assert refuses(pair()[0], pair(secret=None)[1].seal(Kind.COMMAND, BODY))
 
 
-def test_a_malformed_datagram_costs_no_cryptography(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_malformed_datagram_costs_no_cryptography(monkeypatch):
     world, cloud = pair()
     data = cloud.seal(Kind.COMMAND, BODY)
     monkeypatch.setattr(world, "_opening", None)
@@ -64,7 +60,7 @@ def test_a_malformed_datagram_costs_no_cryptography(monkeypatch: pytest.MonkeyPa
     assert refuses(world, bytes([data[0] ^ 1]) + data[1:], "version")
 
 
-def test_without_a_session_only_greetings_are_opened() -> None:
+def test_without_a_session_only_greetings_are_opened():
     cloud = Session(Direction.DOWNLINK, KeyRing(KeySet(OLD)))
     world, _ = pair(NO_EPOCH)
     telemetry = world.seal(Kind.TELEMETRY, bytes(codec.BODY_SIZES[Kind.TELEMETRY]))
@@ -84,7 +80,7 @@ def test_without_a_session_only_greetings_are_opened() -> None:
         (OLD, 1, NONCES[:16] + b"x" * 16),
     ],
 )
-def test_keys_depend_on_key_epoch_and_both_nonces(key: Key, epoch: int, nonces: bytes) -> None:
+def test_keys_depend_on_key_epoch_and_both_nonces(key, epoch, nonces):
     world, _ = pair()
     cloud = Session(Direction.DOWNLINK, KeyRing(KeySet(key)))
     cloud.begin(epoch, nonces)
@@ -92,7 +88,7 @@ def test_keys_depend_on_key_epoch_and_both_nonces(key: Key, epoch: int, nonces: 
     assert refuses(world, cloud.seal(Kind.COMMAND, BODY))
 
 
-def test_each_direction_has_its_own_key() -> None:
+def test_each_direction_has_its_own_key():
     world, cloud = pair()
     data = bytearray(world.seal(Kind.ALIVE, b""))
     data[1] = Direction.DOWNLINK
@@ -100,7 +96,7 @@ def test_each_direction_has_its_own_key() -> None:
     assert cloud.seal(Kind.ALIVE, b"")[16:] != world.seal(Kind.ALIVE, b"")[16:]
 
 
-def test_each_kind_has_its_own_counter_in_each_epoch() -> None:
+def test_each_kind_has_its_own_counter_in_each_epoch():
     """So no nonce is used twice in an epoch."""
     _, cloud = pair()
     kinds = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
@@ -119,14 +115,14 @@ def test_each_kind_has_its_own_counter_in_each_epoch() -> None:
     ("kind", "told"),
     [(Kind.HELLO, (0, 1)), (Kind.CHALLENGE, (0, 1)), (Kind.BUSY, (0, 1)), (Kind.ACCEPT, (5, 0))],
 )
-def test_only_an_acceptance_belongs_to_an_epoch(kind: Kind, told: tuple[int, int]) -> None:
+def test_only_an_acceptance_belongs_to_an_epoch(kind, told):
     _, session = pair()
     session.greet(kind, b"")
     session.begin(5)
     assert codec.peek(session.greet(kind, b"")) == (kind, *told)
 
 
-def test_while_two_keys_are_accepted_greetings_may_have_either() -> None:
+def test_while_two_keys_are_accepted_greetings_may_have_either():
     world, cloud = pair()
     world.ring.keys = KeySet(NEW, OLD)
     for key in (OLD, NEW):
@@ -139,7 +135,7 @@ def test_while_two_keys_are_accepted_greetings_may_have_either() -> None:
 
 
 @pytest.mark.promise("old-keys-end")
-def test_a_dropped_key_opens_nothing() -> None:
+def test_a_dropped_key_opens_nothing():
     world, cloud = pair()
     sealed, hello = cloud.seal(Kind.COMMAND, BODY), cloud.greet(Kind.HELLO, HELLO)
     world.ring.keys = KeySet(NEW, Key(b"m" * 32))
@@ -152,7 +148,7 @@ def test_a_dropped_key_opens_nothing() -> None:
     assert refuses(world, sealed, "old_epoch"), "nor when it comes back"
 
 
-def datagrams(count: int) -> list[tuple[bytes, Session]]:
+def datagrams(count):
     """Make datagrams of every kind in both directions, each with the end that opens it."""
     world, cloud = pair()
     made = []
@@ -168,7 +164,7 @@ def datagrams(count: int) -> list[tuple[bytes, Session]]:
 
 
 @pytest.mark.promise("forged-datagrams-do-nothing")
-def test_no_bit_of_a_thousand_datagrams_can_be_flipped(figure: Callable[..., None]) -> None:
+def test_no_bit_of_a_thousand_datagrams_can_be_flipped(figure):
     accepted = flips = 0
     for data, opener in datagrams(500):
         opener.open(data)
@@ -189,9 +185,7 @@ def test_no_bit_of_a_thousand_datagrams_can_be_flipped(figure: Callable[..., Non
 
 @given(st.sampled_from(datagrams(5)), st.data())
 @settings(max_examples=200, deadline=None)
-def test_a_refused_datagram_changes_nothing(
-    made: tuple[bytes, Session], data: st.DataObject
-) -> None:
+def test_a_refused_datagram_changes_nothing(made, data):
     good, opener = made
     cut = data.draw(st.integers(0, len(good)))
     spoiled = good[:cut] + data.draw(st.binary(max_size=len(good) - cut + 3))
@@ -204,7 +198,7 @@ def test_a_refused_datagram_changes_nothing(
         assert spoiled == good
 
 
-def test_a_counter_that_no_recording_can_hold_is_refused() -> None:
+def test_a_counter_that_no_recording_can_hold_is_refused():
     world, cloud = pair()
     cloud._counters[Kind.COMMAND] = 2**63 - 1
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[2] == 2**63 - 1

@@ -1,7 +1,5 @@
 """Known answers: the datagrams as they stay, and as docs/wire.md alone describes them."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import struct
@@ -19,7 +17,7 @@ SECRET = bytes(range(32))
 CLOUD, WORLD, CLOCK = b"cloud".ljust(16), b"world".ljust(16), b"clock".ljust(16)
 
 
-def derived(salt: bytes, info: bytes) -> bytes:
+def derived(salt, info):
     """Compute the 32 bytes of HKDF-SHA256 by hand: extract, expand."""
     inner = hmac.digest(salt or bytes(32), SECRET, hashlib.sha256)
     return hmac.digest(inner, info + b"\1", hashlib.sha256)
@@ -58,25 +56,25 @@ SEALED = {
 """Datagrams as they go over the wire. If one changes, so does the format: raise `codec.VERSION`."""
 
 
-def greeting(direction: int, epoch: int, kind: int, counter: int, body: bytes) -> bytes:
+def greeting(direction, epoch, kind, counter, body):
     """Make a greeting as docs/wire.md describes it."""
     data = struct.pack("<BBIBBQ", 6, direction, epoch, 0, kind, counter) + body
     return data + hmac.digest(derived(b"", b"cloudrc 6 greeting"), data, hashlib.sha256)[:16]
 
 
-def sealed(direction: int, epoch: int, kind: int, counter: int, body: bytes) -> bytes:
+def sealed(direction, epoch, kind, counter, body):
     """Make a datagram of a session as docs/wire.md describes it."""
     key = derived(CLOUD + WORLD, b"cloudrc 6 session %d %d" % (direction, epoch))
     header = struct.pack("<BBIBBQ", 6, direction, epoch, 0, kind, counter)
     return header + AESGCM(key).encrypt(header[4:], body, header)
 
 
-def test_the_tunnel_is_as_described_and_as_it_was() -> None:
+def test_the_tunnel_is_as_described_and_as_it_was():
     world, cloud = (Session(way, KeyRing(KeySet(Key(SECRET)))) for way in Direction)
     server, client = ServerHandshake(world, WORLD, CLOCK, 1), ClientHandshake(CLOUD, CLOCK)
     server._epoch = 6
 
-    def answer(hello: bytes) -> bytes:
+    def answer(hello):
         _, _, counter, body = world.open(hello)
         told = server.receive_hello(codec.decode_hello(body), counter, 7_999_999_999)
         return told.datagrams[0]
@@ -114,7 +112,7 @@ def test_the_tunnel_is_as_described_and_as_it_was() -> None:
     assert cloud.open(bytes.fromhex(SEALED["alive"])) == (8, 7, 0, b"")
 
 
-def test_names_and_nonces_are_derived_as_described() -> None:
+def test_names_and_nonces_are_derived_as_described():
     assert Key(SECRET).name == derived(b"", b"cloudrc 6 name")[:4].hex()
     client = ClientHandshake(CLOUD, CLOCK)
     for world in (b"1" * 16, b"2" * 16, b"1" * 16):  # the first one comes back

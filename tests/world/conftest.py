@@ -1,8 +1,5 @@
 """Scenes with another spawn, so that a test can start in the air or beside the board."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 
 from cloudrc.world.scene import FOLDER
@@ -11,10 +8,10 @@ SPAWN = 'name="spawn" pos="0 0 .1"'
 
 
 @pytest.fixture
-def scene_at(tmp_path: Path) -> Callable[..., str]:
+def scene_at(tmp_path):
     """Return a function that writes a shipped scene with its spawn at (x, y, z) [m]."""
 
-    def write(x: float, y: float, z: float, scene: str = "pipes") -> str:
+    def write(x, y, z, scene="pipes"):
         text = (FOLDER / "scenes" / f"{scene}.xml").read_text()
         assert SPAWN in text
         path = tmp_path / f"{scene}_{x}_{y}_{z}.xml"

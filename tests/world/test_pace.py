@@ -1,7 +1,5 @@
 """A world that is slower than real time is reported with its factor, but not every second."""
 
-from __future__ import annotations
-
 import pytest
 
 from cloudrc.world.endpoint import REPORT_AGAIN_NS, PaceMonitor
@@ -22,9 +20,7 @@ QUIET = REPORT_AGAIN_NS // 1_000_000_000
     ],
 )
 @pytest.mark.parametrize("start_ns", [0, 10**15])
-def test_seconds_in_which_the_clock_slips_are_reported(
-    slips: tuple[float, ...], reports: dict[int, str], start_ns: int
-) -> None:
+def test_seconds_in_which_the_clock_slips_are_reported(slips, reports, start_ns):
     pace, slip_ns, said = PaceMonitor(), 0, {}
     for n, slip in enumerate(slips):
         slip_ns += round(slip * 1e9)

@@ -1,14 +1,17 @@
-"""Robot and scene are those of docs/reference/plant.md; bad files are refused."""
+"""Robot and scene are those of docs/reference/plant.md; bad files are refused; GL is not needed."""
 
+import os
+import subprocess
+import sys
 from math import pi, sin, tan
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.world.rotors import STOPPED
-from cloudrc.world.scene import FOLDER, compile_model, mujoco
+from cloudrc.world.scene import FOLDER, compile_model, import_mujoco, mujoco
 from cloudrc.world.simulator import Simulator
 
 ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
@@ -21,7 +24,7 @@ def pipes():
     return compile_model("pelican", "pipes")
 
 
-def facts(scene: str) -> dict[str, list[float]]:
+def facts(scene):
     """Return the scene as readers without MuJoCo see it."""
     root = ElementTree.parse(FOLDER / "scenes" / f"{scene}.xml").getroot()
     return {n.get("name"): [float(x) for x in n.get("data").split()] for n in root.iter("numeric")}
@@ -114,7 +117,7 @@ def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
     assert np.sum(directions, axis=0) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
-def touched_at(scene: str) -> set[str]:
+def touched_at(scene):
     """Return the bodies that the robot touches at its spawn, without the floor."""
     simulator = Simulator("pelican", scene)
     simulator.step(STOPPED)
@@ -223,3 +226,43 @@ def test_an_unknown_name_lists_the_available_ones():
     ):
         with pytest.raises(BadInputError, match=message):
             compile_model(robot, scene)
+
+
+FLIGHT = """
+from cloudrc.world.simulator import Simulator
+simulator = Simulator("pelican", "pipes")
+for _ in range(100):
+    simulator.step((600.0,) * 4)
+assert simulator.readings.position[2] > 0.1
+"""
+
+
+def test_it_flies_without_the_requested_gl(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", FLIGHT],
+        env={**os.environ, "MUJOCO_GL": "egl", "PYTHONPATH": os.pathsep.join(sys.path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("wanted", [None, "disable", "egl"])
+def test_the_variable_is_restored(monkeypatch, wanted):
+    if wanted is None:
+        monkeypatch.delenv("MUJOCO_GL", raising=False)
+    else:
+        monkeypatch.setenv("MUJOCO_GL", wanted)
+    import_mujoco()
+    assert os.environ.get("MUJOCO_GL") == wanted
+
+
+def test_without_the_package_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[world\]") as error:
+        import_mujoco()
+    assert error.value.exit_code == 3

@@ -70,11 +70,8 @@ class PositionHold:
     def follow(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
         """Return the next reference for braking, holding or descending [m/s], world frame.
 
-        Args:
-            reference: Reference of the last tick [m/s], world frame, shape (3,).
-            readings: Readings of the onboard sensors.
-            sink: Speed of the descent [m/s]; 0 holds the height.
-            dt: Time since the last call [s].
+        `reference` is that of the last tick [m/s], shape (3,), `dt` ago [s]; `sink` is the speed of
+        the descent [m/s], and 0 holds the height.
         """
         if self._hold_point is None:
             return self._brake(reference, readings, sink, dt)

@@ -101,16 +101,11 @@ def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vec
 
 
 def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vector:
-    """Slow a reference, axis by axis, so that the robot can stop before the faces of the fence.
+    """Slow a finite `velocity` [m/s], axis by axis, so that the robot can stop before the fence.
 
-    Near the floor the horizontal reference is slowed, too, because a rotor that touches the floor
-    at speed turns the robot over.
-
-    Args:
-        velocity: Finite reference [m/s], world frame, shape (3,).
-        position: Position of the base [m], world frame, shape (3,).
-        low: Lower corner of the fence, margins taken off [m], shape (3,).
-        high: Upper corner, likewise.
+    Near the floor the horizontal velocity is limited, too, because a rotor that touches the floor
+    at speed turns the robot over. `position` [m] is that of the base; `low` and `high` [m] are the
+    corners of the fence, margins taken off; all are in the world frame, shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if not z >= az - FLOOR_MARGIN + LOW_HEIGHT:
@@ -178,13 +173,10 @@ def growth(before: float, after: float) -> float:
 
 
 def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float) -> Vector:
-    """Limit how fast the reference [m/s] sinks, so that the robot does not turn over.
+    """Limit how fast the `reference` [m/s] sinks, so that the robot does not turn over.
 
-    Args:
-        reference: Wanted reference [m/s].
-        before: Reference of the last tick [m/s], at most `speed_max` long.
-        climb: Vertical velocity of the robot [m/s].
-        speed_max: Largest speed of the result [m/s].
+    `before` is the reference of the last tick, at most `speed_max` long; `climb` is the vertical
+    velocity of the robot; `speed_max` is the largest speed of the result; all in [m/s].
     """
     x, y, z = reference
     lowest = min(before[2], climb - SINK_LEAD_MAX)
@@ -228,11 +220,10 @@ class Limits:
     hold_max_ns: int = 60_000_000_000
 
     def __post_init__(self) -> None:
-        """Check the limits.
+        """Check the limits; raise a ValueError that names the first wrong one.
 
-        Raises:
-            ValueError: If a limit is not finite or not above 0, if the robot cannot stop in time
-                from `speed_max` with `command_age_max_ns`, or if the fence leaves no room.
+        Each limit must be finite and above 0, the robot must be able to stop in time from
+        `speed_max` with `command_age_max_ns`, and the fence must leave room.
         """
         for name in self.__slots__[2:]:
             value = getattr(self, name)
@@ -262,15 +253,6 @@ class Limits:
     def alone_max_ns(self, flies: bool) -> int:
         """Return how long a robot in a mission waits for its cloud before LAND [ns]."""
         return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
-
-    def age_text(self, beyond_ns: int) -> str:
-        """Describe the age of a command that is too old by `beyond_ns` [ns]."""
-        age, limit = self.command_age_max_ns + beyond_ns, self.command_age_max_ns
-        return f"command age {age * 1e-9:.3f} s above {limit * 1e-9:.3f} s"
-
-    def wait_text(self, flies: bool) -> str:
-        """Describe how long the robot waited for its cloud."""
-        return f"held for {self.alone_max_ns(flies) * 1e-9:g} s without the cloud"
 
     def inner_corners(self) -> tuple[Vector, Vector]:
         """Return both corners of the fence, margins taken off [m], shape (3,) each."""

@@ -156,9 +156,8 @@ class Guard:
     def accept_command(self, command: Command, now_ns: int) -> str | None:
         """Accept or reject at `now_ns` [ns] a command, whose numbers may have any value, even NaN.
 
-        Returns:
-            None if the command is accepted, else the reason: "range" for a value that is too large
-            or NaN; "future" for a basis that is not yet measured; "stale" for one that is too old.
+        Return None, or the reason of the rejection: "range" for a value that is too large or NaN,
+        "future" for a basis that is not yet measured, "stale" for one that is too old.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
@@ -217,9 +216,8 @@ class Guard:
     def step(self, now_ns: int, readings: Readings, dt: float) -> Vector | None:
         """Advance by one tick of `dt` [s] at `now_ns` [ns].
 
-        Returns:
-            Velocity reference for the low-level controller [m/s], shape (3,); None while the rotors
-            are stopped.
+        Return the velocity reference for the low-level controller [m/s], shape (3,); None while the
+        rotors are stopped.
         """
         # The usual case: the same command as in the last tick, far from the fence.
         if now_ns <= self._steady_until_ns and self.reference is self._wanted:
@@ -265,9 +263,13 @@ class Guard:
         if state is TRACK and self._track_until_ns == NEVER_NS:
             self._enter(HOLD, now_ns, Cause.SESSION)
         elif state is TRACK:
-            self._enter(HOLD, now_ns, Cause.SILENCE, limits.age_text(now_ns - self._track_until_ns))
+            most_ns = limits.command_age_max_ns
+            age_ns = most_ns + now_ns - self._track_until_ns
+            text = f"command age {age_ns * 1e-9:.3f} s above {most_ns * 1e-9:.3f} s"
+            self._enter(HOLD, now_ns, Cause.SILENCE, text)
         elif self.armed and now_ns - self._alone_ns > limits.alone_max_ns(self._flies):
-            self._enter(LAND, now_ns, Cause.ALONE, limits.wait_text(self._flies))
+            text = f"held for {limits.alone_max_ns(self._flies) * 1e-9:g} s without the cloud"
+            self._enter(LAND, now_ns, Cause.ALONE, text)
             self._flies = state is HOLD  # not in GROUND
         elif state is LAND and self._flies:
             if self._descent.may_stop(readings):

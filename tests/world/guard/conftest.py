@@ -7,10 +7,7 @@ bit by bit. Other divisions and square roots would take z3 minutes. They are rep
 correct rounding guarantees.
 """
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable
 from math import frexp, hypot, sqrt
 from random import Random
 
@@ -18,7 +15,7 @@ import pytest
 import z3
 
 from cloudrc.geometry import fence
-from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, Vector
+from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState
 from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
@@ -34,24 +31,24 @@ HERE = (1.0, 2.0, 1.3)
 LIMITS = Limits(fence.LOW, fence.HIGH)
 
 
-def command(velocity: Vector = (1.0, 0.0, 0.0), basis_ns: int = 0, yaw_rate: float = 0.0):
+def command(velocity=(1.0, 0.0, 0.0), basis_ns=0, yaw_rate=0.0):
     """Return a command that was computed from odometry of `basis_ns`."""
     return Command(0, basis_ns, 0, velocity, yaw_rate)
 
 
-def sensed(position: Vector = HERE, velocity: Vector = ZERO) -> Readings:
+def sensed(position=HERE, velocity=ZERO):
     """Return the readings of an upright robot."""
     return Readings.of((*position, *UPRIGHT), (*velocity, *ZERO))
 
 
-def armed(limits: Limits = LIMITS, now_ns: int = 0) -> Guard:
+def armed(limits=LIMITS, now_ns=0):
     """Return a guard in GROUND with a started mission."""
     guard = Guard(limits)
     guard.start_mission(now_ns)
     return guard
 
 
-def tracking(velocity: Vector = (1.0, 0.0, 0.0), limits: Limits = LIMITS) -> Guard:
+def tracking(velocity=(1.0, 0.0, 0.0), limits=LIMITS):
     """Return a guard in TRACK since 0 ns, by a command with a basis of 0 ns."""
     guard = armed(limits)
     assert guard.accept_command(command(velocity), 0) is None
@@ -76,7 +73,7 @@ def feed(guard, start_ns, count, velocity=(1.0, 0.0, 0.0), every_ns=10 * MS, pos
     return now_ns
 
 
-def holding(limits: Limits = LIMITS):
+def holding(limits=LIMITS):
     """Return a guard in HOLD in a mission, at rest, at 2 s."""
     guard = tracking(limits=limits)
     run(guard, 0, 2000 * MS)
@@ -84,11 +81,15 @@ def holding(limits: Limits = LIMITS):
     return guard
 
 
-def landing(limits: Limits = LIMITS):
+def landing(limits=LIMITS):
     """Return a guard in LAND after impossible commands, at 2 s."""
-    guard = holding(limits)
+    return bring_down(holding(limits), 2 * SECOND)
+
+
+def bring_down(guard, now_ns):
+    """Return the guard in LAND after five impossible commands."""
     for _ in range(5):
-        guard.accept_command(command((float("nan"), 0.0, 0.0)), 2000 * MS)
+        guard.accept_command(command((float("nan"), 0.0, 0.0), now_ns), now_ns)
     assert guard.state is GuardState.LAND
     return guard
 
@@ -166,39 +167,35 @@ DOUBLE, ROUND = z3.Float64(), z3.RNE()
 LARGEST = sys.float_info.max
 
 
+def arithmetic(operation):
+    return lambda self, other: Symbol(self.run, operation(ROUND, self.term, self.of(other)))
+
+
+def comparison(operation):
+    return lambda self, other: self.run.take(operation(self.term, self.of(other)))
+
+
 class Symbol:
     """Any float that satisfies the path of its run."""
 
-    def __init__(self, run: Run, term: z3.FPRef) -> None:
+    def __init__(self, run, term):
         self.run, self.term = run, term
 
-    def _with(self, other: Symbol | float) -> z3.FPRef:
+    def of(self, other):
         return other.term if isinstance(other, Symbol) else z3.FPVal(other, DOUBLE)
 
-    def _new(self, term: z3.FPRef) -> Symbol:
-        return Symbol(self.run, term)
-
     def __neg__(self):
-        return self._new(z3.fpNeg(self.term))
+        return Symbol(self.run, z3.fpNeg(self.term))
 
     def __abs__(self):
-        return self._new(z3.fpAbs(self.term))
+        return Symbol(self.run, z3.fpAbs(self.term))
 
-    def __add__(self, other):
-        return self._new(z3.fpAdd(ROUND, self.term, self._with(other)))
-
-    __radd__ = __add__
-
-    def __sub__(self, other):
-        return self._new(z3.fpSub(ROUND, self.term, self._with(other)))
-
-    def __rsub__(self, other):
-        return self._new(z3.fpSub(ROUND, self._with(other), self.term))
-
-    def __mul__(self, other):
-        return self._new(z3.fpMul(ROUND, self.term, self._with(other)))
-
-    __rmul__ = __mul__
+    __add__ = __radd__ = arithmetic(z3.fpAdd)
+    __sub__ = arithmetic(z3.fpSub)
+    __rsub__ = arithmetic(lambda rounding, a, b: z3.fpSub(rounding, b, a))
+    __mul__ = __rmul__ = arithmetic(z3.fpMul)
+    __lt__, __le__ = comparison(z3.fpLT), comparison(z3.fpLEQ)
+    __gt__, __ge__ = comparison(z3.fpGT), comparison(z3.fpGEQ)
 
     def __truediv__(self, other):
         """Divide n >= 0 by d >= 0.1, both finite: the quotient is any finite float >= 0.
@@ -207,44 +204,27 @@ class Symbol:
         """
         if isinstance(other, float) and frexp(other)[0] == 0.5:
             return self * (1.0 / other)
-        n, d, q = self.term, self._with(other), self.run.fresh("quotient").term
-        self.run.prove(z3.And(n >= 0.0, d >= 0.1, z3.Not(z3.fpIsInf(n)), z3.Not(z3.fpIsInf(d))))
-        bound = z3.FPVal(1e300, DOUBLE)
-        self.run.prove(n <= 1e299)
-        self.run.learn(z3.And(q >= 0.0, q <= bound))
-        return self._new(q)
-
-    def __lt__(self, other):
-        return self.run.take(z3.fpLT(self.term, self._with(other)))
-
-    def __le__(self, other):
-        return self.run.take(z3.fpLEQ(self.term, self._with(other)))
-
-    def __gt__(self, other):
-        return self.run.take(z3.fpGT(self.term, self._with(other)))
-
-    def __ge__(self, other):
-        return self.run.take(z3.fpGEQ(self.term, self._with(other)))
+        n, d, q = self.term, self.of(other), self.run.fresh("quotient").term
+        self.run.prove(z3.And(n >= 0.0, n <= 1e299, d >= 0.1, z3.Not(z3.fpIsInf(d))))
+        self.run.learn(z3.And(q >= 0.0, q <= 1e300))
+        return Symbol(self.run, q)
 
 
 class Run:
     """One path through the code."""
 
-    def __init__(self, decisions: list[bool]) -> None:
-        self.decisions, self.taken = decisions, 0
-        self.path: list[z3.BoolRef] = []
-        self.names = 0
+    def __init__(self, decisions):
+        self.decisions, self.taken, self.path, self.names = decisions, 0, [], 0
 
-    def fresh(self, name: str) -> Symbol:
+    def fresh(self, name):
         """Return a symbol for any float at all."""
         self.names += 1
         return Symbol(self, z3.FP(f"{name}_{self.names}", DOUBLE))
 
-    def learn(self, fact: z3.BoolRef) -> None:
-        """Add a condition to the path."""
+    def learn(self, fact):
         self.path.append(fact)
 
-    def take(self, condition: z3.BoolRef) -> bool:
+    def take(self, condition):
         """Choose the branch of this run; another run takes the other branch."""
         if self.taken == len(self.decisions):
             self.decisions.append(True)
@@ -253,21 +233,39 @@ class Run:
         self.learn(condition if decision else z3.Not(condition))
         return decision
 
-    def prove(self, claim: z3.BoolRef) -> None:
+    def prove(self, claim):
         """Fail if there is a counterexample on this path."""
         solver = z3.Solver()
         solver.add(*self.path, z3.Not(claim))
         answer = solver.check()
         assert answer == z3.unsat, f"{answer}: {solver.model() if answer == z3.sat else claim}"
 
-    def is_possible(self) -> bool:
+    def is_possible(self):
         """Tell whether any float takes this path."""
         solver = z3.Solver()
         solver.add(*self.path)
         return solver.check() != z3.unsat
 
 
-def root(x: Symbol | float, top: float = LARGEST) -> Symbol | float:
+class AtLeast:
+    """Any float from `bound` > 0 on, infinity included; z3 takes half a minute for their product.
+
+    A correctly rounded sum or product of such floats is monotonic: the result is at least that of
+    the bounds, and never NaN.
+    """
+
+    def __init__(self, bound):
+        assert bound > 0.0
+        self.bound = bound
+
+    def __add__(self, other):
+        return AtLeast(self.bound + other.bound)
+
+    def __mul__(self, other):
+        return AtLeast(self.bound * (other.bound if isinstance(other, AtLeast) else other))
+
+
+def root(x, top=LARGEST):
     """Return the square root of a finite x >= 0: a finite float >= 0.
 
     For x up to `top` it is at most the root of `top`: a correctly rounded root is monotonic.
@@ -281,10 +279,9 @@ def root(x: Symbol | float, top: float = LARGEST) -> Symbol | float:
     return r
 
 
-def everywhere(check: Callable[[Run], None]) -> int:
+def everywhere(check):
     """Run `check` on every path; return the number of possible paths."""
-    decisions: list[bool] = []
-    paths = 0
+    decisions, paths = [], 0
     while True:
         run = Run(decisions)
         check(run)

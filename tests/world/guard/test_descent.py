@@ -1,7 +1,6 @@
 """A landing that the operator acknowledges before touch-down, and one with a low speed cap."""
 
 from dataclasses import replace
-from math import nan
 
 import pytest
 
@@ -9,7 +8,17 @@ from cloudrc.geometry import fence
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.hold import LAND_SPEED
 from cloudrc.world.simulator import Simulator
-from tests.world.guard.conftest import HERE, LIMITS, MS, SECOND, Flight, command, feed, landing, run
+from tests.world.guard.conftest import (
+    HERE,
+    LIMITS,
+    MS,
+    SECOND,
+    Flight,
+    bring_down,
+    feed,
+    landing,
+    run,
+)
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 NEAR = (1.0, 2.0, fence.FLOOR_MARGIN)
@@ -48,8 +57,7 @@ def test_a_landing_acknowledged_in_a_climb_holds_once_it_sinks():
     assert guard.state is HOLD
     guard.start_mission(3 * SECOND)
     now_ns = feed(guard, 3 * SECOND, 20)
-    for _ in range(5):
-        guard.accept_command(command((nan, 0.0, 0.0)), now_ns)
+    bring_down(guard, now_ns)
     run(guard, now_ns, now_ns + SECOND, velocity=SINKS)
     assert guard.state is LAND, "the acknowledgement does not count for the next landing"
 
@@ -83,8 +91,7 @@ def test_with_the_lowest_cap_it_lands_on_the_floor():
     flight = Flight(Simulator("pelican", "empty"), replace(LIMITS, speed_max=0.1))
     flight.fly(6.0, (0.0, 0.0, 0.1))
     assert flight.readings.position[2] > 0.4
-    for _ in range(5):
-        flight.guard.accept_command(command((nan, 0.0, 0.0), flight.now_ns), flight.now_ns)
+    bring_down(flight.guard, flight.now_ns)
     for _ in range(400):
         flight.fly(0.1)
         assert flight.readings.velocity[2] > -0.1

@@ -161,10 +161,3 @@ def test_the_hold_point_is_inside_the_margins(position, hold_point):
     reference = holding_at(position=position).follow(ZERO, sensed(position), 0.0, ENOUGH)
     wanted = tuple(POSITION_GAIN * (a - b) for a, b in zip(hold_point, position, strict=True))
     assert reference == pytest.approx(wanted)
-
-
-def test_after_forget_it_sets_a_new_hold_point():
-    hold = holding_at()
-    hold.forget()
-    for _ in range(2):
-        assert hold.follow(ZERO, moved((1.0, 0.0, 0.0)), 0.0, ENOUGH) == ZERO

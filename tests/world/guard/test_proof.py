@@ -8,7 +8,7 @@ from cloudrc.world.guard import hold
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
 from cloudrc.world.guard.state import Guard
-from tests.world.guard.conftest import LIMITS, everywhere, root
+from tests.world.guard.conftest import LIMITS, AtLeast, everywhere, root
 
 LATEST = AGE_MAX_NS * 1e-9 + rules.REACTION
 """Time until the robot brakes [s] with the largest command age."""
@@ -106,35 +106,23 @@ def test_brake_rate_of_any_speed_is_in_its_range():
     everywhere(check)
 
 
-def any_speed_and_reaction(run):
-    """Return the arguments that `Limits` uses: a finite speed >= 0 and a reaction time."""
-    speed, reaction = run.fresh("speed"), run.fresh("reaction")
-    run.learn(z3.And(speed.term >= 0.0, is_finite(speed.term)))
-    run.learn(z3.And(reaction.term >= rules.REACTION, reaction.term <= LATEST))
-    return speed, reaction
-
-
 def test_stopping_distance_is_a_number_and_never_negative():
     def check(run):
-        way = rules.stopping_distance(*any_speed_and_reaction(run)).term
-        run.prove(way >= 0.0)
+        speed, reaction = run.fresh("speed"), run.fresh("reaction")
+        run.learn(z3.And(speed.term >= 0.0, is_finite(speed.term)))
+        run.learn(z3.And(reaction.term >= rules.REACTION, reaction.term <= LATEST))
+        run.prove(rules.stopping_distance(speed, reaction).term >= 0.0)
 
     assert everywhere(check) == 1
 
 
 def test_above_7_mps_every_stopping_distance_is_too_long():
     """A distance that overflows is infinite, which is too long as well."""
-
-    def check(run):
-        speed, reaction = any_speed_and_reaction(run)
-        run.learn(speed.term >= 7.0)
-        run.prove(rules.stopping_distance(speed, reaction).term > rules.STOPPING_DISTANCE + 1e-4)
-
-    assert everywhere(check) == 1
+    way = rules.stopping_distance(AtLeast(7.0), AtLeast(rules.REACTION))
+    assert way.bound > rules.STOPPING_DISTANCE + 1e-4
 
 
 def lift(run, value):
-    """Turn a number into a symbol."""
     if isinstance(value, float | int):
         symbol = run.fresh("constant")
         run.learn(z3.fpEQ(symbol.term, z3.FPVal(value, z3.Float64())))
