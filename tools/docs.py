@@ -156,7 +156,8 @@ def _row(model: type[BaseModel], path: tuple[str, ...]) -> tuple[str, ...] | Non
         return None  # a section without a word of its own
     value, _, unit = problems.expectation(model, path).removeprefix("must be ").partition(" [")
     unit = unit.removesuffix("]")
-    meaning = info.description.replace(f" [{unit}]", "") if unit else info.description
+    meaning = " ".join(info.description.split())
+    meaning = meaning.replace(f" [{unit}]", "") if unit else meaning
     key = ".".join(path).replace(".0", "[]")
     default = "required" if info.is_required() else f"`{_default(info.default)}`"
     return f"`{key}`", _value(model, path, value), unit, default, meaning
