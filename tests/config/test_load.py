@@ -135,7 +135,6 @@ def test_a_value_is_the_whole_rest_of_its_argument(text: str) -> None:
 def test_a_value_may_be_a_number_a_list_or_quoted() -> None:
     values = {"1e-3": 0.001, "true": True, "": None, "[1, 'a #']": [1, "a #"], '"5"': "5"}
     assert {text: parse_value(text, "x") for text in values} == values
-    assert parse_value("a: 1\nb: 2", "x") == {"a": 1, "b": 2}
 
 
 def test_the_order_of_settings_does_not_matter() -> None:
@@ -198,8 +197,7 @@ plain = st.recursive(
 @settings(max_examples=40, deadline=None)
 @given(plain)
 def test_written_yaml_parses_to_equal_values(value: object) -> None:
-    if "<<" not in repr(value):
-        assert document.parse_yaml(document.write_yaml(value), "text")[0] == value
+    assert document.parse_yaml(document.write_yaml(value), "text")[0] == value
 
 
 @pytest.mark.parametrize(
