@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import json
 import os
+import zlib
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from io import BufferedReader
+from dataclasses import dataclass, field
+from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import Any, Self
 
 from cloudrc import __version__
 from cloudrc.errors import BadInputError, to_one_line
@@ -31,21 +32,9 @@ from cloudrc.record.writer import CLOCK, COUNTS, METADATA, MISSING
 try:
     import lz4.frame
     import zstandard
+    from mcap import records as mcap
     from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
-    from mcap.opcode import Opcode
-    from mcap.records import (
-        Attachment,
-        Channel,
-        Chunk,
-        DataEnd,
-        Header,
-        McapRecord,
-        Message,
-        Metadata,
-        Schema,
-        Statistics,
-    )
-    from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
+    from mcap.stream_reader import CRCValidationError, StreamReader
     from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 except ImportError as error:
     raise missing(error) from error
@@ -55,8 +44,6 @@ UNPACKED_MAX = 64
 1 MiB counts as 1 MiB. Recordings of flights need a factor of 10, recordings of an idle robot 30."""
 MESSAGE_COST = 128
 """Memory of a message's Python objects, in addition to the message's bytes [bytes]."""
-CHANNELS_MAX = 65_535
-"""Limit of the number of channels plus schemas in a file; MCAP numbers both with 16 bits."""
 LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
 LOSSY_SHARE_MAX = 0.999
@@ -73,8 +60,19 @@ class NothingReadableError(BadInputError):
     """Report a file without any readable message, such as after a kill at the start."""
 
 
-class _TooMuchError(Exception):
-    """Report that a file unpacks to more data than any recording may."""
+class _StopError(Exception):
+    """Report, in words, why a file that may be intact is not read further."""
+
+
+_UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
+    "": lambda data, size: data,
+    "zstd": lambda data, size: (
+        zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True).read(size)
+    ),
+    "lz4": lambda data, size: lz4.frame.LZ4FrameDecompressor().decompress(data, size),
+}
+"""Compression -> function that unpacks at most a given size [bytes]. The library's own functions
+allocate what the compressed data states, without a bound."""
 
 
 class Records:
@@ -85,6 +83,8 @@ class Records:
         size: Size of the file [bytes].
         position: Position behind the last intact record [bytes].
         chunks: Number of intact chunks.
+        schemas: The schemas so far, by their number.
+        channels: The channels so far, by their number.
         data_ended: Whether reading has reached the end of the data; only the index follows.
         ended: Whether reading has reached the end of the file.
         fault: Why reading stopped or what is wrong, in words; "" if nothing is wrong.
@@ -109,10 +109,12 @@ class Records:
             raise BadInputError(f"{error}; name a recording (.mcap)") from error
         self.size = os.fstat(self._stream.fileno()).st_size
         self.position = self.chunks = 0
+        self.schemas: dict[int, mcap.Schema] = {}
+        self.channels: dict[int, mcap.Channel] = {}
         self.data_ended = self.ended = self.cut = False
         self.fault = ""
-        self._room = UNPACKED_MAX * max(self.size, 1 << 20)
         self.stated: int | None = None
+        self._room = UNPACKED_MAX * max(self.size, 1 << 20)
 
     def __enter__(self) -> Self:
         return self
@@ -120,11 +122,11 @@ class Records:
     def __exit__(self, *error: object) -> None:
         self._stream.close()
 
-    def __iter__(self) -> Iterator[McapRecord]:
+    def __iter__(self) -> Iterator[mcap.McapRecord]:
         """Yield the records up to the file's end or its first damaged part.
 
         Raises:
-            BadInputError: If the file is not MCAP or has an unknown compression.
+            BadInputError: If the file is not MCAP.
         """
         head = self._stream.read(16)
         if not head.startswith(MCAP0_MAGIC):
@@ -134,37 +136,37 @@ class Records:
         self._stream.seek(0)
         try:
             yield from self._read()
-        except BadInputError:
-            raise
         except CRCValidationError as error:
             self.fault = "damaged: a checksum is wrong"
-            if isinstance(error.record, DataEnd):  # all was read
+            if isinstance(error.record, mcap.DataEnd):  # all was read
                 self.data_ended = self.ended = True
                 self.position = self.size
                 self.fault = "damaged: a byte outside the chunks is wrong"
         except (EndOfFile, RecordLengthLimitExceeded):  # a record that ends behind the file
             self.fault, self.cut = "cut short", True
-        except _TooMuchError:
-            self.fault = f"unpacks to more than {UNPACKED_MAX} times its size, as no recording does"
+        except _StopError as error:
+            self.fault = str(error)
         except OSError as error:
             self.fault = f"unreadable: {error.strerror}"
         except Exception:  # the library may raise anything on damaged bytes
             self.cut = self._stream.tell() >= self.size
             self.fault = "cut short" if self.cut else "damaged"
 
-    def _read(self) -> Iterator[McapRecord]:
+    def _read(self) -> Iterator[mcap.McapRecord]:
         reader = StreamReader(
             self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
         )
         for record in reader.records:
-            if isinstance(record, Chunk):
-                yield from self._unpack(record)
+            if isinstance(record, mcap.Header) == (self.position > 0):
+                raise ValueError("the first record, and only the first, must be a header")
+            if isinstance(record, mcap.Chunk):
+                yield from map(self._check, self._unpack(record))
                 self.chunks += 1
             elif not self.data_ended:  # what follows repeats the definitions
-                yield record
-            if isinstance(record, Statistics):
+                yield self._check(record)
+            if isinstance(record, mcap.Statistics):
                 self.stated = record.message_count
-            self.data_ended |= isinstance(record, DataEnd)
+            self.data_ended |= isinstance(record, mcap.DataEnd)
             self.position = self._stream.tell()
         self.position = self._stream.tell()
         self.ended = self.data_ended = True
@@ -179,45 +181,41 @@ class Records:
     def _take_room(self, size: int) -> None:
         self._room -= size
         if self._room < 0:
-            raise _TooMuchError
+            text = f"unpacks to more than {UNPACKED_MAX} times its size, as no recording does"
+            raise _StopError(text)
 
-    def _unpack(self, chunk: Chunk) -> Iterator[McapRecord]:
+    def _check(self, record: mcap.McapRecord) -> mcap.McapRecord:
+        """Note definitions, and check that each number has one definition, before its messages."""
+        if isinstance(record, mcap.Message):
+            self._take_room(MESSAGE_COST)
+            if record.channel_id not in self.channels:
+                raise ValueError("a message of no channel")
+        elif isinstance(record, mcap.Schema | mcap.Channel):
+            known: Any = self.schemas if isinstance(record, mcap.Schema) else self.channels
+            if known.setdefault(record.id, record) != record:
+                raise ValueError("two definitions have the same number")
+        return record
+
+    def _unpack(self, chunk: mcap.Chunk) -> Iterator[mcap.McapRecord]:
         size = chunk.uncompressed_size
         self._take_room(size)
-        # Not the library's: it allocates what the compressed data states, without a bound.
-        match chunk.compression:
-            case "":
-                data = chunk.data
-            case "zstd":
-                unpacker = zstandard.ZstdDecompressor()
-                data = unpacker.stream_reader(chunk.data, read_across_frames=True).read(size + 1)
-            case "lz4":
-                data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
-            case other if not self.chunks:
-                raise BadInputError(
-                    f"{self.path}: its chunks are compressed by {to_one_line(other)!r}; cloudrc"
-                    " reads zstd and lz4: convert it with: mcap compress"
-                )
-            case _:
-                raise ValueError("another compression than in the chunks before")
+        if chunk.compression not in _UNPACK:
+            raise _StopError(
+                f"its chunks are compressed by {to_one_line(chunk.compression)!r}; cloudrc reads"
+                " zstd and lz4: convert it with: mcap compress"
+            )
+        data = _UNPACK[chunk.compression](chunk.data, size + 1)
         if len(data) != size:
             raise ValueError("the chunk is not as long as it states")
-        whole = replace(chunk, compression="", data=data)
-        stream, _ = get_chunk_data_stream(whole, validate_crc=True)
-        while stream.count < size:  # one at a time: a chunk may hold millions
-            opcode, length = stream.read1(), stream.read8()
-            end = stream.count + length
-            if opcode == Opcode.MESSAGE:
-                self._take_room(MESSAGE_COST)
-                yield Message.read(stream, length)
-            elif opcode == Opcode.SCHEMA:
-                yield Schema.read(stream)
-            elif opcode == Opcode.CHANNEL:
-                yield Channel.read(stream)
-            else:
-                stream.read(length)
-            if stream.count != end:
-                raise ValueError("a record is not as long as it states")
+        if chunk.uncompressed_crc not in (0, checksum := zlib.crc32(data)):
+            raise CRCValidationError(chunk.uncompressed_crc, checksum, chunk)
+        stream = BytesIO(data)
+        records = StreamReader(stream, skip_magic=True).records
+        try:
+            while stream.tell() < size:  # one at a time: a chunk may hold millions
+                yield next(records)
+        except EndOfFile as error:
+            raise ValueError("a record is not as long as it states") from error
 
 
 @dataclass(slots=True)
@@ -249,27 +247,21 @@ def read_contents(path: Path) -> Contents:
     Raises:
         BadInputError: If nothing in the file is readable.
     """
-    contents, sequences = Contents(), array("L")
-    types: dict[int, tuple[str, str]] = {}
-    channels: dict[int, tuple[str, bool]] = {}  # name of the topic; whether it is ours
-    seen: Counter[int] = Counter()  # messages by channel
+    contents, sequences, total = Contents(), array("L"), 0
+    ours: dict[int, bool] = {}  # whether cloudrc records the topic of a channel, in this layout
     with Records(path) as records:
         for record in records:
-            if isinstance(record, Message):
-                seen[record.channel_id] += 1
-                topic, ours = channels.get(record.channel_id, ("", False))
-                if ours:
-                    contents.messages.append((topic, record.log_time, record.data))
+            if isinstance(record, mcap.Message):
+                channel = records.channels[record.channel_id]
+                total += 1
+                if channel.id not in ours:
+                    ours[channel.id] = _is_ours(channel, records.schemas.get(channel.schema_id))
+                if ours[channel.id]:
+                    contents.messages.append((channel.topic, record.log_time, record.data))
                     sequences.append(record.sequence)
-            elif isinstance(record, Schema):
-                types[record.id] = record.name, record.data.decode("utf-8", "replace")
-            elif isinstance(record, Channel):
-                topic, (ros_type, text) = record.topic, types.get(record.schema_id, ("", ""))
-                known = topic in TOPICS and TOPICS[topic].ros_type == ros_type
-                channels[record.id] = topic, known and is_known(ros_type, text)
-            elif isinstance(record, Metadata):
+            elif isinstance(record, mcap.Metadata):
                 contents.metadata.update(record.metadata)
-            elif isinstance(record, Attachment):
+            elif isinstance(record, mcap.Attachment):
                 contents.attachments[record.name] = record.data
     messages, fault = contents.messages, records.fault
     if not records.data_ended and not messages:
@@ -280,12 +272,24 @@ def read_contents(path: Path) -> Contents:
         order = sorted(range(len(messages)), key=lambda n: (messages[n][1], sequences[n]))
         contents.messages = [messages[n] for n in order]
         contents.remarks += (f"was not in order of time: {late} messages were sorted",)
-    _note(contents, records, [(*channels.get(one, ("", None)), n) for one, n in seen.items()])
+    _note(contents, records, ours, total)
     return contents
 
 
-def _note(contents: Contents, records: Records, seen: list[tuple[str, bool | None, int]]) -> None:
-    """Note what is missing; `seen` has topic, whether it is ours, and messages of each channel."""
+def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
+    """Check whether cloudrc records a channel's topic, and in the same layout."""
+    ros_type = TOPICS[channel.topic].ros_type if channel.topic in TOPICS else ""
+    if schema is None or schema.name != ros_type:
+        return False
+    return is_known(ros_type, schema.data.decode("utf-8", "replace"))
+
+
+def _note(contents: Contents, records: Records, ours: dict[int, bool], total: int) -> None:
+    """Note what is missing.
+
+    `ours` has each channel with messages, and whether cloudrc records it; `total` is the number of
+    these messages.
+    """
     cut, lacking = list[str](), list[str]()
     if records.data_ended and records.cut:
         contents.remarks += ("had a torn index: all its messages were read",)
@@ -294,20 +298,18 @@ def _note(contents: Contents, records: Records, seen: list[tuple[str, bool | Non
             count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
             fault += f": {count} messages were read, the last at {until:.2f} s"
         (cut if records.cut else lacking).append(fault)
-    others = {name for name, ours, _ in seen if ours is False}
+    channels = Counter((records.channels[number].topic, known) for number, known in ours.items())
+    others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):
         told = f"has topics that cloudrc does not record: {_list(foreign)}"
         contents.remarks += (to_one_line(told),)
     if changed := sorted(others & TOPICS.keys()):
         lacking.append(f"topics of another layout were left out: {', '.join(changed)}")
-    twice = Counter(name for name, ours, _ in seen if ours and TOPICS[name].end != "either")
-    if double := [name for name, count in twice.items() if count > 1]:
+    twice = [name for (name, known), count in channels.items() if known and count > 1]
+    if double := [name for name in twice if TOPICS[name].end != "either"]:
         lacking.append(f"two robots or two recordings are in one file: {', '.join(double)}")
-    if homeless := sum(count for _, ours, count in seen if ours is None):
-        lacking.append(f"{homeless} messages are of no topic")
     if CLOCK not in contents.metadata:
         lacking.append("the metadata of cloudrc, which names the clock, is not there")
-    total = sum(count for *_, count in seen)
     if records.ended and records.stated not in (None, total):
         lacking.append(f"the index states {records.stated} messages, {total} were read")
     lacking += _changed(contents) if records.data_ended else ()
@@ -375,90 +377,62 @@ def recover(source: Path, target: Path) -> Recovery:
         OSError: If the new file cannot be written.
     """
     with Records(source) as records, atomic_file(target) as new:
-        return _Copy(new, records).finish()
-
-
-class _Copy:
-    """Copies records to a new file, with new numbers for channels and schemas."""
-
-    def __init__(self, new: IO[bytes], records: Records) -> None:
-        self._records = records
-        self._writer: Any = Writer(new, compression=CompressionType.ZSTD, enable_data_crcs=True)
-        self._schemas: dict[int, tuple[Schema, int]] = {}  # old number -> its new number
-        self._channels: dict[int, tuple[Channel, int]] = {}
-        self._kept = {"messages": 0, "attachments": 0, "metadata": 0}
-        self._defined = 0  # channels and schemas in the new file
-        self._homeless = 0  # messages of no channel
-        self._told = ""  # what the recording itself says is missing
-        for number, record in enumerate(records):
-            if isinstance(record, Header) or number == 0:
-                profile = record.profile if isinstance(record, Header) else ""
-                self._writer.start(profile=profile, library=f"cloudrc {__version__} recover")
-            self._take(record)
-
-    def _take(self, record: McapRecord) -> None:
-        add: Any = self._writer
-        if isinstance(record, Message):
-            _, channel = self._channels.get(record.channel_id, (None, 0))
-            self._homeless += not channel
-            self._kept["messages"] += bool(channel)
-            if channel:
-                add.add_message(
-                    channel, record.log_time, record.data, record.publish_time, record.sequence
-                )
-        elif isinstance(record, Schema):
-            self._define(record, self._schemas)
-        elif isinstance(record, Channel):
-            self._define(record, self._channels)
-        elif isinstance(record, Attachment):
-            self._kept["attachments"] += 1
-            add.add_attachment(
-                record.create_time, record.log_time, record.name, record.media_type, record.data
-            )
-        elif isinstance(record, Metadata):
-            self._kept["metadata"] += 1
-            add.add_metadata(record.name, record.metadata)
-            if record.name == METADATA:
-                self._told = record.metadata.get(MISSING, self._told)
-
-    def finish(self) -> Recovery:
-        """Complete the new file; return what the file holds and what is lost."""
-        records, kept = self._records, self._kept
+        writer: Any = Writer(new, compression=CompressionType.ZSTD, enable_data_crcs=True)
+        kept, counts, told = _copy(records, writer)
         if not kept["messages"] and not kept["attachments"]:
             reason = records.fault or "none is in it"
             raise BadInputError(
-                f"{records.path}: holds no readable message: {reason}; nothing is written"
+                f"{source}: holds no readable message: {reason}; nothing is written"
             )
-        lost = max(self._homeless, (records.stated or 0) - kept["messages"])
-        new = []
+        lost = max(0, (records.stated or 0) - kept["messages"])
+        missing = []
         if records.fault and not (records.data_ended and records.cut):
             unread = f": {records.unread} bytes after the last intact part were not read"
-            new.append(records.fault + unread * bool(records.unread))
+            missing.append(records.fault + unread * bool(records.unread))
         if lost:
-            new.append(f"{lost} messages are lost")
-        notes = [self._told, *new] if self._told else new
-        if new:  # otherwise the new file already has what the recording says
-            self._writer.add_metadata(METADATA, {MISSING: "; ".join(notes)})
-        self._writer.finish()
-        kept |= {"chunks": records.chunks, "channels": len(self._channels)}
-        dropped = {"messages": lost} if lost else {}
-        return Recovery(records.size, kept, dropped, records.unread, notes, not records.ended)
+            missing.append(f"{lost} messages are lost")
+        notes = [told, *missing] if told else missing
+        if missing:  # otherwise the new file already has what the recording says
+            noted = {MISSING: "; ".join(notes), COUNTS: json.dumps(counts)}
+            writer.add_metadata(METADATA, noted)
+        writer.finish()
+    dropped = {"messages": lost} if lost else {}
+    return Recovery(records.size, kept, dropped, records.unread, notes, not records.ended)
 
-    def _define(self, record: Any, known: dict[int, Any]) -> None:
-        """Register a schema or channel; register each definition of its number only once."""
-        if record.id in known and known[record.id][0] == record:
-            return
-        self._defined += 1
-        if self._defined > CHANNELS_MAX:
-            raise BadInputError(
-                f"{self._records.path}: defines more than {CHANNELS_MAX} channels and schemas;"
-                " use another file"
-            )
-        if isinstance(record, Schema):
-            number = self._writer.register_schema(record.name, record.encoding, record.data)
-        else:
-            _, schema = self._schemas.get(record.schema_id, (None, 0))
-            number = self._writer.register_channel(
-                record.topic, record.message_encoding, schema, record.metadata
-            )
-        known[record.id] = record, number
+
+def _copy(records: Records, writer: Any) -> tuple[dict[str, int], Counter[str], str]:
+    """Copy all records to a new file, with new numbers for schemas and channels.
+
+    Return the number of objects by kind, the number of messages by topic, and what the recording
+    itself says is missing.
+    """
+    kept = {"messages": 0, "attachments": 0, "metadata": 0}
+    counts, told = Counter[str](), ""
+    schemas, channels = {0: 0}, dict[int, int]()  # old number -> new number
+    for record in records:
+        match record:
+            case mcap.Header():
+                writer.start(profile=record.profile, library=f"cloudrc {__version__} recover")
+            case mcap.Schema() if record.id not in schemas:
+                number = writer.register_schema(record.name, record.encoding, record.data)
+                schemas[record.id] = number
+            case mcap.Channel() if record.id not in channels:
+                channels[record.id] = writer.register_channel(
+                    record.topic,
+                    record.message_encoding,
+                    schemas.get(record.schema_id, 0),
+                    record.metadata,
+                )
+            case mcap.Message():
+                counts[records.channels[record.channel_id].topic] += 1
+                writer.add_message(**vars(record) | {"channel_id": channels[record.channel_id]})
+            case mcap.Attachment():
+                kept["attachments"] += 1
+                writer.add_attachment(**vars(record))
+            case mcap.Metadata():
+                kept["metadata"] += 1
+                writer.add_metadata(record.name, record.metadata)
+                if record.name == METADATA:
+                    told = record.metadata.get(MISSING, told)
+    kept |= {"messages": counts.total(), "chunks": records.chunks, "channels": len(channels)}
+    return kept, counts, told
