@@ -25,7 +25,7 @@ from cloudrc.config import problems, shipped
 from cloudrc.config.overrides import KINDS
 from cloudrc.config.schema import Direction, Experiment, Mission, Profile
 from cloudrc.exposition.table import METRICS, ROLES, Metric
-from cloudrc.record.topics import SAMPLING, TOPICS
+from cloudrc.record.topics import TOPICS
 from tools import chart_values
 from tools.chart_values import ChartValues, Peer, Quantities, Resources, Selector, Values
 
@@ -46,6 +46,29 @@ CLOCKS = {
 }
 
 
+_PERIOD = "100 Hz, while there is telemetry and a setpoint"
+_LINK = "once per change; again when a session, a mission or a state of the guard begins"
+_STAMPS = {
+    ("departure of the telemetry, which is the instant of the measurement", "100 Hz, in a session"):
+        "/odometry /telemetry",
+    ("instant of the physics step", "100 Hz"): "/ground_truth /contact_force /reference",
+    ("arrival at cloud", "once per telemetry that arrives"): "/uplink_delay",
+    ("arrival at world", "once per command that arrives"): "/downlink_delay",
+    ("first physics step that follows the command", "once per command applied"): "/command_applied",
+    ("physics step in which the state changes", "once per event"): "/guard",
+    ("the first odometry after the contact, at most 10 ms later", "once per event"): "/contact",
+    ("begin of the session at this end", "once per event"): "/session",
+    ("departure of the command", _PERIOD):
+        "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
+    ("instant of the event", "once per event"): "/mission",
+    ("when this end notices the fault", "once per fault; repetitions are only counted"): "/fault",
+    ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
+    ("when this end notices it", _LINK): "/link",
+    ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
+    ("when the deadline was handled", "100 Hz per end"): "/lateness",
+}  # fmt: skip
+SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.split()}
+"""Topic -> meaning of a row's stamp, and how often a row is written."""
 OPEN = {
     "version": "the version",
     "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
