@@ -307,7 +307,7 @@ def _fly_local(
         if not interrupted:
             raise
         raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
-    digest = messages_sha256(mission.contents.messages)
+    digest = messages_sha256(mission.messages)
     notes = (*local.notes, *([str(broken)] if broken else ()))
     run = Run("local", "relay", digest, interrupted, notes)
     try:

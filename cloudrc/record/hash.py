@@ -32,7 +32,8 @@ class RecordHash:
 
     def update(self, records: Iterable[Record]) -> None:
         """Add records to the hash, oldest first."""
-        self._sha256.update(b"".join([_packer(type(record))(record) for record in records]))
+        typed: Iterable[tuple[Any, Record]] = ((type(record), record) for record in records)
+        self._sha256.update(b"".join([_packer(cls)(record) for cls, record in typed]))
 
     def hexdigest(self) -> str:
         """Return the hash of all records so far, as 64 hexadecimal digits."""

@@ -13,7 +13,7 @@ import os
 import zlib
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BufferedReader, BytesIO
@@ -21,13 +21,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
-from cloudrc import __version__
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import atomic_file, open_file
 from cloudrc.record import missing
+from cloudrc.record.columns import Recording
 from cloudrc.record.ros import is_known
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import CLOCK, COUNTS, METADATA, MISSING
+from cloudrc.record.writer import CHANGED, CLOCK, COUNTS, MISSING, McapWriter
 
 try:
     import lz4.frame
@@ -35,7 +35,7 @@ try:
     from mcap import records as mcap
     from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
     from mcap.stream_reader import CRCValidationError, StreamReader
-    from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+    from mcap.writer import MCAP0_MAGIC
 except ImportError as error:
     raise missing(error) from error
 
@@ -48,6 +48,7 @@ LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
 LOSSY_SHARE_MAX = 0.999
 """Largest value of `Recovery.share` if anything is missing [1]."""
+_MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
 KINDS = {
     b"": "is empty; name a recording (.mcap)",
     b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
@@ -240,6 +241,28 @@ class Contents:
     lacking: str = ""
     remarks: tuple[str, ...] = ()
 
+    def recording(self) -> Recording:
+        """Decode the messages to tables."""
+        return Recording.from_contents(self)
+
+    def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
+        """Write the contents and further `attachments` to an MCAP file, which is replaced at once.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        clock, clock_id = self.metadata.get(CLOCK, ""), self.metadata.get("clock_id", "")
+        with (
+            atomic_file(target) as file,
+            McapWriter(file, clock=clock, clock_id=clock_id) as writer,
+        ):
+            writer.note(self.metadata)
+            for message in self.messages:
+                writer.write_message(*message)
+            for name, data in {**self.attachments, **(attachments or {})}.items():
+                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+                writer.attach(name, data, media_type)
+
 
 def read_contents(path: Path) -> Contents:
     """Read the topics that cloudrc records, up to the end of a file or its first damaged part.
@@ -247,13 +270,17 @@ def read_contents(path: Path) -> Contents:
     Raises:
         BadInputError: If nothing in the file is readable.
     """
+    return _read(path)[0]
+
+
+def _read(path: Path) -> tuple[Contents, Records, int]:
+    """Read a file; return also the number of messages that are known to be missing."""
     contents, sequences, total = Contents(), array("L"), 0
     ours: dict[int, bool] = {}  # whether cloudrc records the topic of a channel, in this layout
     with Records(path) as records:
         for record in records:
             if isinstance(record, mcap.Message):
-                channel = records.channels[record.channel_id]
-                total += 1
+                channel, total = records.channels[record.channel_id], total + 1
                 if channel.id not in ours:
                     ours[channel.id] = _is_ours(channel, records.schemas.get(channel.schema_id))
                 if ours[channel.id]:
@@ -273,7 +300,7 @@ def read_contents(path: Path) -> Contents:
         contents.messages = [messages[n] for n in order]
         contents.remarks += (f"was not in order of time: {late} messages were sorted",)
     _note(contents, records, ours, total)
-    return contents
+    return contents, records, max(records.stated or 0, total) - len(messages)
 
 
 def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
@@ -290,32 +317,37 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool], total: in
     `ours` has each channel with messages, and whether cloudrc records it; `total` is the number of
     these messages.
     """
-    cut, lacking = list[str](), list[str]()
+    faults, changed, metadata = list[str](), list[str](), contents.metadata
     if records.data_ended and records.cut:
         contents.remarks += ("had a torn index: all its messages were read",)
     elif fault := records.fault:
         if not records.data_ended:
             count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
             fault += f": {count} messages were read, the last at {until:.2f} s"
-        (cut if records.cut else lacking).append(fault)
+        faults.append(fault)
     channels = Counter((records.channels[number].topic, known) for number, known in ours.items())
     others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):
         told = f"has topics that cloudrc does not record: {_list(foreign)}"
         contents.remarks += (to_one_line(told),)
-    if changed := sorted(others & TOPICS.keys()):
-        lacking.append(f"topics of another layout were left out: {', '.join(changed)}")
+    if other := sorted(others & TOPICS.keys()):
+        changed.append(f"topics of another layout were left out: {', '.join(other)}")
     twice = [name for (name, known), count in channels.items() if known and count > 1]
     if double := [name for name in twice if TOPICS[name].end != "either"]:
-        lacking.append(f"two robots or two recordings are in one file: {', '.join(double)}")
-    if CLOCK not in contents.metadata:
-        lacking.append("the metadata of cloudrc, which names the clock, is not there")
+        changed.append(f"two robots or two recordings are in one file: {', '.join(double)}")
+    if not metadata.get(CLOCK):
+        changed.append("the metadata of cloudrc, which names the clock, is not there")
     if records.ended and records.stated not in (None, total):
-        lacking.append(f"the index states {records.stated} messages, {total} were read")
-    lacking += _changed(contents) if records.data_ended else ()
-    told = to_one_line(contents.metadata.get(MISSING, ""))
-    contents.lacking = "; ".join(lacking)
-    contents.note = "; ".join(filter(None, [*cut, *lacking, told]))
+        changed.append(f"the index states {records.stated} messages, {total} were read")
+    changed += _changed(contents) if records.data_ended else ()
+    if before := to_one_line(metadata.get(CHANGED, "")):  # by an earlier reader of the file
+        changed.append(before)
+    if changed:
+        metadata[CHANGED] = "; ".join(changed)
+    told = to_one_line(metadata.get(MISSING, ""))
+    contents.lacking = "; ".join([*(faults if not records.cut else []), *changed])
+    anew = [text for text in changed if text not in told]
+    contents.note = "; ".join(filter(None, [*faults, *anew, told]))
 
 
 def _changed(contents: Contents) -> Iterator[str]:
@@ -369,70 +401,30 @@ class Recovery:
 def recover(source: Path, target: Path) -> Recovery:
     """Write a complete copy of a recording that may be torn, up to its first damaged part.
 
-    The copy keeps messages with their stamps, schemas, channels, attachments and metadata, and has
-    an index, checksums and a note about what is missing. It replaces `target` atomically.
+    The copy has the topics that cloudrc records, the attachments and the metadata, and a note about
+    what is missing. It replaces `target` atomically.
 
     Raises:
         BadInputError: If the file holds no readable message.
         OSError: If the new file cannot be written.
     """
-    with Records(source) as records, atomic_file(target) as new:
-        writer: Any = Writer(new, compression=CompressionType.ZSTD, enable_data_crcs=True)
-        kept, counts, told = _copy(records, writer)
-        if not kept["messages"] and not kept["attachments"]:
-            reason = records.fault or "none is in it"
-            raise BadInputError(
-                f"{source}: holds no readable message: {reason}; nothing is written"
-            )
-        lost = max(0, (records.stated or 0) - kept["messages"])
-        missing = []
-        if records.fault and not (records.data_ended and records.cut):
-            unread = f": {records.unread} bytes after the last intact part were not read"
-            missing.append(records.fault + unread * bool(records.unread))
-        if lost:
-            missing.append(f"{lost} messages are lost")
-        notes = [told, *missing] if told else missing
-        if missing:  # otherwise the new file already has what the recording says
-            noted = {MISSING: "; ".join(notes), COUNTS: json.dumps(counts)}
-            writer.add_metadata(METADATA, noted)
-        writer.finish()
+    contents, records, lost = _read(source)
+    if not contents.messages and not contents.attachments:
+        reason = contents.note or "none is in it"
+        raise BadInputError(f"{source}: holds no readable message: {reason}; nothing is written")
+    notes = [contents.note] if contents.note else []
+    if records.unread:
+        notes.append(f"{records.unread} bytes after the last intact part were not read")
+    if lost:
+        notes.append(f"{lost} messages are lost, or of topics that cloudrc does not record")
+    if notes:
+        contents.metadata[MISSING] = "; ".join(notes)
+    contents.write(target)
+    counts = Counter(topic for topic, _, _ in contents.messages)
+    kept = {
+        "messages": counts.total(),
+        "attachments": len(contents.attachments),
+        "topics": len(counts),
+    }
     dropped = {"messages": lost} if lost else {}
     return Recovery(records.size, kept, dropped, records.unread, notes, not records.ended)
-
-
-def _copy(records: Records, writer: Any) -> tuple[dict[str, int], Counter[str], str]:
-    """Copy all records to a new file, with new numbers for schemas and channels.
-
-    Return the number of objects by kind, the number of messages by topic, and what the recording
-    itself says is missing.
-    """
-    kept = {"messages": 0, "attachments": 0, "metadata": 0}
-    counts, told = Counter[str](), ""
-    schemas, channels = {0: 0}, dict[int, int]()  # old number -> new number
-    for record in records:
-        match record:
-            case mcap.Header():
-                writer.start(profile=record.profile, library=f"cloudrc {__version__} recover")
-            case mcap.Schema() if record.id not in schemas:
-                number = writer.register_schema(record.name, record.encoding, record.data)
-                schemas[record.id] = number
-            case mcap.Channel() if record.id not in channels:
-                channels[record.id] = writer.register_channel(
-                    record.topic,
-                    record.message_encoding,
-                    schemas.get(record.schema_id, 0),
-                    record.metadata,
-                )
-            case mcap.Message():
-                counts[records.channels[record.channel_id].topic] += 1
-                writer.add_message(**vars(record) | {"channel_id": channels[record.channel_id]})
-            case mcap.Attachment():
-                kept["attachments"] += 1
-                writer.add_attachment(**vars(record))
-            case mcap.Metadata():
-                kept["metadata"] += 1
-                writer.add_metadata(record.name, record.metadata)
-                if record.name == METADATA:
-                    told = record.metadata.get(MISSING, told)
-    kept |= {"messages": counts.total(), "chunks": records.chunks, "channels": len(channels)}
-    return kept, counts, told

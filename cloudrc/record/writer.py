@@ -45,6 +45,8 @@ CLOCK = "clock"
 """Metadata key: the end ("world" or "cloud") whose clock the stamps use."""
 MISSING = "missing"
 """Metadata key: what is missing from the file, in words."""
+CHANGED = "changed"
+"""Metadata key: what another program has removed from the file or added to it, in words."""
 COUNTS, SHA256 = "counts", "messages_sha256"
 """Metadata keys of a complete file: number of messages by topic as JSON, and hash of the messages
 by `record.hash`. The values show whether another program has changed the recording. The value of

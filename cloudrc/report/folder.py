@@ -61,16 +61,15 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     if not config.is_file():
         raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
     experiment = read_experiment(config)
-    mission, contents = None, _read_merged(folder)
+    contents = before = _read_merged(folder)
     if contents is None:
-        mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-        contents = mission.contents
-    recording = Recording.from_contents(contents)
+        contents = merge(folder / "world.mcap", folder / "cloud.mcap")
+    recording = contents.recording()
     earlier = _earlier_report(folder / "report.json")
     for lack in _lacking(recording, config, whole=earlier is not None and earlier.complete):
         raise BadInputError(f"{merged}: {lack}; no report is written")
-    if mission is not None:
-        mission.write(merged)
+    if before is None:
+        contents.write(merged)
     return recording, experiment, _describe(recording, earlier, contents)
 
 

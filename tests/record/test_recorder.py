@@ -166,7 +166,7 @@ def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> N
     said = "recording stopped: the file has reached its size limit"
     assert Recording.read(path).note == said
     path.write_bytes(path.read_bytes()[:-50])
-    assert recover(path, tmp_path / "new.mcap").notes[0] == said
+    assert said in recover(path, tmp_path / "new.mcap").notes[0]
 
 
 @pytest.mark.parametrize("works", [True, False])
