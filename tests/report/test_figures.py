@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import matplotlib
-import numpy as np
 import pytest
 
 from cloudrc.config.schema import Direction
-from cloudrc.geometry.scene import load_scene
 from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, draw_all
-from cloudrc.report.figures.snapshots import WALL_COLOUR, is_inside_pipe, pipe_faces
 from cloudrc.report.figures.style import RC, Subject
 from tests.metrics.conftest import ONE_PIPE, START, Log, at, flown
 
@@ -32,19 +29,6 @@ def test_a_flight_without_data_is_drawn(name: str, end_ns: int) -> None:
     with matplotlib.rc_context(RC):
         draw(subject).draw_without_rendering()
     assert caption(subject)
-
-
-def test_a_pipes_rim_inside_another_pipe_is_not_drawn() -> None:
-    """Sorted by depth, its faces would appear between those of the other pipe."""
-    first, second, _ = load_scene("pipes").pipes
-    faces = pipe_faces(second, np.array([0.0, 0.0, 1.0]), np.array(second.centre), second.length)
-    met = [face for face in faces if is_inside_pipe(face, first)]
-    assert 0 < len(met) < len(faces)
-    assert {face.colour for face in met} == {WALL_COLOUR}
-    for face in met:
-        offset = face.corners.mean(axis=0) - np.array(first.centre)
-        assert np.hypot(offset[0], offset[2]) < first.outer  # its axis is y
-        assert abs(offset[1]) < first.length / 2
 
 
 def test_waypoints_are_the_first_setpoints_of_each() -> None:

@@ -16,7 +16,8 @@ from mcap.writer import CompressionType
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump
 from cloudrc.errors import BadInputError
-from cloudrc.record.columns import Recording, merged
+from cloudrc.record.columns import Recording
+from cloudrc.record.reader import recover
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
 from cloudrc.report.document import Run
@@ -90,6 +91,12 @@ def damaged(source: Path, target: Path) -> None:
     target.write_bytes(data)
 
 
+def recovered_and_filtered(source: Path, target: Path) -> None:
+    cut(source, source)
+    recover(source, target)
+    rewrite(target, source, keep=lambda c, m: c.topic != "/telemetry").replace(target)
+
+
 def recorded(*, more: int = 0, config: bytes = b"") -> Change:
     """Record the flight anew: with more records of ground truth, or of another experiment."""
 
@@ -115,6 +122,7 @@ OTHER = b"seed: 2\nmission: pipes\n"
         (filtered(rename=lambda topic: f"/r1{topic}"), "does not record: /r1/cmd_vel, "),
         (filtered(metadata=False), "the metadata of cloudrc, which names the clock, is not there"),
         (cut, "cut short: .* but report.json is of the whole recording"),
+        (recovered_and_filtered, "messages were removed or added: it holds 0 of [0-9]+ on /tele"),
         (damaged, "damaged: a checksum is wrong"),
         (recorded(more=40), "on /ground_truth that are not later than the row before"),
         (recorded(config=OTHER), "is the recording of an experiment with other values for: "),
@@ -126,38 +134,12 @@ def test_a_recording_that_carries_no_report_is_refused(
 ) -> None:
     (run / "report.html").write_text("the page")
     change(run / "mission.mcap", run / "n.mcap")
-    (run / "mission.mcap").unlink()
-    (run / "n.mcap").rename(run / "mission.mcap")
+    (run / "n.mcap").replace(run / "mission.mcap")
     before = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
     assert main(["report", str(run)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(said, line), line
     assert {path: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
-
-
-@pytest.mark.parametrize(
-    ("topic", "said"),
-    [
-        ("/telemetry", "has 0 rows on /telemetry, but 401 on /odometry"),
-        ("/guard", "has rows on /command_applied, but none on /guard"),
-        ("/mission", "has rows on /pid, but none on /mission"),
-    ],
-)
-def test_a_killed_runs_topics_are_compared(
-    run: Path, monkeypatch: pytest.MonkeyPatch, topic: str, said: str
-) -> None:
-    """Its writer has not counted its messages."""
-    monkeypatch.setattr(McapWriter, "close", McapWriter.flush)
-    (run / "report.json").unlink()
-    for left_out in ("", topic):
-        with McapWriter(run / "mission.mcap", clock="world") as writer:
-            for log_time_ns, row in merged(*good().ends()):
-                if row[0] != left_out:
-                    writer.write_row(row, log_time_ns)
-        if not left_out:
-            assert read_run(run)[0].note.startswith("cut short")
-    with pytest.raises(BadInputError, match=said):
-        read_run(run)
 
 
 def test_a_torn_recording_still_gives_a_report(run: Path) -> None:

@@ -170,4 +170,3 @@ def test_numbers_of_close_changes_do_not_overlap() -> None:
             boxes = [label.get_window_extent() for label in labels]
             assert len(boxes) == count + 1
             assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
-            assert boxes[-1].y0 == pytest.approx(boxes[0].y0), "back in the first row"
