@@ -27,7 +27,7 @@ from cloudrc.config.schema import Direction, Experiment, Mission, Profile
 from cloudrc.exposition.table import METRICS, ROLES, Metric
 from cloudrc.record.topics import TOPICS
 from tools import chart_values
-from tools.chart_values import ChartValues, Peer, Quantities, Resources, Selector, Values
+from tools.chart_values import ChartValues, Quantities, Resources, Values
 
 ROOT = Path(__file__).resolve().parents[1]
 CHART = ROOT / "charts" / "cloudrc"
@@ -300,7 +300,6 @@ def _labels(metric: Metric) -> str:
 VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"
 WIDTH = 96
 COMPACT = (Resources, Quantities)
-FOREIGN = (*COMPACT, Peer, Selector, chart_values.Expression, chart_values.IpBlock)
 """Parts of the values that Kubernetes defines."""
 
 
@@ -335,9 +334,9 @@ def _chart_schema() -> dict[str, Any]:
     made = ChartValues.model_json_schema(by_alias=True)
     made = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc", **made}
     made["$defs"] = {name: _adapt(part) for name, part in made.pop("$defs").items()}
-    kinds = {name: getattr(chart_values, name, None) for name in made["$defs"]}
-    own = [name for name, kind in kinds.items() if _is_own(kind)]
-    for part in (made, *(made["$defs"][name] for name in own)):
+    kinds = ((getattr(chart_values, name, object), part) for name, part in made["$defs"].items())
+    own = [part for kind, part in kinds if issubclass(kind, Values) and kind not in COMPACT]
+    for part in (made, *own):
         # Templates need the parts as mappings: the schema refuses null for them.
         needed = [key for key, value in part["properties"].items() if "$ref" in value]
         part["required"] = sorted({*part.get("required", ()), *needed})
@@ -346,10 +345,6 @@ def _chart_schema() -> dict[str, Any]:
         "type": ["number", "string", "boolean", "array", "null"],
     }
     return dict(_adapt(made))
-
-
-def _is_own(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, Values) and kind not in FOREIGN
 
 
 def _adapt(part: Any) -> Any:

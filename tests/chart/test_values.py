@@ -13,7 +13,8 @@ jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-val
 
 DEFAULTS = values_of(CHART / "values.yaml")
 # Values that Helm, Kubernetes or a plug-in defines and checks.
-OPEN = {"global", "affinity", "tolerations", "podSecurityContext", "containerSecurityContext"}
+CONTEXTS = {"podSecurityContext", "containerSecurityContext"}
+OPEN = {"global", "affinity", "tolerations", "allowFrom", "dns"} | CONTEXTS
 
 
 def parts(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Object]]:
