@@ -79,7 +79,7 @@ def test_the_defaults_are_valid_and_written_out() -> None:
         ({"experiment": {"seed": 2**53}}, "9007199254740992"),
         ({"fullnameOverride": "1abc"}, "1abc"),
         ({"experiment": None}, "experiment"),
-        ({"metrics": {"allowFrom": [{"namespace": "x"}]}}, "namespace"),
+        ({"metrics": {"allowFrom": [{"namespace": {"name": "x"}}]}}, "namespace"),
         ({"metrics": {"allowFrom": "all"}}, "all"),
         ({"image": {"world": {"digest": "sha256:12"}}}, "sha256:12"),
         ({"image": {"tag": "a b"}}, "a b"),
