@@ -12,7 +12,7 @@ from tests.config.conftest import refused
 
 
 @pytest.fixture
-def mine(tmp_path: Path) -> Path:
+def mine(tmp_path):
     return tmp_path / "mine.yaml"
 
 
@@ -21,7 +21,7 @@ def refused_text(path: Path, text: str, *settings: str) -> str:
     return refused(path, *settings).replace(f"{path.parent}/", "")
 
 
-def test_all_problems_are_listed_with_their_lines(mine: Path) -> None:
+def test_all_problems_are_listed_with_their_lines(mine):
     text = refused_text(
         mine,
         "seed: one\n"
@@ -53,7 +53,7 @@ def test_all_problems_are_listed_with_their_lines(mine: Path) -> None:
     ])  # fmt: skip
 
 
-def test_at_most_fifty_problems_are_listed(mine: Path) -> None:
+def test_at_most_fifty_problems_are_listed(mine):
     points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 2000)
     text = refused_text(mine, f"mission: {{waypoints: [{points}]}}\n")
     assert "mine.yaml has 2000 problems:" in text
@@ -94,13 +94,13 @@ def test_at_most_fifty_problems_are_listed(mine: Path) -> None:
         ("guard: {speed_max_mps: 7}", "must be at most 6 m/s: above it the robot does not stop"),
     ],
 )  # fmt: skip
-def test_an_invalid_file_is_one_line(mine: Path, text: str, reason: str) -> None:
+def test_an_invalid_file_is_one_line(mine, text, reason):
     found = refused_text(mine, text)
     assert reason in found
     assert "\n" not in found
 
 
-def test_a_missing_parameter_is_reported_once(mine: Path) -> None:
+def test_a_missing_parameter_is_reported_once(mine):
     (mine.parent / "strict.py").write_text("def build(share: float): ...")
     text = refused_text(mine, "seed: 1\ncloud: {predictor: ./strict.py}\n")
     assert text == "mine.yaml:2: cloud.predictor.share: is missing; must be a number"
@@ -111,7 +111,7 @@ def test_a_missing_parameter_is_reported_once(mine: Path) -> None:
     [("command_age_max_ms", "true"), ("command_age_max_ms", "x"), ("speed_max_mps", "1e-320"),
      ("acceleration_max_mps2", "0"), ("yaw_rate_max_radps", "0"), ("hold_max_s", "1e-10")],
 )  # fmt: skip
-def test_a_guard_limit_cannot_be_switched_off(key: str, value: str) -> None:
+def test_a_guard_limit_cannot_be_switched_off(key, value):
     text = refused("hover", f"guard.{key}={value}")
     assert text.startswith(f"--set: guard.{key}: ")
     assert "\n" not in text
@@ -127,9 +127,7 @@ def test_a_guard_limit_cannot_be_switched_off(key: str, value: str) -> None:
         ("latin.yaml", "is not UTF-8 text"),
     ],
 )
-def test_an_unreadable_file_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, reason: str
-) -> None:
+def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
     monkeypatch.chdir(tmp_path)
     Path("latin.yaml").write_bytes(b"description: \xff\xfe")
     assert reason in refused(name)
@@ -151,11 +149,11 @@ def test_an_unreadable_file_is_reported(
         ("world.robot=/x/q", "world.robot: not an .xml file: /x/q"),
     ],
 )
-def test_an_invalid_setting_is_refused(text: str, reason: str) -> None:
+def test_an_invalid_setting_is_refused(text, reason):
     assert reason in refused("paper", text)
 
 
-def test_a_key_that_is_set_twice_is_refused() -> None:
+def test_a_key_that_is_set_twice_is_refused():
     assert "--set seed: is set twice; keep one" in refused("paper", "seed=1", "name=x", "seed=2")
 
 
@@ -178,7 +176,7 @@ def test_a_key_that_is_set_twice_is_refused() -> None:
         ('uplink: {"<chance>": 3}', "uplink.<chance>: unknown key; "),
     ],
 )
-def test_an_invalid_profile_is_refused_with_the_reason(mine: Path, text: str, reason: str) -> None:
+def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
     (mine.parent / "falling.csv").write_text("time_s,delay_ms\n1,20\n0,20\n")
     mine.write_text(text)
     with pytest.raises(BadInputError) as caught:
@@ -205,14 +203,12 @@ def test_an_invalid_profile_is_refused_with_the_reason(mine: Path, text: str, re
          "pipe_1; nearest legal point found: [0.08, 0, 0.8]"),
     ],
 )  # fmt: skip
-def test_an_invalid_mission_is_refused_with_the_reason(
-    mine: Path, waypoints: str, reason: str
-) -> None:
+def test_an_invalid_mission_is_refused_with_the_reason(mine, waypoints, reason):
     found = refused_text(mine, f"mission: {{waypoints: {waypoints}}}")
     assert reason in found
     assert found.startswith("mine.yaml:1: mission.waypoints")
 
 
-def test_too_many_waypoints_are_refused(mine: Path) -> None:
+def test_too_many_waypoints_are_refused(mine):
     mine.write_text("waypoints:\n" + "- {position_m: [0.5, 0.0, 0.7], dwell_s: 0}\n" * 10_001)
     assert "at most 10000 entries" in refused("paper", f"mission={mine}")

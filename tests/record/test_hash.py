@@ -26,7 +26,7 @@ def digest(*records: Any) -> str:
     return found.hexdigest()
 
 
-def test_the_bytes_are_those_that_the_module_promises() -> None:
+def test_the_bytes_are_those_that_the_module_promises():
     applied = rec.CommandApplied(1, 2, 3, -4, (0.5, 1.0, 2.0))
     data = b"\x0eCommandApplied" + struct.pack("<4q3d", 1, 2, 3, -4, 0.5, 1.0, 2.0)
     change = rec.GuardChange(5, GuardState.HOLD, "né")
@@ -36,7 +36,7 @@ def test_the_bytes_are_those_that_the_module_promises() -> None:
 
 @given(st.lists(any_record(), max_size=6), st.integers(0, 6))
 @settings(max_examples=30, deadline=None)
-def test_batches_do_not_matter(records: list[Any], cut: int) -> None:
+def test_batches_do_not_matter(records, cut):
     found = RecordHash()
     found.update(records[:cut])
     found.update(iter(records[cut:]))
@@ -67,7 +67,7 @@ def variants(instance: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
-def test_every_value_counts(cls: type[Any]) -> None:
+def test_every_value_counts(cls):
     every = [*world_records(9), *cloud_records(9), LATE, LINK, CHECK]
     record = next(each for each in every if type(each) is cls)
     digests = [digest(record), *map(digest, variants(record))]

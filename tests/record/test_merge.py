@@ -40,7 +40,7 @@ def files(
     ("start", "ahead"),
     [(4 * SECOND, 0), (9 * SECOND, 5 * SECOND), (4 * SECOND, -3 * SECOND - 1), (0, -SECOND)],
 )
-def test_two_clocks_are_related_by_the_packets(tmp_path: Path, start: int, ahead: int) -> None:
+def test_two_clocks_are_related_by_the_packets(tmp_path, start, ahead):
     """Up 40 ms, down 30 ms: the middle is 5 ms off, inside half of the 70 ms.
 
     The last case puts cloud's first stamps below zero, where MCAP has no log times.
@@ -69,9 +69,7 @@ def test_two_clocks_are_related_by_the_packets(tmp_path: Path, start: int, ahead
     st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**9)), min_size=1, max_size=20),
 )
 @settings(max_examples=30, deadline=None)
-def test_the_true_offset_is_within_the_uncertainty(
-    ahead: int, delays: list[tuple[int, int]]
-) -> None:
+def test_the_true_offset_is_within_the_uncertainty(ahead, delays):
     """World's clock is `ahead` of cloud's; the fastest packet may come later."""
     telemetry, control = world_records(1)[2], cloud_records(1)[2]
     world: list[Record] = []
@@ -90,7 +88,7 @@ def test_the_true_offset_is_within_the_uncertainty(
     assert found.uncertainty_ns == (smallest + 1) // 2
 
 
-def test_clocks_that_nothing_relates_begin_together(tmp_path: Path) -> None:
+def test_clocks_that_nothing_relates_begin_together(tmp_path):
     world, cloud = world_records(2, 7 * SECOND), cloud_records(2, SECOND)
     cloud = [record for record in cloud if not isinstance(record, rec.Arrival)]
     mission = merge(*files(tmp_path, world, cloud, ("a", "b")))
@@ -100,7 +98,7 @@ def test_clocks_that_nothing_relates_begin_together(tmp_path: Path) -> None:
     assert mission.recording()["/session"]["stamp_ns"].tolist() == [7 * SECOND, 7 * SECOND]
 
 
-def test_the_same_clock_is_left_as_it_is(tmp_path: Path) -> None:
+def test_the_same_clock_is_left_as_it_is(tmp_path):
     world, cloud = world_records(20), cloud_records(20)
     paths = (tmp_path / "world.mcap", tmp_path / "cloud.mcap")
     for end, path in zip(("world", "cloud"), paths, strict=True):
@@ -117,7 +115,7 @@ def test_the_same_clock_is_left_as_it_is(tmp_path: Path) -> None:
     assert merged.attachments == texts | {"report.json": b"{}"}
 
 
-def test_torn_files_are_merged_as_far_as_they_go(tmp_path: Path) -> None:
+def test_torn_files_are_merged_as_far_as_they_go(tmp_path):
     world, cloud = files(tmp_path, world_records(150), cloud_records(150), ("x", "x"))
     cloud.write_bytes(cloud.read_bytes()[: cloud.stat().st_size // 2])
     mission = merge(world, cloud)
@@ -131,7 +129,7 @@ def test_torn_files_are_merged_as_far_as_they_go(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lost", ["world", "cloud"])
-def test_one_end_alone_is_better_than_nothing(tmp_path: Path, lost: str) -> None:
+def test_one_end_alone_is_better_than_nothing(tmp_path, lost):
     world, cloud = files(tmp_path, world_records(9), cloud_records(9), ("x", "y"))
     (tmp_path / f"{lost}.mcap").write_bytes(b"")
     mission = merge(world, cloud)
@@ -144,7 +142,7 @@ def test_one_end_alone_is_better_than_nothing(tmp_path: Path, lost: str) -> None
     assert [len(recording[topic]) for topic in ours.values()] == [9]
 
 
-def test_nothing_at_all_is_bad_input(tmp_path: Path) -> None:
+def test_nothing_at_all_is_bad_input(tmp_path):
     with pytest.raises(BadInputError, match=r"world\.mcap: cannot be read"):
         merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap")
 
@@ -160,7 +158,7 @@ def slipping(records: list[Record], slips_ns: list[int]) -> list[Record]:
     return found
 
 
-def test_a_slip_of_world_is_taken_out_of_clouds_stamps(tmp_path: Path) -> None:
+def test_a_slip_of_world_is_taken_out_of_clouds_stamps(tmp_path):
     world = slipping(world_records(60, 4 * SECOND), [5 * SECOND])
     cloud = cloud_records(60, 4 * SECOND + 5 * SECOND)
     mission = merge(*files(tmp_path, world, cloud, ("same", "same")))
@@ -171,7 +169,7 @@ def test_a_slip_of_world_is_taken_out_of_clouds_stamps(tmp_path: Path) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, SECOND), min_size=2, max_size=20), st.data())
-def test_time_never_runs_backwards(steps: list[int], data: st.DataObject) -> None:
+def test_time_never_runs_backwards(steps, data):
     world = slipping(world_records(60, SECOND), np.cumsum(steps).tolist())
     telemetry = Recording.from_records(world)["/telemetry"]
     instants = st.lists(st.integers(0, 60 * SECOND), min_size=2, max_size=30)

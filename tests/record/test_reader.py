@@ -7,11 +7,9 @@ import itertools
 import json
 import re
 import tracemalloc
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import pytest
 from mcap.opcode import Opcode
@@ -64,13 +62,13 @@ SIZES = [
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     """The path of a file that does not exist yet."""
     return tmp_path / "x.mcap"
 
 
 @pytest.fixture
-def whole(tmp_path: Path) -> Path:
+def whole(tmp_path):
     (tmp_path / "whole.mcap").write_bytes(WHOLE)
     return tmp_path / "whole.mcap"
 
@@ -79,7 +77,7 @@ def flipped(at: int, mask: int = 255) -> bytes:
     return WHOLE[:at] + bytes([WHOLE[at] ^ mask]) + WHOLE[at + 1 :]
 
 
-def test_a_cut_file_is_read_to_its_last_whole_chunk(path: Path) -> None:
+def test_a_cut_file_is_read_to_its_last_whole_chunk(path):
     for (_, end), by in itertools.product(CHUNKS, (-1, 0, 500)):
         path.write_bytes(WHOLE[: end + by])
         whole = [n for n, (_, last) in enumerate(CHUNKS) if last <= end + by]
@@ -107,7 +105,7 @@ def copied(path: Path) -> list[object]:
 
 
 @pytest.mark.parametrize("cut", [0, 1, 8, 30])
-def test_a_lost_index_loses_nothing(path: Path, cut: int) -> None:
+def test_a_lost_index_loses_nothing(path, cut):
     path.write_bytes(WHOLE[: len(WHOLE) - cut])
     recording = Recording.read(path)
     assert (recording.complete, recording.note) == (True, "")
@@ -118,7 +116,7 @@ def test_a_lost_index_loses_nothing(path: Path, cut: int) -> None:
     assert copied(new) == copied(path)
 
 
-def test_reading_stops_at_the_first_damage(path: Path) -> None:
+def test_reading_stops_at_the_first_damage(path):
     for data, said in (
         (flipped(sum(CHUNKS[1]) // 2), f"damaged: a checksum is wrong: {SIZES[0]} messages were"),
         (WHOLE * 2, "something follows its end"),
@@ -144,7 +142,7 @@ def test_reading_stops_at_the_first_damage(path: Path) -> None:
         ),
     ],
 )
-def test_a_file_of_another_kind_is_named(path: Path, data: bytes, reason: str) -> None:
+def test_a_file_of_another_kind_is_named(path, data, reason):
     path.write_bytes(data)
     for read in (read_contents, lambda path: recover(path, path.with_name("new.mcap"))):
         with pytest.raises(BadInputError, match=rf"^[^\n]*x\.mcap: {reason}[^\n]*$"):
@@ -152,7 +150,7 @@ def test_a_file_of_another_kind_is_named(path: Path, data: bytes, reason: str) -
     assert not path.with_name("new.mcap").exists(), "an empty file is never offered"
 
 
-def test_a_folder_or_an_absent_file_is_named(tmp_path: Path) -> None:
+def test_a_folder_or_an_absent_file_is_named(tmp_path):
     for path in (tmp_path / "absent.mcap", tmp_path):
         with pytest.raises(BadInputError, match=r"cannot be read \(.+\); name a recording"):
             Recording.read(path)
@@ -170,7 +168,7 @@ def test_a_folder_or_an_absent_file_is_named(tmp_path: Path) -> None:
     ],
     ids=["lz4", "plain", "no-chunks", "no-crc", "no-summary", "shuffled"],
 )
-def test_an_unusual_layout_is_read(whole: Path, path: Path, options: dict[str, Any]) -> None:
+def test_an_unusual_layout_is_read(whole, path, options):
     rewrite(whole, path, **options)
     contents = read_contents(path)
     assert contents.note == ""
@@ -193,15 +191,13 @@ def test_an_unusual_layout_is_read(whole: Path, path: Path, options: dict[str, A
     ],
     ids=["topic", "half", "renamed", "joined", "metadata", "doubled"],
 )
-def test_what_other_programs_changed_is_named(
-    whole: Path, path: Path, options: dict[str, Any], said: str
-) -> None:
+def test_what_other_programs_changed_is_named(whole, path, options, said):
     recording = Recording.read(rewrite(whole, path, **options))
     assert recording.lacking == recording.note
     assert re.search(said, recording.lacking), recording.lacking
 
 
-def test_a_torn_recording_that_others_ended_is_told(path: Path) -> None:
+def test_a_torn_recording_that_others_ended_is_told(path):
     with path.open("wb") as stream:
         writer = McapWriter(stream, clock="world")
         writer.write(RECORDS)
@@ -222,9 +218,7 @@ ARRIVAL = definition("cloudrc_msgs/msg/Arrival")
         ("/camera", "Arrival", ARRIVAL, 1, ""),
     ],
 )
-def test_foreign_topics_are_told_apart(
-    path: Path, topic: str, name: str, text: str, channels: int, said: str
-) -> None:
+def test_foreign_topics_are_told_apart(path, topic, name, text, channels, said):
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")
@@ -244,9 +238,7 @@ def test_foreign_topics_are_told_apart(
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
 @pytest.mark.parametrize(("size", "count"), [(0, 40_000), (1 << 20, 20)])
 @pytest.mark.parametrize("stated", [None, 1000])
-def test_a_bomb_ends_with_one_line(
-    path: Path, monkeypatch: pytest.MonkeyPatch, compression: CompressionType, size, count, stated
-) -> None:
+def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, stated):
     """A few kilobytes unpack to far more: in large messages, or in very many."""
     monkeypatch.setattr("cloudrc.record.reader.UNPACKED_MAX", limit := 4)
     with path.open("wb") as stream:
@@ -302,13 +294,13 @@ FOURTHS = [range(part, len(WHOLE), 4) for part in range(4)]
     [SOME, *(pytest.param(part, marks=pytest.mark.full) for part in FOURTHS)],
     ids=["some", *"1234"],
 )
-def test_no_cut_or_flipped_byte_passes_unnoticed(tmp_path: Path, places: Iterable[int]) -> None:
+def test_no_cut_or_flipped_byte_passes_unnoticed(tmp_path, places):
     for at in places:
         examine(tmp_path, flipped(at, 1 << at % 8))
         examine(tmp_path, WHOLE[:at])
 
 
-def test_a_recovery_says_what_is_kept_and_lost(path: Path) -> None:
+def test_a_recovery_says_what_is_kept_and_lost(path):
     new, middle = path.with_name("new.mcap"), sum(CHUNKS[1]) // 2
     for data, said in ((WHOLE[:middle], "cut short"), (flipped(middle), "damaged")):
         path.write_bytes(data)
@@ -324,7 +316,7 @@ def test_a_recovery_says_what_is_kept_and_lost(path: Path) -> None:
     assert (recovery.bytes_lost, recovery.share) == (len(WHOLE), pytest.approx(0.5))
 
 
-def test_a_number_without_its_one_definition_is_a_damage(path: Path, tmp_path: Path) -> None:
+def test_a_number_without_its_one_definition_is_a_damage(path, tmp_path):
     source = write(tmp_path / "w.mcap", world_records(5))
     flat = rewrite(source, path, use_chunking=False).read_bytes()
     channels = [start for code, start, _ in spans(flat) if code == Opcode.CHANNEL]
@@ -334,15 +326,13 @@ def test_a_number_without_its_one_definition_is_a_damage(path: Path, tmp_path: P
         assert Recording.read(path).lacking.startswith("damaged: ")
 
 
-def test_nothing_is_offered_of_what_holds_nothing(path: Path) -> None:
+def test_nothing_is_offered_of_what_holds_nothing(path):
     with pytest.raises(BadInputError, match="holds no readable message: none is in it; nothing"):
         recover(write(path, []), new := path.with_name("new.mcap"))
     assert not new.exists()
 
 
-def test_the_command_says_what_is_kept_and_lost(
-    path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_says_what_is_kept_and_lost(path, capsys):
     new, folder = path.with_name("new.mcap"), path.parent
     path.write_bytes(WHOLE)
     assert main(["recover", str(path)]) == 0

@@ -23,7 +23,7 @@ def leaves(cls: type[Any], prefix: str = "") -> set[str]:
 
 @given(any_record())
 @settings(max_examples=60, deadline=None)
-def test_rows_hold_the_records_own_values(record: Any) -> None:
+def test_rows_hold_the_records_own_values(record):
     found = rows(record)
     assert found
     if isinstance(record, rec.Arrival):
@@ -39,7 +39,7 @@ def test_rows_hold_the_records_own_values(record: Any) -> None:
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
-def test_every_value_is_recorded_and_documented(cls: type[Any]) -> None:
+def test_every_value_is_recorded_and_documented(cls):
     topics = {name: topic for name, topic in TOPICS.items() if topic.source is cls}
     recorded = {path for topic in topics.values() for path in (*topic.paths(), topic.stamp_path)}
     chosen_by = {"uplink"} if cls is rec.Arrival else set()

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import tracemalloc
 from collections import defaultdict
-from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
@@ -23,7 +22,7 @@ RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS)]
 NEEDED = ["lz4", "mcap", "rosbags", "zstandard"]
 
 
-def test_other_programs_read_every_topic(tmp_path: Path) -> None:
+def test_other_programs_read_every_topic(tmp_path):
     path, stamps = write(tmp_path / "both.mcap", RECORDS), defaultdict(list)
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -47,7 +46,7 @@ def test_other_programs_read_every_topic(tmp_path: Path) -> None:
         assert chunk.message_end_time - chunk.message_start_time < CHUNK_NS
 
 
-def test_log_times_never_fall_on_a_topic(tmp_path: Path) -> None:
+def test_log_times_never_fall_on_a_topic(tmp_path):
     states = [GuardChange(stamp, GuardState.HOLD, "") for stamp in (5, 9, 7, 8, 12)]
     path = write(tmp_path / "back.mcap", states)
     with path.open("rb") as stream:
@@ -56,7 +55,7 @@ def test_log_times_never_fall_on_a_topic(tmp_path: Path) -> None:
     assert Recording.read(path)["/guard"]["stamp_ns"].tolist() == [5, 9, 7, 8, 12]
 
 
-def test_attachments_and_metadata_come_back(tmp_path: Path) -> None:
+def test_attachments_and_metadata_come_back(tmp_path):
     path, report = tmp_path / "a.mcap", b'{"verdict": "success"}'
     with McapWriter(path, clock="cloud", clock_id="boot-1") as writer:
         writer.write(cloud_records(3))
@@ -72,7 +71,7 @@ def test_attachments_and_metadata_come_back(tmp_path: Path) -> None:
     assert recording.metadata["version"]
 
 
-def test_an_hour_of_recording_takes_no_memory(tmp_path: Path) -> None:
+def test_an_hour_of_recording_takes_no_memory(tmp_path):
     """A chunk every quarter of a second: mcap's own list of them takes 20 MB in an hour."""
     path, records = tmp_path / "long.mcap", world_records(1)
     grown, count = list[int](), 200
@@ -104,7 +103,7 @@ def run(code: str) -> str:
 
 
 @pytest.mark.parametrize("module", ["reader", "merge"])
-def test_a_missing_package_is_named_with_its_remedy(module: str) -> None:
+def test_a_missing_package_is_named_with_its_remedy(module):
     code = f"""
 import sys
 from cloudrc.errors import MissingPrerequisiteError
@@ -120,7 +119,7 @@ for name in {NEEDED}:
         assert text.endswith("install it with: pip install 'cloudrc[record]'")
 
 
-def test_flying_needs_none_of_them() -> None:
+def test_flying_needs_none_of_them():
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({NEEDED}))\n"
         "from cloudrc.record import hash, recorder, topics\n"

@@ -20,7 +20,7 @@ def subject_of(log: Log) -> Subject:
 
 @pytest.mark.parametrize("end_ns", [0, START], ids=["empty", "ends at the start"])
 @pytest.mark.parametrize("name", FIGURES)
-def test_a_flight_without_data_is_drawn(name: str, end_ns: int) -> None:
+def test_a_flight_without_data_is_drawn(name, end_ns):
     log = flown()
     for records in (log.world, log.cloud):
         records[:] = [record for record in records if record.stamp_ns <= end_ns]
@@ -31,7 +31,7 @@ def test_a_flight_without_data_is_drawn(name: str, end_ns: int) -> None:
     assert caption(subject)
 
 
-def test_waypoints_are_the_first_setpoints_of_each() -> None:
+def test_waypoints_are_the_first_setpoints_of_each():
     log = flown()
 
     def fly_to(n: int, control: Control) -> Control:
@@ -43,7 +43,7 @@ def test_waypoints_are_the_first_setpoints_of_each() -> None:
     assert subject_of(log).waypoints == {0: (50.0, 2.0, 3.0), 1: (125.0, 2.0, 3.0)}
 
 
-def test_figures_ignore_the_users_matplotlib_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures_ignore_the_users_matplotlib_settings(monkeypatch):
     """matplotlib reads settings in the working folder, which may be somebody else's run."""
     monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
     (picture,) = draw_all(subject_of(flown()))

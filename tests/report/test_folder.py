@@ -31,7 +31,7 @@ Change = Callable[[Path, Path], object]
 
 
 @pytest.fixture(scope="module")
-def flown_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def flown_once(tmp_path_factory):
     """The folder of a run in virtual time, with its report."""
     folder, (world, cloud) = tmp_path_factory.mktemp("run"), good().ends()
     (folder / "config.yaml").write_text(dump(paper()[0]))
@@ -42,7 +42,7 @@ def flown_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def run(flown_once: Path, tmp_path: Path) -> Path:
+def run(flown_once, tmp_path):
     return shutil.copytree(flown_once, tmp_path / "run")
 
 
@@ -51,7 +51,7 @@ def report(folder: Path) -> dict[str, Any]:
     return found
 
 
-def test_a_run_gives_the_same_report_again(run: Path) -> None:
+def test_a_run_gives_the_same_report_again(run):
     first = report(run)
     assert first["records_sha256"] == "f" * 64
     assert write_report(run, *read_run(run), page=False) == first
@@ -68,7 +68,7 @@ def test_a_run_gives_the_same_report_again(run: Path) -> None:
     ],
     ids=["lz4", "shuffled", "bare"],
 )
-def test_another_layout_gives_the_same_report(run: Path, options: dict[str, Any]) -> None:
+def test_another_layout_gives_the_same_report(run, options):
     first, recording = report(run), run / "mission.mcap"
     rewrite(recording, run / "n.mcap", **options).replace(recording)
     again = write_report(run, *read_run(run), page=False)
@@ -129,9 +129,7 @@ OTHER = b"seed: 2\nmission: pipes\n"
         (lambda source, target: target.write_bytes(b"PK"), "is not an MCAP file"),
     ],
 )
-def test_a_recording_that_carries_no_report_is_refused(
-    run: Path, capsys: pytest.CaptureFixture[str], change: Change, said: str
-) -> None:
+def test_a_recording_that_carries_no_report_is_refused(run, capsys, change, said):
     (run / "report.html").write_text("the page")
     change(run / "mission.mcap", run / "n.mcap")
     (run / "n.mcap").replace(run / "mission.mcap")
@@ -142,7 +140,7 @@ def test_a_recording_that_carries_no_report_is_refused(
     assert {path: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 
-def test_a_torn_recording_still_gives_a_report(run: Path) -> None:
+def test_a_torn_recording_still_gives_a_report(run):
     (run / "report.json").unlink()
     mission = run / "mission.mcap"
     cut(mission, mission)
@@ -155,7 +153,7 @@ def test_a_torn_recording_still_gives_a_report(run: Path) -> None:
     assert again == found
 
 
-def test_a_hash_is_of_the_recording_beside_it(run: Path) -> None:
+def test_a_hash_is_of_the_recording_beside_it(run):
     world, cloud = good().ends()
     longer = [*world, Counted(world[-1].stamp_ns, "world", "sent", 1)]
     write_mission(run / "mission.mcap", longer, cloud)
@@ -163,7 +161,7 @@ def test_a_hash_is_of_the_recording_beside_it(run: Path) -> None:
     assert "records_sha256" not in found
 
 
-def test_an_interrupted_run_stays_interrupted(run: Path) -> None:
+def test_an_interrupted_run_stays_interrupted(run):
     world, cloud = ([r for r in part if r.stamp_ns < at(4)] for part in good().ends())
     write_mission(run / "mission.mcap", world, cloud)
     recording = Recording.from_records(world, cloud)
@@ -176,7 +174,7 @@ def test_an_interrupted_run_stays_interrupted(run: Path) -> None:
     assert (found.notes, len(found.records_sha256 or "")) == (stopped.notes, 64)
 
 
-def test_the_ends_are_merged_if_nobody_has(run: Path) -> None:
+def test_the_ends_are_merged_if_nobody_has(run):
     world, cloud = good().ends()
     for end, part in (("world", world), ("cloud", cloud)):
         with McapWriter(run / f"{end}.mcap", clock=end, clock_id="same") as writer:
@@ -189,7 +187,7 @@ def test_the_ends_are_merged_if_nobody_has(run: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "mission.mcap"])
-def test_a_folder_without_a_run_is_refused(run: Path, name: str) -> None:
+def test_a_folder_without_a_run_is_refused(run, name):
     (run / name).unlink()
     with pytest.raises(BadInputError, match=f"has no {name}"):
         read_run(run)
