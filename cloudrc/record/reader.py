@@ -409,7 +409,7 @@ def recover(source: Path, target: Path) -> Recovery:
         OSError: If the new file cannot be written.
     """
     contents, records, lost = _read(source)
-    if not contents.messages and not contents.attachments:
+    if not contents.messages:
         reason = contents.note or "none is in it"
         raise BadInputError(f"{source}: holds no readable message: {reason}; nothing is written")
     notes = [contents.note] if contents.note else []

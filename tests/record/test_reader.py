@@ -116,17 +116,6 @@ def test_a_lost_index_loses_nothing(path, cut):
     assert copied(new) == copied(path)
 
 
-def test_reading_stops_at_the_first_damage(path):
-    for data, said in (
-        (flipped(sum(CHUNKS[1]) // 2), f"damaged: a checksum is wrong: {SIZES[0]} messages were"),
-        (WHOLE * 2, "something follows its end"),
-    ):
-        path.write_bytes(data)
-        recording = Recording.read(path)
-        assert recording.lacking == recording.note
-        assert recording.note.startswith(said)
-
-
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
@@ -148,12 +137,6 @@ def test_a_file_of_another_kind_is_named(path, data, reason):
         with pytest.raises(BadInputError, match=rf"^[^\n]*x\.mcap: {reason}[^\n]*$"):
             read(path)
     assert not path.with_name("new.mcap").exists(), "an empty file is never offered"
-
-
-def test_a_folder_or_an_absent_file_is_named(tmp_path):
-    for path in (tmp_path / "absent.mcap", tmp_path):
-        with pytest.raises(BadInputError, match=r"cannot be read \(.+\); name a recording"):
-            Recording.read(path)
 
 
 @pytest.mark.parametrize(
@@ -195,6 +178,9 @@ def test_what_other_programs_changed_is_named(whole, path, options, said):
     recording = Recording.read(rewrite(whole, path, **options))
     assert recording.lacking == recording.note
     assert re.search(said, recording.lacking), recording.lacking
+    with suppress(BadInputError):  # no message is of cloudrc
+        recover(path, new := path.with_name("new.mcap"))
+        assert recording.lacking in Recording.read(new).lacking, "a copy hides nothing"
 
 
 def test_a_torn_recording_that_others_ended_is_told(path):
@@ -203,6 +189,20 @@ def test_a_torn_recording_that_others_ended_is_told(path):
         writer.write(RECORDS)
         writer._mcap.finish()
     assert "another program has put an end to it" in Recording.read(path).lacking
+
+
+def write_foreign(path, topic, ros_type, text, data, channels=1, **options):
+    """Write messages as another program that names the clock as cloudrc does."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start(profile="ros2")
+        writer.add_metadata("cloudrc", {"clock": "world"})
+        schema = writer.register_schema(ros_type, "ros2msg", text.encode())
+        numbers = [writer.register_channel(topic, "cdr", schema, {"robot": str(n)})
+                   for n in range(channels)]  # fmt: skip
+        for each, number in itertools.product(data, numbers):
+            writer.add_message(number, 1, each, 1)
+        writer.finish()
 
 
 ARRIVAL = definition("cloudrc_msgs/msg/Arrival")
@@ -219,15 +219,8 @@ ARRIVAL = definition("cloudrc_msgs/msg/Arrival")
     ],
 )
 def test_foreign_topics_are_told_apart(path, topic, name, text, channels, said):
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2")
-        writer.add_metadata("cloudrc", {"clock": "world"})
-        schema = writer.register_schema(f"cloudrc_msgs/msg/{name}", "ros2msg", text.encode())
-        for n in range(channels):
-            channel = writer.register_channel(topic, "cdr", schema, {"robot": str(n)})
-            writer.add_message(channel, 1, b"\0\1\0\0\7", 1)
-        writer.finish()
+    data = [b"\0\1\0\0\7"]
+    write_foreign(path, topic, f"cloudrc_msgs/msg/{name}", text, data, channels)
     recording = Recording.read(path)
     assert said in recording.lacking
     assert bool(said) == bool(recording.note)
@@ -241,16 +234,9 @@ def test_foreign_topics_are_told_apart(path, topic, name, text, channels, said):
 def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, stated):
     """A few kilobytes unpack to far more: in large messages, or in very many."""
     monkeypatch.setattr("cloudrc.record.reader.UNPACKED_MAX", limit := 4)
-    with path.open("wb") as stream:
-        writer = Writer(
-            stream, chunk_size=1 << 27, compression=compression, index_types=IndexType.NONE
-        )
-        writer.start()
-        schema = writer.register_schema("nav_msgs/msg/Odometry", "ros2msg", b"")
-        channel = writer.register_channel("/odometry", "cdr", schema)
-        for _ in range(count):
-            writer.add_message(channel, 1, bytes(size), 1)
-        writer.finish()
+    options = {"chunk_size": 1 << 27, "compression": compression, "index_types": IndexType.NONE}
+    data = (bytes(size) for _ in range(count))
+    write_foreign(path, "/odometry", "nav_msgs/msg/Odometry", "", data, **options)
     if stated is not None:  # the chunk lies about its size
         data = bytearray(path.read_bytes())
         start = data.index(compression.name.lower().encode()) - 16
@@ -302,8 +288,12 @@ def test_no_cut_or_flipped_byte_passes_unnoticed(tmp_path, places):
 
 def test_a_recovery_says_what_is_kept_and_lost(path):
     new, middle = path.with_name("new.mcap"), sum(CHUNKS[1]) // 2
-    for data, said in ((WHOLE[:middle], "cut short"), (flipped(middle), "damaged")):
+    for data, said in (
+        (WHOLE[:middle], "cut short"),
+        (flipped(middle), "damaged: a checksum is wrong"),
+    ):
         path.write_bytes(data)
+        assert Recording.read(path).note.startswith(f"{said}: {SIZES[0]} messages were read")
         recovery = recover(path, new)
         assert recovery.kept["messages"] == SIZES[0]
         assert recovery.share == 1 - recovery.bytes_lost / len(data)
@@ -312,6 +302,7 @@ def test_a_recovery_says_what_is_kept_and_lost(path):
         assert kept.note == "; ".join(recovery.notes)
         assert 40 < len(kept["/odometry"]) < 80
     path.write_bytes(WHOLE * 2)
+    assert Recording.read(path).lacking == "something follows its end"
     recovery = recover(path, new)
     assert (recovery.bytes_lost, recovery.share) == (len(WHOLE), pytest.approx(0.5))
 
