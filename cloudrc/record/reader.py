@@ -83,7 +83,6 @@ class Records:
         path: The file, for messages.
         size: Size of the file [bytes].
         position: Position behind the last intact record [bytes].
-        chunks: Number of intact chunks.
         schemas: The schemas so far, by their number.
         channels: The channels so far, by their number.
         data_ended: Whether reading has reached the end of the data; only the index follows.
@@ -109,7 +108,7 @@ class Records:
         except ValueError as error:  # a pipe or a device
             raise BadInputError(f"{error}; name a recording (.mcap)") from error
         self.size = os.fstat(self._stream.fileno()).st_size
-        self.position = self.chunks = 0
+        self.position = 0
         self.schemas: dict[int, mcap.Schema] = {}
         self.channels: dict[int, mcap.Channel] = {}
         self.data_ended = self.ended = self.cut = False
@@ -162,7 +161,6 @@ class Records:
                 raise ValueError("the first record, and only the first, must be a header")
             if isinstance(record, mcap.Chunk):
                 yield from map(self._check, self._unpack(record))
-                self.chunks += 1
             elif not self.data_ended:  # what follows repeats the definitions
                 yield self._check(record)
             if isinstance(record, mcap.Statistics):
