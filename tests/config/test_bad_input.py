@@ -1,7 +1,5 @@
 """Bad input gives one message with place, reason and remedy, for all problems of a file at once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -16,7 +14,7 @@ def mine(tmp_path):
     return tmp_path / "mine.yaml"
 
 
-def refused_text(path: Path, text: str, *settings: str) -> str:
+def refused_text(path, text, *settings):
     path.write_text(text, "utf-8")
     return refused(path, *settings).replace(f"{path.parent}/", "")
 

@@ -1,9 +1,6 @@
 """Every key of the schema can be set; a typo, a wrong type and a wrong range are refused."""
 
-from __future__ import annotations
-
 import re
-from typing import Any
 
 import pytest
 
@@ -14,11 +11,11 @@ ONE_WAY = [key for key in LEAVES if "downlink" not in key]  # both directions ha
 RANGED = [key for key in ONE_WAY if ">" in words(key)]
 
 
-def refusal(key: str, value: Any) -> str:
+def refusal(key, value):
     return refused(base(key), *beside(key), setting(key, value))
 
 
-def value_at(tree: Any, key: str) -> Any:
+def value_at(tree, key):
     for step in key.split("."):
         tree = tree[int(step)] if isinstance(tree, list) else tree[step]
     return tree

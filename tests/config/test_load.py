@@ -1,7 +1,5 @@
 """Experiments are resolved, values override each other in order, and a dump loads again."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 
@@ -13,7 +11,6 @@ from cloudrc.assembly import link_profile
 from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
 from cloudrc.config.load import (
-    ResolvedExperiment,
     dump,
     fingerprint,
     load_experiment,
@@ -25,7 +22,7 @@ from cloudrc.geometry.scene import load_scene
 PROFILES = shipped.names("profile")
 
 
-def again(experiment: ResolvedExperiment, folder: Path, *settings: str) -> ResolvedExperiment:
+def again(experiment, folder, *settings):
     path = folder / "config.yaml"
     path.write_text(dump(experiment), "utf-8")
     return load_experiment(path, settings)

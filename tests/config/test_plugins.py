@@ -1,7 +1,5 @@
 """Plug-ins are found by name, entry point or path; an unknown one lists the known ones."""
 
-from __future__ import annotations
-
 import sys
 from importlib.metadata import EntryPoint
 
@@ -18,8 +16,6 @@ SOURCE = '''"""Looks ahead by a share of the horizon.
 
 More text.
 """
-from __future__ import annotations
-
 from cloudrc.cloud.predictors import Predictor
 
 

@@ -1,10 +1,7 @@
 """The hash depends on the records' values and on nothing else."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -20,7 +17,7 @@ LATE = rec.Lateness(1, "world", 0.1, 0.2, 3)
 CHECK = rec.LinkChecked(1, True, "mean", 0.04, 0.05, 0.03, 0.06, "ok", 3000)
 
 
-def digest(*records: Any) -> str:
+def digest(*records):
     found = RecordHash()
     found.update(records)
     return found.hexdigest()
@@ -43,7 +40,7 @@ def test_batches_do_not_matter(records, cut):
     assert found.hexdigest() == digest(*records)
 
 
-def changed(value: Any) -> Any:
+def changed(value):
     """Return a different value of the same type."""
     if isinstance(value, bool):
         return not value
@@ -56,7 +53,7 @@ def changed(value: Any) -> Any:
     return 0.1 if value != value else value + 1
 
 
-def variants(instance: Any) -> list[Any]:
+def variants(instance):
     """Return the record with each of its values changed in turn."""
     found = []
     for name in instance._fields:

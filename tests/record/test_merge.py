@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -27,9 +25,7 @@ from tests.record.conftest import (
 )
 
 
-def files(
-    folder: Path, world: list[Record], cloud: list[Record], ids: tuple[str, str]
-) -> tuple[Path, Path]:
+def files(folder, world, cloud, ids):
     return (
         write(folder / "world.mcap", world, "world", ids[0]),
         write(folder / "cloud.mcap", cloud, "cloud", ids[1]),
@@ -147,7 +143,7 @@ def test_nothing_at_all_is_bad_input(tmp_path):
         merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap")
 
 
-def slipping(records: list[Record], slips_ns: list[int]) -> list[Record]:
+def slipping(records, slips_ns):
     """Make world's records; the n-th telemetry has the n-th slip, later ones the last slip."""
     slips, slip, found = iter(slips_ns), 0, list[Record]()
     for record in records:

@@ -1,14 +1,11 @@
 """A file is read or recovered up to its end or first damage; foreign files are named."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json
 import re
 import tracemalloc
 from contextlib import suppress
-from pathlib import Path
 from random import Random
 
 import pytest
@@ -31,7 +28,7 @@ from tests.record.conftest import assert_equal, rewrite, world_records, write
 RECORDS = world_records(160)
 
 
-def make_whole() -> bytes:
+def make_whole():
     stream = io.BytesIO()
     with McapWriter(stream, clock="world") as writer:
         writer.write(RECORDS)
@@ -43,7 +40,7 @@ WHOLE, EXPECTED = make_whole(), Recording.from_records(RECORDS)
 HASH = [one.metadata for one in make_reader(io.BytesIO(WHOLE)).iter_metadata()][-1][SHA256]
 
 
-def spans(data: bytes) -> list[tuple[int, int, int]]:
+def spans(data):
     """Return the opcode, start and end of each record."""
     found, start = [], 8
     while start < len(data) - 8:
@@ -73,7 +70,7 @@ def whole(tmp_path):
     return tmp_path / "whole.mcap"
 
 
-def flipped(at: int, mask: int = 255) -> bytes:
+def flipped(at, mask=255):
     return WHOLE[:at] + bytes([WHOLE[at] ^ mask]) + WHOLE[at + 1 :]
 
 
@@ -91,7 +88,7 @@ def test_a_cut_file_is_read_to_its_last_whole_chunk(path):
         assert (recording.complete, recording.lacking) == (False, "")
 
 
-def copied(path: Path) -> list[object]:
+def copied(path):
     """Return all that a recovery keeps."""
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
@@ -254,7 +251,7 @@ def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, 
     assert peak < 4 * limit << 20
 
 
-def examine(folder: Path, data: bytes) -> None:
+def examine(folder, data):
     """Read and recover a file; both say what is wrong, or find all that was recorded."""
     source, new, found = folder / "f.mcap", folder / "new.mcap", list[Contents]()
     source.write_bytes(data)

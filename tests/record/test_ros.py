@@ -1,9 +1,6 @@
 """ROS messages hold the same values as the rows, in ROS's conventions."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +12,13 @@ from cloudrc.record.topics import TOPICS, rows
 from tests.record.conftest import any_record
 
 
-def standard(topic: str, stamp_ns: int, values: Any) -> Any:
+def standard(topic, stamp_ns, values):
     """Encode a row, and decode it as a ROS 2 tool that knows only the standard types."""
     data = encode(TOPICS[topic], stamp_ns, values)
     return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, TOPICS[topic].ros_type)
 
 
-def xyz(vector: Any) -> tuple[float, float, float]:
+def xyz(vector):
     return vector.x, vector.y, vector.z
 
 

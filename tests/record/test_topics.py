@@ -1,10 +1,8 @@
 """The topics contain all values of the records, with their names and units."""
 
-from __future__ import annotations
-
 import re
 from operator import attrgetter
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 import pytest
 from hypothesis import given, settings
@@ -14,7 +12,7 @@ from cloudrc.record.topics import TOPICS, rows
 from tests.record.conftest import CLASSES, any_record
 
 
-def leaves(cls: type[Any], prefix: str = "") -> set[str]:
+def leaves(cls, prefix=""):
     found = set()
     for name, kind in get_type_hints(cls).items():
         found |= leaves(kind, f"{prefix}{name}.") if hasattr(kind, "_fields") else {prefix + name}

@@ -1,7 +1,5 @@
 """The file is a valid MCAP, and only recording needs the packages for it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tracemalloc
@@ -96,7 +94,7 @@ def test_an_hour_of_recording_takes_no_memory(tmp_path):
         assert sum(1 for _ in reader.iter_messages(["/odometry"])) == 2 * count + 1
 
 
-def run(code: str) -> str:
+def run(code):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()

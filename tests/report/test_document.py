@@ -1,13 +1,10 @@
 """report.json and environment.json: their names, absent values, and what they never contain."""
 
-from __future__ import annotations
-
 import builtins
 import getpass
 import json
 import platform
 import sys
-from typing import Any
 
 import pytest
 
@@ -24,7 +21,7 @@ NAMES = {
 }
 
 
-def document(run: Run = RUN, **criteria: Any) -> dict[str, Any]:
+def document(run=RUN, **criteria):
     experiment, recording = paper()
     changed = experiment.criteria.model_copy(update=criteria)
     return assess(recording, experiment.model_copy(update={"criteria": changed}), run).document
@@ -82,7 +79,7 @@ def test_the_environment_names_software_but_no_user_or_host():
 def test_without_matplotlib_the_numbers_are_written(tmp_path, monkeypatch):
     real = builtins.__import__
 
-    def refuse(name: str, *args: Any) -> Any:
+    def refuse(name, *args):
         if name.partition(".")[0] == "matplotlib":
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
         return real(name, *args)

@@ -1,7 +1,5 @@
 """Figures are drawn of any flight, also with little data, and in the style of cloudrc alone."""
 
-from __future__ import annotations
-
 import matplotlib
 import pytest
 
@@ -9,12 +7,12 @@ from cloudrc.config.schema import Direction
 from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, draw_all
 from cloudrc.report.figures.style import RC, Subject
-from tests.metrics.conftest import ONE_PIPE, START, Log, at, flown
+from tests.metrics.conftest import ONE_PIPE, START, at, flown
 
 CALM = Direction(delay_ms=50.0)
 
 
-def subject_of(log: Log) -> Subject:
+def subject_of(log):
     return Subject(log.flight(ONE_PIPE), CALM, CALM)
 
 
@@ -34,7 +32,7 @@ def test_a_flight_without_data_is_drawn(name, end_ns):
 def test_waypoints_are_the_first_setpoints_of_each():
     log = flown()
 
-    def fly_to(n: int, control: Control) -> Control:
+    def fly_to(n, control):
         waypoint = -1 if control.stamp_ns < at(1) else 0 if control.stamp_ns < at(4) else 1
         return control._replace(waypoint=waypoint, setpoint=(float(n), 2.0, 3.0))
 

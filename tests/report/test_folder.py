@@ -46,7 +46,7 @@ def run(flown_once, tmp_path):
     return shutil.copytree(flown_once, tmp_path / "run")
 
 
-def report(folder: Path) -> dict[str, Any]:
+def report(folder):
     found: dict[str, Any] = json.loads((folder / "report.json").read_text())
     return found
 
@@ -77,30 +77,30 @@ def test_another_layout_gives_the_same_report(run, options):
     assert again | {"notes": []} == first
 
 
-def filtered(**options: Any) -> Change:
+def filtered(**options):
     return lambda source, target: rewrite(source, target, **options)
 
 
-def cut(source: Path, target: Path) -> None:
+def cut(source, target):
     target.write_bytes(source.read_bytes()[: source.stat().st_size // 2])
 
 
-def damaged(source: Path, target: Path) -> None:
+def damaged(source, target):
     data = bytearray(source.read_bytes())
     data[data.index(b"zstd") + 1000] ^= 255
     target.write_bytes(data)
 
 
-def recovered_and_filtered(source: Path, target: Path) -> None:
+def recovered_and_filtered(source, target):
     cut(source, source)
     recover(source, target)
     rewrite(target, source, keep=lambda c, m: c.topic != "/telemetry").replace(target)
 
 
-def recorded(*, more: int = 0, config: bytes = b"") -> Change:
+def recorded(*, more=0, config=b""):
     """Record the flight anew: with more records of ground truth, or of another experiment."""
 
-    def change(source: Path, target: Path) -> None:
+    def change(source, target):
         world, cloud = good().ends()
         world[more:more] = world[:more]
         write_mission(target, world, cloud, attachments={"config.yaml": config} if config else {})

@@ -1,7 +1,5 @@
 """Figures show the configured delays, and mark events of the link and the guard."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -9,7 +7,6 @@ import math
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 
 from cloudrc.config.schema import Blackout, Change, Direction
 from cloudrc.messages import GuardState
@@ -17,7 +14,7 @@ from cloudrc.records import GuardChange, LinkChanged
 from cloudrc.report.figures import curves
 from cloudrc.report.figures.marks import LEGEND, bounds, legend, mark_events, set_in_flight, spans
 from cloudrc.report.figures.style import RC, Subject, new_figure
-from tests.metrics.conftest import ONE_PIPE, Log, at, flown
+from tests.metrics.conftest import ONE_PIPE, at, flown
 
 CALM = Direction(delay_ms=50.0)
 TIMED = Direction(
@@ -27,45 +24,37 @@ TIMED = Direction(
 )
 
 
-def changed(
-    time: float,
-    direction: Direction,
-    cause: str,
-    age: float = 0.0,
-    *,
-    time_line: float | None = None,
-    uplink: bool = True,
-) -> LinkChanged:
+def changed(time, direction, cause, age=0.0, *, time_line=None, uplink=True):
     conditions = json.dumps(direction.model_dump(mode="json", exclude_defaults=True))
     line, measured = age if time_line is None else time_line, (0.0, 0.0, 0.0, math.nan)
     return LinkChanged(at(time), uplink, "relay", cause, age, line, *measured, conditions)
 
 
-def subject_of(*changes: LinkChanged, uplink: Direction = CALM, log: Log | None = None) -> Subject:
+def subject_of(*changes, uplink=CALM, log=None):
     log = log or flown()
     log.world += [change for change in changes if change.uplink]
     log.cloud += [change for change in changes if not change.uplink]
     return Subject(log.flight(ONE_PIPE), uplink, CALM)
 
 
-def band(subject: Subject, time: float, *, uplink: bool = True) -> tuple[float, float]:
+def band(subject, time, *, uplink=True):
     """Return the bounds of the delay [s] at a time since the start of the flight [s]."""
     found = bounds(subject, np.array([time]), uplink=uplink)
     assert found is not None
     return float(found[0][0]), float(found[1][0])
 
 
-def low(subject: Subject, *times: float) -> list[float]:
+def low(subject, *times):
     return [band(subject, time)[0] for time in times]
 
 
-def marked(subject: Subject) -> Axes:
+def marked(subject):
     axes = new_figure(2.0, 3.0).subplots()
     mark_events(axes, subject)
     return axes
 
 
-def patches(axes: Axes) -> list[tuple[float, float]]:
+def patches(axes):
     return [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
 
 
