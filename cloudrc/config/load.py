@@ -31,7 +31,6 @@ from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.document import SET_LABEL, Document, KeyPath, write_yaml
 from cloudrc.config.mission_check import check_mission
-from cloudrc.config.overrides import Override
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import (
     Change,
@@ -131,11 +130,12 @@ def load_experiment(
     name = str(name)
     document = shipped.read("experiment", name, Path())
     changes = overrides.parse_settings(settings)
-    inner = [change for change in changes if _is_inside_name(change.path)]
+    inner = {path: value for path, value in changes.items() if _is_inside_name(path)}
     _default(document, ("name",), Path(name).stem)
-    if any(change.path in (("link",), ("link", "profile")) for change in changes):
+    if changes.keys() & {("link",), ("link", "profile")}:
         _remove_profile_values(document)
-    overrides.apply_overrides(document, [change for change in changes if change not in inner])
+    outer = {path: value for path, value in changes.items() if path not in inner}
+    overrides.apply_overrides(document, outer)
     for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found: list[Problem] = []
@@ -361,12 +361,12 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
                 f"profile {profile} needs guard.command_age_max_ms={new.command_age_max_ms:g}; the "
                 "guard keeps the limit that it started with, so the robot may hold"
             )
-    changes = []
-    for path, value in overrides.parse_settings(settings):
+    changes: dict[KeyPath, Any] = {}
+    for path, value in overrides.parse_settings(settings).items():
         way, *keys = path[1:] if path[0] == "link" else path
         if not keys or way not in DIRECTIONS:
             raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")
-        changes.append(Override((way, *keys), value))
+        changes[way, *keys] = value
         restart |= keys[0] in TIME_LINE_KEYS
         notes += _drop_from_time_line(document, way, keys[0])
     overrides.apply_overrides(document, changes)
