@@ -32,8 +32,9 @@ class RecordHash:
 
     def update(self, records: Iterable[Record]) -> None:
         """Add records to the hash, oldest first."""
-        typed: Iterable[tuple[Any, Record]] = ((type(record), record) for record in records)
-        self._sha256.update(b"".join([_packer(cls)(record) for cls, record in typed]))
+        # mypy does not know that these classes are hashable.
+        packed = [_packer(type(record))(record) for record in records]  # type: ignore[arg-type]
+        self._sha256.update(b"".join(packed))
 
     def hexdigest(self) -> str:
         """Return the hash of all records so far, as 64 hexadecimal digits."""
