@@ -145,7 +145,7 @@ bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
 
 # Without a C compiler, the bench ends with 3; make turns every failure into 2.
-bench-link: $(VENV)/all ## compare the relay with its profiles and with C programs; needs cc
+bench-link: $(VENV)/all ## compare the relay with its profiles and with a C program; needs cc
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 
 pictures: $(VENV)/all ## draw the README's picture of a flight

@@ -63,44 +63,10 @@ def resources(cpu: str, memory: str, cpu_limit: str, memory_limit: str) -> Any:
     return Field(default, description="Requests and limits of the container")
 
 
-class Expression(Values):
-    """One condition of a selector."""
-
-    key: str
-    """Label"""
-    operator: Literal["In", "NotIn", "Exists", "DoesNotExist"]
-    """Relation of the label to the values"""
-    values: tuple[str, ...] | None = None
-    """Values for In and NotIn"""
-
-
-class Selector(Values):
-    """A label selector of Kubernetes."""
-
-    match_labels: Texts | None = None
-    """Labels and their values"""
-    match_expressions: tuple[Expression, ...] | None = None
-    """Conditions"""
-
-
-class IpBlock(Values):
-    """A range of addresses."""
-
-    cidr: str
-    """Address range, such as 10.0.0.0/8"""
-    except_: tuple[str, ...] | None = Field(None, alias="except")
-    """Excluded ranges"""
-
-
-class Peer(Values):
-    """A peer of a NetworkPolicy; with both selectors, a pod must match both."""
-
-    pod_selector: Selector | None = None
-    """Selects pods: of this namespace, or of the selected ones"""
-    namespace_selector: Selector | None = None
-    """Selects namespaces"""
-    ip_block: IpBlock | None = None
-    """Address range, in place of selectors"""
+Peer = Annotated[
+    dict[Literal["podSelector", "namespaceSelector", "ipBlock"], dict[str, Any]],
+    Field(description="A peer of a NetworkPolicy; with both selectors, a pod must match both"),
+]
 
 
 class ImageOf(Values):
@@ -307,9 +273,7 @@ class NetworkPolicy(Values):
     enabled: bool = True
     """Whether the chart makes the NetworkPolicies"""
     dns: tuple[Peer, ...] = (
-        Peer(
-            namespace_selector=Selector(match_labels={"kubernetes.io/metadata.name": "kube-system"})
-        ),
+        {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "kube-system"}}},
     )
     """NetworkPolicy peers that resolve names (port 53); for a node-local cache use an ipBlock"""
 

@@ -25,9 +25,9 @@ from cloudrc.config import problems, shipped
 from cloudrc.config.overrides import KINDS
 from cloudrc.config.schema import Direction, Experiment, Mission, Profile
 from cloudrc.exposition.table import METRICS, ROLES, Metric
-from cloudrc.record.topics import SAMPLING, TOPICS
+from cloudrc.record.topics import TOPICS
 from tools import chart_values
-from tools.chart_values import ChartValues, Peer, Quantities, Resources, Selector, Values
+from tools.chart_values import ChartValues, Quantities, Resources, Values
 
 ROOT = Path(__file__).resolve().parents[1]
 CHART = ROOT / "charts" / "cloudrc"
@@ -46,6 +46,29 @@ CLOCKS = {
 }
 
 
+_PERIOD = "100 Hz, while there is telemetry and a setpoint"
+_LINK = "once per change; again when a session, a mission or a state of the guard begins"
+_STAMPS = {
+    ("departure of the telemetry, which is the instant of the measurement", "100 Hz, in a session"):
+        "/odometry /telemetry",
+    ("instant of the physics step", "100 Hz"): "/ground_truth /contact_force /reference",
+    ("arrival at cloud", "once per telemetry that arrives"): "/uplink_delay",
+    ("arrival at world", "once per command that arrives"): "/downlink_delay",
+    ("first physics step that follows the command", "once per command applied"): "/command_applied",
+    ("physics step in which the state changes", "once per event"): "/guard",
+    ("the first odometry after the contact, at most 10 ms later", "once per event"): "/contact",
+    ("begin of the session at this end", "once per event"): "/session",
+    ("departure of the command", _PERIOD):
+        "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
+    ("instant of the event", "once per event"): "/mission",
+    ("when this end notices the fault", "once per fault; repetitions are only counted"): "/fault",
+    ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
+    ("when this end notices it", _LINK): "/link",
+    ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
+    ("when the deadline was handled", "100 Hz per end"): "/lateness",
+}  # fmt: skip
+SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.split()}
+"""Topic -> meaning of a row's stamp, and how often a row is written."""
 OPEN = {
     "version": "the version",
     "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
@@ -156,7 +179,8 @@ def _row(model: type[BaseModel], path: tuple[str, ...]) -> tuple[str, ...] | Non
         return None  # a section without a word of its own
     value, _, unit = problems.expectation(model, path).removeprefix("must be ").partition(" [")
     unit = unit.removesuffix("]")
-    meaning = info.description.replace(f" [{unit}]", "") if unit else info.description
+    meaning = " ".join(info.description.split())
+    meaning = meaning.replace(f" [{unit}]", "") if unit else meaning
     key = ".".join(path).replace(".0", "[]")
     default = "required" if info.is_required() else f"`{_default(info.default)}`"
     return f"`{key}`", _value(model, path, value), unit, default, meaning
@@ -276,7 +300,6 @@ def _labels(metric: Metric) -> str:
 VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"
 WIDTH = 96
 COMPACT = (Resources, Quantities)
-FOREIGN = (*COMPACT, Peer, Selector, chart_values.Expression, chart_values.IpBlock)
 """Parts of the values that Kubernetes defines."""
 
 
@@ -311,9 +334,9 @@ def _chart_schema() -> dict[str, Any]:
     made = ChartValues.model_json_schema(by_alias=True)
     made = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc", **made}
     made["$defs"] = {name: _adapt(part) for name, part in made.pop("$defs").items()}
-    kinds = {name: getattr(chart_values, name, None) for name in made["$defs"]}
-    own = [name for name, kind in kinds.items() if _is_own(kind)]
-    for part in (made, *(made["$defs"][name] for name in own)):
+    kinds = ((getattr(chart_values, name, object), part) for name, part in made["$defs"].items())
+    own = [part for kind, part in kinds if issubclass(kind, Values) and kind not in COMPACT]
+    for part in (made, *own):
         # Templates need the parts as mappings: the schema refuses null for them.
         needed = [key for key, value in part["properties"].items() if "$ref" in value]
         part["required"] = sorted({*part.get("required", ()), *needed})
@@ -322,10 +345,6 @@ def _chart_schema() -> dict[str, Any]:
         "type": ["number", "string", "boolean", "array", "null"],
     }
     return dict(_adapt(made))
-
-
-def _is_own(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, Values) and kind not in FOREIGN
 
 
 def _adapt(part: Any) -> Any:

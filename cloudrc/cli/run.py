@@ -340,7 +340,7 @@ def _record_local(
             raise
         raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
     notes = (*local.notes, *([str(broken)] if broken else ()))
-    digest = messages_sha256(mission.contents.messages)
+    digest = messages_sha256(mission.messages)
     try:
         yield mission.recording(), Run("local", "relay", digest, interrupted, notes)
     finally:

@@ -21,7 +21,7 @@ from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.record.merge import Mission
+    from cloudrc.record.reader import Contents
 
 Tell = Callable[[str], None]
 
@@ -230,7 +230,7 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
         raise ClusterError(f"Job {job.name} did not fly its mission: {ended.message}")
 
 
-def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Mission:
+def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Contents:
     """Fetch recordings, metrics and logs into a folder, and merge the recordings.
 
     The report needs only the recordings; the errors of other files go to `tell`. If `want_end`,
@@ -248,8 +248,8 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
                 raise
             tell(f"{error}; trying again")
             continue
-        mission, ended = cut_to_last_mission(merge(folder / "world.mcap", folder / "cloud.mcap"))
-        if ended or not want_end:
+        mission = merge(folder / "world.mcap", folder / "cloud.mcap")
+        if cut_to_last_mission(mission) or not want_end:
             break
     for component in COMPONENTS:
         _fetch_previous(release, component, folder / f"{component}.before.mcap", tell)
@@ -278,7 +278,7 @@ def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) ->
 
 
 def _report(
-    experiment: ResolvedExperiment, folder: Path, mission: Mission, interrupted: bool
+    experiment: ResolvedExperiment, folder: Path, mission: Contents, interrupted: bool
 ) -> dict[str, Any]:
     from cloudrc.record.hash import messages_sha256
     from cloudrc.report.document import Run
@@ -288,7 +288,7 @@ def _report(
     texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
     found = re.findall(r'cloudrc_link_info\{[^}]*shaper="(\w+)"', "\n".join(texts))
     shaper = "+".join(sorted(set(found))) or "unknown"
-    digest = messages_sha256(mission.contents.messages)
+    digest = messages_sha256(mission.messages)
     run_facts = replace(Run("cluster", shaper, digest), interrupted=interrupted)
     try:
         own = experiment.report.metrics  # evaluated here, so the pods do not need the file

@@ -24,26 +24,29 @@ SIZE_MAX = 8 << 20
 """Largest file that is read [bytes]: more than any mission needs."""
 SET_LABEL = "--set"
 """Label of a value that was set on the command line."""
-_VALUES_MAX = 300_000
-"""Largest number of values in a document; nested aliases multiply values."""
 
-_SCALARS = (
-    ("null", r"~|null|Null|NULL|", [*"~nN", ""]),
-    ("bool", r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
-    ("int", r"[-+]?[0-9]+", [*"-+0123456789"]),
-    (
-        "float",
+_SCALARS = {
+    "null": (r"~|null|Null|NULL|", [*"~nN", ""]),
+    "bool": (r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
+    "int": (r"[-+]?[0-9]+", [*"-+0123456789"]),
+    "float": (
         r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
         r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
         [*"-+.0123456789"],
     ),
-)
-"""Tag, pattern and possible first characters of each kind of scalar.
+}
+"""Tag of each kind of scalar -> its pattern and possible first characters.
 Source: YAML 1.2.2, section 10.3.2."""
+_TAG = "tag:yaml.org,2002:"
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012
+    # Other tags, such as !!binary, are refused.
+    yaml_constructors = {  # noqa: RUF012
+        tag: yaml.SafeLoader.yaml_constructors[tag]
+        for tag in (None, f"{_TAG}str", *(f"{_TAG}{name}" for name in _SCALARS))
+    }
 
 
 class _Dumper(yaml.SafeDumper):
@@ -54,12 +57,10 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-for _tag, _pattern, _first in _SCALARS:
+for _name, (_pattern, _first) in _SCALARS.items():
     for _class in (_Loader, _Dumper):
-        _class.add_implicit_resolver(
-            f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first
-        )
-_Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
+        _class.add_implicit_resolver(f"{_TAG}{_name}", re.compile(f"(?:{_pattern})$"), _first)
+_Loader.add_constructor(f"{_TAG}int", lambda loader, node: int(node.value))
 
 
 def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
@@ -75,7 +76,8 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
     lines: dict[KeyPath, int] = {}
     try:
         loader = _Loader(text)
-        return _value(loader, loader.get_single_node(), (), lines), lines
+        node = loader.get_single_node()
+        return None if node is None else _construct(loader, node, (), lines), lines
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{name}:{mark.line + 1}" if mark else name
@@ -97,8 +99,6 @@ def parse_value(text: str, name: str) -> Any:
         BadInputError: If brackets or quotes hold no YAML, or if text follows them.
     """
     stripped = text.strip()
-    if "\n" in stripped:
-        return parse_yaml(text, name)[0]
     quoted = len(stripped) > 1 and stripped[0] in "'\"" and stripped[0] == stripped[-1]
     if quoted or stripped.startswith(("[", "{")):
         # A comment would swallow the outer bracket; what follows the value adds an element.
@@ -119,36 +119,26 @@ def write_yaml(value: Any) -> str:
     )  # fmt: skip
 
 
-def _value(loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int]) -> Any:
-    if node is None:
-        return None
-    lines[path] = node.start_mark.line + 1
-    if len(lines) > _VALUES_MAX:
-        raise _refuse(node, f"more than {_VALUES_MAX} values")
-    if isinstance(node, yaml.MappingNode):
-        return _mapping(loader, node, path, lines)
+def _construct(loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int]) -> Any:
+    """Convert a node to plain values, and note the lines of all values in it."""
+    lines.setdefault(path, node.start_mark.line + 1)
     if isinstance(node, yaml.SequenceNode):
-        return [_value(loader, item, (*path, str(n)), lines) for n, item in enumerate(node.value)]
-    value = loader.construct_object(node)
-    if value is not None and not isinstance(value, bool | int | float | str):
-        raise _refuse(node, f"{node.tag} is not a plain value")
-    if isinstance(value, str) and "\0" in value:
-        raise _refuse(node, "text with the character NUL, which no path can contain")
-    return value
-
-
-def _mapping(loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int]) -> dict[str, Any]:
+        items = enumerate(node.value)
+        return [_construct(loader, item, (*path, str(n)), lines) for n, item in items]
+    if isinstance(node, yaml.ScalarNode):
+        value = loader.construct_object(node)
+        if isinstance(value, str) and "\0" in value:
+            raise _refuse(node, "text with the character NUL, which no path can contain")
+        return value
     result: dict[str, Any] = {}
     for key_node, value_node in node.value:
         if not isinstance(key_node, yaml.ScalarNode):
             raise _refuse(key_node, "a key must be text")
         key = str(key_node.value)
-        if key == "<<":
-            raise _refuse(key_node, "merge keys are not supported; write the keys out")
         if key in result:
             raise _refuse(key_node, f"the key {key!r} is given twice; keep one of them")
-        result[key] = _value(loader, value_node, (*path, key), lines)
         lines[(*path, key)] = key_node.start_mark.line + 1
+        result[key] = _construct(loader, value_node, (*path, key), lines)
     return result
 
 
@@ -184,10 +174,8 @@ class Document:
         for key, source in self.sources.items():
             if source.label == SET_LABEL and key[: len(path)] == path:
                 return source
-        above = (path[:length] for length in range(len(path), -1, -1))
-        return next(
-            (self.sources[key] for key in above if key in self.sources), Source("default", Path())
-        )
+        above = (self.sources.get(path[:length]) for length in range(len(path), -1, -1))
+        return next(filter(None, above), Source("default", Path()))
 
     def get(self, *path: str) -> Any:
         """Return the value at `path`; None if it or one of its parents is missing."""

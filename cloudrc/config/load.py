@@ -12,18 +12,25 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from math import sqrt
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, write_yaml
+from cloudrc.config.document import SET_LABEL, Document, KeyPath, write_yaml
 from cloudrc.config.mission_check import check_mission
-from cloudrc.config.overrides import Override
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import (
     Change,
@@ -67,25 +74,20 @@ class ResolvedGuard(Guard):
     command_age_max_ms: CommandAge = COMMAND_AGE_MAX_MS
     speed_max_mps: Speed = Field(None, validate_default=True)
 
-    @field_validator("speed_max_mps", mode="before")
+    @field_validator("speed_max_mps", mode="wrap")
     @classmethod
-    def _default_speed(cls, speed_max: Any, info: ValidationInfo) -> Any:
-        return speed_cap(_age_max(info)) if speed_max is None else speed_max
-
-    @field_validator("speed_max_mps")
-    @classmethod
-    def _check_stopping(cls, speed_max: float, info: ValidationInfo) -> float:
-        if speed_max > (cap := speed_cap(age_max := _age_max(info))) + 1e-6:
+    def _limit_speed(
+        cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
+    ) -> float:
+        age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
+        cap = speed_cap(age_max)
+        speed_max: float = cap if given is None else check(given)
+        if speed_max > cap + 1e-6:
             raise ValueError(
                 f"must be at most {cap:g} m/s: above it the robot does not stop in time with "
                 f"commands {age_max:g} ms old; lower it, or guard.command_age_max_ms"
             )
         return speed_max
-
-
-def _age_max(info: ValidationInfo) -> float:
-    age_max: float = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
-    return age_max
 
 
 class ResolvedCloud(Cloud):
@@ -114,15 +116,43 @@ class ResolvedExperiment(Experiment):
         return self.link.downlink
 
 
-def load_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
+def load_experiment(
+    name: str | Path, settings: Iterable[str] = (), *, build: bool = True
+) -> ResolvedExperiment:
     """Load an experiment for a flight by name or path, and import the plug-ins that it names.
 
     The texts `key=value` in `settings` override the file, in any order. Paths become absolute.
+    `build` is False for `read_experiment`.
 
     Raises:
         BadInputError: If the experiment has problems; one line, or a summary and a line for each.
     """
-    return _load_experiment(str(name), settings, build=True)
+    name = str(name)
+    document = shipped.read("experiment", name, Path())
+    changes = overrides.parse_settings(settings)
+    inner = {path: value for path, value in changes.items() if _is_inside_name(path)}
+    _default(document, ("name",), Path(name).stem)
+    if changes.keys() & {("link",), ("link", "profile")}:
+        _remove_profile_values(document)
+    outer = {path: value for path, value in changes.items() if path not in inner}
+    overrides.apply_overrides(document, outer)
+    for key in ("world", "guard", "link", "cloud", "report"):
+        _default(document, (key,), {})
+    found: list[Problem] = []
+    with _collect(found, ("mission",)):
+        _inline_mission(document)
+    with _collect(found, ("link", "profile")):
+        _inline_profile(document)
+    overrides.apply_overrides(document, inner)
+    for key in overrides.KINDS:
+        _default(document, ("cloud", key), getattr(Cloud(), key))
+    found += overrides.resolve_plugins(document, build=build)
+    found += _resolve_traces(document, ("link",)) + _resolve_files(document)
+    experiment = _validate(document, ResolvedExperiment, name, found)
+    wrong = check_mission(experiment.mission, load_scene(experiment.world.scene))
+    below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
+    problems.raise_problems(document, below, name)
+    return experiment
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
@@ -130,7 +160,7 @@ def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedE
 
     They have only the parameters that the file gives; the config.yaml of a run gives all.
     """
-    return _load_experiment(str(name), settings, build=False)
+    return load_experiment(name, settings, build=False)
 
 
 def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
@@ -164,29 +194,6 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
     return hashlib.sha256(dump(experiment).encode()).hexdigest()
 
 
-def _load_experiment(name: str, settings: Iterable[str], *, build: bool) -> ResolvedExperiment:
-    document = shipped.read("experiment", name, Path())
-    changes = overrides.parse_settings(settings)
-    inner = [change for change in changes if _is_inside_name(change.path)]
-    _default(document, ("name",), Path(name).stem)
-    if any(change.path in (("link",), ("link", "profile")) for change in changes):
-        _remove_profile_values(document)
-    overrides.apply_overrides(document, [change for change in changes if change not in inner])
-    for key in ("world", "guard", "link", "cloud", "report"):
-        _default(document, (key,), {})
-    found = [*_inline_mission(document), *_inline_profile(document)]
-    overrides.apply_overrides(document, inner)
-    for key in overrides.KINDS:
-        _default(document, ("cloud", key), getattr(Cloud(), key))
-    found += overrides.resolve_plugins(document, build=build)
-    found += _resolve_traces(document, ("link",)) + _resolve_files(document)
-    experiment = _validate(document, ResolvedExperiment, name, found)
-    wrong = check_mission(experiment.mission, load_scene(experiment.world.scene))
-    below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
-    problems.raise_problems(document, below, name)
-    return experiment
-
-
 def _is_inside_name(path: KeyPath) -> bool:
     """Whether a key is inside the mission or the profile, which a file may give by name."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
@@ -215,36 +222,35 @@ def _default(document: Document, path: KeyPath, value: Any) -> None:
         document.set_value(path, value, document.source(path))
 
 
-def _inline_mission(document: Document) -> list[Problem]:
+@contextmanager
+def _collect(found: list[Problem], path: KeyPath) -> Iterator[None]:
+    """Convert an error about the value at `path` to a problem, so that one error lists all."""
+    try:
+        yield
+    except BadInputError as error:
+        found.append(Problem(path, "", str(error)))
+
+
+def _inline_mission(document: Document) -> None:
     """Replace the mission's name by the contents of its file."""
     _default(document, ("mission",), Experiment().mission)
     name = document.tree["mission"]
-    if not isinstance(name, str):
-        return []
-    folder = document.source(("mission",)).folder
-    document.tree["mission"] = {}
-    try:
-        file = shipped.read("mission", name, folder)
+    if isinstance(name, str):
+        file = shipped.read("mission", name, document.source(("mission",)).folder)
         _validate(file, Mission, name)
-    except BadInputError as error:
-        return [Problem(("mission",), "", str(error))]
-    document.tree["mission"] = file.tree
-    document.sources |= {("mission", *key): source for key, source in file.sources.items()}
-    return []
+        document.tree["mission"] = file.tree
+        document.sources |= {("mission", *key): source for key, source in file.sources.items()}
 
 
-def _inline_profile(document: Document) -> list[Problem]:
+def _inline_profile(document: Document) -> None:
     """Insert the profile's values where the experiment gives none for a direction."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
     if not isinstance(name, str) or _has_all_values(document):
-        return []
+        return
     source = document.source(("link", "profile"))
-    try:
-        file = shipped.read("profile", name, source.folder)
-        profile = _validate(file, Profile, name)
-    except BadInputError as error:
-        return [Problem(("link", "profile"), "", str(error))]
+    file = shipped.read("profile", name, source.folder)
+    profile = _validate(file, Profile, name)
     if shipped.is_path(name):
         document.set_value(("link", "profile"), str(source.absolute(name)), source)
     for way in DIRECTIONS:
@@ -259,14 +265,14 @@ def _inline_profile(document: Document) -> list[Problem]:
             document.sources = inserted | document.sources
     age_max = profile.command_age_max_ms or COMMAND_AGE_MAX_MS
     _default(document, ("guard", "command_age_max_ms"), age_max)
-    return []
 
 
 def _has_all_values(document: Document) -> bool:
-    """Whether both directions have every key, as in a resolved file; old files have no `loop`."""
-    wanted = Direction.model_fields.keys() - {"loop"}
+    """Whether both directions have every key, as in a resolved file."""
     given = [document.get("link", way) for way in DIRECTIONS]
-    return all(isinstance(one, dict) and one.keys() >= wanted for one in given)
+    return all(
+        isinstance(one, dict) and one.keys() >= Direction.model_fields.keys() for one in given
+    )
 
 
 def _remove_profile_values(document: Document) -> None:
@@ -275,10 +281,9 @@ def _remove_profile_values(document: Document) -> None:
         return
     for way in DIRECTIONS:
         del document.tree["link"][way]
-    try:
+    age_max = None
+    with suppress(BadInputError):  # the profile's file may no longer exist
         age_max = load_profile(str(document.get("link", "profile"))).command_age_max_ms
-    except BadInputError:
-        age_max = None  # the profile's file no longer exists
     age_max = age_max or COMMAND_AGE_MAX_MS
     implied = {"command_age_max_ms": age_max, "speed_max_mps": speed_cap(age_max)}
     for key, value in implied.items():
@@ -288,30 +293,26 @@ def _remove_profile_values(document: Document) -> None:
 
 def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
     """Make the paths of traces and tables absolute; check that the files can be read."""
-    found = []
+    found: list[Problem] = []
     for path in ((*above, way, key) for way in DIRECTIONS for key in FILE_READERS):
         given, source = document.get(*path), document.source(path)
         if isinstance(given, str):
             absolute = source.absolute(given)
             document.set_value(path, str(absolute), source)
-            try:
+            with _collect(found, path):
                 FILE_READERS[path[-1]](absolute)
-            except BadInputError as error:
-                found.append(Problem(path, "", str(error)))
     return found
 
 
 def _resolve_files(document: Document) -> list[Problem]:
     """Make the paths of robot, scene and the user's metrics absolute; metrics are not imported."""
-    found = []
+    found: list[Problem] = []
     for key in ("robot", "scene"):
-        name = document.get("world", key)
+        path, name = ("world", key), document.get("world", key)
         if isinstance(name, str):
-            try:
-                folder = document.source(("world", key)).folder
+            with _collect(found, path):
+                folder = document.source(path).folder
                 document.tree["world"][key] = shipped.model_path(key, name, folder)
-            except BadInputError as error:
-                found.append(Problem(("world", key), "", str(error)))
     names = document.get("report", "metrics")
     if isinstance(names, str):  # a single one
         names = document.tree["report"]["metrics"] = [names]
@@ -360,26 +361,22 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
                 f"profile {profile} needs guard.command_age_max_ms={new.command_age_max_ms:g}; the "
                 "guard keeps the limit that it started with, so the robot may hold"
             )
-    changes = [_without_prefix(change) for change in overrides.parse_settings(settings)]
-    for path, _ in changes:
-        restart |= path[1] in TIME_LINE_KEYS
-        notes += _drop_from_time_line(document, *path[:2])
+    changes: dict[KeyPath, Any] = {}
+    for path, value in overrides.parse_settings(settings).items():
+        way, *keys = path[1:] if path[0] == "link" else path
+        if not keys or way not in DIRECTIONS:
+            raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")
+        changes[way, *keys] = value
+        restart |= keys[0] in TIME_LINE_KEYS
+        notes += _drop_from_time_line(document, way, keys[0])
     overrides.apply_overrides(document, changes)
     document.sources = {
-        path: Source(_HERE, source.folder) if source.label == SET_LABEL else source
+        path: source._replace(label=_HERE) if source.label == SET_LABEL else source
         for path, source in document.sources.items()
     }
     values = check_profile(document, _HERE).model_dump(mode="json", exclude_defaults=True)
     words = [f"profile {profile}"] if profile else []
     return Edit(values, ", ".join([*words, *settings]), restart, notes)
-
-
-def _without_prefix(change: Override) -> Override:
-    """Remove a leading "link."; refuse a key that belongs to no direction."""
-    path = change.path[1:] if change.path[0] == "link" else change.path
-    if len(path) < 2 or path[0] not in DIRECTIONS:
-        raise BadInputError(f"{'.'.join(change.path)}: set a key of uplink or downlink, {_EXAMPLE}")
-    return Override(path, change.value)
 
 
 def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:

@@ -15,10 +15,10 @@ from __future__ import annotations
 import copy
 import inspect
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
@@ -34,15 +34,8 @@ KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "co
 _DEFAULTS = Experiment().model_dump(mode="json")
 
 
-class Override(NamedTuple):
-    """One value to set, as parsed from YAML, and the keys down to it."""
-
-    path: KeyPath
-    value: Any
-
-
-def parse_settings(texts: Iterable[str]) -> list[Override]:
-    """Parse texts `key=value`, the values by `document.parse_value`; sort shorter keys first.
+def parse_settings(texts: Iterable[str]) -> dict[KeyPath, Any]:
+    """Parse texts `key=value`, the values by `document.parse_value`; shorter keys come first.
 
     Raises:
         BadInputError: If a text has no key or no `=`, if a key is set twice, or if a value is not
@@ -59,17 +52,17 @@ def parse_settings(texts: Iterable[str]) -> list[Override]:
         if path in found:
             raise BadInputError(f"{SET_LABEL} {key}: is set twice; keep one of them")
         found[path] = parse_value(value, f"{SET_LABEL} {key}")
-    return [Override(path, found[path]) for path in sorted(found, key=len)]
+    return {path: found[path] for path in sorted(found, key=len)}
 
 
-def apply_overrides(document: Document, overrides: Iterable[Override]) -> None:
-    """Set values in a document; relative paths in them start at the working folder.
+def apply_overrides(document: Document, overrides: Mapping[KeyPath, Any]) -> None:
+    """Set values in a document, in order; relative paths in them start at the working folder.
 
     Raises:
         BadInputError: If an index is not a number or beyond the end of its list.
     """
     source = Source(SET_LABEL, Path.cwd())
-    for path, value in overrides:
+    for path, value in overrides.items():
         default: Any = _DEFAULTS
         for depth, (key, below) in enumerate(pairwise(path), start=1):
             _check_index(document, path[:depth])
@@ -118,7 +111,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
         try:
             if build:
                 checked = _check(kind, name, parameters)
-                plugins.load(kind, name, **_values(checked))
+                plugins.load(kind, name, **dict(checked))
                 parameters = checked.model_dump(mode="json")
         except ValidationError as error:
             found += problems.from_pydantic(error, parameter_model(kind, name), path)
@@ -136,7 +129,7 @@ def build_plugin(kind: str, choice: PlugIn) -> Any:
     `kind` is a key of `cloudrc.plugins.PACKAGES`.
     """
     checked = _check(kind, choice.name, choice.model_extra or {})
-    return plugins.load(kind, choice.name, **_values(checked))
+    return plugins.load(kind, choice.name, **dict(checked))
 
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
@@ -160,7 +153,3 @@ def parameter_model(kind: str, name: str) -> type[BaseModel]:
 
 def _check(kind: str, name: str, parameters: dict[str, Any]) -> BaseModel:
     return parameter_model(kind, name).model_validate_json(json.dumps(parameters))
-
-
-def _values(checked: BaseModel) -> dict[str, Any]:
-    return {key: getattr(checked, key) for key in type(checked).model_fields}

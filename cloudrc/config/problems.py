@@ -131,7 +131,7 @@ def _limits(part: Any) -> Iterator[str]:
 
 
 def _unit(field: FieldInfo) -> str:
-    found = re.search(r"\[[^\],]+\]$|\[[^\],]+\](?=[,;. ])", field.description or "")
+    found = re.search(r"\[[^\],]+\]$|\[[^\],]+\](?=[,;.\s])", field.description or "")
     return found.group() if found else ""
 
 

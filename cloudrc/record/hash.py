@@ -13,10 +13,11 @@ import hashlib
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from enum import IntEnum
+from functools import cache
 from itertools import chain
-from operator import attrgetter
 from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
 
+from cloudrc.record.topics import values_getter
 from cloudrc.records import Record
 
 _Pack: TypeAlias = Callable[[Any], bytes]
@@ -31,8 +32,9 @@ class RecordHash:
 
     def update(self, records: Iterable[Record]) -> None:
         """Add records to the hash, oldest first."""
-        packers = _PACKERS
-        self._sha256.update(b"".join([packers[type(record)](record) for record in records]))
+        # mypy does not know that these classes are hashable.
+        packed = [_packer(type(record))(record) for record in records]  # type: ignore[arg-type]
+        self._sha256.update(b"".join(packed))
 
     def hexdigest(self) -> str:
         """Return the hash of all records so far, as 64 hexadecimal digits."""
@@ -56,22 +58,12 @@ def add_message(sha256: hashlib._Hash, topic: str, log_time_ns: int, data: bytes
     sha256.update(data)
 
 
-class _Packers(dict[type, _Pack]):
-    """Record class -> packer; a packer is made for the first record of its class."""
-
-    def __missing__(self, cls: type) -> _Pack:
-        packer = self[cls] = _packer(cls)
-        return packer
-
-
-_PACKERS = _Packers()
-
-
+@cache
 def _packer(cls: type) -> _Pack:
     leaves = list(_leaves(cls, ""))
-    numbers = _getter([path for path, code in leaves if len(code) == 1 and code != "s"])
-    vectors = _getter([path for path, code in leaves if len(code) > 1])
-    strings = _getter([path for path, code in leaves if code == "s"])
+    numbers = values_getter([path for path, code in leaves if len(code) == 1 and code != "s"])
+    vectors = values_getter([path for path, code in leaves if len(code) > 1])
+    strings = values_getter([path for path, code in leaves if code == "s"])
     codes = sorted((code for _, code in leaves if code != "s"), key=lambda code: len(code) > 1)
     name = cls.__name__.encode()
     size, pack = len(name), struct.Struct(f"<B{len(name)}s" + "".join(codes)).pack
@@ -93,13 +85,6 @@ def _leaves(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
             yield path, "d" * len(get_args(kind))
         else:
             yield path, "q" if issubclass(kind, IntEnum) else _CODES[kind]
-
-
-def _getter(paths: list[str]) -> Callable[[Any], tuple[Any, ...]]:
-    if not paths:
-        return lambda record: ()
-    get = attrgetter(*paths)
-    return get if len(paths) > 1 else lambda record: (get(record),)
 
 
 def _packed_string(text: str) -> bytes:

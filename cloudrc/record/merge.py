@@ -13,8 +13,6 @@ world's clock also lags the clock of world's machine.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -23,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import atomic_file
 from cloudrc.record.columns import Recording, Table
 from cloudrc.record.reader import Contents, read_contents
 from cloudrc.record.ros import shifted
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import MISSING, McapWriter
+from cloudrc.record.writer import CHANGED, MISSING
 from cloudrc.records import UNDER_WAY
 
 BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
@@ -36,7 +33,6 @@ BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
 first change are before the start."""
 CUT_SHORT = "cut short"
 """Start of the reader's note about a file without an end."""
-_MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
 
 
 class ClockOffset(NamedTuple):
@@ -120,44 +116,8 @@ def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np
     return at_ns
 
 
-@dataclass(frozen=True, slots=True)
-class Mission:
-    """The merged recordings of both ends.
-
-    Attributes:
-        contents: All messages in the order of their log times, on world's clock.
-        offset: Clock offset that was added to cloud's stamps.
-    """
-
-    contents: Contents
-    offset: ClockOffset
-
-    def recording(self) -> Recording:
-        """Decode the mission to tables."""
-        return Recording.from_contents(self.contents)
-
-    def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
-        """Write the mission and further `attachments` to an MCAP file, which is replaced at once.
-
-        Raises:
-            OSError: If the file cannot be written.
-        """
-        metadata = self.contents.metadata
-        clock, clock_id = metadata["clock"], metadata["clock_id"]
-        with (
-            atomic_file(target) as file,
-            McapWriter(file, clock=clock, clock_id=clock_id) as writer,
-        ):
-            writer.note(metadata)
-            for topic, log_time_ns, data in self.contents.messages:
-                writer.write_message(topic, log_time_ns, data)
-            for name, data in {**self.contents.attachments, **(attachments or {})}.items():
-                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
-                writer.attach(name, data, media_type)
-
-
-def merge(world: Path, cloud: Path) -> Mission:
-    """Merge the files of both ends, complete or torn, on world's clock.
+def merge(world: Path, cloud: Path) -> Contents:
+    """Merge the files of both ends, complete or torn, into one mission on world's clock.
 
     If one file cannot be read, the mission contains only the other file, on that file's own clock,
     and the note of the mission says so.
@@ -174,54 +134,55 @@ def merge(world: Path, cloud: Path) -> Mission:
             failures.append(error)
     if not read:
         raise failures[0]
-    one = next(iter(read.values()))
-    mission = Mission(one, SAME_CLOCK) if failures else _join(read["world"], read["cloud"])
     notes = [f"{end}: {contents.note}" for end, contents in read.items() if contents.note]
-    if notes := [*notes, *map(str, failures)]:
-        mission.contents.note = mission.contents.metadata[MISSING] = "; ".join(notes)
+    mission = next(iter(read.values())) if failures else _join(read["world"], read["cloud"])
+    _set_note(mission, [*notes, *map(str, failures)])
     return mission
 
 
-def _join(world: Contents, cloud: Contents) -> Mission:
+def _set_note(mission: Contents, notes: list[str]) -> None:
+    mission.note = "; ".join(notes)
+    mission.metadata.pop(MISSING, None)
+    if mission.note:
+        mission.metadata[MISSING] = mission.note
+
+
+def _join(world: Contents, cloud: Contents) -> Contents:
     logged_ns = np.array([message[1] for message in cloud.messages], dtype=np.int64)
     if _share_clock(world, cloud):
         offset, moved_ns = SAME_CLOCK, world_time_ns(_table(world, "/telemetry"), logged_ns)
     else:
-        offset = clock_offset(Recording.from_contents(world), Recording.from_contents(cloud))
+        offset = clock_offset(world.recording(), cloud.recording())
         moved_ns = logged_ns + offset.offset_ns
     moved = [
         (topic, to_ns, shifted(data, to_ns - from_ns))
         for (topic, from_ns, data), to_ns in zip(cloud.messages, moved_ns.tolist(), strict=True)
     ]
     in_order = heapq.merge(world.messages, moved, key=itemgetter(1))
-    joined = Contents(
+    metadata = {**cloud.metadata, **world.metadata, **offset.metadata()}
+    return Contents(
         messages=[(topic, max(ns, 0), data) for topic, ns, data in in_order],  # MCAP's least time
-        metadata={**cloud.metadata, **world.metadata, **offset.metadata()},
+        metadata=metadata,
         attachments={**cloud.attachments, **world.attachments},
+        lacking=metadata.get(CHANGED, ""),
     )
-    return Mission(joined, offset)
 
 
-def cut_to_last_mission(mission: Mission) -> tuple[Mission, bool]:
+def cut_to_last_mission(mission: Contents) -> bool:
     """Cut a pod's recording, which may hold several missions, down to the last that was started.
 
-    Return also whether the recording contains the end of that mission. If it does, the mission is
+    Return whether the recording contains the end of that mission. If it does, the mission is
     complete, even if the end of the file is missing: a pod still writes its file when it is copied.
     """
-    contents = mission.contents
-    began, ended = _last_mission(contents)
-    until = contents.messages[-1][1] if contents.messages else 0
+    began, ended = _last_mission(mission)
+    until = mission.messages[-1][1] if mission.messages else 0
     whole = ended is not None and until > ended
     first = began - BEFORE_NS if began is not None else 0
     last = ended + AFTER_NS if ended is not None else until
-    kept = [message for message in contents.messages if first <= message[1] <= last]
-    cut = Contents(kept, dict(contents.metadata), contents.attachments, contents.note)
+    mission.messages = [message for message in mission.messages if first <= message[1] <= last]
     if whole:
-        cut.note = "; ".join(n for n in contents.note.split("; ") if CUT_SHORT not in n)
-        cut.metadata.pop(MISSING, None)
-        if cut.note:
-            cut.metadata[MISSING] = cut.note
-    return replace(mission, contents=cut), whole
+        _set_note(mission, [n for n in mission.note.split("; ") if n and CUT_SHORT not in n])
+    return whole
 
 
 def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
@@ -241,4 +202,4 @@ def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
 def _table(contents: Contents, topic: str) -> Table:
     """Decode only one topic; decoding a whole flight takes as long as reading it."""
     messages = [message for message in contents.messages if message[0] == topic]
-    return Recording.from_contents(Contents(messages))[topic]
+    return Contents(messages).recording()[topic]

@@ -10,43 +10,32 @@ from __future__ import annotations
 
 import json
 import os
+import zlib
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from io import BufferedReader
+from dataclasses import dataclass, field
+from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import Any, Self
 
-from cloudrc import __version__
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import atomic_file, open_file
 from cloudrc.record import missing
+from cloudrc.record.columns import Recording
 from cloudrc.record.ros import is_known
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import CLOCK, COUNTS, METADATA, MISSING
+from cloudrc.record.writer import CHANGED, CLOCK, COUNTS, MISSING, McapWriter
 
 try:
     import lz4.frame
     import zstandard
+    from mcap import records as mcap
     from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
-    from mcap.opcode import Opcode
-    from mcap.records import (
-        Attachment,
-        Channel,
-        Chunk,
-        DataEnd,
-        Header,
-        McapRecord,
-        Message,
-        Metadata,
-        Schema,
-        Statistics,
-    )
-    from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
-    from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+    from mcap.stream_reader import CRCValidationError, StreamReader
+    from mcap.writer import MCAP0_MAGIC
 except ImportError as error:
     raise missing(error) from error
 
@@ -55,12 +44,11 @@ UNPACKED_MAX = 64
 1 MiB counts as 1 MiB. Recordings of flights need a factor of 10, recordings of an idle robot 30."""
 MESSAGE_COST = 128
 """Memory of a message's Python objects, in addition to the message's bytes [bytes]."""
-CHANNELS_MAX = 65_535
-"""Limit of the number of channels plus schemas in a file; MCAP numbers both with 16 bits."""
 LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
 LOSSY_SHARE_MAX = 0.999
 """Largest value of `Recovery.share` if anything is missing [1]."""
+_MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
 KINDS = {
     b"": "is empty; name a recording (.mcap)",
     b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
@@ -73,8 +61,19 @@ class NothingReadableError(BadInputError):
     """Report a file without any readable message, such as after a kill at the start."""
 
 
-class _TooMuchError(Exception):
-    """Report that a file unpacks to more data than any recording may."""
+class _StopError(Exception):
+    """Report, in words, why a file that may be intact is not read further."""
+
+
+_UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
+    "": lambda data, size: data,
+    "zstd": lambda data, size: (
+        zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True).read(size)
+    ),
+    "lz4": lambda data, size: lz4.frame.LZ4FrameDecompressor().decompress(data, size),
+}
+"""Compression -> function that unpacks at most a given size [bytes]. The library's own functions
+allocate what the compressed data states, without a bound."""
 
 
 class Records:
@@ -84,7 +83,8 @@ class Records:
         path: The file, for messages.
         size: Size of the file [bytes].
         position: Position behind the last intact record [bytes].
-        chunks: Number of intact chunks.
+        schemas: The schemas so far, by their number.
+        channels: The channels so far, by their number.
         data_ended: Whether reading has reached the end of the data; only the index follows.
         ended: Whether reading has reached the end of the file.
         fault: Why reading stopped or what is wrong, in words; "" if nothing is wrong.
@@ -108,11 +108,13 @@ class Records:
         except ValueError as error:  # a pipe or a device
             raise BadInputError(f"{error}; name a recording (.mcap)") from error
         self.size = os.fstat(self._stream.fileno()).st_size
-        self.position = self.chunks = 0
+        self.position = 0
+        self.schemas: dict[int, mcap.Schema] = {}
+        self.channels: dict[int, mcap.Channel] = {}
         self.data_ended = self.ended = self.cut = False
         self.fault = ""
-        self._room = UNPACKED_MAX * max(self.size, 1 << 20)
         self.stated: int | None = None
+        self._room = UNPACKED_MAX * max(self.size, 1 << 20)
 
     def __enter__(self) -> Self:
         return self
@@ -120,11 +122,11 @@ class Records:
     def __exit__(self, *error: object) -> None:
         self._stream.close()
 
-    def __iter__(self) -> Iterator[McapRecord]:
+    def __iter__(self) -> Iterator[mcap.McapRecord]:
         """Yield the records up to the file's end or its first damaged part.
 
         Raises:
-            BadInputError: If the file is not MCAP or has an unknown compression.
+            BadInputError: If the file is not MCAP.
         """
         head = self._stream.read(16)
         if not head.startswith(MCAP0_MAGIC):
@@ -134,37 +136,36 @@ class Records:
         self._stream.seek(0)
         try:
             yield from self._read()
-        except BadInputError:
-            raise
         except CRCValidationError as error:
             self.fault = "damaged: a checksum is wrong"
-            if isinstance(error.record, DataEnd):  # all was read
+            if isinstance(error.record, mcap.DataEnd):  # all was read
                 self.data_ended = self.ended = True
                 self.position = self.size
                 self.fault = "damaged: a byte outside the chunks is wrong"
         except (EndOfFile, RecordLengthLimitExceeded):  # a record that ends behind the file
             self.fault, self.cut = "cut short", True
-        except _TooMuchError:
-            self.fault = f"unpacks to more than {UNPACKED_MAX} times its size, as no recording does"
+        except _StopError as error:
+            self.fault = str(error)
         except OSError as error:
             self.fault = f"unreadable: {error.strerror}"
         except Exception:  # the library may raise anything on damaged bytes
             self.cut = self._stream.tell() >= self.size
             self.fault = "cut short" if self.cut else "damaged"
 
-    def _read(self) -> Iterator[McapRecord]:
+    def _read(self) -> Iterator[mcap.McapRecord]:
         reader = StreamReader(
             self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
         )
         for record in reader.records:
-            if isinstance(record, Chunk):
-                yield from self._unpack(record)
-                self.chunks += 1
+            if isinstance(record, mcap.Header) == (self.position > 0):
+                raise ValueError("the first record, and only the first, must be a header")
+            if isinstance(record, mcap.Chunk):
+                yield from map(self._check, self._unpack(record))
             elif not self.data_ended:  # what follows repeats the definitions
-                yield record
-            if isinstance(record, Statistics):
+                yield self._check(record)
+            if isinstance(record, mcap.Statistics):
                 self.stated = record.message_count
-            self.data_ended |= isinstance(record, DataEnd)
+            self.data_ended |= isinstance(record, mcap.DataEnd)
             self.position = self._stream.tell()
         self.position = self._stream.tell()
         self.ended = self.data_ended = True
@@ -179,45 +180,41 @@ class Records:
     def _take_room(self, size: int) -> None:
         self._room -= size
         if self._room < 0:
-            raise _TooMuchError
+            text = f"unpacks to more than {UNPACKED_MAX} times its size, as no recording does"
+            raise _StopError(text)
 
-    def _unpack(self, chunk: Chunk) -> Iterator[McapRecord]:
+    def _check(self, record: mcap.McapRecord) -> mcap.McapRecord:
+        """Note definitions, and check that each number has one definition, before its messages."""
+        if isinstance(record, mcap.Message):
+            self._take_room(MESSAGE_COST)
+            if record.channel_id not in self.channels:
+                raise ValueError("a message of no channel")
+        elif isinstance(record, mcap.Schema | mcap.Channel):
+            known: Any = self.schemas if isinstance(record, mcap.Schema) else self.channels
+            if known.setdefault(record.id, record) != record:
+                raise ValueError("two definitions have the same number")
+        return record
+
+    def _unpack(self, chunk: mcap.Chunk) -> Iterator[mcap.McapRecord]:
         size = chunk.uncompressed_size
         self._take_room(size)
-        # Not the library's: it allocates what the compressed data states, without a bound.
-        match chunk.compression:
-            case "":
-                data = chunk.data
-            case "zstd":
-                unpacker = zstandard.ZstdDecompressor()
-                data = unpacker.stream_reader(chunk.data, read_across_frames=True).read(size + 1)
-            case "lz4":
-                data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
-            case other if not self.chunks:
-                raise BadInputError(
-                    f"{self.path}: its chunks are compressed by {to_one_line(other)!r}; cloudrc"
-                    " reads zstd and lz4: convert it with: mcap compress"
-                )
-            case _:
-                raise ValueError("another compression than in the chunks before")
+        if chunk.compression not in _UNPACK:
+            raise _StopError(
+                f"its chunks are compressed by {to_one_line(chunk.compression)!r}; cloudrc reads"
+                " zstd and lz4: convert it with: mcap compress"
+            )
+        data = _UNPACK[chunk.compression](chunk.data, size + 1)
         if len(data) != size:
             raise ValueError("the chunk is not as long as it states")
-        whole = replace(chunk, compression="", data=data)
-        stream, _ = get_chunk_data_stream(whole, validate_crc=True)
-        while stream.count < size:  # one at a time: a chunk may hold millions
-            opcode, length = stream.read1(), stream.read8()
-            end = stream.count + length
-            if opcode == Opcode.MESSAGE:
-                self._take_room(MESSAGE_COST)
-                yield Message.read(stream, length)
-            elif opcode == Opcode.SCHEMA:
-                yield Schema.read(stream)
-            elif opcode == Opcode.CHANNEL:
-                yield Channel.read(stream)
-            else:
-                stream.read(length)
-            if stream.count != end:
-                raise ValueError("a record is not as long as it states")
+        if chunk.uncompressed_crc not in (0, checksum := zlib.crc32(data)):
+            raise CRCValidationError(chunk.uncompressed_crc, checksum, chunk)
+        stream = BytesIO(data)
+        records = StreamReader(stream, skip_magic=True).records
+        try:
+            while stream.tell() < size:  # one at a time: a chunk may hold millions
+                yield next(records)
+        except EndOfFile as error:
+            raise ValueError("a record is not as long as it states") from error
 
 
 @dataclass(slots=True)
@@ -242,6 +239,28 @@ class Contents:
     lacking: str = ""
     remarks: tuple[str, ...] = ()
 
+    def recording(self) -> Recording:
+        """Decode the messages to tables."""
+        return Recording.from_contents(self)
+
+    def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
+        """Write the contents and further `attachments` to an MCAP file, which is replaced at once.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        clock, clock_id = self.metadata.get(CLOCK, ""), self.metadata.get("clock_id", "")
+        with (
+            atomic_file(target) as file,
+            McapWriter(file, clock=clock, clock_id=clock_id) as writer,
+        ):
+            writer.note(self.metadata)
+            for message in self.messages:
+                writer.write_message(*message)
+            for name, data in {**self.attachments, **(attachments or {})}.items():
+                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+                writer.attach(name, data, media_type)
+
 
 def read_contents(path: Path) -> Contents:
     """Read the topics that cloudrc records, up to the end of a file or its first damaged part.
@@ -249,27 +268,25 @@ def read_contents(path: Path) -> Contents:
     Raises:
         BadInputError: If nothing in the file is readable.
     """
-    contents, sequences = Contents(), array("L")
-    types: dict[int, tuple[str, str]] = {}
-    channels: dict[int, tuple[str, bool]] = {}  # name of the topic; whether it is ours
-    seen: Counter[int] = Counter()  # messages by channel
+    return _read(path)[0]
+
+
+def _read(path: Path) -> tuple[Contents, Records, int]:
+    """Read a file; return also the number of messages that are known to be missing."""
+    contents, sequences, total = Contents(), array("L"), 0
+    ours: dict[int, bool] = {}  # whether cloudrc records the topic of a channel, in this layout
     with Records(path) as records:
         for record in records:
-            if isinstance(record, Message):
-                seen[record.channel_id] += 1
-                topic, ours = channels.get(record.channel_id, ("", False))
-                if ours:
-                    contents.messages.append((topic, record.log_time, record.data))
+            if isinstance(record, mcap.Message):
+                channel, total = records.channels[record.channel_id], total + 1
+                if channel.id not in ours:
+                    ours[channel.id] = _is_ours(channel, records.schemas.get(channel.schema_id))
+                if ours[channel.id]:
+                    contents.messages.append((channel.topic, record.log_time, record.data))
                     sequences.append(record.sequence)
-            elif isinstance(record, Schema):
-                types[record.id] = record.name, record.data.decode("utf-8", "replace")
-            elif isinstance(record, Channel):
-                topic, (ros_type, text) = record.topic, types.get(record.schema_id, ("", ""))
-                known = topic in TOPICS and TOPICS[topic].ros_type == ros_type
-                channels[record.id] = topic, known and is_known(ros_type, text)
-            elif isinstance(record, Metadata):
+            elif isinstance(record, mcap.Metadata):
                 contents.metadata.update(record.metadata)
-            elif isinstance(record, Attachment):
+            elif isinstance(record, mcap.Attachment):
                 contents.attachments[record.name] = record.data
     messages, fault = contents.messages, records.fault
     if not records.data_ended and not messages:
@@ -280,40 +297,55 @@ def read_contents(path: Path) -> Contents:
         order = sorted(range(len(messages)), key=lambda n: (messages[n][1], sequences[n]))
         contents.messages = [messages[n] for n in order]
         contents.remarks += (f"was not in order of time: {late} messages were sorted",)
-    _note(contents, records, [(*channels.get(one, ("", None)), n) for one, n in seen.items()])
-    return contents
+    _note(contents, records, ours, total)
+    return contents, records, max(records.stated or 0, total) - len(messages)
 
 
-def _note(contents: Contents, records: Records, seen: list[tuple[str, bool | None, int]]) -> None:
-    """Note what is missing; `seen` has topic, whether it is ours, and messages of each channel."""
-    cut, lacking = list[str](), list[str]()
+def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
+    """Check whether cloudrc records a channel's topic, and in the same layout."""
+    ros_type = TOPICS[channel.topic].ros_type if channel.topic in TOPICS else ""
+    if schema is None or schema.name != ros_type:
+        return False
+    return is_known(ros_type, schema.data.decode("utf-8", "replace"))
+
+
+def _note(contents: Contents, records: Records, ours: dict[int, bool], total: int) -> None:
+    """Note what is missing.
+
+    `ours` has each channel with messages, and whether cloudrc records it; `total` is the number of
+    these messages.
+    """
+    faults, changed, metadata = list[str](), list[str](), contents.metadata
     if records.data_ended and records.cut:
         contents.remarks += ("had a torn index: all its messages were read",)
     elif fault := records.fault:
         if not records.data_ended:
             count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
             fault += f": {count} messages were read, the last at {until:.2f} s"
-        (cut if records.cut else lacking).append(fault)
-    others = {name for name, ours, _ in seen if ours is False}
+        faults.append(fault)
+    channels = Counter((records.channels[number].topic, known) for number, known in ours.items())
+    others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):
         told = f"has topics that cloudrc does not record: {_list(foreign)}"
         contents.remarks += (to_one_line(told),)
-    if changed := sorted(others & TOPICS.keys()):
-        lacking.append(f"topics of another layout were left out: {', '.join(changed)}")
-    twice = Counter(name for name, ours, _ in seen if ours and TOPICS[name].end != "either")
-    if double := [name for name, count in twice.items() if count > 1]:
-        lacking.append(f"two robots or two recordings are in one file: {', '.join(double)}")
-    if homeless := sum(count for _, ours, count in seen if ours is None):
-        lacking.append(f"{homeless} messages are of no topic")
-    if CLOCK not in contents.metadata:
-        lacking.append("the metadata of cloudrc, which names the clock, is not there")
-    total = sum(count for *_, count in seen)
+    if other := sorted(others & TOPICS.keys()):
+        changed.append(f"topics of another layout were left out: {', '.join(other)}")
+    twice = [name for (name, known), count in channels.items() if known and count > 1]
+    if double := [name for name in twice if TOPICS[name].end != "either"]:
+        changed.append(f"two robots or two recordings are in one file: {', '.join(double)}")
+    if not metadata.get(CLOCK):
+        changed.append("the metadata of cloudrc, which names the clock, is not there")
     if records.ended and records.stated not in (None, total):
-        lacking.append(f"the index states {records.stated} messages, {total} were read")
-    lacking += _changed(contents) if records.data_ended else ()
-    told = to_one_line(contents.metadata.get(MISSING, ""))
-    contents.lacking = "; ".join(lacking)
-    contents.note = "; ".join(filter(None, [*cut, *lacking, told]))
+        changed.append(f"the index states {records.stated} messages, {total} were read")
+    changed += _changed(contents) if records.data_ended else ()
+    if before := to_one_line(metadata.get(CHANGED, "")):  # by an earlier reader of the file
+        changed.append(before)
+    if changed:
+        metadata[CHANGED] = "; ".join(changed)
+    told = to_one_line(metadata.get(MISSING, ""))
+    contents.lacking = "; ".join([*(faults if not records.cut else []), *changed])
+    anew = [text for text in changed if text not in told]
+    contents.note = "; ".join(filter(None, [*faults, *anew, told]))
 
 
 def _changed(contents: Contents) -> Iterator[str]:
@@ -367,98 +399,30 @@ class Recovery:
 def recover(source: Path, target: Path) -> Recovery:
     """Write a complete copy of a recording that may be torn, up to its first damaged part.
 
-    The copy keeps messages with their stamps, schemas, channels, attachments and metadata, and has
-    an index, checksums and a note about what is missing. It replaces `target` atomically.
+    The copy has the topics that cloudrc records, the attachments and the metadata, and a note about
+    what is missing. It replaces `target` atomically.
 
     Raises:
         BadInputError: If the file holds no readable message.
         OSError: If the new file cannot be written.
     """
-    with Records(source) as records, atomic_file(target) as new:
-        return _Copy(new, records).finish()
-
-
-class _Copy:
-    """Copies records to a new file, with new numbers for channels and schemas."""
-
-    def __init__(self, new: IO[bytes], records: Records) -> None:
-        self._records = records
-        self._writer: Any = Writer(new, compression=CompressionType.ZSTD, enable_data_crcs=True)
-        self._schemas: dict[int, tuple[Schema, int]] = {}  # old number -> its new number
-        self._channels: dict[int, tuple[Channel, int]] = {}
-        self._kept = {"messages": 0, "attachments": 0, "metadata": 0}
-        self._defined = 0  # channels and schemas in the new file
-        self._homeless = 0  # messages of no channel
-        self._told = ""  # what the recording itself says is missing
-        for number, record in enumerate(records):
-            if isinstance(record, Header) or number == 0:
-                profile = record.profile if isinstance(record, Header) else ""
-                self._writer.start(profile=profile, library=f"cloudrc {__version__} recover")
-            self._take(record)
-
-    def _take(self, record: McapRecord) -> None:
-        add: Any = self._writer
-        if isinstance(record, Message):
-            _, channel = self._channels.get(record.channel_id, (None, 0))
-            self._homeless += not channel
-            self._kept["messages"] += bool(channel)
-            if channel:
-                add.add_message(
-                    channel, record.log_time, record.data, record.publish_time, record.sequence
-                )
-        elif isinstance(record, Schema):
-            self._define(record, self._schemas)
-        elif isinstance(record, Channel):
-            self._define(record, self._channels)
-        elif isinstance(record, Attachment):
-            self._kept["attachments"] += 1
-            add.add_attachment(
-                record.create_time, record.log_time, record.name, record.media_type, record.data
-            )
-        elif isinstance(record, Metadata):
-            self._kept["metadata"] += 1
-            add.add_metadata(record.name, record.metadata)
-            if record.name == METADATA:
-                self._told = record.metadata.get(MISSING, self._told)
-
-    def finish(self) -> Recovery:
-        """Complete the new file; return what the file holds and what is lost."""
-        records, kept = self._records, self._kept
-        if not kept["messages"] and not kept["attachments"]:
-            reason = records.fault or "none is in it"
-            raise BadInputError(
-                f"{records.path}: holds no readable message: {reason}; nothing is written"
-            )
-        lost = max(self._homeless, (records.stated or 0) - kept["messages"])
-        new = []
-        if records.fault and not (records.data_ended and records.cut):
-            unread = f": {records.unread} bytes after the last intact part were not read"
-            new.append(records.fault + unread * bool(records.unread))
-        if lost:
-            new.append(f"{lost} messages are lost")
-        notes = [self._told, *new] if self._told else new
-        if new:  # otherwise the new file already has what the recording says
-            self._writer.add_metadata(METADATA, {MISSING: "; ".join(notes)})
-        self._writer.finish()
-        kept |= {"chunks": records.chunks, "channels": len(self._channels)}
-        dropped = {"messages": lost} if lost else {}
-        return Recovery(records.size, kept, dropped, records.unread, notes, not records.ended)
-
-    def _define(self, record: Any, known: dict[int, Any]) -> None:
-        """Register a schema or channel; register each definition of its number only once."""
-        if record.id in known and known[record.id][0] == record:
-            return
-        self._defined += 1
-        if self._defined > CHANNELS_MAX:
-            raise BadInputError(
-                f"{self._records.path}: defines more than {CHANNELS_MAX} channels and schemas;"
-                " use another file"
-            )
-        if isinstance(record, Schema):
-            number = self._writer.register_schema(record.name, record.encoding, record.data)
-        else:
-            _, schema = self._schemas.get(record.schema_id, (None, 0))
-            number = self._writer.register_channel(
-                record.topic, record.message_encoding, schema, record.metadata
-            )
-        known[record.id] = record, number
+    contents, records, lost = _read(source)
+    if not contents.messages:
+        reason = contents.note or "none is in it"
+        raise BadInputError(f"{source}: holds no readable message: {reason}; nothing is written")
+    notes = [contents.note] if contents.note else []
+    if records.unread:
+        notes.append(f"{records.unread} bytes after the last intact part were not read")
+    if lost:
+        notes.append(f"{lost} messages are lost, or of topics that cloudrc does not record")
+    if notes:
+        contents.metadata[MISSING] = "; ".join(notes)
+    contents.write(target)
+    counts = Counter(topic for topic, _, _ in contents.messages)
+    kept = {
+        "messages": counts.total(),
+        "attachments": len(contents.attachments),
+        "topics": len(counts),
+    }
+    dropped = {"messages": lost} if lost else {}
+    return Recovery(records.size, kept, dropped, records.unread, notes, not records.ended)

@@ -220,50 +220,23 @@ _TABLE = (
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Name -> topic, for every topic of a recording."""
 
-_WHEN_SENT = "departure of the telemetry, which is the instant of the measurement"
-_WHEN_TRUE = "instant of the physics step"
-_WHEN_COMMANDED = "departure of the command"
-_TICK, _PERIOD = "100 Hz", "100 Hz, while there is telemetry and a setpoint"
-_ON_EVENT = "once per event"
-SAMPLING: dict[str, tuple[str, str]] = {
-    "/odometry": (_WHEN_SENT, "100 Hz, in a session"),
-    "/telemetry": (_WHEN_SENT, "100 Hz, in a session"),
-    "/ground_truth": (_WHEN_TRUE, _TICK),
-    "/contact_force": (_WHEN_TRUE, _TICK),
-    "/reference": (_WHEN_TRUE, _TICK),
-    "/uplink_delay": ("arrival at cloud", "once per telemetry that arrives"),
-    "/downlink_delay": ("arrival at world", "once per command that arrives"),
-    "/command_applied": ("first physics step that follows the command", "once per command applied"),
-    "/guard": ("physics step in which the state changes", _ON_EVENT),
-    "/contact": ("the first odometry after the contact, at most 10 ms later", _ON_EVENT),
-    "/session": ("begin of the session at this end", _ON_EVENT),
-    "/estimated_odometry": (_WHEN_COMMANDED, _PERIOD),
-    "/setpoint_position": (_WHEN_COMMANDED, _PERIOD),
-    "/cmd_vel": (_WHEN_COMMANDED, _PERIOD),
-    "/delay_estimate": (_WHEN_COMMANDED, _PERIOD),
-    "/pid": (_WHEN_COMMANDED, _PERIOD),
-    "/mission": ("instant of the event", _ON_EVENT),
-    "/fault": ("when this end notices the fault", "once per fault; repetitions are only counted"),
-    "/count": ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"),
-    "/link": (
-        "when this end notices it",
-        "once per change; again when a session, a mission or a state of the guard begins",
-    ),
-    "/link_check": ("end of the interval that is judged", "every 5 s per quantity"),
-    "/lateness": ("when the deadline was handled", "100 Hz per end"),
-}
-"""Topic -> meaning of a row's stamp, and how often a row is written; for docs/topics.md."""
 _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Values]]
 
 
-def _extractor(topic: Topic) -> _Extract:
-    get = attrgetter(*topic.paths())
-    values = get if len(topic.fields) > 1 else lambda record: (get(record),)
-    return topic.name, attrgetter(topic.stamp_path), values
+def values_getter(paths: list[str]) -> Callable[[Any], Values]:
+    """Make a function that reads the values at dotted paths from a record, always as a tuple."""
+    if not paths:
+        return lambda record: ()
+    get = attrgetter(*paths)
+    return get if len(paths) > 1 else lambda record: (get(record),)
 
 
 _EXTRACT: dict[type[Record], tuple[_Extract, ...]] = {
-    source: tuple(_extractor(topic) for topic in _TABLE if topic.source is source)
+    source: tuple(
+        (topic.name, attrgetter(topic.stamp_path), values_getter(topic.paths()))
+        for topic in _TABLE
+        if topic.source is source
+    )
     for source in {topic.source for topic in _TABLE}
 }
 _UPLINK, _DOWNLINK = _EXTRACT.pop(rec.Arrival)

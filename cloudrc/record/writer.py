@@ -12,15 +12,14 @@ import errno
 import hashlib
 import json
 import os
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from io import FileIO
-from itertools import islice
+from dataclasses import replace
+from io import BytesIO, FileIO
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Any, Self, cast
 
 from cloudrc import __version__
 from cloudrc.record import missing
@@ -33,6 +32,7 @@ try:
     import zstandard  # noqa: F401  (mcap imports it, but with a worse error if it is missing)
     from mcap.data_stream import RecordBuilder
     from mcap.records import ChunkIndex, DataEnd, Footer, Metadata
+    from mcap.stream_reader import StreamReader
     from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 except ImportError as error:
     raise missing(error) from error
@@ -45,6 +45,8 @@ CLOCK = "clock"
 """Metadata key: the end ("world" or "cloud") whose clock the stamps use."""
 MISSING = "missing"
 """Metadata key: what is missing from the file, in words."""
+CHANGED = "changed"
+"""Metadata key: what another program has removed from the file or added to it, in words."""
 COUNTS, SHA256 = "counts", "messages_sha256"
 """Metadata keys of a complete file: number of messages by topic as JSON, and hash of the messages
 by `record.hash`. The values show whether another program has changed the recording. The value of
@@ -207,29 +209,21 @@ class _ChunkIndexes:
 
     def append(self, index: ChunkIndex) -> None:
         """Add the index of a chunk."""
-        offsets, end = index.message_index_offsets, index.chunk_start_offset + index.chunk_length
-        row = (
-            *(index.message_start_time, index.message_end_time),
-            *(index.chunk_start_offset, index.chunk_length, index.message_index_length),
-            *(index.compressed_size, index.uncompressed_size),
-            *offsets,
-            *[offset - end for offset in offsets.values()],
-        )
-        if block := self._compress.compress(struct.pack(f"<{1 + len(row)}q", len(row), *row)):
+        row: Any = RecordBuilder()
+        _moved(index, -1).write(row)
+        if block := self._compress.compress(row.end()):
             self._blocks.append(block)
 
     def __iter__(self) -> Iterator[ChunkIndex]:
         data = zlib.decompress(b"".join([*self._blocks, self._compress.copy().flush()]))
-        values = iter(struct.unpack(f"<{len(data) // 8}q", data))
-        for size in values:
-            first, last, start, length, index_length, *sizes = islice(values, 7)
-            channels, places = (list(islice(values, (size - 7) // 2)) for _ in range(2))
-            offsets = {
-                channel: start + length + place
-                for channel, place in zip(channels, places, strict=True)
-            }
-            compressed, uncompressed = sizes
-            yield ChunkIndex(
-                *(length, start, "zstd", compressed, last, index_length),
-                *(offsets, first, uncompressed),
-            )
+        stream = BytesIO(data)
+        rows = StreamReader(stream, skip_magic=True).records
+        while stream.tell() < len(data):
+            yield _moved(cast("ChunkIndex", next(rows)), 1)
+
+
+def _moved(index: ChunkIndex, sign: int) -> ChunkIndex:
+    """Add to the offsets of a chunk's index, or subtract from them, the end of the chunk."""
+    end = sign * (index.chunk_start_offset + index.chunk_length)
+    offsets = {channel: at + end for channel, at in index.message_index_offsets.items()}
+    return replace(index, message_index_offsets=offsets)

@@ -25,7 +25,6 @@ from cloudrc.record.merge import merge
 from cloudrc.record.reader import Contents, NothingReadableError, read_contents
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import SHA256
-from cloudrc.records import Arrival
 from cloudrc.report.document import Run
 from cloudrc.report.write import DIFFERS, RECORDING_NOTE
 
@@ -33,8 +32,6 @@ REPORT_BYTES_MAX = 16 << 20
 """Largest report.json that is read [bytes]; a report may have many notes."""
 JUDGEMENT = ("criteria", "description", "name", "report")
 """Keys of an experiment that change the report, but not the flight."""
-FOLLOWS = (("/command_applied", "/guard"), ("/pid", "/mission"))
-"""Pairs of topics: if the first topic has rows, the second topic must have rows, too."""
 
 
 class _EarlierReport(BaseModel):
@@ -61,16 +58,15 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     if not config.is_file():
         raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
     experiment = read_experiment(config)
-    mission, contents = None, _read_merged(folder)
+    contents = before = _read_merged(folder)
     if contents is None:
-        mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-        contents = mission.contents
-    recording = Recording.from_contents(contents)
+        contents = merge(folder / "world.mcap", folder / "cloud.mcap")
+    recording = contents.recording()
     earlier = _earlier_report(folder / "report.json")
     for lack in _lacking(recording, config, whole=earlier is not None and earlier.complete):
         raise BadInputError(f"{merged}: {lack}; no report is written")
-    if mission is not None:
-        mission.write(merged)
+    if before is None:
+        contents.write(merged)
     return recording, experiment, _describe(recording, earlier, contents)
 
 
@@ -111,25 +107,10 @@ def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str
         here = _flown(read(config), str(config))
         if names := sorted(key for key in there | here if there.get(key) != here.get(key)):
             yield f"is the recording of an experiment with other values for: {', '.join(names)}"
-    if SHA256 not in recording.metadata:  # without the writer's own count of its messages
-        yield from _unequal(recording)
     for topic in ("/ground_truth", *CONTROL_TOPICS):
         steps = np.diff(recording[topic]["stamp_ns"])
         if wrong := int((steps < (topic == "/ground_truth")).sum()):
             yield f"has {wrong} rows on {topic} that are not later than the row before"
-
-
-def _unequal(recording: Recording) -> Iterator[str]:
-    """Yield the topics that have fewer rows than related topics show."""
-    for topic in TOPICS.values():
-        count = len(recording[topic.name])
-        for other in TOPICS.values() if topic.source is not Arrival else ():
-            more = len(recording[other.name])
-            if other.source is topic.source and more > count + 1:
-                yield f"has {count} rows on {topic.name}, but {more} on {other.name}"
-    for first, second in FOLLOWS:
-        if len(recording[first]) and not len(recording[second]):
-            yield f"has rows on {first}, but none on {second}"
 
 
 def _flown(data: bytes, name: str) -> dict[str, Any]:

@@ -6,7 +6,6 @@ The page embeds its pictures, uses the reader's fonts and sends no request to th
 from __future__ import annotations
 
 import json
-import re
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -49,8 +48,6 @@ GROUPS = {
 """Groups of the table, in order; metrics in no group come last, under "Others"."""
 SHARES = ("loss_", "late_")
 """Prefixes of the names of numbers that are shown in per cent."""
-_UNIT = re.compile(r"(\d) (s|m|mm|ms|N|m/s)\b")
-"""Pattern of a number and its unit; no line may break between number and unit."""
 
 
 def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:
@@ -129,7 +126,7 @@ def render(
         accent=accent,
         kicker=escape(kicker),
         headline=escape(headline),
-        summary=_UNIT.sub("\\1\u00a0\\2", escape(summary(assessment.flight, assessment.numbers))),
+        summary=escape(summary(assessment.flight, assessment.numbers)),
         failures=_list([_failure(failure) for failure in verdict.failures], "failures"),
         notes=_list([escape(note) for note in assessment.notes], "note"),
         facts=_facts(run, experiment),

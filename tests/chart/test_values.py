@@ -8,7 +8,8 @@ jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-val
 
 DEFAULTS = values_of(CHART / "values.yaml")
 # Values that Helm, Kubernetes or a plug-in defines and checks.
-OPEN = {"global", "affinity", "tolerations", "podSecurityContext", "containerSecurityContext"}
+CONTEXTS = {"podSecurityContext", "containerSecurityContext"}
+OPEN = {"global", "affinity", "tolerations", "allowFrom", "dns"} | CONTEXTS
 
 
 def parts(node, path=()):
@@ -72,7 +73,7 @@ def test_the_defaults_are_valid_and_written_out():
         ({"experiment": {"seed": 2**53}}, "9007199254740992"),
         ({"fullnameOverride": "1abc"}, "1abc"),
         ({"experiment": None}, "experiment"),
-        ({"metrics": {"allowFrom": [{"namespace": "x"}]}}, "namespace"),
+        ({"metrics": {"allowFrom": [{"namespace": {"name": "x"}}]}}, "namespace"),
         ({"metrics": {"allowFrom": "all"}}, "all"),
         ({"image": {"world": {"digest": "sha256:12"}}}, "sha256:12"),
         ({"image": {"tag": "a b"}}, "a b"),

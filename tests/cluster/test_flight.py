@@ -14,7 +14,8 @@ from cloudrc.cluster import flight, pods
 from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
-from cloudrc.record.merge import Mission, cut_to_last_mission, merge
+from cloudrc.record.merge import cut_to_last_mission, merge
+from cloudrc.record.reader import Contents
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
 from cloudrc.report.document import Run
@@ -37,7 +38,7 @@ def later(given: list[Record], by_ns: int) -> list[Record]:
     return [record._replace(stamp_ns=record.stamp_ns + by_ns) for record in given]
 
 
-def merged(folder: Path, *flights: tuple[list[Record], list[Record]], torn: bool) -> Mission:
+def merged(folder: Path, *flights: tuple[list[Record], list[Record]], torn: bool) -> Contents:
     """Record flights as two pods do; torn: the files have no end, as when copied in flight."""
     for number, name in enumerate(("world", "cloud")):
         path = folder / f"{name}.mcap"
@@ -59,14 +60,13 @@ def test_a_recording_with_the_missions_end_is_complete(tmp_path: Path, torn: boo
     # The mission's start may be in the recording of a pod that is gone.
     for flight_of_cloud in (cloud, cloud[len(cloud) // 3 :]):
         mission = merged(tmp_path, (world, flight_of_cloud), after, torn=torn)
-        assert bool(mission.contents.note) == torn
-        cut, ended = cut_to_last_mission(mission)
-        assert ended
-        assert cut.contents.messages[0][1] <= world[0].stamp_ns + SECOND
+        assert bool(mission.note) == torn
+        assert cut_to_last_mission(mission)
+        assert mission.messages[0][1] <= world[0].stamp_ns + SECOND
     half = (world[: len(world) // 2], cloud[: len(cloud) // 2])
-    cut, ended = cut_to_last_mission(merged(tmp_path, half, torn=True))
-    assert not ended
-    assert not cut.recording().complete
+    mission = merged(tmp_path, half, torn=True)
+    assert not cut_to_last_mission(mission)
+    assert not mission.recording().complete
 
 
 def test_only_the_last_of_two_missions_is_kept(tmp_path: Path) -> None:
@@ -74,9 +74,10 @@ def test_only_the_last_of_two_missions_is_kept(tmp_path: Path) -> None:
     gap = world[-1].stamp_ns + 5 * SECOND
     second = later(world, gap), later(cloud, gap)
     after = later(world[-300:], gap + SECOND), list[Record]()
-    cut, ended = cut_to_last_mission(merged(tmp_path, flown(), second, after, torn=True))
-    assert ended
-    alone, _ = cut_to_last_mission(merged(tmp_path, second, after, torn=True))
+    cut = merged(tmp_path, flown(), second, after, torn=True)
+    alone = merged(tmp_path, second, after, torn=True)
+    assert cut_to_last_mission(cut)
+    assert cut_to_last_mission(alone)
     experiment = load_experiment(NAME, [SETTING])
     both = [assess(m.recording(), experiment, Run("virtual", "virtual")) for m in (cut, alone)]
     assert both[0].verdict.outcome == "success"

@@ -35,7 +35,7 @@ SPECIAL: dict[str, Any] = {
 }
 
 
-def refused(name: object, *settings: str) -> str:
+def refused(name, *settings):
     """Return the message that refuses an experiment."""
     with pytest.raises(BadInputError) as caught:
         load_experiment(str(name), settings)
@@ -43,11 +43,11 @@ def refused(name: object, *settings: str) -> str:
     return str(caught.value)
 
 
-def words(key: str) -> str:
+def words(key):
     return problems.expectation(Experiment, tuple(key.split(".")))
 
 
-def valid(key: str) -> Any:
+def valid(key):
     """Return a valid value of the key, different from its default if possible."""
     if key in SPECIAL:
         return SPECIAL[key]
@@ -59,7 +59,7 @@ def valid(key: str) -> Any:
     return next((value for word, value in known.items() if word in words(key)), "some text")
 
 
-def beside(key: str) -> list[str]:
+def beside(key):
     """List the settings that the key needs."""
     above, _, last = key.rpartition(".")
     if above.endswith(".loss"):
@@ -74,10 +74,10 @@ def beside(key: str) -> list[str]:
     return []
 
 
-def base(key: str) -> str:
+def base(key):
     """Return the shipped experiment in which to set the key."""
     return "steps" if key == "mission" or key.startswith("mission.steps") else "paper"
 
 
-def setting(key: str, value: Any) -> str:
+def setting(key, value):
     return f"{key}={json.dumps(value)}"

@@ -1,9 +1,6 @@
 """Every key of the schema can be set; a typo, a wrong type and a wrong range are refused."""
 
-from __future__ import annotations
-
 import re
-from typing import Any
 
 import pytest
 
@@ -14,18 +11,18 @@ ONE_WAY = [key for key in LEAVES if "downlink" not in key]  # both directions ha
 RANGED = [key for key in ONE_WAY if ">" in words(key)]
 
 
-def refusal(key: str, value: Any) -> str:
+def refusal(key, value):
     return refused(base(key), *beside(key), setting(key, value))
 
 
-def value_at(tree: Any, key: str) -> Any:
+def value_at(tree, key):
     for step in key.split("."):
         tree = tree[int(step)] if isinstance(tree, list) else tree[step]
     return tree
 
 
 @pytest.mark.parametrize("key", LEAVES)
-def test_set_reaches_the_key(key: str) -> None:
+def test_set_reaches_the_key(key):
     value = valid(key)
     tree = load_experiment(base(key), [*beside(key), setting(key, value)]).model_dump(mode="json")
     found = value_at(tree, key)
@@ -37,7 +34,7 @@ def test_set_reaches_the_key(key: str) -> None:
 
 
 @pytest.mark.parametrize("key", ONE_WAY)
-def test_typo_is_refused_with_the_nearest_key(key: str) -> None:
+def test_typo_is_refused_with_the_nearest_key(key):
     above, dot, last = key.rpartition(".")
     typo = f"{above}{dot}{last[:-1]}{'x' if last[-1] != 'x' else 'y'}{last[-1]}"
     text = refused(base(key), *beside(key), setting(typo, valid(key)))
@@ -47,7 +44,7 @@ def test_typo_is_refused_with_the_nearest_key(key: str) -> None:
 
 
 @pytest.mark.parametrize("key", ONE_WAY)
-def test_wrong_type_is_refused(key: str) -> None:
+def test_wrong_type_is_refused(key):
     wrong = 3 if "text" in words(key) or "true or" in words(key) else [["a"]]
     text = refusal(key, wrong)
     assert f"--set: {key}" in text
@@ -55,7 +52,7 @@ def test_wrong_type_is_refused(key: str) -> None:
 
 
 @pytest.mark.parametrize("key", RANGED)
-def test_out_of_range_is_refused(key: str) -> None:
+def test_out_of_range_is_refused(key):
     above = [1.001 * float(limit) for limit in re.findall(r"<= ([\d.]+)", words(key))]
     for value in (-1, *((int(limit) + 1 for limit in above) if "whole" in words(key) else above)):
         text = refusal(key, value)
@@ -65,7 +62,7 @@ def test_out_of_range_is_refused(key: str) -> None:
     assert "[" in words(key) or "<=" in words(key) or key == "seed", "a unit, a share or a count"
 
 
-def test_every_key_is_described_and_dumped() -> None:
+def test_every_key_is_described_and_dumped():
     text = dump(load_experiment("paper"))
     optional = ("mission.steps", ".loss.", ".changes.0", ".blackouts.0")
     for key, field in LEAVES.items():

@@ -1,7 +1,5 @@
 """Experiments are resolved, values override each other in order, and a dump loads again."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 
@@ -13,7 +11,6 @@ from cloudrc.assembly import link_profile
 from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
 from cloudrc.config.load import (
-    ResolvedExperiment,
     dump,
     fingerprint,
     load_experiment,
@@ -25,21 +22,21 @@ from cloudrc.geometry.scene import load_scene
 PROFILES = shipped.names("profile")
 
 
-def again(experiment: ResolvedExperiment, folder: Path, *settings: str) -> ResolvedExperiment:
+def again(experiment, folder, *settings):
     path = folder / "config.yaml"
     path.write_text(dump(experiment), "utf-8")
     return load_experiment(path, settings)
 
 
 @pytest.mark.parametrize("kind", ["experiment", "mission", "profile"])
-def test_every_shipped_file_is_described(kind: str) -> None:
+def test_every_shipped_file_is_described(kind):
     for name in shipped.names(kind):
         assert shipped.describe(kind, name), f"{kind} {name} has no description"
 
 
 @pytest.mark.parametrize("experiment", ["paper", "paper-verbatim", "steps", "hover"])
 @pytest.mark.parametrize("profile", PROFILES)
-def test_a_dump_loads_to_the_same(experiment: str, profile: str, tmp_path: Path) -> None:
+def test_a_dump_loads_to_the_same(experiment, profile, tmp_path):
     loaded = load_experiment(experiment, [f"link.profile={profile}"])
     assert again(loaded, tmp_path) == loaded
     assert loaded.link.profile == profile
@@ -50,7 +47,7 @@ def test_a_dump_loads_to_the_same(experiment: str, profile: str, tmp_path: Path)
     assert changed == load_experiment(experiment, ["link.profile=paper-p3"])
 
 
-def test_a_dump_needs_no_profile_file(tmp_path: Path) -> None:
+def test_a_dump_needs_no_profile_file(tmp_path):
     profile = tmp_path / "mine.yaml"
     profile.write_text("uplink: {delay_ms: 12}\n")
     loaded = load_experiment("paper", [f"link.profile={profile}"])
@@ -61,7 +58,7 @@ def test_a_dump_needs_no_profile_file(tmp_path: Path) -> None:
     assert changed == load_experiment("paper", ["link.profile=paper-p3"])
 
 
-def test_paper_is_the_published_scheme() -> None:
+def test_paper_is_the_published_scheme():
     paper = load_experiment("paper")
     assert (paper.name, paper.link.profile, paper.tunnel.order) == ("paper", "paper-p2", "newest")
     assert (paper.uplink.delay_ms, paper.uplink.jitter_ms) == (45, 25)
@@ -92,7 +89,7 @@ def test_the_age_limit_of_file_or_profile_sets_the_speed_cap(experiment, setting
     assert guard.speed_max_mps == pytest.approx(cap, abs=1e-5)
 
 
-def test_single_values_override_the_profile(tmp_path: Path) -> None:
+def test_single_values_override_the_profile(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("link: {profile: lossy, uplink: {delay_ms: 120}}\n")
     experiment = load_experiment(path)
@@ -103,7 +100,7 @@ def test_single_values_override_the_profile(tmp_path: Path) -> None:
     assert (other.uplink.delay_ms, other.uplink.jitter_ms) == (120, 10)
 
 
-def test_set_turns_a_name_into_a_mapping(tmp_path: Path) -> None:
+def test_set_turns_a_name_into_a_mapping(tmp_path):
     experiment = load_experiment("paper", ["cloud.controller.speed_max=2"])
     assert experiment.cloud.controller.name == "pid"
     assert (experiment.cloud.controller.model_extra or {})["speed_max"] == 2.0
@@ -112,7 +109,7 @@ def test_set_turns_a_name_into_a_mapping(tmp_path: Path) -> None:
     assert load_experiment(empty, ["cloud.controller.speed_max=2"]).cloud == experiment.cloud
 
 
-def test_set_reaches_into_lists_by_index() -> None:
+def test_set_reaches_into_lists_by_index():
     waypoints = load_experiment("paper", ["mission.waypoints.0.tolerance_m=.2"]).mission.waypoints
     assert [point.tolerance_m for point in waypoints[:2]] == [0.2, 0.3]
     before = load_profile("handover").uplink.changes
@@ -127,25 +124,22 @@ def test_set_reaches_into_lists_by_index() -> None:
 
 
 @pytest.mark.parametrize("text", ["exp #2", "exp: 2", "*x", "exp ", "12:30"])
-def test_a_value_is_the_whole_rest_of_its_argument(text: str) -> None:
+def test_a_value_is_the_whole_rest_of_its_argument(text):
     assert parse_value(text, "--set name") == text
     assert load_experiment("hover", [f"name={text}"]).name == text
 
 
-def test_a_value_may_be_a_number_a_list_or_quoted() -> None:
+def test_a_value_may_be_a_number_a_list_or_quoted():
     values = {"1e-3": 0.001, "true": True, "": None, "[1, 'a #']": [1, "a #"], '"5"': "5"}
     assert {text: parse_value(text, "x") for text in values} == values
-    assert parse_value("a: 1\nb: 2", "x") == {"a": 1, "b": 2}
 
 
-def test_the_order_of_settings_does_not_matter() -> None:
+def test_the_order_of_settings_does_not_matter():
     texts = ["mission.steps.count=3", "mission=steps", "world.scene=empty"]
     assert load_experiment("paper", texts) == load_experiment("paper", texts[::-1])
 
 
-def test_paths_start_at_the_file_that_names_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_paths_start_at_the_file_that_names_them(tmp_path, monkeypatch):
     links = tmp_path / "links"
     links.mkdir()
     (links / "trace.csv").write_text("time_s,delay_ms\n0,20\n1,40\n")
@@ -197,9 +191,8 @@ plain = st.recursive(
 
 @settings(max_examples=40, deadline=None)
 @given(plain)
-def test_written_yaml_parses_to_equal_values(value: object) -> None:
-    if "<<" not in repr(value):
-        assert document.parse_yaml(document.write_yaml(value), "text")[0] == value
+def test_written_yaml_parses_to_equal_values(value):
+    assert document.parse_yaml(document.write_yaml(value), "text")[0] == value
 
 
 @pytest.mark.parametrize(
@@ -207,13 +200,13 @@ def test_written_yaml_parses_to_equal_values(value: object) -> None:
     [("1e-3", 1e-3), (".2", 0.2), ("-3", -3), ("on", "on"), ("12:30", "12:30"), ("~", None),
      ("true", True), ("2024-01-01", "2024-01-01"), ("010", 10), ("'1'", "1")],
 )  # fmt: skip
-def test_scalars_follow_yaml_1_2(text: str, value: object) -> None:
+def test_scalars_follow_yaml_1_2(text, value):
     found = document.parse_yaml(text, "text")[0]
     assert (found, type(found)) == (value, type(value))
 
 
 @pytest.mark.parametrize("settings", [[], ["link.profile=satellite", "seed=7"]])
-def test_a_configuration_has_the_hash_of_its_file(settings: list[str], tmp_path: Path) -> None:
+def test_a_configuration_has_the_hash_of_its_file(settings, tmp_path):
     experiment, path = load_experiment("paper", settings), tmp_path / "config.yaml"
     path.write_text(dump(experiment), "utf-8")
     expected = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,10 +1,7 @@
 """Plug-ins are found by name, entry point or path; an unknown one lists the known ones."""
 
-from __future__ import annotations
-
 import sys
 from importlib.metadata import EntryPoint
-from pathlib import Path
 
 import pytest
 
@@ -19,8 +16,6 @@ SOURCE = '''"""Looks ahead by a share of the horizon.
 
 More text.
 """
-from __future__ import annotations
-
 from cloudrc.cloud.predictors import Predictor
 
 
@@ -37,7 +32,7 @@ def build(share: float = 0.5, axes: tuple[bool, bool, bool] = (True, True, False
 
 
 @pytest.fixture
-def share(tmp_path: Path) -> Path:
+def share(tmp_path):
     path = tmp_path / "share.py"
     path.write_text(SOURCE)
     return path
@@ -47,7 +42,7 @@ def share(tmp_path: Path) -> Path:
     ("kind", "shipped"),
     [("estimators", "ewma"), ("predictors", "last_sample"), ("controllers", "pid")],
 )
-def test_every_shipped_plug_in_has_a_line(kind: str, shipped: str) -> None:
+def test_every_shipped_plug_in_has_a_line(kind, shipped):
     names = plugins.names(kind)
     assert shipped in names
     assert names == sorted(names)
@@ -58,14 +53,14 @@ def test_every_shipped_plug_in_has_a_line(kind: str, shipped: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["_rotation", "__init__", "os", "..", ""])
-def test_helpers_and_other_modules_are_refused(name: str) -> None:
+def test_helpers_and_other_modules_are_refused(name):
     with pytest.raises(BadInputError):
         plugins.load("predictors", name)
     with pytest.raises(BadInputError, match="no kind of plug-in named 'pilots'"):
         plugins.names("pilots")
 
 
-def test_a_plug_in_is_loaded_by_path(share: Path) -> None:
+def test_a_plug_in_is_loaded_by_path(share):
     assert plugins.describe("predictors", str(share)) == "Looks ahead by a share of the horizon."
     predictor = load_experiment("paper", [f"cloud.predictor={share}"]).cloud.predictor
     assert predictor.model_extra == {"share": 0.5, "axes": [True, True, False]}
@@ -85,7 +80,7 @@ def test_a_plug_in_is_loaded_by_path(share: Path) -> None:
         ("share=2", "cannot be built: share: must be at most 1"),
     ],
 )
-def test_parameters_are_checked_against_build(share: Path, setting: str, reason: str) -> None:
+def test_parameters_are_checked_against_build(share, setting, reason):
     found = refused("paper", f"cloud.predictor={share}", f"cloud.predictor.{setting}")
     assert reason in found
 
@@ -102,7 +97,7 @@ def test_parameters_are_checked_against_build(share: Path, setting: str, reason:
         ("def build():\n    return 1 / 0\n", "cannot be built: ZeroDivisionError"),
     ],
 )  # fmt: skip
-def test_a_broken_plug_in_is_one_line(share: Path, text: str, reason: str) -> None:
+def test_a_broken_plug_in_is_one_line(share, text, reason):
     share.write_text(text)
     found = refused("paper", f"cloud.predictor={share}")
     assert reason in found
@@ -111,13 +106,13 @@ def test_a_broken_plug_in_is_one_line(share: Path, text: str, reason: str) -> No
         assert plugins.describe("predictors", str(share)).startswith("(not usable")
 
 
-def test_a_missing_plug_in_file_is_refused(tmp_path: Path) -> None:
+def test_a_missing_plug_in_file_is_refused(tmp_path):
     assert "there is no such file" in refused("paper", f"cloud.predictor={tmp_path}/no.py")
     (tmp_path / "notes.txt").write_text("no")
     assert "name it *.py" in refused("paper", f"cloud.predictor={tmp_path}/notes.txt")
 
 
-def test_installed_packages_add_plug_ins(share: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_installed_packages_add_plug_ins(share, monkeypatch):
     values = {"as_module": "share", "as_function": "share:build", "last_sample": "share"}
     group = "cloudrc.predictors"
     entries = tuple(EntryPoint(name, value, group) for name, value in values.items())

@@ -40,7 +40,7 @@ from cloudrc.link.relay import (
 from cloudrc.tunnel.codec import Kind, encode_header
 from tests.drivers.conftest import FAST
 from tools.bench_link.flow import EPOCH, SEED, SIZE, Flow, judge, run_flow, since_first_ns
-from tools.bench_link.relays import fifo_allowed, measure_profiles, ours, profiles_of
+from tools.bench_link.relays import RelayProcess, fifo_allowed, measure_profiles, profiles_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 20.0
@@ -319,7 +319,7 @@ LIVELY: dict[str, object] = {
 @pytest.mark.parametrize("link", [{"profile": "lossy"}, LIVELY])
 def test_a_relay_run_draws_the_virtual_sequence(tmp_path, link):
     """Ask a model that never saw a clock: which numbers arrive, how often, how late."""
-    relay = ours(tmp_path, link)
+    relay = RelayProcess(tmp_path, link)
     flows = run_flow(relay.ways, 200.0, 1.5, 0.5)
     relay.stop()
     for flow, profile in zip(flows, profiles_of(tmp_path, link), strict=True):

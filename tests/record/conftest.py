@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
-from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
 
 from cloudrc import records as rec
 from cloudrc.messages import GuardState, Odometry, Telemetry
-from cloudrc.record.columns import Recording, merged
+from cloudrc.record.columns import merged
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
@@ -31,11 +28,11 @@ _metres = st.floats(-1e6, 1e6)
 _directions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1)
 
 
-def _unit(q: tuple[float, ...]) -> tuple[float, ...]:
+def _unit(q):
     return tuple(component / math.hypot(*q) for component in q)
 
 
-def _strategy(name: str, kind: Any) -> st.SearchStrategy[Any]:
+def _strategy(name, kind):
     if hasattr(kind, "_fields"):
         return instances(kind)
     if get_origin(kind) is tuple:
@@ -47,17 +44,17 @@ def _strategy(name: str, kind: Any) -> st.SearchStrategy[Any]:
     return {int: _integers, float: st.floats(), bool: st.booleans(), str: st.text()}[kind]
 
 
-def instances(cls: type[Any]) -> st.SearchStrategy[Any]:
+def instances(cls):
     """Generate records of the loop."""
     hints = get_type_hints(cls)
     return st.builds(cls, **{name: _strategy(name, kind) for name, kind in hints.items()})
 
 
-def any_record() -> st.SearchStrategy[Record]:
+def any_record():
     return st.one_of(*map(instances, CLASSES))
 
 
-def world_records(count: int, start_ns: int = 0) -> list[Record]:
+def world_records(count, start_ns=0):
     """Make world's records at 100 Hz; each command took 30 ms."""
     records: list[Record] = [
         rec.SessionOpened(start_ns, "world", 1, "cloud said hello"),
@@ -82,7 +79,7 @@ def world_records(count: int, start_ns: int = 0) -> list[Record]:
     return [*records, contact, rec.Counted(now, "world", "sent", count)]
 
 
-def cloud_records(count: int, start_ns: int = 0, up_ns: int = 40 * MS) -> list[Record]:
+def cloud_records(count, start_ns=0, up_ns=40 * MS):
     """Make cloud's records at 100 Hz; a command leaves 3 ms after each period."""
     records: list[Record] = [rec.SessionOpened(start_ns, "cloud", 1, "world said yes")]
     v = (0.1, 0.2, 0.3)
@@ -100,18 +97,13 @@ def cloud_records(count: int, start_ns: int = 0, up_ns: int = 40 * MS) -> list[R
     return [*records, rec.Fault(period, "horizon_clamped", ""), rec.Counted(period, "cloud", "", 3)]
 
 
-def write(path: Path, records: list[Record], clock: str = "world", clock_id: str = "") -> Path:
+def write(path, records, clock="world", clock_id=""):
     with McapWriter(path, clock=clock, clock_id=clock_id) as writer:
         writer.write(records)
     return path
 
 
-def write_mission(
-    path: Path,
-    world: Iterable[Record],
-    cloud: Iterable[Record],
-    attachments: Mapping[str, bytes] | None = None,
-) -> None:
+def write_mission(path, world, cloud, attachments=None):
     """Record both ends as one mission, as a run in virtual time does."""
     with McapWriter(path, clock="world") as writer:
         for log_time_ns, row in merged(world, cloud):
@@ -121,15 +113,15 @@ def write_mission(
 
 
 def rewrite(
-    source: Path,
-    target: Path,
+    source,
+    target,
     *,
-    keep: Callable[[Channel, Message], object] = lambda channel, message: True,
-    rename: Callable[[str], str] = str,
-    shuffle: Callable[[list[Any]], object] = lambda messages: None,
-    metadata: bool = True,
-    **options: Any,
-) -> Path:
+    keep=lambda channel, message: True,
+    rename=str,
+    shuffle=lambda messages: None,
+    metadata=True,
+    **options,
+):
     """Rewrite a recording as another program does; `shuffle` changes the messages in place."""
     with source.open("rb") as old, target.open("wb") as new:
         reader = make_reader(old)
@@ -143,22 +135,16 @@ def rewrite(
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 name = rename(channel.topic)
                 ids[channel.id] = writer.register_channel(name, "cdr", number, channel.metadata)
-            writer.add_message(
-                ids[channel.id],
-                message.log_time,
-                message.data,
-                message.publish_time,
-                message.sequence,
-            )
+            writer.add_message(**vars(message) | {"channel_id": ids[channel.id]})
         for each in reader.iter_attachments() if metadata else ():
-            writer.add_attachment(0, each.log_time, each.name, each.media_type, each.data)
+            writer.add_attachment(**vars(each))
         for entry in reader.iter_metadata() if metadata else ():
             writer.add_metadata(entry.name, entry.metadata)
         writer.finish()
     return target
 
 
-def assert_equal(one: Recording, other: Recording) -> None:
+def assert_equal(one, other):
     """Check that all columns are equal; two rotations of a velocity change its last digits."""
     for topic in TOPICS:
         assert one[topic].names == other[topic].names
@@ -172,34 +158,34 @@ def assert_equal(one: Recording, other: Recording) -> None:
                 np.testing.assert_array_equal(first, second, err_msg=f"{topic} {name}")
 
 
-def counted(count: int) -> list[Record]:
+def counted(count):
     """Make `count` records of a counter, 10 ms apart."""
     return [rec.Counted(n * 10 * MS, "world", "sent", n) for n in range(count)]
 
 
-def open_mcap(path: Path) -> McapWriter:
+def open_mcap(path):
     return McapWriter(path, clock="world")
 
 
 class Shelf:
     """A sink that stores its records."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.records: list[Record] = []
         self.closed = False
 
-    def write(self, records: Iterable[Record]) -> None:
+    def write(self, records):
         self.records += records
 
-    def flush(self) -> None:
+    def flush(self):
         pass
 
-    def sync(self) -> None:
+    def sync(self):
         pass
 
-    def abandon(self, reason: str) -> int:
+    def abandon(self, reason):
         self.closed = True
         return 0
 
-    def close(self) -> None:
+    def close(self):
         self.closed = True

@@ -15,7 +15,7 @@ from cloudrc.record.topics import TOPICS
 from tests.record.conftest import any_record, assert_equal, cloud_records, world_records, write
 
 
-def test_kinds_have_their_types() -> None:
+def test_kinds_have_their_types():
     recording = Recording.from_records(world_records(3), cloud_records(3))
     table = recording["/command_applied"]
     assert table.names == ("stamp_ns", "epoch", "counter", "basis_stamp_ns", "velocity")
@@ -26,7 +26,7 @@ def test_kinds_have_their_types() -> None:
     assert recording["/estimated_odometry"]["orientation_wxyz"].shape == (3, 4)
 
 
-def test_a_topic_without_rows_is_an_empty_table() -> None:
+def test_a_topic_without_rows_is_an_empty_table():
     shapes = {"vector": (0, 3), "quaternion": (0, 4)}
     recording = Recording.from_records([])
     for name, topic in TOPICS.items():
@@ -36,7 +36,7 @@ def test_a_topic_without_rows_is_an_empty_table() -> None:
             assert table[field.name].shape == shapes.get(field.kind, (0,))
 
 
-def test_what_does_not_exist_is_answered_with_what_does() -> None:
+def test_what_does_not_exist_is_answered_with_what_does():
     recording = Recording.from_records([])
     with pytest.raises(KeyError, match="no topic '/odometri'; there are: /odometry, /telemetry"):
         recording["/odometri"]
@@ -44,7 +44,7 @@ def test_what_does_not_exist_is_answered_with_what_does() -> None:
         recording["/guard"]["x"]
 
 
-def test_rows_of_both_ends_are_in_order_of_time() -> None:
+def test_rows_of_both_ends_are_in_order_of_time():
     world: list[Any] = [rec.Counted(t, "world", "sent", t) for t in (0, 10, 20, 20)]
     cloud: list[Any] = [rec.Counted(t, "cloud", "sent", t) for t in (5, 20, 30)]
     expected = ["world", "cloud", "world", "world", "world", "cloud", "cloud"]
@@ -53,9 +53,7 @@ def test_rows_of_both_ends_are_in_order_of_time() -> None:
 
 @given(st.lists(any_record(), max_size=12))
 @settings(max_examples=30, deadline=None)
-def test_a_file_gives_what_memory_gives(
-    tmp_path_factory: pytest.TempPathFactory, records: list[Any]
-) -> None:
+def test_a_file_gives_what_memory_gives(tmp_path_factory, records):
     path = write(tmp_path_factory.getbasetemp() / "any.mcap", records)
     recording = Recording.read(path)
     assert recording.complete

@@ -1,10 +1,7 @@
 """The hash depends on the records' values and on nothing else."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -20,13 +17,13 @@ LATE = rec.Lateness(1, "world", 0.1, 0.2, 3)
 CHECK = rec.LinkChecked(1, True, "mean", 0.04, 0.05, 0.03, 0.06, "ok", 3000)
 
 
-def digest(*records: Any) -> str:
+def digest(*records):
     found = RecordHash()
     found.update(records)
     return found.hexdigest()
 
 
-def test_the_bytes_are_those_that_the_module_promises() -> None:
+def test_the_bytes_are_those_that_the_module_promises():
     applied = rec.CommandApplied(1, 2, 3, -4, (0.5, 1.0, 2.0))
     data = b"\x0eCommandApplied" + struct.pack("<4q3d", 1, 2, 3, -4, 0.5, 1.0, 2.0)
     change = rec.GuardChange(5, GuardState.HOLD, "né")
@@ -36,14 +33,14 @@ def test_the_bytes_are_those_that_the_module_promises() -> None:
 
 @given(st.lists(any_record(), max_size=6), st.integers(0, 6))
 @settings(max_examples=30, deadline=None)
-def test_batches_do_not_matter(records: list[Any], cut: int) -> None:
+def test_batches_do_not_matter(records, cut):
     found = RecordHash()
     found.update(records[:cut])
     found.update(iter(records[cut:]))
     assert found.hexdigest() == digest(*records)
 
 
-def changed(value: Any) -> Any:
+def changed(value):
     """Return a different value of the same type."""
     if isinstance(value, bool):
         return not value
@@ -56,7 +53,7 @@ def changed(value: Any) -> Any:
     return 0.1 if value != value else value + 1
 
 
-def variants(instance: Any) -> list[Any]:
+def variants(instance):
     """Return the record with each of its values changed in turn."""
     found = []
     for name in instance._fields:
@@ -67,7 +64,7 @@ def variants(instance: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
-def test_every_value_counts(cls: type[Any]) -> None:
+def test_every_value_counts(cls):
     every = [*world_records(9), *cloud_records(9), LATE, LINK, CHECK]
     record = next(each for each in every if type(each) is cls)
     digests = [digest(record), *map(digest, variants(record))]

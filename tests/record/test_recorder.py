@@ -1,43 +1,39 @@
 """The recorder never blocks and survives all disk errors."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.reader import recover
-from cloudrc.record.recorder import Recorder
+from cloudrc.record.recorder import TROUBLE, Recorder
 from cloudrc.record.writer import McapWriter
-from cloudrc.records import Counted, Record
+from cloudrc.records import Counted
 from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records, write
 
 
 class Disk(io.BytesIO):
     """A file on a disk with space for `room` bytes."""
 
-    def __init__(self, room: int) -> None:
+    def __init__(self, room):
         super().__init__()
         self.room = room
 
-    def write(self, data: Any) -> int:
+    def write(self, data):
         if self.tell() + len(data) > self.room:
             raise OSError(errno.ENOSPC, "No space left on device")
         return super().write(data)
 
 
-def record_all(recorder: Recorder, records: list[Record], every: int) -> None:
+def record_all(recorder, records, every):
     """Record, with a flush after `every` records."""
     for start in range(0, len(records), every):
         recorder.put(records[start : start + every])
@@ -47,7 +43,7 @@ def record_all(recorder: Recorder, records: list[Record], every: int) -> None:
     recorder.close()
 
 
-def test_the_oldest_are_dropped_and_counted() -> None:
+def test_the_oldest_are_dropped_and_counted():
     shelf, records = Shelf(), counted(25)
     recorder = Recorder(Path("x"), lambda path: shelf, capacity=10)
     for record in records:
@@ -62,7 +58,7 @@ def test_the_oldest_are_dropped_and_counted() -> None:
     assert recorder.error == ""
 
 
-def test_what_is_recorded_can_be_read(tmp_path: Path) -> None:
+def test_what_is_recorded_can_be_read(tmp_path):
     path, records = tmp_path / "world.mcap", world_records(30)
     for target in (path, Path(os.devnull)):  # a device has no sync
         recorder = Recorder(target, open_mcap)
@@ -73,7 +69,7 @@ def test_what_is_recorded_can_be_read(tmp_path: Path) -> None:
 
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
 @pytest.mark.parametrize("room", [0, 100, 1500, *range(20_000, 60_800, 2_720)])
-def test_on_a_full_disk_all_is_kept_or_counted(tmp_path: Path, room: int) -> None:
+def test_on_a_full_disk_all_is_kept_or_counted(tmp_path, room):
     path, records = tmp_path / "w.mcap", counted(3000)
     disk = Disk(room)
     recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
@@ -95,7 +91,7 @@ def test_on_a_full_disk_all_is_kept_or_counted(tmp_path: Path, room: int) -> Non
     assert kept < len(records)
 
 
-def test_without_room_for_the_index_all_chunks_are_kept(tmp_path: Path) -> None:
+def test_without_room_for_the_index_all_chunks_are_kept(tmp_path):
     path, records = tmp_path / "w.mcap", counted(20)
     disk = Disk(write(path, records).stat().st_size - 100)
     recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
@@ -106,10 +102,10 @@ def test_without_room_for_the_index_all_chunks_are_kept(tmp_path: Path) -> None:
     assert (len(Recording.read(path)["/count"]), recorder.dropped) == (20, 0)
 
 
-def failing(step: str, code: int) -> Shelf:
+def failing(step, code):
     """Make a sink whose `step` fails."""
 
-    def refuse(*_: object) -> None:
+    def refuse(*_):
         raise OSError(code, "Input/output error")
 
     shelf = Shelf()
@@ -119,16 +115,8 @@ def failing(step: str, code: int) -> Shelf:
 
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
 @pytest.mark.parametrize("step", ["flush", "sync", "close"])
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [
-        (errno.ENOSPC, "disk full"),
-        (errno.EROFS, "disk is read-only"),
-        (errno.EDQUOT, "disk quota used up"),
-        (errno.EIO, "Input/output error"),
-    ],
-)
-def test_disk_errors_are_told_and_never_raised(step: str, code: int, words: str) -> None:
+@pytest.mark.parametrize(("code", "words"), [*TROUBLE.items(), (errno.EIO, "Input/output error")])
+def test_disk_errors_are_told_and_never_raised(step, code, words):
     shelf = failing(step, code)
     recorder = Recorder(Path("w.mcap"), lambda path: shelf)
     recorder.put(counted(3))
@@ -140,14 +128,14 @@ def test_disk_errors_are_told_and_never_raised(step: str, code: int, words: str)
     assert recorder.dropped == (0 if step == "close" else 2)
 
 
-def test_a_folder_that_is_not_there_stops_the_recording_only(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_there_stops_the_recording_only(tmp_path):
     recorder = Recorder(tmp_path / "absent" / "world.mcap", open_mcap)
     record_all(recorder, counted(10), 7)
     assert recorder.dropped == 10
     assert "world.mcap: recording stopped: No such file or directory" in recorder.error
 
 
-def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path: Path) -> None:
+def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path):
     path, bad = tmp_path / "w.mcap", Counted(1, "world", "sent", 2**70)
     recorder = Recorder(path, open_mcap)
     record_all(recorder, [*counted(1), bad, *counted(3)], 64)
@@ -156,7 +144,7 @@ def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path: Path) -> No
     assert len(Recording.read(path)["/count"]) == 4
 
 
-def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> None:
+def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path):
     path = tmp_path / "world.mcap"
     recorder = Recorder(path, open_mcap, size_max=20_000)
     record_all(recorder, world_records(3000), 200)
@@ -166,11 +154,11 @@ def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path: Path) -> N
     said = "recording stopped: the file has reached its size limit"
     assert Recording.read(path).note == said
     path.write_bytes(path.read_bytes()[:-50])
-    assert recover(path, tmp_path / "new.mcap").notes[0] == said
+    assert said in recover(path, tmp_path / "new.mcap").notes[0]
 
 
 @pytest.mark.parametrize("works", [True, False])
-def test_a_sync_by_another_thread_reports_its_error_later(tmp_path: Path, works: bool) -> None:
+def test_a_sync_by_another_thread_reports_its_error_later(tmp_path, works):
     path, shelf = tmp_path / "w.mcap", Shelf() if works else failing("sync", errno.EIO)
     recorder = Recorder(path, lambda path: shelf)
     recorder.put(counted(1))
@@ -183,7 +171,7 @@ def test_a_sync_by_another_thread_reports_its_error_later(tmp_path: Path, works:
     assert (shelf.closed, recorder.error == "") == (not works, works)
 
 
-def test_a_sync_of_a_closed_file_is_nothing(tmp_path: Path) -> None:
+def test_a_sync_of_a_closed_file_is_nothing(tmp_path):
     recorder = Recorder(tmp_path / "w.mcap", open_mcap)
     recorder.put(counted(1))
     recorder.drain()
@@ -197,7 +185,7 @@ FLIGHT = """
 import sys, time
 from pathlib import Path
 from cloudrc.drivers.recording import RecordingThread
-from cloudrc.record.recorder import Recorder
+from cloudrc.record.recorder import TROUBLE, Recorder
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
 
@@ -226,9 +214,7 @@ INSTANTS = [pytest.param(0.6 + 0.031 * n, 0.0, marks=pytest.mark.full) for n in 
 @pytest.mark.parametrize(
     ("after", "sync"), [(0.9, 0.0), (1.3, 0.0), (2.1, 0.4), (2.1, 60.0), *INSTANTS]
 )
-def test_sigkill_loses_at_most_half_a_second(
-    tmp_path: Path, after: float, sync: float, figure: Callable[..., None]
-) -> None:
+def test_sigkill_loses_at_most_half_a_second(tmp_path, after, sync, figure):
     """Even if the disk is slow: `sync` is how long it takes [s]."""
     path, clean = tmp_path / "world.mcap", tmp_path / "clean.mcap"
     command = [sys.executable, "-c", FLIGHT, str(path), str(sync)]

@@ -1,9 +1,6 @@
 """ROS messages hold the same values as the rows, in ROS's conventions."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,17 +12,17 @@ from cloudrc.record.topics import TOPICS, rows
 from tests.record.conftest import any_record
 
 
-def standard(topic: str, stamp_ns: int, values: Any) -> Any:
+def standard(topic, stamp_ns, values):
     """Encode a row, and decode it as a ROS 2 tool that knows only the standard types."""
     data = encode(TOPICS[topic], stamp_ns, values)
     return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, TOPICS[topic].ros_type)
 
 
-def xyz(vector: Any) -> tuple[float, float, float]:
+def xyz(vector):
     return vector.x, vector.y, vector.z
 
 
-def test_rows_are_converted_to_the_conventions_of_ros() -> None:
+def test_rows_are_converted_to_the_conventions_of_ros():
     half = math.sqrt(0.5)
     # A quarter turn to the left: forward is the world's y, so a motion along x is to the right.
     values = ((1.0, 2.0, 3.0), (half, 0.0, 0.0, half), (4.0, 1.0, 0.5), (0.1, 0.2, 0.3))
@@ -45,7 +42,7 @@ def test_rows_are_converted_to_the_conventions_of_ros() -> None:
 
 @given(any_record())
 @settings(max_examples=50, deadline=None)
-def test_rows_come_back_from_their_bytes(record: Any) -> None:
+def test_rows_come_back_from_their_bytes(record):
     for name, stamp_ns, values in rows(record):
         found_ns, found = decode(TOPICS[name], encode(TOPICS[name], stamp_ns, values))
         assert found_ns == stamp_ns
@@ -56,20 +53,20 @@ def test_rows_come_back_from_their_bytes(record: Any) -> None:
                 np.testing.assert_equal(back, value)
 
 
-def test_text_that_is_not_unicode_is_recorded_as_far_as_it_is() -> None:
+def test_text_that_is_not_unicode_is_recorded_as_far_as_it_is():
     topic = TOPICS["/fault"]
     assert decode(topic, encode(topic, 0, ("bad_name", "file \udcff")))[1][1] == "file ?"
 
 
 @pytest.mark.parametrize("offset_ns", [0, -1, -3_000_000_001, 10**15])
-def test_a_stamp_is_moved_and_nothing_else(offset_ns: int) -> None:
+def test_a_stamp_is_moved_and_nothing_else(offset_ns):
     topic, values = TOPICS["/cmd_vel"], ((1.0, 2.0, 3.0), 0.4)
     data = shifted(encode(topic, 2_000_000_000, values), offset_ns)
     assert decode(topic, data) == (2_000_000_000 + offset_ns, values)
 
 
 @pytest.mark.parametrize("ros_type", sorted({topic.ros_type for topic in TOPICS.values()}))
-def test_a_definition_stands_on_its_own(ros_type: str) -> None:
+def test_a_definition_stands_on_its_own(ros_type):
     text = definition(ros_type)
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, ros_type))
@@ -89,7 +86,7 @@ def test_a_definition_stands_on_its_own(ros_type: str) -> None:
         ("int64 epoch", "#" * 70_000 + "\nint64 epoch", False),
     ],
 )
-def test_another_layout_is_noticed(old: str, new: str, known: bool) -> None:
+def test_another_layout_is_noticed(old, new, known):
     text = definition("cloudrc_msgs/msg/Arrival")
     assert old in text
     assert is_known("cloudrc_msgs/msg/Arrival", text.replace(old, new)) is known

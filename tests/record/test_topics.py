@@ -1,10 +1,8 @@
 """The topics contain all values of the records, with their names and units."""
 
-from __future__ import annotations
-
 import re
 from operator import attrgetter
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 import pytest
 from hypothesis import given, settings
@@ -14,7 +12,7 @@ from cloudrc.record.topics import TOPICS, rows
 from tests.record.conftest import CLASSES, any_record
 
 
-def leaves(cls: type[Any], prefix: str = "") -> set[str]:
+def leaves(cls, prefix=""):
     found = set()
     for name, kind in get_type_hints(cls).items():
         found |= leaves(kind, f"{prefix}{name}.") if hasattr(kind, "_fields") else {prefix + name}
@@ -23,7 +21,7 @@ def leaves(cls: type[Any], prefix: str = "") -> set[str]:
 
 @given(any_record())
 @settings(max_examples=60, deadline=None)
-def test_rows_hold_the_records_own_values(record: Any) -> None:
+def test_rows_hold_the_records_own_values(record):
     found = rows(record)
     assert found
     if isinstance(record, rec.Arrival):
@@ -39,7 +37,7 @@ def test_rows_hold_the_records_own_values(record: Any) -> None:
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
-def test_every_value_is_recorded_and_documented(cls: type[Any]) -> None:
+def test_every_value_is_recorded_and_documented(cls):
     topics = {name: topic for name, topic in TOPICS.items() if topic.source is cls}
     recorded = {path for topic in topics.values() for path in (*topic.paths(), topic.stamp_path)}
     chosen_by = {"uplink"} if cls is rec.Arrival else set()

@@ -1,12 +1,9 @@
 """The file is a valid MCAP, and only recording needs the packages for it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tracemalloc
 from collections import defaultdict
-from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
@@ -23,7 +20,7 @@ RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS)]
 NEEDED = ["lz4", "mcap", "rosbags", "zstandard"]
 
 
-def test_other_programs_read_every_topic(tmp_path: Path) -> None:
+def test_other_programs_read_every_topic(tmp_path):
     path, stamps = write(tmp_path / "both.mcap", RECORDS), defaultdict(list)
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -47,7 +44,7 @@ def test_other_programs_read_every_topic(tmp_path: Path) -> None:
         assert chunk.message_end_time - chunk.message_start_time < CHUNK_NS
 
 
-def test_log_times_never_fall_on_a_topic(tmp_path: Path) -> None:
+def test_log_times_never_fall_on_a_topic(tmp_path):
     states = [GuardChange(stamp, GuardState.HOLD, "") for stamp in (5, 9, 7, 8, 12)]
     path = write(tmp_path / "back.mcap", states)
     with path.open("rb") as stream:
@@ -56,7 +53,7 @@ def test_log_times_never_fall_on_a_topic(tmp_path: Path) -> None:
     assert Recording.read(path)["/guard"]["stamp_ns"].tolist() == [5, 9, 7, 8, 12]
 
 
-def test_attachments_and_metadata_come_back(tmp_path: Path) -> None:
+def test_attachments_and_metadata_come_back(tmp_path):
     path, report = tmp_path / "a.mcap", b'{"verdict": "success"}'
     with McapWriter(path, clock="cloud", clock_id="boot-1") as writer:
         writer.write(cloud_records(3))
@@ -72,7 +69,7 @@ def test_attachments_and_metadata_come_back(tmp_path: Path) -> None:
     assert recording.metadata["version"]
 
 
-def test_an_hour_of_recording_takes_no_memory(tmp_path: Path) -> None:
+def test_an_hour_of_recording_takes_no_memory(tmp_path):
     """A chunk every quarter of a second: mcap's own list of them takes 20 MB in an hour."""
     path, records = tmp_path / "long.mcap", world_records(1)
     grown, count = list[int](), 200
@@ -97,14 +94,14 @@ def test_an_hour_of_recording_takes_no_memory(tmp_path: Path) -> None:
         assert sum(1 for _ in reader.iter_messages(["/odometry"])) == 2 * count + 1
 
 
-def run(code: str) -> str:
+def run(code):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 
 
 @pytest.mark.parametrize("module", ["reader", "merge"])
-def test_a_missing_package_is_named_with_its_remedy(module: str) -> None:
+def test_a_missing_package_is_named_with_its_remedy(module):
     code = f"""
 import sys
 from cloudrc.errors import MissingPrerequisiteError
@@ -120,7 +117,7 @@ for name in {NEEDED}:
         assert text.endswith("install it with: pip install 'cloudrc[record]'")
 
 
-def test_flying_needs_none_of_them() -> None:
+def test_flying_needs_none_of_them():
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({NEEDED}))\n"
         "from cloudrc.record import hash, recorder, topics\n"

@@ -1,14 +1,10 @@
 """report.json and environment.json: their names, absent values, and what they never contain."""
 
-from __future__ import annotations
-
 import builtins
 import getpass
 import json
 import platform
 import sys
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -25,13 +21,13 @@ NAMES = {
 }
 
 
-def document(run: Run = RUN, **criteria: Any) -> dict[str, Any]:
+def document(run=RUN, **criteria):
     experiment, recording = paper()
     changed = experiment.criteria.model_copy(update=criteria)
     return assess(recording, experiment.model_copy(update={"criteria": changed}), run).document
 
 
-def test_names_and_values() -> None:
+def test_names_and_values():
     report = document()
     assert set(report) == NAMES
     assert (report["schemaVersion"], report["verdict"], report["failures"]) == (1, "success", [])
@@ -44,7 +40,7 @@ def test_names_and_values() -> None:
     assert set(document(Run("virtual", "virtual"))) == NAMES - {"records_sha256"}
 
 
-def test_failures_say_code_text_time_and_place() -> None:
+def test_failures_say_code_text_time_and_place():
     report = document(time_limit_s=5.0)
     (failure,) = report["failures"]
     assert set(failure) == {"code", "text", "time", "place"}
@@ -63,18 +59,16 @@ def test_failures_say_code_text_time_and_place() -> None:
         ({"clock_offset_method": "same clock"}, None),
     ],
 )
-def test_a_clock_offset_has_its_uncertainty(
-    metadata: dict[str, str], expected: dict[str, Any] | None
-) -> None:
+def test_a_clock_offset_has_its_uncertainty(metadata, expected):
     assert clock_offset_document(metadata) == expected
 
 
-def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+def test_numbers_that_are_not_finite_are_refused(tmp_path):
     with pytest.raises(ValueError, match="JSON compliant"):
         write_json(tmp_path / "report.json", {"value": float("nan")})
 
 
-def test_the_environment_names_software_but_no_user_or_host() -> None:
+def test_the_environment_names_software_but_no_user_or_host():
     environment = environment_document()
     assert environment["packages"]["numpy"]
     assert environment["cores"] >= 1
@@ -82,12 +76,10 @@ def test_the_environment_names_software_but_no_user_or_host() -> None:
     assert {getpass.getuser(), platform.node()}.isdisjoint(words)
 
 
-def test_without_matplotlib_the_numbers_are_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_matplotlib_the_numbers_are_written(tmp_path, monkeypatch):
     real = builtins.__import__
 
-    def refuse(name: str, *args: Any) -> Any:
+    def refuse(name, *args):
         if name.partition(".")[0] == "matplotlib":
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
         return real(name, *args)

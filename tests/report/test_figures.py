@@ -1,29 +1,24 @@
 """Figures are drawn of any flight, also with little data, and in the style of cloudrc alone."""
 
-from __future__ import annotations
-
 import matplotlib
-import numpy as np
 import pytest
 
 from cloudrc.config.schema import Direction
-from cloudrc.geometry.scene import load_scene
 from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, draw_all
-from cloudrc.report.figures.snapshots import WALL_COLOUR, is_inside_pipe, pipe_faces
 from cloudrc.report.figures.style import RC, Subject
-from tests.metrics.conftest import ONE_PIPE, START, Log, at, flown
+from tests.metrics.conftest import ONE_PIPE, START, at, flown
 
 CALM = Direction(delay_ms=50.0)
 
 
-def subject_of(log: Log) -> Subject:
+def subject_of(log):
     return Subject(log.flight(ONE_PIPE), CALM, CALM)
 
 
 @pytest.mark.parametrize("end_ns", [0, START], ids=["empty", "ends at the start"])
 @pytest.mark.parametrize("name", FIGURES)
-def test_a_flight_without_data_is_drawn(name: str, end_ns: int) -> None:
+def test_a_flight_without_data_is_drawn(name, end_ns):
     log = flown()
     for records in (log.world, log.cloud):
         records[:] = [record for record in records if record.stamp_ns <= end_ns]
@@ -34,23 +29,10 @@ def test_a_flight_without_data_is_drawn(name: str, end_ns: int) -> None:
     assert caption(subject)
 
 
-def test_a_pipes_rim_inside_another_pipe_is_not_drawn() -> None:
-    """Sorted by depth, its faces would appear between those of the other pipe."""
-    first, second, _ = load_scene("pipes").pipes
-    faces = pipe_faces(second, np.array([0.0, 0.0, 1.0]), np.array(second.centre), second.length)
-    met = [face for face in faces if is_inside_pipe(face, first)]
-    assert 0 < len(met) < len(faces)
-    assert {face.colour for face in met} == {WALL_COLOUR}
-    for face in met:
-        offset = face.corners.mean(axis=0) - np.array(first.centre)
-        assert np.hypot(offset[0], offset[2]) < first.outer  # its axis is y
-        assert abs(offset[1]) < first.length / 2
-
-
-def test_waypoints_are_the_first_setpoints_of_each() -> None:
+def test_waypoints_are_the_first_setpoints_of_each():
     log = flown()
 
-    def fly_to(n: int, control: Control) -> Control:
+    def fly_to(n, control):
         waypoint = -1 if control.stamp_ns < at(1) else 0 if control.stamp_ns < at(4) else 1
         return control._replace(waypoint=waypoint, setpoint=(float(n), 2.0, 3.0))
 
@@ -59,7 +41,7 @@ def test_waypoints_are_the_first_setpoints_of_each() -> None:
     assert subject_of(log).waypoints == {0: (50.0, 2.0, 3.0), 1: (125.0, 2.0, 3.0)}
 
 
-def test_figures_ignore_the_users_matplotlib_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures_ignore_the_users_matplotlib_settings(monkeypatch):
     """matplotlib reads settings in the working folder, which may be somebody else's run."""
     monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
     (picture,) = draw_all(subject_of(flown()))

@@ -16,7 +16,8 @@ from mcap.writer import CompressionType
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump
 from cloudrc.errors import BadInputError
-from cloudrc.record.columns import Recording, merged
+from cloudrc.record.columns import Recording
+from cloudrc.record.reader import recover
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
 from cloudrc.report.document import Run
@@ -30,7 +31,7 @@ Change = Callable[[Path, Path], object]
 
 
 @pytest.fixture(scope="module")
-def flown_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def flown_once(tmp_path_factory):
     """The folder of a run in virtual time, with its report."""
     folder, (world, cloud) = tmp_path_factory.mktemp("run"), good().ends()
     (folder / "config.yaml").write_text(dump(paper()[0]))
@@ -41,16 +42,16 @@ def flown_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def run(flown_once: Path, tmp_path: Path) -> Path:
+def run(flown_once, tmp_path):
     return shutil.copytree(flown_once, tmp_path / "run")
 
 
-def report(folder: Path) -> dict[str, Any]:
+def report(folder):
     found: dict[str, Any] = json.loads((folder / "report.json").read_text())
     return found
 
 
-def test_a_run_gives_the_same_report_again(run: Path) -> None:
+def test_a_run_gives_the_same_report_again(run):
     first = report(run)
     assert first["records_sha256"] == "f" * 64
     assert write_report(run, *read_run(run), page=False) == first
@@ -67,7 +68,7 @@ def test_a_run_gives_the_same_report_again(run: Path) -> None:
     ],
     ids=["lz4", "shuffled", "bare"],
 )
-def test_another_layout_gives_the_same_report(run: Path, options: dict[str, Any]) -> None:
+def test_another_layout_gives_the_same_report(run, options):
     first, recording = report(run), run / "mission.mcap"
     rewrite(recording, run / "n.mcap", **options).replace(recording)
     again = write_report(run, *read_run(run), page=False)
@@ -76,24 +77,30 @@ def test_another_layout_gives_the_same_report(run: Path, options: dict[str, Any]
     assert again | {"notes": []} == first
 
 
-def filtered(**options: Any) -> Change:
+def filtered(**options):
     return lambda source, target: rewrite(source, target, **options)
 
 
-def cut(source: Path, target: Path) -> None:
+def cut(source, target):
     target.write_bytes(source.read_bytes()[: source.stat().st_size // 2])
 
 
-def damaged(source: Path, target: Path) -> None:
+def damaged(source, target):
     data = bytearray(source.read_bytes())
     data[data.index(b"zstd") + 1000] ^= 255
     target.write_bytes(data)
 
 
-def recorded(*, more: int = 0, config: bytes = b"") -> Change:
+def recovered_and_filtered(source, target):
+    cut(source, source)
+    recover(source, target)
+    rewrite(target, source, keep=lambda c, m: c.topic != "/telemetry").replace(target)
+
+
+def recorded(*, more=0, config=b""):
     """Record the flight anew: with more records of ground truth, or of another experiment."""
 
-    def change(source: Path, target: Path) -> None:
+    def change(source, target):
         world, cloud = good().ends()
         world[more:more] = world[:more]
         write_mission(target, world, cloud, attachments={"config.yaml": config} if config else {})
@@ -115,19 +122,17 @@ OTHER = b"seed: 2\nmission: pipes\n"
         (filtered(rename=lambda topic: f"/r1{topic}"), "does not record: /r1/cmd_vel, "),
         (filtered(metadata=False), "the metadata of cloudrc, which names the clock, is not there"),
         (cut, "cut short: .* but report.json is of the whole recording"),
+        (recovered_and_filtered, "messages were removed or added: it holds 0 of [0-9]+ on /tele"),
         (damaged, "damaged: a checksum is wrong"),
         (recorded(more=40), "on /ground_truth that are not later than the row before"),
         (recorded(config=OTHER), "is the recording of an experiment with other values for: "),
         (lambda source, target: target.write_bytes(b"PK"), "is not an MCAP file"),
     ],
 )
-def test_a_recording_that_carries_no_report_is_refused(
-    run: Path, capsys: pytest.CaptureFixture[str], change: Change, said: str
-) -> None:
+def test_a_recording_that_carries_no_report_is_refused(run, capsys, change, said):
     (run / "report.html").write_text("the page")
     change(run / "mission.mcap", run / "n.mcap")
-    (run / "mission.mcap").unlink()
-    (run / "n.mcap").rename(run / "mission.mcap")
+    (run / "n.mcap").replace(run / "mission.mcap")
     before = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
     assert main(["report", str(run)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
@@ -135,32 +140,7 @@ def test_a_recording_that_carries_no_report_is_refused(
     assert {path: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 
-@pytest.mark.parametrize(
-    ("topic", "said"),
-    [
-        ("/telemetry", "has 0 rows on /telemetry, but 401 on /odometry"),
-        ("/guard", "has rows on /command_applied, but none on /guard"),
-        ("/mission", "has rows on /pid, but none on /mission"),
-    ],
-)
-def test_a_killed_runs_topics_are_compared(
-    run: Path, monkeypatch: pytest.MonkeyPatch, topic: str, said: str
-) -> None:
-    """Its writer has not counted its messages."""
-    monkeypatch.setattr(McapWriter, "close", McapWriter.flush)
-    (run / "report.json").unlink()
-    for left_out in ("", topic):
-        with McapWriter(run / "mission.mcap", clock="world") as writer:
-            for log_time_ns, row in merged(*good().ends()):
-                if row[0] != left_out:
-                    writer.write_row(row, log_time_ns)
-        if not left_out:
-            assert read_run(run)[0].note.startswith("cut short")
-    with pytest.raises(BadInputError, match=said):
-        read_run(run)
-
-
-def test_a_torn_recording_still_gives_a_report(run: Path) -> None:
+def test_a_torn_recording_still_gives_a_report(run):
     (run / "report.json").unlink()
     mission = run / "mission.mcap"
     cut(mission, mission)
@@ -173,7 +153,7 @@ def test_a_torn_recording_still_gives_a_report(run: Path) -> None:
     assert again == found
 
 
-def test_a_hash_is_of_the_recording_beside_it(run: Path) -> None:
+def test_a_hash_is_of_the_recording_beside_it(run):
     world, cloud = good().ends()
     longer = [*world, Counted(world[-1].stamp_ns, "world", "sent", 1)]
     write_mission(run / "mission.mcap", longer, cloud)
@@ -181,7 +161,7 @@ def test_a_hash_is_of_the_recording_beside_it(run: Path) -> None:
     assert "records_sha256" not in found
 
 
-def test_an_interrupted_run_stays_interrupted(run: Path) -> None:
+def test_an_interrupted_run_stays_interrupted(run):
     world, cloud = ([r for r in part if r.stamp_ns < at(4)] for part in good().ends())
     write_mission(run / "mission.mcap", world, cloud)
     recording = Recording.from_records(world, cloud)
@@ -194,7 +174,7 @@ def test_an_interrupted_run_stays_interrupted(run: Path) -> None:
     assert (found.notes, len(found.records_sha256 or "")) == (stopped.notes, 64)
 
 
-def test_the_ends_are_merged_if_nobody_has(run: Path) -> None:
+def test_the_ends_are_merged_if_nobody_has(run):
     world, cloud = good().ends()
     for end, part in (("world", world), ("cloud", cloud)):
         with McapWriter(run / f"{end}.mcap", clock=end, clock_id="same") as writer:
@@ -207,7 +187,7 @@ def test_the_ends_are_merged_if_nobody_has(run: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "mission.mcap"])
-def test_a_folder_without_a_run_is_refused(run: Path, name: str) -> None:
+def test_a_folder_without_a_run_is_refused(run, name):
     (run / name).unlink()
     with pytest.raises(BadInputError, match=f"has no {name}"):
         read_run(run)

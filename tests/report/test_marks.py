@@ -1,16 +1,12 @@
 """Figures show the configured delays, and mark events of the link and the guard."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
-from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 
 from cloudrc.config.schema import Blackout, Change, Direction
 from cloudrc.messages import GuardState
@@ -18,7 +14,7 @@ from cloudrc.records import GuardChange, LinkChanged
 from cloudrc.report.figures import curves
 from cloudrc.report.figures.marks import LEGEND, bounds, legend, mark_events, set_in_flight, spans
 from cloudrc.report.figures.style import RC, Subject, new_figure
-from tests.metrics.conftest import ONE_PIPE, Log, at, flown
+from tests.metrics.conftest import ONE_PIPE, at, flown
 
 CALM = Direction(delay_ms=50.0)
 TIMED = Direction(
@@ -28,45 +24,37 @@ TIMED = Direction(
 )
 
 
-def changed(
-    time: float,
-    direction: Direction,
-    cause: str,
-    age: float = 0.0,
-    *,
-    time_line: float | None = None,
-    uplink: bool = True,
-) -> LinkChanged:
+def changed(time, direction, cause, age=0.0, *, time_line=None, uplink=True):
     conditions = json.dumps(direction.model_dump(mode="json", exclude_defaults=True))
     line, measured = age if time_line is None else time_line, (0.0, 0.0, 0.0, math.nan)
     return LinkChanged(at(time), uplink, "relay", cause, age, line, *measured, conditions)
 
 
-def subject_of(*changes: LinkChanged, uplink: Direction = CALM, log: Log | None = None) -> Subject:
+def subject_of(*changes, uplink=CALM, log=None):
     log = log or flown()
     log.world += [change for change in changes if change.uplink]
     log.cloud += [change for change in changes if not change.uplink]
     return Subject(log.flight(ONE_PIPE), uplink, CALM)
 
 
-def band(subject: Subject, time: float, *, uplink: bool = True) -> tuple[float, float]:
+def band(subject, time, *, uplink=True):
     """Return the bounds of the delay [s] at a time since the start of the flight [s]."""
     found = bounds(subject, np.array([time]), uplink=uplink)
     assert found is not None
     return float(found[0][0]), float(found[1][0])
 
 
-def low(subject: Subject, *times: float) -> list[float]:
+def low(subject, *times):
     return [band(subject, time)[0] for time in times]
 
 
-def marked(subject: Subject) -> Axes:
+def marked(subject):
     axes = new_figure(2.0, 3.0).subplots()
     mark_events(axes, subject)
     return axes
 
 
-def patches(axes: Axes) -> list[tuple[float, float]]:
+def patches(axes):
     return [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in axes.patches]
 
 
@@ -83,11 +71,11 @@ STEPS = (Change(at_s=5.0, delay_ms=70.0), Change(at_s=9.0, jitter_ms=5.0))
         (Direction(delay_ms=20.0, jitter_ms=10.0, changes=STEPS), 4.0, (0.060, 0.080)),
     ],
 )
-def test_band(direction: Direction, time: float, expected: tuple[float, float]) -> None:
+def test_band(direction, time, expected):
     assert band(subject_of(uplink=direction), time) == pytest.approx(expected)
 
 
-def test_a_trace_replaces_the_delay(tmp_path: Path) -> None:
+def test_a_trace_replaces_the_delay(tmp_path):
     trace = tmp_path / "trace.csv"
     trace.write_text("time_s,delay_ms,loss\n1,30,0\n5,90,0\n", encoding="utf-8-sig")  # of Excel
     subject = subject_of(uplink=Direction(delay_ms=5.0, jitter_ms=10.0, trace=str(trace)))
@@ -97,7 +85,7 @@ def test_a_trace_replaces_the_delay(tmp_path: Path) -> None:
     assert bounds(subject, np.zeros(1), uplink=True) is None
 
 
-def test_a_change_affects_only_its_own_direction() -> None:
+def test_a_change_affects_only_its_own_direction():
     cause = "uplink.delay_ms=120"
     subject = subject_of(changed(3.05, Direction(delay_ms=120.0), cause, 0.05))
     assert low(subject, 2.9, 3.1) == pytest.approx([0.05, 0.12])
@@ -105,7 +93,7 @@ def test_a_change_affects_only_its_own_direction() -> None:
     assert set_in_flight(subject) == [(pytest.approx(3.0), cause)]
 
 
-def test_a_time_line_starts_at_its_change_and_ends_at_the_next() -> None:
+def test_a_time_line_starts_at_its_change_and_ends_at_the_next():
     subject = subject_of(changed(1.0, TIMED, "profile timed"), changed(4.0, CALM, "profile calm"))
     assert low(subject, 0.5, 1.5, 3.5, 4.5) == pytest.approx([0.05, 0.02, 0.09, 0.05])
     assert patches(marked(subject)) == [pytest.approx((2.0, 4.0))], "its blackout ends, too"
@@ -113,7 +101,7 @@ def test_a_time_line_starts_at_its_change_and_ends_at_the_next() -> None:
     assert said in legend(subject)
 
 
-def test_changing_one_value_keeps_the_time_line() -> None:
+def test_changing_one_value_keeps_the_time_line():
     noisy = TIMED.model_copy(update={"jitter_ms": 5.0})
     subject = subject_of(
         changed(1.0, TIMED, "profile timed"),
@@ -123,7 +111,7 @@ def test_changing_one_value_keeps_the_time_line() -> None:
     assert low(subject, 2.2, 2.9, 3.1) == pytest.approx([0.015, 0.02, 0.09])
 
 
-def test_repeated_records_are_no_changes() -> None:
+def test_repeated_records_are_no_changes():
     fast = Direction(delay_ms=9.0)
     subject = subject_of(
         changed(-1.0, CALM, "", time_line=math.nan),  # the link started as configured
@@ -135,13 +123,13 @@ def test_repeated_records_are_no_changes() -> None:
     assert set_in_flight(subject) == [(pytest.approx(3.0), "by hand")]
 
 
-def test_a_change_before_the_mission_holds_from_its_start() -> None:
+def test_a_change_before_the_mission_holds_from_its_start():
     subject = subject_of(changed(-0.5, Direction(delay_ms=9.0), "by hand", 300.0))
     assert low(subject, 0.0) == pytest.approx([0.009])
     assert set_in_flight(subject) == []
 
 
-def test_holds_blackouts_and_changes_are_marked() -> None:
+def test_holds_blackouts_and_changes_are_marked():
     assert legend(subject_of()) == ""
     log = flown()
     log.world += [
@@ -159,7 +147,7 @@ def test_holds_blackouts_and_changes_are_marked() -> None:
     assert [line.get_xdata()[0] for line in axes.lines] == pytest.approx([5.0])
 
 
-def test_numbers_of_close_changes_do_not_overlap() -> None:
+def test_numbers_of_close_changes_do_not_overlap():
     count = 8
     each = [changed(3.0 + 0.1 * n, CALM, f"number {n + 1}") for n in range(count)]
     with matplotlib.rc_context(RC):
@@ -170,4 +158,3 @@ def test_numbers_of_close_changes_do_not_overlap() -> None:
             boxes = [label.get_window_extent() for label in labels]
             assert len(boxes) == count + 1
             assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
-            assert boxes[-1].y0 == pytest.approx(boxes[0].y0), "back in the first row"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 from xml.etree import ElementTree
 
 import matplotlib
@@ -23,22 +22,22 @@ from tests.metrics.conftest import ONE_PIPE, flown, paper, touch
 class Reader(HTMLParser):
     """Check that tags are closed, in order."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.open: list[str] = []
         self.feed(text)
         assert self.open == []
 
-    def handle_starttag(self, tag: str, attrs: object) -> None:
+    def handle_starttag(self, tag, attrs):
         if tag not in ("meta", "img", "br", "hr"):
             self.open.append(tag)
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Folder with the complete report of the shipped experiment."""
     path = tmp_path_factory.mktemp("run")
     before = dict(matplotlib.rcParams)
@@ -48,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_page_fetches_nothing_and_describes_every_picture(folder: Path) -> None:
+def test_the_page_fetches_nothing_and_describes_every_picture(folder):
     page = (folder / "report.html").read_text(encoding="utf-8")
     Reader(page)
     pictures = re.findall(r"<img\b[^>]*>", page)
@@ -60,7 +59,7 @@ def test_the_page_fetches_nothing_and_describes_every_picture(folder: Path) -> N
     assert not re.search(r"""@import|url\(|(?:href|src|action)\s*=\s*["']?(?:https?:)?//""", page)
 
 
-def test_the_page_says_what_the_flight_did(folder: Path) -> None:
+def test_the_page_says_what_the_flight_did(folder):
     page = (folder / "report.html").read_text(encoding="utf-8")
     text = re.sub(r"\s", " ", re.sub(r"<[^>]+>", "", page))
     for said in (
@@ -84,7 +83,7 @@ def test_the_page_says_what_the_flight_did(folder: Path) -> None:
         assert len(svg.findall(".//{*}path")) > 10
 
 
-def test_failures_and_notes_are_escaped() -> None:
+def test_failures_and_notes_are_escaped():
     failures = (
         Failure("pipe_touched", "it hit", 3.5, (1.0, -2.0, 0.7)),
         Failure("x", "<script>alert(1)</script>"),
@@ -116,11 +115,11 @@ def test_failures_and_notes_are_escaped() -> None:
         ("hold_time", Number(0.0, "s", ""), ("0", "s")),
     ],
 )
-def test_numbers_have_readable_units(name: str, number: Number, expected: tuple[str, str]) -> None:
+def test_numbers_have_readable_units(name, number, expected):
     assert readable(name, number) == expected
 
 
-def test_the_summary_of_a_failed_flight() -> None:
+def test_the_summary_of_a_failed_flight():
     log = flown()
     log.world.append(touch(3, "pipe_1"))
     flight = log.flight(ONE_PIPE, contact=True, waypoints=2)

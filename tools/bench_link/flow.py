@@ -41,7 +41,7 @@ class Way(NamedTuple):
     uplink: bool
     target: Address
     sink: Address
-    source: Address | None = None
+    source: Address
 
 
 @dataclass
@@ -135,14 +135,14 @@ def _datagram(uplink: bool, number: int) -> bytes:
     return encode_header(_kind(uplink), 0 if uplink else 1, EPOCH, number).ljust(SIZE, b"\0")
 
 
-def _open(address: Address | None) -> socket.socket:
+def _open(address: Address) -> socket.socket:
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
     one.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
     flags = _TX_SOFTWARE | _SOFTWARE | _ID | _STAMP_ONLY
     one.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, flags)
     one.setblocking(False)
-    one.bind(address or ("127.0.0.1", 0))
+    one.bind(address)
     return one
 
 

@@ -1,11 +1,9 @@
-"""The relays that are measured, each a process: `cloudrc relay`, and one in C."""
+"""Start `cloudrc relay` on a link, and measure it; measure how late C wakes."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -25,69 +23,48 @@ from tools.bench_link.flow import SEED, Array, Flow, Judged, Way, judge, run_flo
 
 Links: TypeAlias = dict[str, dict[str, object]]
 """Name -> the section `link` of an experiment file."""
-DELAY = 0.020
-"""Delay of the C relay, and of ours beside it [s]."""
-LINK: dict[str, object] = {"profile": "ideal", "uplink": {"delay_ms": DELAY * 1e3}}
 
 
-class Process:
-    """A relay that runs; `ways` tells how to send through it."""
+class RelayProcess:
+    """A running `cloudrc relay`; `ways` tells how to send through it."""
 
-    def __init__(self, command: list[str], ways: list[Way]) -> None:
-        """Start it and wait until it says that it is ready."""
-        self.ways = ways
+    def __init__(self, folder: Path, link: dict[str, object], *, fifo: bool = False) -> None:
+        """Start it on a link, the section `link` of an experiment file, until it is ready."""
+        config = _write(folder, link)
+        world_side, cloud_side, world, cloud = (("127.0.0.1", port) for port in free_ports(4))
+        addresses = {
+            "world-side": world_side, "cloud-side": cloud_side, "world": world, "cloud": cloud
+        }  # fmt: skip
+        command = [sys.executable, "-m", "cloudrc", "relay", f"--config={config}", "--feed"]
+        command += [f"--{name}={host}:{port}" for name, (host, port) in addresses.items()]
+        command += ["--fifo"] if fifo else []
+        self.ways = [Way(True, world_side, cloud, world), Way(False, cloud_side, world, cloud)]
         self._process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         assert self._process.stdout is not None
         self._process.stdout.readline()
 
-    def use_fifo(self) -> None:
-        """Put it under SCHED_FIFO."""
-        os.sched_setscheduler(self._process.pid, os.SCHED_FIFO, os.sched_param(10))
-
     def stop(self) -> None:
         """End it."""
-        self._process.send_signal(signal.SIGTERM)
+        self._process.terminate()
         self._process.communicate(timeout=10)
 
 
-def ours(folder: Path, link: dict[str, object], *, fifo: bool = False) -> Process:
-    """Start `cloudrc relay` on a link: the section `link` of an experiment file."""
-    config = _write(folder, link)
-    world_side, cloud_side, world, cloud = (("127.0.0.1", port) for port in free_ports(4))
-    addresses = {
-        "world-side": world_side, "cloud-side": cloud_side, "world": world, "cloud": cloud
-    }  # fmt: skip
-    command = [sys.executable, "-m", "cloudrc", "relay", f"--config={config}", "--feed"]
-    command += [f"--{name}={host}:{port}" for name, (host, port) in addresses.items()]
-    command += ["--fifo"] if fifo else []
-    return Process(
-        command, [Way(True, world_side, cloud, world), Way(False, cloud_side, world, cloud)]
-    )
-
-
-def of_c(program: Path) -> Process:
-    """Start the C relay."""
-    listen, target = free_ports(2)
-    command = [str(program), str(listen), str(target), str(round(DELAY * 1e6)), "1"]
-    return Process(command, [Way(True, ("127.0.0.1", listen), ("127.0.0.1", target))])
-
-
-def compile_anchors(folder: Path) -> tuple[Path, Path]:
-    """Compile the programs `wake_lateness` and `relay` into a folder.
+def compile_anchor(folder: Path) -> Path:
+    """Compile the program `wake_lateness` into a folder.
 
     Raises:
         MissingPrerequisiteError: If there is no C compiler.
     """
     if shutil.which("cc") is None:
         raise MissingPrerequisiteError(
-            "bench-link compiles two anchors and finds no C compiler 'cc'; apt-get install gcc"
+            "bench-link compiles a program in C and finds no 'cc'; apt-get install gcc"
         )
-    for name in ("wake_lateness", "relay"):
-        source = Path(__file__).parent / "c" / f"{name}.c"
-        subprocess.run(["cc", "-O2", "-o", str(folder / name), str(source)], check=True)
-    return folder / "wake_lateness", folder / "relay"
+    program = folder / "wake_lateness"
+    source = Path(__file__).parent / "wake_lateness.c"
+    subprocess.run(["cc", "-O2", "-o", str(program), str(source)], check=True)
+    return program
 
 
 def wake_lateness(program: Path, count: int, *, fifo: bool) -> Array:
@@ -119,7 +96,7 @@ def measure_profiles(folder: Path, links: Links, duration: float, *, fifo: bool)
     Returns:
         Two rows for each link.
     """
-    relays = {name: ours(folder, link, fifo=fifo) for name, link in links.items()}
+    relays = {name: RelayProcess(folder, link, fifo=fifo) for name, link in links.items()}
     # Once all senders are up: to start one takes 0.6 s of processor time from the others.
     begin = time.monotonic() + 0.6 * (len(links) + 1)
     tasks = [(relay.ways, duration, begin) for relay in relays.values()]

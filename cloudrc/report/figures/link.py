@@ -12,7 +12,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
 from cloudrc.config.schema import Direction
 from cloudrc.metrics.flight import Array
@@ -153,16 +153,8 @@ def _draw_runs(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
         axes.set_xticks([])
         axes.set_yticks([])
         return
-    _scale_runs(axes, longest, least, most)
-    legend_above(axes, 4)
-
-
-def _scale_runs(axes: Axes, longest: int, least: float, most: float) -> None:
-    """Set the limits to whole decades and the ticks to whole run lengths."""
     axes.set_yscale("log")
     axes.set_ylim(10.0 ** np.floor(np.log10(least) - 0.01), 10.0 ** np.ceil(np.log10(most) + 0.01))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    few = max(longest, 5) <= 10
     axes.set_xlim(0.4, max(longest, 5) + 0.6)
-    axes.set_xticks(np.arange(1, max(longest, 5) + 1) if few else [1, *range(5, longest + 1, 5)])
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    legend_above(axes, 4)

@@ -30,10 +30,9 @@ SAME_CHANGE = 0.05
 """Two records less than this time apart describe the same change [s]."""
 SAME_CAUSE = 1.0
 """Largest time between the records of one change in both directions [s]."""
-LABEL_WIDTH = 0.05
-"""Width of a number beside a triangle, as a share of the narrowest panel's time axis [1]."""
 ROW_HEIGHT, ROWS = 8, 8
-"""Distance between two rows of numbers [points], and number of rows for which there is room."""
+"""Distance between two rows of numbers [points], and number of rows for which there is room. The
+numbers take turns, so that those of close changes do not overlap."""
 LEGEND = (
     " Behind the curves: red, the guard was in HOLD; hatched, a blackout of the link; dotted, a "
     "change of the link by its profile."
@@ -165,31 +164,21 @@ def mark_events(axes: Axes, subject: Subject) -> None:
         axes.axvspan(begin, end, fc="none", ec="#b0b0b0", hatch="////", lw=0, zorder=0.6)
     for instant in changed:
         axes.axvline(instant, color=style.GREY, lw=0.7, ls=(0, (1, 2)))
-    last = [-inf] * ROWS  # start of the last number in each row: numbers must not overlap
-    for number, (instant, _) in enumerate(set_in_flight(subject), start=1):
-        width = LABEL_WIDTH * subject.duration
-        free = (row for row, before in enumerate(last) if instant - before >= width)
-        row = next(free, last.index(min(last)))
-        last[row] = instant
-        _mark_set(axes, instant, number, row)
-
-
-def _mark_set(axes: Axes, instant: float, number: int, row: int) -> None:
-    """Mark a change by the user at an instant [s]: a line, a triangle on top, and its number."""
-    place = axes.get_xaxis_transform()
-    axes.axvline(instant, color=style.PURPLE, lw=0.8, zorder=2.5)
-    axes.plot(instant, 1.0, "v", ms=6.5, mew=0, color=style.PURPLE, transform=place, clip_on=False)
-    axes.annotate(
-        str(number),
-        (instant, 1.0),
-        (3.5, -9 - ROW_HEIGHT * row),
-        xycoords=place,
-        textcoords="offset points",
-        fontsize=7.0,
-        color=style.PURPLE,
-        bbox={"fc": "white", "ec": "none", "pad": 0.5, "alpha": 0.8},
-        zorder=6,
-    )
+    place, colour = axes.get_xaxis_transform(), style.PURPLE
+    for number, (instant, _) in enumerate(set_in_flight(subject)):
+        axes.axvline(instant, color=colour, lw=0.8, zorder=2.5)
+        axes.plot(instant, 1.0, "v", ms=6.5, mew=0, color=colour, transform=place, clip_on=False)
+        axes.annotate(
+            str(number + 1),
+            (instant, 1.0),
+            (3.5, -9 - ROW_HEIGHT * (number % ROWS)),
+            xycoords=place,
+            textcoords="offset points",
+            fontsize=7.0,
+            color=colour,
+            bbox={"fc": "white", "ec": "none", "pad": 0.5, "alpha": 0.8},
+            zorder=6,
+        )
 
 
 def _marks(subject: Subject) -> tuple[list[Interval], list[Interval], list[float]]:
