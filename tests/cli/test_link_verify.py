@@ -171,7 +171,7 @@ def test_a_shaper_that_reports_another_rate_is_not_believed(release, asked, appl
     assert said["verdict"] == ("not believed" if code else "believed")
     assert "NOT JUDGED" not in as_text(said)
     assert ("no limit" in as_text(said)) == (applied is None)
-    release.links["uplink"].tells(lambda: "{}")
+    release.links["uplink"].link.tell = lambda: "{}"
     assert "uplink: rate NOT JUDGED" in as_text(release.ask())
 
 

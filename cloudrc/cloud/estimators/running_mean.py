@@ -18,7 +18,7 @@ class RunningMean(Estimator):
     """
 
     def __init__(self, count_max: float = inf) -> None:
-        """Set the number of samples after which the gain stays at 1/count_max; by default never."""
+        """Keep the gain at 1/count_max after `count_max` samples [1]; by default it falls for ever."""
         self._count_max, self._count, self._mean = count_max, 0, 0.0
 
     def update(self, sample: DelaySample) -> None:
