@@ -6,7 +6,6 @@ import gc
 import json
 import os
 import signal
-from collections.abc import Callable, Iterator
 from math import isfinite, nan
 
 import pytest
@@ -31,7 +30,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 @pytest.fixture
-def handlers() -> Iterator[None]:
+def handlers():
     """Give back what a process of its own would keep: its signals, and what it has frozen."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     yield
@@ -41,11 +40,7 @@ def handlers() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def flights_of_others_are_not_seen(
-    request: pytest.FixtureRequest,
-    tmp_path_factory: pytest.TempPathFactory,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def flights_of_others_are_not_seen(request, tmp_path_factory, monkeypatch):
     """Whoever runs the tests may fly something else meanwhile."""
     if "e2e" in request.path.parts:
         return  # kind's containers may need the first one
@@ -59,7 +54,7 @@ ROUNDING = 1e-9
 
 
 @pytest.fixture
-def figure(request: pytest.FixtureRequest) -> Callable[..., None]:
+def figure(request):
     """Check a number: figure("HOLD after", 0.252, "<=", 0.252, "s", count=200).
 
     `count` is the number of cases of which it is the worst; None was not measured, and fails. Where
@@ -91,7 +86,7 @@ def figure(request: pytest.FixtureRequest) -> Callable[..., None]:
 
 
 @pytest.fixture(autouse=True)
-def signals_stay_as_they_were() -> Iterator[None]:
+def signals_stay_as_they_were():
     """A command that a test calls may take over signals, as a process of its own should.
 
     Under `nohup` tests ignore SIGHUP, and so would all that they start; some are tested for it.

@@ -48,7 +48,7 @@ def _delay_error(flight: Flight) -> float | None:
     return rms(applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9)
 
 
-def _wakes(flight: Flight, end: str) -> Columns:
+def wakes(flight: Flight, end: str) -> Columns:
     """Select the rows of /lateness that "world" or "cloud" recorded; none in virtual time."""
     columns = flight.during("/lateness")
     rows = columns["end"] == end
@@ -56,7 +56,7 @@ def _wakes(flight: Flight, end: str) -> Columns:
 
 
 def _slip(flight: Flight) -> float | None:
-    slips = _wakes(flight, "world")["slip_ns"]
+    slips = wakes(flight, "world")["slip_ns"]
     return float(slips[-1] - slips[0]) * 1e-9 if len(slips) else None
 
 
@@ -97,9 +97,9 @@ add_metrics(
     ("tracking_rms_estimated", "m", "RMS distance between the setpoint and cloud's estimated "
      "position.", lambda flight: rms(flight.control["setpoint"] - flight.control["position"])),
     ("world_lateness_p99", "s", "Lateness of world's wakes: 99th percentile; real time only.",
-     lambda flight: percentile(_wakes(flight, "world")["lateness"], 99.0)),
+     lambda flight: percentile(wakes(flight, "world")["lateness"], 99.0)),
     ("cloud_lateness_p99", "s", "Lateness of cloud's wakes: 99th percentile; real time only.",
-     lambda flight: percentile(_wakes(flight, "cloud")["lateness"], 99.0)),
+     lambda flight: percentile(wakes(flight, "cloud")["lateness"], 99.0)),
     ("world_slip", "s", "Time that world's clock lost on the machine's clock because the "
      "simulation was late.", _slip),
     ("real_time_factor", "1", "Simulated time divided by time on the machine's clock; real time "

@@ -3,7 +3,6 @@
 import socket
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -20,7 +19,7 @@ def test_without_fastapi_the_api_is_refused_and_the_extra_named(monkeypatch, tmp
 
 
 @pytest.mark.process
-def test_a_missing_resource_is_named(tmp_path: Path) -> None:
+def test_a_missing_resource_is_named(tmp_path):
     token = tmp_path / "operator"
     token.touch(0o600)
     token.write_text("a-token-of-the-operator")

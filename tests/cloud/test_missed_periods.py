@@ -5,7 +5,7 @@ import pytest
 from cloudrc.cloud.endpoint import MissedPeriods
 
 
-def throttled(since: float, until: float, count: int = 9) -> list[tuple[float, int]]:
+def throttled(since, until, count=9):
     """Miss nine of ten periods of 10 ms, every 100 ms."""
     return [(tenth * 0.1, count) for tenth in range(round(since * 10), round(until * 10))]
 

@@ -8,7 +8,7 @@ import json
 import os
 import threading
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from cloudrc.cluster import client, flight, jobs
-from cloudrc.cluster.client import Release, connect
+from cloudrc.cluster.client import connect
 from cloudrc.cluster.jobs import UID_LABEL
 
 VERSION_KEYS = (
@@ -225,7 +225,7 @@ CONFIG_PLACE = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
 
 
 @pytest.fixture
-def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeApi]:
+def api(tmp_path, monkeypatch):
     server = FakeApi()
     path = tmp_path / "kubeconfig"
     path.write_text(kubeconfig(server.url))
@@ -239,12 +239,12 @@ def api(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeApi]:
 
 
 @pytest.fixture
-def release(api: FakeApi) -> Release:
+def release(api):
     return connect()
 
 
 @pytest.fixture
-def running(api: FakeApi, release: Release) -> FakeApi:
+def running(api, release):
     """The fake API server with a release that is ready to fly."""
     for component in ("world", "cloud"):
         api.put("deployments", deployment(component))
@@ -261,7 +261,7 @@ def running(api: FakeApi, release: Release) -> FakeApi:
 
 
 @pytest.fixture
-def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def pretend(tmp_path, monkeypatch):
     """Make a fake program from a shell script; the PATH has it before the real one."""
     folder = tmp_path / "bin"
     folder.mkdir()
@@ -277,7 +277,7 @@ def pretend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.fixture
-def teleop(running: FakeApi, pretend: Callable[[str, str], Path]) -> Iterator[FakeTeleop]:
+def teleop(running, pretend):
     """A fake API of the release, to which the fake kubectl forwards ports."""
     fake = FakeTeleop()
     pretend("kubectl", fake.forwards())

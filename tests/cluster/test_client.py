@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,22 +12,14 @@ from cloudrc.cluster.client import ClusterError, Release, UnavailableError, conn
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import find_pod, list_pods
-from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
-from tests.cluster.conftest import (
-    CONFIG_PLACE,
-    MISSION,
-    FakeApi,
-    end,
-    pod,
-    start_pod,
-    terminated,
-)
+from cloudrc.errors import MissingPrerequisiteError, TimedOutError
+from tests.cluster.conftest import CONFIG_PLACE, MISSION, end, pod, start_pod, terminated
 
 ROOT = Path(__file__).resolve().parents[2]
 Pretend = Callable[[str, str], Path]
 
 
-def test_flags_override_the_kubeconfig(api: FakeApi) -> None:
+def test_flags_override_the_kubeconfig(api):
     assert connect().namespace == "demo"
     assert connect("elsewhere").namespace == "default"
     release = connect("elsewhere", "mine", "paper")
@@ -40,9 +31,7 @@ def test_flags_override_the_kubeconfig(api: FakeApi) -> None:
 
 
 @pytest.mark.parametrize("text", [None, ":\n  - x: ["])
-def test_a_missing_kubeconfig_is_reported_with_a_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str | None
-) -> None:
+def test_a_missing_kubeconfig_is_reported_with_a_remedy(tmp_path, monkeypatch, text):
     path = tmp_path / "config"
     if text is not None:
         path.write_text(text)
@@ -61,16 +50,14 @@ def test_a_missing_kubeconfig_is_reported_with_a_remedy(
         (500, "etcd\nis gone", "etcd is gone"),
     ],
 )
-def test_a_refusal_names_cause_and_next_command(
-    api: FakeApi, release: Release, code: int, said: str, expected: str
-) -> None:
+def test_a_refusal_names_cause_and_next_command(api, release, code, said, expected):
     api.refuse["GET", "pods"] = code, said
     with pytest.raises(ClusterError, match=expected) as caught:
         list_pods(release, "cloud")
     assert "\n" not in str(caught.value)
 
 
-def test_the_newest_pod_of_the_release_is_found(api: FakeApi, release: Release) -> None:
+def test_the_newest_pod_of_the_release_is_found(api, release):
     with pytest.raises(ClusterError, match=r"no release 'cloudrc' in namespace 'demo'; install it"):
         find_pod(release, "cloud")
     for name in ("old", "new", "ending"):
@@ -80,11 +67,11 @@ def test_the_newest_pod_of_the_release_is_found(api: FakeApi, release: Release) 
     assert find_pod(release, "cloud").metadata.name == "new"
 
 
-def away(api: FakeApi, plural: str, code: int, times: int) -> Callable[[], int]:
+def away(api, plural, code, times):
     """Refuse a number of read requests; return a function that counts those left."""
     original, left = api.answer, times
 
-    def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
+    def answer(method, path, body):
         nonlocal left
         if method == "GET" and f"/{plural}" in path and left:
             left -= 1
@@ -96,9 +83,7 @@ def away(api: FakeApi, plural: str, code: int, times: int) -> Callable[[], int]:
 
 
 @pytest.mark.parametrize(("plural", "code"), [("jobs", 429), ("pods", 500)])
-def test_follow_survives_an_outage(
-    running: FakeApi, release: Release, plural: str, code: int
-) -> None:
+def test_follow_survives_an_outage(running, release, plural, code):
     run_job(release, MISSION, name="first")
     start_pod(running, "first", state=terminated(0, "done"))
     running.logs["first-x"] = "waypoint 1 of 1 reached\n"
@@ -115,9 +100,7 @@ def test_follow_survives_an_outage(
     assert last == "waypoint 1 of 1 reached"
 
 
-def test_only_a_short_outage_is_waited_for(
-    running: FakeApi, release: Release, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_short_outage_is_waited_for(running, release, monkeypatch):
     monkeypatch.setattr(client, "OUTAGE_MAX", 0.05)
     run_job(release, MISSION, name="first")
     left = away(running, "jobs", 403, 5)
@@ -129,13 +112,13 @@ def test_only_a_short_outage_is_waited_for(
         follow(release, "first", print, timeout=10.0)
 
 
-def test_a_missing_program_is_named_with_its_page(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_program_is_named_with_its_page(monkeypatch):
     monkeypatch.setenv("PATH", "")
     with pytest.raises(MissingPrerequisiteError, match=r"helm is not installed; .* http"):
         client.run("helm", ["version"], timeout=1.0)
 
 
-def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path: Path) -> None:
+def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path):
     package = tmp_path / "cloudrc"
     with pytest.raises(MissingPrerequisiteError, match="install cloudrc again"):
         client.chart_folder(package)
@@ -153,9 +136,7 @@ def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path: Path) -> 
         ("echo 'error: no context'", ClusterError, "'helm list' failed: no context"),
     ],
 )
-def test_the_error_of_a_program_becomes_one_line(
-    pretend: Pretend, script: str, kind: type[CloudrcError], expected: str
-) -> None:
+def test_the_error_of_a_program_becomes_one_line(pretend, script, kind, expected):
     pretend("helm", f"exec >&2\n{script}\nexit 1")
     with pytest.raises(kind, match=expected) as caught:
         client.run("helm", ["list", "--all"], timeout=0.3 if "sleep" in script else 10.0)

@@ -1,12 +1,9 @@
 """`cloudrc doctor --mode cluster` says "can run" if and only if `cloudrc run` can."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -14,14 +11,14 @@ import yaml
 from cloudrc.cli import doctor as checks
 from cloudrc.cli.main import main
 from cloudrc.cluster.client import OLDEST
-from tests.cluster.conftest import CONFIG_PLACE, FakeApi, kubeconfig
+from tests.cluster.conftest import CONFIG_PLACE, kubeconfig
 
 Printed = pytest.CaptureFixture[str]
 CHART = Path(__file__).resolve().parents[2] / "charts" / "cloudrc" / "Chart.yaml"
 
 
 @pytest.fixture(autouse=True)
-def programs(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+def programs(monkeypatch):
     """Make only these programs available; skip slow checks that are not about a cluster."""
     for name in ("mujoco_steps", "udp_loopback", "timer"):
         monkeypatch.setattr(checks, name, lambda name=name: checks.Check(name, "ok", ""))
@@ -30,16 +27,14 @@ def programs(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     return found
 
 
-def doctor(capsys: Printed, code: int, *more: str) -> dict[str, dict[str, Any]]:
+def doctor(capsys, code, *more):
     assert main(["doctor", "--mode", "cluster", "-o", "json", *more]) == code
     report = json.loads(capsys.readouterr().out)
     assert report["ready"] is (code == 0)
     return {check["name"]: check for check in report["checks"]}
 
 
-def test_a_cluster_elsewhere_needs_neither_docker_nor_kind(
-    api: FakeApi, programs: set[str], capsys: Printed
-) -> None:
+def test_a_cluster_elsewhere_needs_neither_docker_nor_kind(api, programs, capsys):
     found = doctor(capsys, 0)
     assert found["cluster"]["found"] == "Kubernetes 1.33 answers"
     for name in ("docker", "kind"):
@@ -51,9 +46,7 @@ def test_a_cluster_elsewhere_needs_neither_docker_nor_kind(
     assert doctor(capsys, 3)["helm"]["state"] == "missing"
 
 
-def test_a_cluster_that_cannot_be_reached_blocks_the_mode(
-    tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cluster_that_cannot_be_reached_blocks_the_mode(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(CONFIG_PLACE, str(tmp_path / "config"))
     (tmp_path / "config").touch()
     check = doctor(capsys, 3)["kubeconfig"]
@@ -65,9 +58,7 @@ def test_a_cluster_that_cannot_be_reached_blocks_the_mode(
 
 
 @pytest.mark.parametrize(("minor", "code"), [("28+", 3), ("29", 0), ("30+", 0), ("100", 0)])
-def test_a_cluster_that_is_too_old_is_reported(
-    api: FakeApi, capsys: Printed, minor: str, code: int
-) -> None:
+def test_a_cluster_that_is_too_old_is_reported(api, capsys, minor, code):
     api.version["minor"] = minor
     cluster = doctor(capsys, code)["cluster"]
     assert cluster["state"] == ("missing" if code else "ok")
@@ -77,5 +68,5 @@ def test_a_cluster_that_is_too_old_is_reported(
 
 
 @pytest.mark.parametrize("mode", ["local", "virtual"])
-def test_other_modes_contact_no_cluster(mode: str) -> None:
+def test_other_modes_contact_no_cluster(mode):
     assert not {"cluster", "kubeconfig"} & {check.name for check in checks.all_checks(mode)}

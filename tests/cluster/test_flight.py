@@ -1,11 +1,7 @@
 """`cloudrc run --mode cluster` from the flags to the report, on a fake cluster."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 import pytest
 
@@ -15,12 +11,11 @@ from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
 from cloudrc.record.merge import cut_to_last_mission, merge
-from cloudrc.record.reader import Contents
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
-from tests.cluster.conftest import FakeApi, FakeTeleop, at_look, end, start_pod, terminated
+from tests.cluster.conftest import at_look, end, start_pod, terminated
 from tests.flights.conftest import records
 
 Printed = pytest.CaptureFixture[str]
@@ -30,15 +25,15 @@ LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
 
 
 @cache
-def flown() -> tuple[list[Record], list[Record]]:
+def flown():
     return records(load_experiment(NAME, [SETTING]))
 
 
-def later(given: list[Record], by_ns: int) -> list[Record]:
+def later(given, by_ns):
     return [record._replace(stamp_ns=record.stamp_ns + by_ns) for record in given]
 
 
-def merged(folder: Path, *flights: tuple[list[Record], list[Record]], torn: bool) -> Contents:
+def merged(folder, *flights, torn):
     """Record flights as two pods do; torn: the files have no end, as when copied in flight."""
     for number, name in enumerate(("world", "cloud")):
         path = folder / f"{name}.mcap"
@@ -54,7 +49,7 @@ def merged(folder: Path, *flights: tuple[list[Record], list[Record]], torn: bool
 
 
 @pytest.mark.parametrize("torn", [True, False])
-def test_a_recording_with_the_missions_end_is_complete(tmp_path: Path, torn: bool) -> None:
+def test_a_recording_with_the_missions_end_is_complete(tmp_path, torn):
     world, cloud = flown()
     after = later(world[-300:], SECOND), list[Record]()
     # The mission's start may be in the recording of a pod that is gone.
@@ -69,7 +64,7 @@ def test_a_recording_with_the_missions_end_is_complete(tmp_path: Path, torn: boo
     assert not mission.recording().complete
 
 
-def test_only_the_last_of_two_missions_is_kept(tmp_path: Path) -> None:
+def test_only_the_last_of_two_missions_is_kept(tmp_path):
     world, cloud = flown()
     gap = world[-1].stamp_ns + 5 * SECOND
     second = later(world, gap), later(cloud, gap)
@@ -86,13 +81,7 @@ def test_only_the_last_of_two_missions_is_kept(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def ready(
-    running: FakeApi,
-    teleop: FakeTeleop,
-    pretend: Callable[[str, str], Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> FakeApi:
+def ready(running, teleop, pretend, tmp_path, monkeypatch):
     """A release whose pods have recorded a flight."""
     monkeypatch.setattr(flight, "FLUSH", 0.0)
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
@@ -112,10 +101,10 @@ def ready(
     return running
 
 
-def ends(api: FakeApi, kind: str = "Complete", exit_code: int = 0, message: str = "done") -> None:
+def ends(api, kind="Complete", exit_code=0, message="done"):
     """Let the Job end at the second look."""
 
-    def action() -> None:
+    def action():
         (name,) = [key[1] for key in api.objects if key[0] == "jobs"]
         start_pod(api, name, state=terminated(exit_code, message))
         api.logs[f"{name}-x"] = "waypoint 1 of 1 reached at 3.00 s\n"
@@ -124,9 +113,7 @@ def ends(api: FakeApi, kind: str = "Complete", exit_code: int = 0, message: str 
     at_look(api, 2, action)
 
 
-def test_a_flight_on_a_cluster_writes_a_whole_run(
-    ready: FakeApi, tmp_path: Path, capsys: Printed
-) -> None:
+def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, capsys):
     (tmp_path / "two.py").write_text("UNIT = '1'\ndef measure(flight):\n    return 2.0\n")
     ends(ready)
     code = main([*LINE, "--out", "out", "--set", "report.metrics=./two.py"])
@@ -149,7 +136,7 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(
     assert "--namespace=demo --create-namespace" in line
 
 
-def test_a_refused_mission_leaves_no_run(ready: FakeApi, tmp_path: Path, capsys: Printed) -> None:
+def test_a_refused_mission_leaves_no_run(ready, tmp_path, capsys):
     ends(ready, "Failed", 5, "mission m-1 is under way")
     assert main(LINE) == 5
     said = capsys.readouterr().err
@@ -159,9 +146,7 @@ def test_a_refused_mission_leaves_no_run(ready: FakeApi, tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize("left", [True, False])
-def test_the_recording_from_before_a_restart_is_copied(
-    ready: FakeApi, tmp_path: Path, capsys: Printed, left: bool
-) -> None:
+def test_the_recording_from_before_a_restart_is_copied(ready, tmp_path, capsys, left):
     (key,) = [key for key in ready.objects if key[0] == "pods" and "world" in key[1]]
     ready.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
     ends(ready)
@@ -176,13 +161,11 @@ def test_the_recording_from_before_a_restart_is_copied(
     assert before.read_text() == "before\n" if left else not before.exists()
 
 
-def test_a_broken_port_forward_loses_metrics_but_no_report(
-    ready: FakeApi, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(*arguments: object) -> dict[str, str]:
+def test_a_broken_port_forward_loses_metrics_but_no_report(ready, tmp_path, capsys, monkeypatch):
+    def broken(*arguments):
         raise ClusterError("no way to the pod")
 
-    def once_broken(*arguments: object) -> None:
+    def once_broken(*arguments):
         monkeypatch.setattr(pods, "fetch_recording", fetch_recording)
         raise ClusterError("kubectl exec failed")
 
@@ -199,9 +182,9 @@ def test_a_broken_port_forward_loses_metrics_but_no_report(
 
 
 def test_an_interrupted_flight_cancels_its_mission_and_is_reported(
-    ready: FakeApi, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*arguments: object, **more: object) -> None:
+    ready, tmp_path, capsys, monkeypatch
+):
+    def interrupted(*arguments, **more):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(flight, "follow", interrupted)
@@ -213,9 +196,7 @@ def test_an_interrupted_flight_cancels_its_mission_and_is_reported(
     assert json.loads(captured.out)["mode"] == "cluster"
 
 
-def test_a_run_does_not_end_a_flight_in_progress(
-    ready: FakeApi, tmp_path: Path, capsys: Printed
-) -> None:
+def test_a_run_does_not_end_a_flight_in_progress(ready, tmp_path, capsys):
     run_job(connect(), {}, name="first")
     assert main([*LINE, "--out", "out"]) == 5
     said = capsys.readouterr().err
@@ -234,12 +215,8 @@ def test_a_run_does_not_end_a_flight_in_progress(
     ],
 )
 def test_what_pods_cannot_have_is_refused_before_the_install(
-    tmp_path: Path,
-    capsys: Printed,
-    monkeypatch: pytest.MonkeyPatch,
-    settings: list[str],
-    words: str,
-) -> None:
+    tmp_path, capsys, monkeypatch, settings, words
+):
     monkeypatch.chdir(tmp_path)
     plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
     (tmp_path / "mine.py").write_text(plugin)
@@ -249,7 +226,7 @@ def test_what_pods_cannot_have_is_refused_before_the_install(
     assert not (tmp_path / "runs").exists()
 
 
-def test_an_upgrade_keeps_the_values_of_a_release() -> None:
+def test_an_upgrade_keeps_the_values_of_a_release():
     before = {
         "metrics": {"allowFrom": ["x"]},
         "link": {"mode": "relay", "profile": "paper-p1"},

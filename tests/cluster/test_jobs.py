@@ -4,27 +4,18 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
 from cloudrc.cluster import jobs
-from cloudrc.cluster.client import ClusterError, Release
-from cloudrc.cluster.jobs import (
-    delete_job,
-    follow,
-    follow_limit,
-    job_under_way,
-    read_job,
-    run_job,
-)
+from cloudrc.cluster.client import ClusterError
+from cloudrc.cluster.jobs import delete_job, follow, follow_limit, job_under_way, read_job, run_job
 from cloudrc.errors import TimedOutError
 from tests.cluster.conftest import (
     MISSION,
     SECURE,
     TELEOP,
     TOKEN,
-    FakeApi,
     at_look,
     end,
     made,
@@ -33,11 +24,11 @@ from tests.cluster.conftest import (
 )
 
 
-def pod_of(api: FakeApi, name: str) -> Any:
+def pod_of(api, name):
     return api.get("jobs", name)["spec"]["template"]["spec"]
 
 
-def test_a_job_posts_the_mission_to_its_release(running: FakeApi, release: Release) -> None:
+def test_a_job_posts_the_mission_to_its_release(running, release):
     status = run_job(release, MISSION, name="first", limit=60.0)
     assert status.state == "pending"
     plan = running.get("configmaps", "first")
@@ -58,9 +49,7 @@ def test_a_job_posts_the_mission_to_its_release(running: FakeApi, release: Relea
     assert "--queue" in pod_of(running, "patient")["containers"][0]["args"]
 
 
-def test_a_job_has_owner_nodes_and_rights_of_its_release(
-    running: FakeApi, release: Release
-) -> None:
+def test_a_job_has_owner_nodes_and_rights_of_its_release(running, release):
     cloud = running.get("deployments", "cloudrc-cloud")
     where = {"nodeSelector": {"disk": "fast"}, "tolerations": [{"key": "lab"}]}
     where["imagePullSecrets"] = [{"name": "registry"}]
@@ -84,7 +73,7 @@ def test_a_job_has_owner_nodes_and_rights_of_its_release(
     assert "securityContext" not in str(pod_of(running, "third"))
 
 
-def test_a_job_has_an_unused_and_short_name(running: FakeApi, release: Release) -> None:
+def test_a_job_has_an_unused_and_short_name(running, release):
     assert len({run_job(release, MISSION).name for _ in range(5)}) == 5
     for body in list(running.objects.values()):
         body["metadata"].setdefault("labels", {})["app.kubernetes.io/instance"] = "r" * 53
@@ -92,16 +81,14 @@ def test_a_job_has_an_unused_and_short_name(running: FakeApi, release: Release) 
     assert len(status.name) <= 63 - len("-xxxxx")
 
 
-def test_follow_writes_each_line_once_and_returns_the_verdict(
-    running: FakeApi, release: Release
-) -> None:
+def test_follow_writes_each_line_once_and_returns_the_verdict(running, release):
     run_job(release, MISSION, name="first")
 
-    def fly() -> None:
+    def fly():
         start_pod(running, "first")
         running.logs["first-x"] = "waypoint 1 of 2 reached\n"
 
-    def land() -> None:
+    def land():
         start_pod(running, "first", state=terminated(1, "the\nverdict"))
         statuses = running.get("pods", "first-x")["status"]["containerStatuses"]
         statuses.append({**statuses[0], "name": "mesh", "state": terminated(0, "bye")})
@@ -116,7 +103,7 @@ def test_follow_writes_each_line_once_and_returns_the_verdict(
     assert (ended.state, ended.exit_code, ended.message) == ("failed", 1, "the verdict")
 
 
-def test_follow_ends_when_the_pod_cannot_run(running: FakeApi, release: Release) -> None:
+def test_follow_ends_when_the_pod_cannot_run(running, release):
     run_job(release, MISSION, name="first")
     with pytest.raises(TimedOutError, match=r"'first' has not ended within 0\.05 s"):
         follow(release, "first", print, timeout=0.05)
@@ -135,14 +122,14 @@ def test_follow_ends_when_the_pod_cannot_run(running: FakeApi, release: Release)
         follow(release, "first", print, timeout=10.0)
 
 
-def test_a_deadline_is_named_and_bounded(running: FakeApi, release: Release) -> None:
+def test_a_deadline_is_named_and_bounded(running, release):
     run_job(release, MISSION, name="first")
     end(running, "first", "Failed", reason="DeadlineExceeded", message="...")
     assert "activeDeadlineSeconds" in read_job(release, "first")[0].message
     assert follow_limit(1e300, queue=True) < 2**31 + 100
 
 
-def test_a_job_that_cannot_be_made_leaves_nothing(running: FakeApi, release: Release) -> None:
+def test_a_job_that_cannot_be_made_leaves_nothing(running, release):
     running.refuse["POST", "configmaps"] = 403, "configmaps is forbidden"
     with pytest.raises(ClusterError, match="can-i create configmaps"):
         run_job(release, MISSION, name="first")

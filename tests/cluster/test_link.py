@@ -20,7 +20,6 @@ from cloudrc.cluster.link import APPLY_LIMIT, APPLY_SCRIPT, with_files
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import HANDED_FILE, Handed, read_handed, write_handed
 from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
-from tests.cluster.conftest import FakeApi
 
 Printed = pytest.CaptureFixture[str]
 PROFILE = "uplink: {delay_ms: 45, jitter_ms: 25}\ndownlink: {delay_ms: 45, jitter_ms: 25}\n"
@@ -28,7 +27,7 @@ TRACE = "time_s,delay_ms\n0,40\n1,60\n"
 LINE = ["link", "set", "downlink.delay_ms=120", "-n", "demo"]
 
 
-def item(kind: str, name: str, component: str, **rest: Any) -> dict[str, Any]:
+def item(kind, name, component, **rest):
     labels = {"app.kubernetes.io/component": component}
     metadata = {"name": name, "labels": labels, "creationTimestamp": "2026-01-01T00:00:00Z"}
     return {"kind": kind, "metadata": metadata, **rest}
@@ -37,7 +36,7 @@ def item(kind: str, name: str, component: str, **rest: Any) -> dict[str, Any]:
 class Cluster:
     """A release behind a fake kubectl, with a record of its calls."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         running = {"status": {"phase": "Running"}}
         self.items = [
             item("ConfigMap", "demo-link", "link", data={"profile.yaml": PROFILE}),
@@ -58,7 +57,7 @@ class Cluster:
         self.handed: dict[str, dict[str, Any]] = {}
         self.kept: dict[str, str] = {}
 
-    def run(self, name: str, words: list[str], *, timeout: float, given: str = "") -> str:
+    def run(self, name, words, *, timeout, given=""):
         assert name == "kubectl"
         self.asked.append(words)
         verb = next(word for word in words if word in ("get", "patch", "exec"))
@@ -82,13 +81,13 @@ class Cluster:
 
 
 @pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
+def cluster(monkeypatch):
     found = Cluster()
     monkeypatch.setattr("cloudrc.cluster.link.run", found.run)
     return found
 
 
-def test_a_change_reaches_both_pods_and_the_configmap(cluster: Cluster, capsys: Printed) -> None:
+def test_a_change_reaches_both_pods_and_the_configmap(cluster, capsys):
     assert main([*LINE, "--context", "kind"]) == 0
     assert yaml.safe_load(cluster.kept["profile.yaml"]) == {
         "uplink": {"delay_ms": 45.0, "jitter_ms": 25.0},
@@ -108,9 +107,7 @@ def test_a_change_reaches_both_pods_and_the_configmap(cluster: Cluster, capsys: 
     assert shown[2].split()[:4] == ["downlink", "netem", "120", "ms"]
 
 
-def test_a_local_trace_is_stored_beside_the_profile(
-    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypatch):
     (tmp_path / "my trace.csv").write_text(TRACE)
     setting = [f"uplink.trace={tmp_path / 'my trace.csv'}"]
     cluster.items[0]["data"] |= {"old.csv": "of a profile before"}
@@ -134,13 +131,13 @@ FORBIDDEN = "Error from server (Forbidden): this is forbidden"
 LATER = "; the ConfigMap has the change, and the pods apply it within 2 minutes"
 
 
-def error(capsys: Printed) -> str:
+def error(capsys):
     """Return the one line of an error message."""
     (line,) = capsys.readouterr().err.splitlines()
     return line
 
 
-def test_an_unreachable_container_gets_the_change_later(cluster: Cluster, capsys: Printed) -> None:
+def test_an_unreachable_container_gets_the_change_later(cluster, capsys):
     cluster.broken.add("cloud-1")
     assert main(LINE) == 5
     said = error(capsys)
@@ -149,7 +146,7 @@ def test_an_unreachable_container_gets_the_change_later(cluster: Cluster, capsys
     assert cluster.kept
 
 
-def test_a_change_that_cannot_be_kept_says_where_it_is(cluster: Cluster, capsys: Printed) -> None:
+def test_a_change_that_cannot_be_kept_says_where_it_is(cluster, capsys):
     cluster.refused["patch"] = FORBIDDEN
     assert main(LINE) == 5
     said = error(capsys)
@@ -162,9 +159,7 @@ def test_a_change_that_cannot_be_kept_says_where_it_is(cluster: Cluster, capsys:
     assert (said.count("this is forbidden"), "has the change" in said) == (3, False)
 
 
-def test_a_change_that_one_direction_refuses_does_not_last(
-    cluster: Cluster, capsys: Printed
-) -> None:
+def test_a_change_that_one_direction_refuses_does_not_last(cluster, capsys):
     cluster.cannot["cloud-1"] = "corrupt"
     assert main(["link", "set", "downlink.corrupt=0.5", "uplink.delay_ms=9", "-n", "demo"]) == 2
     assert error(capsys) == (
@@ -174,7 +169,7 @@ def test_a_change_that_one_direction_refuses_does_not_last(
     assert not cluster.kept
 
 
-def test_a_silent_or_strange_container_is_named(cluster: Cluster, capsys: Printed) -> None:
+def test_a_silent_or_strange_container_is_named(cluster, capsys):
     cluster.deaf.add("cloud-1")
     assert main(LINE) == 4
     said = error(capsys)
@@ -185,9 +180,7 @@ def test_a_silent_or_strange_container_is_named(cluster: Cluster, capsys: Printe
     assert "a link container has another version: not the state of a link" in error(capsys)
 
 
-def test_a_missing_release_or_pod_is_named(
-    cluster: Cluster, running: FakeApi, capsys: Printed
-) -> None:
+def test_a_missing_release_or_pod_is_named(cluster, running, capsys):
     running.get("pods", "world-1")["status"]["phase"] = "Pending"
     del cluster.items[2]
     assert main(LINE) == 5
@@ -205,28 +198,26 @@ LONG = "time_s,delay_ms\n" + "0,40\n" * 20_000
 DOCUMENT = write_handed(Handed(NOTE, {"profile.yaml": "uplink: {trace: t.csv}\n", "t": LONG}))
 
 
-def start(folder: Path, script: str = APPLY_SCRIPT) -> subprocess.Popen[str]:
+def start(folder, script=APPLY_SCRIPT):
     length = str(len(DOCUMENT.encode()))
     command = ["sh", "-c", script, "sh", str(folder), "b2", length]
     pipe = subprocess.PIPE
     return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
 
 
-def tell(folder: Path, **state: str) -> str:
+def tell(folder, **state):
     text = to_text(LinkState("relay", "", "relay", "uplink", {}, "", 1, **state))
     publish(folder / STATE_FILE, text)
     return text
 
 
 @pytest.mark.parametrize("state", [{"change": "b2"}, {"change": "a1", "refused": "b2"}])
-def test_the_script_hands_over_a_change_and_prints_the_state(
-    tmp_path: Path, state: dict[str, str]
-) -> None:
+def test_the_script_hands_over_a_change_and_prints_the_state(tmp_path, state):
     tell(tmp_path, change="a1", refused="b22")
     running = start(tmp_path)
     decided = list[str]()
 
-    def sidecar() -> None:
+    def sidecar():
         while not (tmp_path / HANDED_FILE).exists():
             time.sleep(0.005)
         decided.append(tell(tmp_path, **state))
@@ -240,7 +231,7 @@ def test_the_script_hands_over_a_change_and_prints_the_state(
     assert sorted(os.listdir(tmp_path)) == [HANDED_FILE, STATE_FILE], "no draft is left"
 
 
-def test_a_silent_sidecar_leaves_the_old_state(tmp_path: Path) -> None:
+def test_a_silent_sidecar_leaves_the_old_state(tmp_path):
     told = tell(tmp_path, change="a1")
     quick = APPLY_SCRIPT.replace("seq 250", "seq 3")
     assert quick != APPLY_SCRIPT
@@ -252,9 +243,7 @@ def test_a_silent_sidecar_leaves_the_old_state(tmp_path: Path) -> None:
     ("folder", "given", "words"),
     [(".", DOCUMENT[:-1], "the change arrived incomplete"), ("none", "", "no link runs here")],
 )
-def test_what_the_script_cannot_hand_over_is_refused(
-    tmp_path: Path, folder: str, given: str, words: str
-) -> None:
+def test_what_the_script_cannot_hand_over_is_refused(tmp_path, folder, given, words):
     tell(tmp_path, change="a1")
     running = start(tmp_path / folder)
     _, err = running.communicate(given)
@@ -274,7 +263,7 @@ KUBECTL_NEEDS = {
 """Command of kubectl -> rights that it needs, as an API server has recorded them."""
 
 
-def test_the_role_allows_just_what_its_commands_need(cluster: Cluster) -> None:
+def test_the_role_allows_just_what_its_commands_need(cluster):
     assert main(LINE) == 0
     rules = yaml.safe_load(ROLE.read_text())["rules"]
     (changing,) = (rule for rule in rules if "patch" in rule["verbs"])

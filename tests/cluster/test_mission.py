@@ -1,27 +1,19 @@
 """`cloudrc mission` in a cluster: where it goes, what it checks, its output and exit codes."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket
 import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from cloudrc.cli import mission as command
 from cloudrc.cli.main import main
 from cloudrc.cluster import jobs
-from cloudrc.cluster.client import Release
 from cloudrc.drivers import local
 from tests.cluster.conftest import (
     CONFIG_PLACE,
     TOKEN,
-    FakeApi,
-    FakeTeleop,
     at_look,
     end,
     made,
@@ -36,7 +28,7 @@ VERDICT = {0: "SUCCESS: all met", 1: "FAILURE: pipe_contact"}
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "one.yaml").write_text(WAYPOINTS)
@@ -44,11 +36,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def lands(running: FakeApi, monkeypatch: pytest.MonkeyPatch) -> FakeApi:
+def lands(running, monkeypatch):
     """A release whose Jobs succeed as soon as they are followed."""
     original = jobs.follow
 
-    def follow(release: Release, name: str, *given: Any, timeout: float) -> Any:
+    def follow(release, name, *given, timeout):
         running.objects["jobs", name]["metadata"]["patience"] = timeout
         start_pod(running, name, state=terminated(0, "done"))
         end(running, name, "Complete")
@@ -108,12 +100,12 @@ def test_a_jobs_deadline_follows_the_missions_time_limit(lands, folder, mission,
         assert job["metadata"]["patience"] > deadline
 
 
-def test_run_waits_until_the_release_is_ready(lands: FakeApi, capsys: Printed) -> None:
+def test_run_waits_until_the_release_is_ready(lands, capsys):
     """`helm install` does not wait for the pods."""
     original, looks = lands.answer, 0
     lands.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending"))
 
-    def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
+    def answer(method, path, body):
         nonlocal looks
         looks += "/pods" in path
         if looks == 4:
@@ -128,10 +120,8 @@ def test_run_waits_until_the_release_is_ready(lands: FakeApi, capsys: Printed) -
     assert json.loads(plan) == command.read_mission("pipes")
 
 
-def test_an_interrupted_run_says_that_the_job_continues(
-    running: FakeApi, capsys: Printed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*arguments: object, **more: object) -> None:
+def test_an_interrupted_run_says_that_the_job_continues(running, capsys, monkeypatch):
+    def interrupted(*arguments, **more):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(jobs, "follow", interrupted)
@@ -143,7 +133,7 @@ def test_an_interrupted_run_says_that_the_job_continues(
 
 
 @pytest.fixture
-def flies_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def flies_here(tmp_path, monkeypatch):
     """A run on this machine whose API accepts connections and never answers."""
     monkeypatch.setattr("cloudrc.cli.client.REQUEST_TIMEOUT", 0.05)
     with socket.socket(socket.AF_UNIX) as server:
@@ -154,7 +144,7 @@ def flies_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None
 
 
 @pytest.mark.usefixtures("flies_here")
-def test_the_local_run_is_the_default(running: FakeApi, capsys: Printed) -> None:
+def test_the_local_run_is_the_default(running, capsys):
     assert main(["mission", "list"]) == 5
     assert "silent.sock" in capsys.readouterr().err
     assert running.seen == []
@@ -166,20 +156,14 @@ def test_the_local_run_is_the_default(running: FakeApi, capsys: Printed) -> None
     [["cloudrc", "mission", "list", "-n", "demo"], ["/bin/kubectl-cloudrc", "mission", "list"]],
 )
 def test_a_flag_or_the_plugin_of_kubectl_selects_the_cluster(
-    running: FakeApi,
-    teleop: FakeTeleop,
-    capsys: Printed,
-    monkeypatch: pytest.MonkeyPatch,
-    words: list[str],
-) -> None:
+    running, teleop, capsys, monkeypatch, words
+):
     monkeypatch.setattr(sys, "argv", words)
     assert main() == 0
     assert capsys.readouterr().out == "no missions yet\n"
 
 
-def test_neither_a_run_nor_a_cluster_is_reported(
-    tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_neither_a_run_nor_a_cluster_is_reported(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(CONFIG_PLACE, str(tmp_path / "none"))
     assert main(["mission", "status"]) == 3
     assert re.match(".*no run flies here.*KUBECONFIG.*\n$", capsys.readouterr().err)

@@ -1,31 +1,28 @@
 """Pods are explained, waited for and reached; tokens are read and never printed."""
 
-from __future__ import annotations
-
 import base64
 import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from cloudrc.cluster import pods
-from cloudrc.cluster.client import ClusterError, Release
+from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.flight import install, wait_ready
 from cloudrc.cluster.pods import list_pods, operator_token, pod_failure
-from cloudrc.errors import CloudrcError, TimedOutError
-from tests.cluster.conftest import TOKEN, FakeApi, deployment, pod
+from cloudrc.errors import TimedOutError
+from tests.cluster.conftest import TOKEN, deployment, pod
 
 Pretend = Callable[[str, str], Path]
 
 
-def waiting(reason: str, message: str = "") -> dict[str, Any]:
+def waiting(reason, message=""):
     return {"waiting": {"reason": reason, "message": message}}
 
 
-def unscheduled(message: str) -> list[dict[str, str]]:
+def unscheduled(message):
     return [{"type": "PodScheduled", "status": "False", "message": message}]
 
 
@@ -52,9 +49,7 @@ def unscheduled(message: str) -> list[dict[str, str]]:
         ({"restarts": 1}, "^$"),
     ],
 )
-def test_a_failure_of_a_pod_is_explained(
-    api: FakeApi, release: Release, given: dict[str, Any], expected: str
-) -> None:
+def test_a_failure_of_a_pod_is_explained(api, release, given, expected):
     api.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending", **given))
     said = pod_failure(list_pods(release, "cloud")[0])
     assert re.search(expected, said)
@@ -79,9 +74,7 @@ REFUSED = {"type": "ReplicaFailure", "status": "True", "message": "violates PodS
         ),
     ],
 )
-def test_the_wait_for_a_release_ends_with_the_cause(
-    running: FakeApi, release: Release, body: dict[str, Any], error: type[CloudrcError], words: str
-) -> None:
+def test_the_wait_for_a_release_ends_with_the_cause(running, release, body, error, words):
     wait_ready(release, timeout=0.0)
     running.put("pods" if "phase" in body["status"] else "deployments", body)
     with pytest.raises(error, match=words):
@@ -97,9 +90,7 @@ def test_the_wait_for_a_release_ends_with_the_cause(
         ("values don't meet the specifications of the schema(s)\n- link: mdoe", "helm show values"),
     ],
 )
-def test_a_refusal_of_helm_has_a_hint(
-    release: Release, pretend: Pretend, said: str, hint: str
-) -> None:
+def test_a_refusal_of_helm_has_a_hint(release, pretend, said, hint):
     pretend("helm", f"cat >&2 <<'END'\nError: {said}\nEND\nexit 1")
     with pytest.raises(ClusterError, match=f"{said.split()[0]}.*{hint}") as caught:
         install(release, {}, 1.0, print)
@@ -107,9 +98,7 @@ def test_a_refusal_of_helm_has_a_hint(
 
 
 @pytest.mark.parametrize("data", [{}, {"operator": "%%%"}, {"operator": "//4gc2VjcmV0"}])
-def test_a_secret_without_a_token_is_named(
-    running: FakeApi, release: Release, data: dict[str, str]
-) -> None:
+def test_a_secret_without_a_token_is_named(running, release, data):
     assert operator_token(release) == TOKEN
     running.get("secrets", "cloudrc-tokens")["data"] = data
     with pytest.raises(ClusterError, match=r"'cloudrc-tokens' .* has no token under") as refused:
@@ -123,9 +112,7 @@ def test_a_secret_without_a_token_is_named(
         operator_token(release)
 
 
-def test_a_port_is_forwarded_while_the_block_runs(
-    release: Release, pretend: Pretend, tmp_path: Path
-) -> None:
+def test_a_port_is_forwarded_while_the_block_runs(release, pretend, tmp_path):
     pretend(
         "kubectl",
         f"echo $$ > {tmp_path}/pid; echo $@ > {tmp_path}/line\n"
@@ -152,14 +139,7 @@ def test_a_port_is_forwarded_while_the_block_runs(
         ("exec sleep 60", TimedOutError, "has not started within 0.5 s"),
     ],
 )
-def test_a_failed_port_forward_is_reported(
-    release: Release,
-    pretend: Pretend,
-    monkeypatch: pytest.MonkeyPatch,
-    script: str,
-    error: type[CloudrcError],
-    words: str,
-) -> None:
+def test_a_failed_port_forward_is_reported(release, pretend, monkeypatch, script, error, words):
     if error is TimedOutError:
         monkeypatch.setattr(pods, "START_LIMIT", 0.5)
     pretend("kubectl", script)

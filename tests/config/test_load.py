@@ -10,13 +10,7 @@ from hypothesis import strategies as st
 from cloudrc.assembly import link_profile
 from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
-from cloudrc.config.load import (
-    dump,
-    fingerprint,
-    load_experiment,
-    load_profile,
-    read_experiment,
-)
+from cloudrc.config.load import dump, fingerprint, load_experiment, load_profile, read_experiment
 from cloudrc.geometry.scene import load_scene
 
 PROFILES = shipped.names("profile")

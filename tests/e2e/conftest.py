@@ -240,13 +240,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session")
-def note() -> Callable[[str], None]:
+def note():
     """Add a line to the summary."""
     return SUMMARY.append
 
 
 @pytest.fixture(scope="session")
-def cluster(request: pytest.FixtureRequest) -> Iterator[None]:
+def cluster(request):
     """A cluster with our images in it: that of KUBECONFIG, or a kind cluster of our own."""
     own = "KUBECONFIG" not in os.environ
     missing = [tool for tool in TOOLS if shutil.which(tool) is None]
@@ -317,7 +317,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 @pytest.fixture(scope="session")
-def values(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def values(tmp_path_factory):
     """What the tests' release is installed with, over the chart's own values."""
     prometheus = {"kubernetes.io/metadata.name": f"{NAMESPACE}-monitoring"}
     given = {
@@ -330,7 +330,7 @@ def values(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def installed(cluster: None, values: Path) -> None:
+def installed(cluster, values):
     """The release that most tests use."""
     kubectl("delete", "jobs", "--all")  # of an earlier session, where the cluster was kept
     began = time.monotonic()
@@ -340,7 +340,7 @@ def installed(cluster: None, values: Path) -> None:
 
 
 @pytest.fixture(scope="session")
-def prometheus_image(cluster: None) -> str:
+def prometheus_image(cluster):
     """A real Prometheus, and promtool with it."""
     found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
     return found.split()[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,12 +49,12 @@ class FirstFlight:
 
 
 @pytest.fixture(scope="module")
-def prometheus(installed: None, prometheus_image: str) -> None:
+def prometheus(installed, prometheus_image):
     install_prometheus(prometheus_image)
 
 
 @pytest.fixture(scope="module")
-def first(prometheus: None) -> FirstFlight:
+def first(prometheus):
     kubectl("apply", f"--filename={EXAMPLES / 'mission-paper.yaml'}")
     eventually(lambda: "waypoint 1 of 7" in job_log(MISSION), "the mission flies", 60.0)
     fly("second", [{"position_m": [0.5, 0.0, 0.7]}])
@@ -76,18 +76,18 @@ def first(prometheus: None) -> FirstFlight:
     return FirstFlight(paper, log, second, opened, knocks, malformed(), seconds)
 
 
-def ip(component: str) -> str:
+def ip(component):
     return str(pod(component)["status"]["podIP"])
 
 
-def malformed() -> float:
+def malformed():
     """Datagrams that both ends could make nothing of."""
     name, outcome = "cloudrc_datagrams_total", "malformed"
     time.sleep(1.2)  # they are told once a second
     return sum(value(metrics(end), name, outcome=outcome) for end in ("world", "cloud"))
 
 
-def test_the_papers_mission_ends_complete(first: FirstFlight, note: Callable[[str], None]) -> None:
+def test_the_papers_mission_ends_complete(first, note):
     note(f"from 'kind create cluster' to a Job that is Complete: {first.seconds:.0f} s")
     assert (first.paper.state, first.paper.exit_code) == ("complete", 0), first.paper
     assert first.seconds < LIMIT_TIME
@@ -99,19 +99,19 @@ def test_the_papers_mission_ends_complete(first: FirstFlight, note: Callable[[st
     assert said in " ".join(described.split())
 
 
-def test_a_second_mission_is_refused_with_the_id_of_the_first(first: FirstFlight) -> None:
+def test_a_second_mission_is_refused_with_the_id_of_the_first(first):
     assert first.second.state == "failed"
     assert first.second.exit_code != 0
     assert re.search(rf"\b{missions()[0]['id']}\b", first.second.message), first.second.message
 
 
-def test_a_stranger_reaches_neither_tunnel_nor_metrics_nor_api(first: FirstFlight) -> None:
+def test_a_stranger_reaches_neither_tunnel_nor_metrics_nor_api(first):
     assert first.opened == []
     assert first.knocks == 0
     assert first.own_knocks >= 1, "a knock that gets through is counted"
 
 
-def test_all_metrics_are_well_formed_and_of_one_configuration(first: FirstFlight) -> None:
+def test_all_metrics_are_well_formed_and_of_one_configuration(first):
     texts = scrapes("world") | scrapes("cloud")
     for container, text in texts.items():
         assert promtool("check", "metrics", given=text) == "", container
@@ -122,19 +122,19 @@ def test_all_metrics_are_well_formed_and_of_one_configuration(first: FirstFlight
     assert len(found["world"][0]) == 12
 
 
-def test_the_alerts_fire_when_they_should_and_only_then(prometheus: None) -> None:
+def test_the_alerts_fire_when_they_should_and_only_then(prometheus):
     for words in (["check", "rules", "rules.yaml"], ["test", "rules", "alerts.yaml"]):
         *verb, file = words
         assert "SUCCESS" in promtool(*verb, f"/etc/prometheus/{file}")
 
 
 @pytest.fixture(scope="module")
-def asked(first: FirstFlight) -> Iterator[Ask]:
+def asked(first):
     with Prometheus() as one:
         yield one.ask
 
 
-def mean(name: str) -> str:
+def mean(name):
     return f"sum(cloudrc_{name}_seconds_sum) / sum(cloudrc_{name}_seconds_count)"
 
 
@@ -151,7 +151,7 @@ def mean(name: str) -> str:
     ],
     ids=["pods", "prediction error", "PID terms", "uplink", "downlink", "rtt", "real time"],
 )
-def test_prometheus_answers(asked: Ask, query: str, series: int, low: float, high: float) -> None:
+def test_prometheus_answers(asked, query, series, low, high):
     answers = [float(sample["value"][1]) for sample in asked(query)]
     assert len(answers) == series
     assert all(math.isfinite(a) and low <= a <= high for a in answers), answers

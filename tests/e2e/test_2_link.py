@@ -1,14 +1,10 @@
 """The link is what its profile says, changes in flight, and changes nothing else; what it costs."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
 import time
-from collections.abc import Callable, Iterator
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 import yaml
@@ -78,7 +74,7 @@ Times = tuple[float, dict[str, float]]
 
 
 @pytest.fixture(scope="module")
-def flight(installed: None) -> Iterator[None]:
+def flight(installed):
     """A mission that is in the air while the profiles change, and is cancelled after them."""
     before = identity()
     fly("long", LONG, limit=300.0)
@@ -92,25 +88,25 @@ def flight(installed: None) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def readings(flight: None) -> list[Times]:
+def readings(flight):
     """Of what the release has used; each test of the flight adds one. The least cost of a window
     counts, since what else runs only adds to it."""
     return [processor_times()]
 
 
-def counts(direction: str) -> tuple[float, float]:
+def counts(direction):
     """Sum [s] and number of the one-way delays that were measured so far."""
     samples = metrics(DIRECTIONS[direction])
     name = f"cloudrc_{direction}_delay_seconds"
     return value(samples, f"{name}_sum"), value(samples, f"{name}_count")
 
 
-def changes(component: str) -> int:
+def changes(component):
     """How often a pod's link has taken a new profile over."""
     return kubectl("logs", pod(component)["metadata"]["name"], "-c", "link").count("in force")
 
 
-def change_profile(name: str) -> None:
+def change_profile(name):
     before = {component: changes(component) for component in ("world", "cloud")}
     helm("upgrade", NAME, str(CHART), "--reuse-values", f"--set=link.profile={name}")
     # The kubelet looks at its volumes about once a minute; a change of the pod makes it look now.
@@ -125,12 +121,8 @@ def change_profile(name: str) -> None:
 
 @pytest.mark.parametrize(("profile", "wanted", "seconds"), PROFILES)
 def test_both_delays_are_the_profiles_within_two_milliseconds(
-    readings: list[Times],
-    profile: str,
-    wanted: float,
-    seconds: float,
-    note: Callable[[str], None],
-) -> None:
+    readings, profile, wanted, seconds, note
+):
     change_profile(profile)
     time.sleep(SETTLE)
     before = {direction: counts(direction) for direction in DIRECTIONS}
@@ -144,9 +136,7 @@ def test_both_delays_are_the_profiles_within_two_milliseconds(
     readings.append(processor_times())
 
 
-def test_the_link_is_set_by_hand_and_read_back(
-    readings: list[Times], note: Callable[[str], None]
-) -> None:
+def test_the_link_is_set_by_hand_and_read_back(readings, note):
     took = []
     try:
         for delay in (80, 120):
@@ -174,11 +164,11 @@ def test_the_link_is_set_by_hand_and_read_back(
     readings.append(processor_times())
 
 
-def test_the_operator_holds_moves_and_resumes_a_mission(readings: list[Times]) -> None:
+def test_the_operator_holds_moves_and_resumes_a_mission(readings):
     assert "(long): held" in in_release("mission", "hold")
     assert "(long): held" in in_release("mission", "goto", *map(str, ASIDE))
 
-    def away() -> float:
+    def away():
         seen = json.loads(in_release("mission", "status", "-o", "json"))["seen"]
         return math.dist(seen["position_m"], ASIDE)
 
@@ -187,7 +177,7 @@ def test_the_operator_holds_moves_and_resumes_a_mission(readings: list[Times]) -
     readings.append(processor_times())
 
 
-def test_a_release_is_cheap(readings: list[Times], note: Callable[[str], None]) -> None:
+def test_a_release_is_cheap(readings, note):
     if len(readings) < 2:  # where this test runs alone
         time.sleep(10.0)
         readings.append(processor_times())
@@ -210,9 +200,7 @@ def test_a_release_is_cheap(readings: list[Times], note: Callable[[str], None]) 
 
 
 @pytest.mark.full
-def test_helm_test_refuses_a_link_whose_delay_was_doubled(
-    flight: None, note: Callable[[str], None]
-) -> None:
+def test_helm_test_refuses_a_link_whose_delay_was_doubled(flight, note):
     """Cloud's pod alone is told: the other end goes on asking for what the release asks for."""
     began = time.monotonic()
     try:
@@ -235,7 +223,7 @@ def test_helm_test_refuses_a_link_whose_delay_was_doubled(
     assert causes == [("downlink", "doubled_delay")], said
 
 
-def objects() -> dict[str, int]:
+def objects():
     """Every object of the release with the generation or version that a change would raise."""
     kinds = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc"
     found = read(kinds, f"--selector=app.kubernetes.io/instance={NAME}")["items"]
@@ -246,7 +234,7 @@ def objects() -> dict[str, int]:
     }
 
 
-def test_an_upgrade_with_the_same_values_changes_nothing(installed: None, values: Path) -> None:
+def test_an_upgrade_with_the_same_values_changes_nothing(installed, values):
     line = ["upgrade", NAME, str(CHART), f"--values={values}"]
     helm(*line)
     before, pods = objects(), identity()

@@ -1,15 +1,11 @@
 """Faults in flight: pods deleted, a container killed, a partition, a busy CPU, a rotated key."""
 
-from __future__ import annotations
-
 import base64
 import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -66,30 +62,30 @@ child and os.waitpid(child, 0)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _no_mission_is_left(installed: None) -> Iterator[None]:
+def _no_mission_is_left(installed):
     """A deleted Job cancels its mission, which would block the tests after a failed one."""
     yield
     kubectl("delete", "jobs", "--all")
 
 
-def guard() -> str:
+def guard():
     """State of the guard, by the world's own metrics."""
     return GuardState(int(value(metrics("world"), "cloudrc_guard_state"))).name
 
 
-def fly_until(name: str, line: str, limit: float = 120.0) -> None:
+def fly_until(name, line, limit=120.0):
     fly(name, PIPES, limit)
     eventually(lambda: line in job_log(name), f"{name}: {line}", 90.0)
 
 
-def replace(component: str) -> None:
+def replace(component):
     """Delete a pod, and wait only until there is a new one."""
     old = pod(component)["metadata"]["name"]
     kubectl("delete", "pod", old, "--wait=false")
     eventually(lambda: any(p["metadata"]["name"] != old for p in pods(component)), "a new pod")
 
 
-def check_completed(name: str) -> None:
+def check_completed(name):
     """The Job completes, and no waypoint was reached twice or left out, across both pods."""
     end, log = job_end(name)
     assert (end.state, end.exit_code) == ("complete", 0), end
@@ -104,9 +100,7 @@ def check_completed(name: str) -> None:
     assert {body: number for body, number in touched.items() if "pipe" in body and number} == {}
 
 
-def test_a_deleted_cloud_is_replaced_and_the_mission_goes_on(
-    installed: None, note: Callable[[str], None]
-) -> None:
+def test_a_deleted_cloud_is_replaced_and_the_mission_goes_on(installed, note):
     fly_until("bereft", "waypoint 2 of 7 reached")
     began = time.monotonic()
     replace("cloud")
@@ -117,7 +111,7 @@ def test_a_deleted_cloud_is_replaced_and_the_mission_goes_on(
 
 
 @pytest.fixture
-def lingering() -> Iterator[None]:
+def lingering():
     """Let a deleted cloud pod fly on for a while, as one on a node that is slow to hear of it."""
     deployment = f"deployment/{NAME}-cloud"
     hook = {"preStop": {"exec": {"command": ["sleep", str(LINGER)]}}}
@@ -132,7 +126,7 @@ def lingering() -> Iterator[None]:
 
 
 @pytest.mark.full
-def test_an_old_cloud_beside_the_new_one_does_no_harm(installed: None, lingering: None) -> None:
+def test_an_old_cloud_beside_the_new_one_does_no_harm(installed, lingering):
     fly_until("haunted", "waypoint 1 of 7 reached")
     replace("cloud")
     eventually(lambda: len(pods("cloud")) == 2, "both are there", 10.0)
@@ -140,7 +134,7 @@ def test_an_old_cloud_beside_the_new_one_does_no_harm(installed: None, lingering
 
 
 @pytest.mark.full
-def test_a_deleted_world_ends_the_mission_as_failed(installed: None) -> None:
+def test_a_deleted_world_ends_the_mission_as_failed(installed):
     fly_until("orphaned", "waypoint 1 of 7 reached")
     replace("world")
     end, _ = job_end("orphaned", 90.0)
@@ -149,7 +143,7 @@ def test_a_deleted_world_ends_the_mission_as_failed(installed: None) -> None:
     wait_ready(place(), timeout=60.0)
 
 
-def recording(component: str, folder: Path) -> Recording:
+def recording(component, folder):
     """Fetch the recording of an end as it is now."""
     time.sleep(1.0)  # the recorder's flush
     path = folder / f"{component}.mcap"
@@ -158,7 +152,7 @@ def recording(component: str, folder: Path) -> Recording:
 
 
 @pytest.mark.full
-def test_a_partition_makes_the_robot_hold_and_go_on(installed: None, tmp_path: Path) -> None:
+def test_a_partition_makes_the_robot_hold_and_go_on(installed, tmp_path):
     before = len(ages_at_hold(recording("world", tmp_path)))
     fly_until("parted", "waypoint 2 of 7 reached")
     try:
@@ -173,7 +167,7 @@ def test_a_partition_makes_the_robot_hold_and_go_on(installed: None, tmp_path: P
 
 
 @pytest.mark.full
-def test_a_mission_survives_a_throttled_cloud(installed: None) -> None:
+def test_a_mission_survives_a_throttled_cloud(installed):
     throttled = ("cloudrc_cpu_throttled_periods_total", ())
     before = metrics("cloud").get(throttled, 0.0)  # absent before the first one
     fly_until("throttled", "waypoint 2 of 7 reached")
@@ -184,7 +178,7 @@ def test_a_mission_survives_a_throttled_cloud(installed: None) -> None:
 
 
 @pytest.mark.full
-def test_a_killed_cloud_container_is_replaced(installed: None) -> None:
+def test_a_killed_cloud_container_is_replaced(installed):
     fly_until("struck", "waypoint 2 of 7 reached")
     epoch, cloud = value(metrics("world"), "cloudrc_session_epoch"), pod("cloud")
     began = time.monotonic()
@@ -202,7 +196,7 @@ def test_a_killed_cloud_container_is_replaced(installed: None) -> None:
 
 
 @pytest.mark.full
-def test_a_mission_whose_job_is_deleted_is_cancelled(installed: None) -> None:
+def test_a_mission_whose_job_is_deleted_is_cancelled(installed):
     fly_until("leaderless", "waypoint 2 of 7 reached")
     follow = ["kubectl", f"--namespace={NAMESPACE}", "logs", "--follow", "job/leaderless"]
     with subprocess.Popen(follow, stdout=subprocess.PIPE, text=True) as reader:
@@ -216,7 +210,7 @@ def test_a_mission_whose_job_is_deleted_is_cancelled(installed: None) -> None:
 
 
 @pytest.mark.full
-def test_a_rotated_key_costs_one_hold_at_most(installed: None, tmp_path: Path) -> None:
+def test_a_rotated_key_costs_one_hold_at_most(installed, tmp_path):
     secret = f"{NAME}-tunnel"
     key = tmp_path / "key"
     key.write_bytes(base64.b64decode(read("secret", secret)["data"]["key"]))

@@ -1,10 +1,6 @@
 """The images, and `cloudrc run --mode cluster`: it leaves what a run leaves, as in virtual time."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -31,9 +27,7 @@ print(json.dumps(found))
 
 
 @pytest.mark.parametrize(("role", "holds"), [("world", ["mujoco"]), ("cloud", [])])
-def test_an_image_is_small_and_holds_no_more_than_its_role_needs(
-    cluster: None, note: Callable[[str], None], role: str, holds: list[str]
-) -> None:
+def test_an_image_is_small_and_holds_no_more_than_its_role_needs(cluster, note, role, holds):
     image = f"cloudrc/{role}:{__version__}"
     size = int(command("docker", "image", "inspect", "--format={{.Size}}", image)) / 1e6
     note(f"image {role}: asked {SIZES[role]} MB | {size:.0f} MB")
@@ -50,13 +44,8 @@ def test_an_image_is_small_and_holds_no_more_than_its_role_needs(
     ],
 )
 def test_a_run_in_a_cluster_is_that_of_virtual_time(
-    installed: None,
-    tmp_path: Path,
-    note: Callable[[str], None],
-    name: str,
-    setting: str,
-    instant: str,
-) -> None:
+    installed, tmp_path, note, name, setting, instant
+):
     done = cloudrc("doctor", "--mode", "cluster", "-o", "json")
     found = {check["name"]: check["state"] for check in json.loads(done.stdout)["checks"]}
     assert (done.returncode, found["kubeconfig"], found["cluster"]) == (0, "ok", "ok")

@@ -1,10 +1,7 @@
 """Limits as emulation: they constrain, it shows, and a run not in real time says so."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -22,10 +19,10 @@ Constrained = Callable[..., tuple[int, dict[str, Any]]]
 
 
 @pytest.fixture
-def constrained(installed: None, values: Path, tmp_path: Path) -> Iterator[Constrained]:
+def constrained(installed, values, tmp_path):
     """Fly under an example's limits: exit code and report."""
 
-    def fly(name: str, *words: str) -> tuple[int, dict[str, Any]]:
+    def fly(name, *words):
         file = EXAMPLES / f"values-{name}.yaml"
         helm("upgrade", NAME, str(CHART), f"--values={values}", f"--values={file}", *words)
         # 'cloudrc run' keeps these values, lays its experiment over them and waits.
@@ -38,11 +35,11 @@ def constrained(installed: None, values: Path, tmp_path: Path) -> Iterator[Const
     helm("upgrade", NAME, str(CHART), f"--values={values}")
 
 
-def throttled(component: str) -> float:
+def throttled(component):
     return value(metrics(component), "cloudrc_cpu_throttled_seconds_total")
 
 
-def scaled(name: str, component: str) -> list[str]:
+def scaled(name, component):
     """Give a part the share of what it takes on this machine that the example names.
 
     The examples are chosen where Python is quick. With 40m of the 110m that it takes on a slow
@@ -57,14 +54,9 @@ def scaled(name: str, component: str) -> list[str]:
 
 @pytest.mark.parametrize(
     ("name", "component"),
-    [
-        ("constrained-drone", "world"),
-        pytest.param("loaded-cloud", "cloud", marks=pytest.mark.full),
-    ],
+    [("constrained-drone", "world"), pytest.param("loaded-cloud", "cloud", marks=pytest.mark.full)],
 )
-def test_a_constrained_part_is_throttled_yet_keeps_real_time(
-    constrained: Constrained, note: Callable[[str], None], name: str, component: str
-) -> None:
+def test_a_constrained_part_is_throttled_yet_keeps_real_time(constrained, note, name, component):
     plain = throttled(component)
     code, report = constrained(name, *scaled(name, component))
     assert (code, report["verdict"]) == (0, "success"), report
@@ -82,6 +74,6 @@ def test_a_constrained_part_is_throttled_yet_keeps_real_time(
 
 
 @pytest.mark.full
-def test_a_world_that_cannot_keep_up_says_invalid(constrained: Constrained) -> None:
+def test_a_world_that_cannot_keep_up_says_invalid(constrained):
     code, report = constrained("invalid")
     assert (code, report["verdict"]) == (6, "invalid")

@@ -1,12 +1,8 @@
 """What can be wrong with a cluster ends in one sentence, with the code that belongs to it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 import yaml
@@ -17,14 +13,14 @@ ELSEWHERE = f"{NAMESPACE}-bad"
 
 
 @pytest.fixture(scope="module")
-def namespace(cluster: None) -> Iterator[str]:
+def namespace(cluster):
     """A namespace that allows everything, for releases that are not meant to work."""
     apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": ELSEWHERE}})
     yield ELSEWHERE
     command("kubectl", "delete", "namespace", ELSEWHERE, "--wait=false")
 
 
-def refused(release: str, *settings: str) -> tuple[int, str]:
+def refused(release, *settings):
     """Install with helm, then let our own command say what is wrong: exit code and message."""
     command("helm", "install", release, CHART, f"-n={ELSEWHERE}", *settings)
     line = ["run", "hover", "--mode", "cluster", "-n", ELSEWHERE, "--release", release]
@@ -35,7 +31,7 @@ def refused(release: str, *settings: str) -> tuple[int, str]:
     return done.returncode, said
 
 
-def test_an_image_that_is_not_loaded_is_named(namespace: str) -> None:
+def test_an_image_that_is_not_loaded_is_named(namespace):
     code, line = refused("no-image", "--set=image.tag=0.0.0-missing")
     assert code == 5
     assert "cloudrc/world:0.0.0-missing" in line or "cloudrc/cloud:0.0.0-missing" in line
@@ -43,7 +39,7 @@ def test_an_image_that_is_not_loaded_is_named(namespace: str) -> None:
 
 
 @pytest.mark.full
-def test_netem_without_kernel_support_is_refused_with_advice(namespace: str) -> None:
+def test_netem_without_kernel_support_is_refused_with_advice(namespace):
     if has_netem():
         pytest.skip("this kernel has sch_netem")
     code, line = refused("no-netem", "--set=link.mode=netem")
@@ -52,7 +48,7 @@ def test_netem_without_kernel_support_is_refused_with_advice(namespace: str) -> 
     assert "relay" in line
 
 
-def has_netem() -> bool:
+def has_netem():
     nodes = command("kubectl", "get", "nodes", "--output=jsonpath={.items[0].metadata.name}")
     probe = "ip link add probe0 type dummy && tc qdisc add dev probe0 root netem delay 1ms"
     done = subprocess.run(["docker", "exec", nodes, "sh", "-c", probe], capture_output=True)
@@ -69,14 +65,12 @@ def has_netem() -> bool:
     ],
     ids=["missing Secret", "unknown value", "unknown profile"],
 )
-def test_helm_itself_refuses_what_cannot_work(
-    namespace: str, settings: list[str], words: str
-) -> None:
+def test_helm_itself_refuses_what_cannot_work(namespace, settings, words):
     with pytest.raises(AssertionError, match=words):
         command("helm", "install", "refused", CHART, f"-n={ELSEWHERE}", *settings)
 
 
-def test_without_permission_one_sentence_says_so(namespace: str, tmp_path: Path) -> None:
+def test_without_permission_one_sentence_says_so(namespace, tmp_path):
     environ = {**os.environ, "KUBECONFIG": str(powerless(tmp_path))}
     words = ["mission", "list", "-n", ELSEWHERE, "--release", "bad"]
     done = subprocess.run(
@@ -91,7 +85,7 @@ def test_without_permission_one_sentence_says_so(namespace: str, tmp_path: Path)
     assert "kubectl auth can-i" in done.stderr
 
 
-def powerless(folder: Path) -> Path:
+def powerless(folder):
     """A kubeconfig of a service account that may do nothing."""
     account = {"name": "powerless", "namespace": ELSEWHERE}
     apply({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": account})

@@ -1,7 +1,5 @@
 """What helm prints works as printed, `helm test` passes, uninstalling leaves only the Secrets."""
 
-from __future__ import annotations
-
 import shlex
 
 import pytest
@@ -12,7 +10,7 @@ KINDS = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc,jo
 
 
 @pytest.mark.full
-def test_the_commands_of_the_notes_work_as_printed(installed: None) -> None:
+def test_the_commands_of_the_notes_work_as_printed(installed):
     """All three end by themselves; the second flies `pipes`, for half a minute."""
     printed = [line for line in helm("get", "notes", NAME).splitlines() if line.startswith("  ")]
     wait, mission, logs = (shlex.split(line) for line in printed)
@@ -22,17 +20,17 @@ def test_the_commands_of_the_notes_work_as_printed(installed: None) -> None:
     assert command(*logs).strip(), "the link says what it is"
 
 
-def test_helm_test_flies_and_passes(installed: None) -> None:
+def test_helm_test_flies_and_passes(installed):
     said = helm("test", NAME, "--timeout=300s", timeout=500.0)
     assert "Phase:          Succeeded" in said
 
 
-def test_uninstalling_leaves_only_the_secrets(installed: None) -> None:
+def test_uninstalling_leaves_only_the_secrets(installed):
     """What `cloudrc mission run` has made goes with it; a user's own Job is the user's."""
     kubectl("delete", f"--filename={EXAMPLES / 'mission-paper.yaml'}", "--ignore-not-found")
     helm("uninstall", NAME, "--wait")
 
-    def left() -> list[str]:
+    def left():
         found = read(KINDS, f"--selector=app.kubernetes.io/instance={NAME}")["items"]
         return sorted(f"{one['kind']} {one['metadata']['name']}" for one in found)
 

@@ -1,7 +1,5 @@
 """Current metrics of a process: histograms and counts of a flight, peer, mission, absent values."""
 
-from __future__ import annotations
-
 import json
 import math
 

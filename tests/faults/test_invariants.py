@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from operator import methodcaller
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import pytest
 
 from cloudrc.faults.invariants import ESTOP, GROUND, HOLD, LAND, RAMP, TRACK
-from cloudrc.messages import ZERO, Cause, GuardState, Request, Start, Vector
+from cloudrc.messages import ZERO, Cause, Request, Start
 from tests.faults.conftest import FakeRobot
 
 Deed: TypeAlias = Callable[[FakeRobot], object]
@@ -27,7 +27,7 @@ RELEASE = (request(Request.ACKNOWLEDGE, Request.START), offer(10))
 STEPPED = lambda robot: setattr(robot.simulator, "steps", robot.simulator.steps + 1)  # noqa: E731
 
 
-def play(*story: Deed, **options: Any) -> set[str]:
+def play(*story, **options):
     """Return the kinds of breaches of a story."""
     robot = FakeRobot(**options)
     for deed in story:
@@ -35,19 +35,19 @@ def play(*story: Deed, **options: Any) -> set[str]:
     return set(robot.watch.counts)
 
 
-def cause(cause: Cause) -> Deed:
+def cause(cause):
     return lambda robot: setattr(robot.guard, "cause", cause)
 
 
-def fly(*references: Vector) -> tuple[Deed, ...]:
+def fly(*references):
     return tuple(step(TRACK, reference=reference) for reference in references)
 
 
-def holds(state: GuardState, position: Vector, reference: Vector) -> tuple[Deed, ...]:
+def holds(state, position, reference):
     return (IMPOSSIBLE, step(state, position=position, reference=reference))
 
 
-def rest(speed: float, way: float) -> tuple[Deed, ...]:
+def rest(speed, way):
     moved = step(HOLD, position=(1.0, 1.0 + way, 1.0))
     return (put(velocity=(0.0, speed, 0.0)), step(TRACK), step(HOLD), moved)
 
@@ -114,23 +114,23 @@ MOTION: list[tuple[set[str], tuple[Deed, ...]]] = [
 ]  # fmt: skip
 
 
-def wait(state: GuardState, ms: int, then: GuardState | None = None) -> tuple[Deed, ...]:
+def wait(state, ms, then=None):
     return (step(state, ms=ms), step(then or state))
 
 
-def resumes(count: int, apart_ms: float) -> tuple[Deed, ...]:
+def resumes(count, apart_ms):
     """Offer some fresh commands in HOLD."""
     took = -count * apart_ms
     deeds = [each for _ in range(count) for each in (offer(), skip(apart_ms))]
     return (step(HOLD), *deeds, skip(took), step(TRACK, fresh=False))
 
 
-def held_again(why: Cause, apart_ms: int, *others: Deed) -> tuple[Deed, ...]:
+def held_again(why, apart_ms, *others):
     begun = (step(TRACK, ms=1000), step(HOLD, ms=apart_ms - 20), offer(10), step(TRACK, ms=10))
     return (*begun, step(TRACK, ms=10, fresh=False), *others, cause(why), step(HOLD))
 
 
-def ramp(growth: float) -> tuple[Deed, ...]:
+def ramp(growth):
     speeds = [n * growth * 0.002 for n in range(5)]
     return (step(HOLD, ms=1000), offer(10), *fly(*((0.6 * v, 0.0, 0.8 * v) for v in speeds)))
 
@@ -173,12 +173,12 @@ OPERATOR: list[tuple[set[str], tuple[Deed, ...]]] = [
 
 
 @pytest.mark.parametrize(("kinds", "story"), [*MOTION, *OPERATOR])
-def test_a_story_has_its_breaches_and_no_others(kinds: set[str], story: tuple[Deed, ...]) -> None:
+def test_a_story_has_its_breaches_and_no_others(kinds, story):
     assert play(*story) == kinds
 
 
 @pytest.mark.parametrize("yaw_rate", [-1.0, 1.001, -1.001, NAN])
-def test_the_reference_turns_no_faster_than_the_cap(yaw_rate: float) -> None:
+def test_the_reference_turns_no_faster_than_the_cap(yaw_rate):
     assert play(step(TRACK), yaw_rate=yaw_rate) == (set() if yaw_rate == -1.0 else {"cap"})
 
 
@@ -191,9 +191,7 @@ def test_the_reference_turns_no_faster_than_the_cap(yaw_rate: float) -> None:
         (GROUND, 2_000, 10_000),
     ],
 )
-def test_a_mission_waits_for_its_cloud_as_long_as_configured(
-    state: GuardState, hold_ms: int, wait_ms: int
-) -> None:
+def test_a_mission_waits_for_its_cloud_as_long_as_configured(state, hold_ms, wait_ms):
     assert play(step(state, ms=wait_ms), hold_ms=hold_ms) == set()
     assert play(step(state, ms=wait_ms + 6), hold_ms=hold_ms) == {"hold"}
     assert play(*wait(state, wait_ms, LAND), hold_ms=hold_ms) == {"hold"}
@@ -231,8 +229,6 @@ FALLS = (step(TRACK), STOP, touch("pipe_3"), step(ESTOP), touch("pipe_2"), step(
         (set(), (step(TRACK), put(touch_age=9.0), STOP, step(ESTOP))),
     ],
 )
-def test_an_honest_cloud_touches_only_the_board_and_only_by_the_tip(
-    kinds: set[str], story: tuple[Deed, ...]
-) -> None:
+def test_an_honest_cloud_touches_only_the_board_and_only_by_the_tip(kinds, story):
     assert play(*story, honest=True) == kinds
     assert play(*story) == set(), "with a hostile one a contact is no breach"

@@ -1,7 +1,5 @@
 """The models of processes, clocks and teleop."""
 
-from __future__ import annotations
-
 from functools import partial
 from unittest.mock import Mock
 
@@ -13,20 +11,17 @@ from cloudrc.faults.models import FAR_NS, SOCKET_MAX, Clock, RestartableEndpoint
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.faults.trial import inject
 from cloudrc.messages import GuardState
-from cloudrc.teleop.service import MissionService
 
 
 @given(st.integers(-(2**50), 2**50), st.integers(-500, 500), st.integers(0, 2**45))
-def test_a_clock_reaches_a_time_exactly_when_it_says(
-    offset_ns: int, drift_ppm: int, now_ns: int
-) -> None:
+def test_a_clock_reaches_a_time_exactly_when_it_says(offset_ns, drift_ppm, now_ns):
     clock = Clock(offset_ns, drift_ppm)
     when_ns = clock.when(clock.at(now_ns))
     assert when_ns <= now_ns
     assert clock.at(when_ns - 1) < clock.at(now_ns) <= clock.at(when_ns)
 
 
-def test_datagrams_wait_during_a_freeze_and_are_lost_after_a_kill() -> None:
+def test_datagrams_wait_during_a_freeze_and_are_lost_after_a_kill():
     inner = Mock(next_deadline_ns=lambda: FAR_NS, take_records=list)
     process, sent = RestartableEndpoint(lambda start_ns: inner, Clock()), []
     process.freeze(0, 0.1)
@@ -44,13 +39,13 @@ def test_datagrams_wait_during_a_freeze_and_are_lost_after_a_kill() -> None:
     assert len(heard) == inner.receive_datagram.call_count
 
 
-def separate(*events: Event, start: bool = True) -> Flight:
+def separate(*events, start=True):
     flight = Flight("link.profile=ideal", seed=3, separate=True, start=start)
     inject(flight, Schedule(3, events=events))
     return flight
 
 
-def test_a_separate_teleop_pauses_and_its_successor_resumes() -> None:
+def test_a_separate_teleop_pauses_and_its_successor_resumes():
     flight = separate(Event("pod_shut_down", 8.0, 4.0, 0.25)).fly(8.5)
     assert flight.events("paused")
     assert flight.guard_now()[0] is GuardState.HOLD
@@ -59,10 +54,10 @@ def test_a_separate_teleop_pauses_and_its_successor_resumes() -> None:
     assert flight.fly_mission().mission.state == "done"
 
 
-def test_a_frozen_cloud_forwards_no_old_start() -> None:
+def test_a_frozen_cloud_forwards_no_old_start():
     flight = separate(Event("cloud_paused", 8.0, 3.03), start=False)
 
-    def cancel(service: MissionService, now_ns: int) -> None:
+    def cancel(service, now_ns):
         service.cancel(flight.mission.id, now_ns)
 
     flight.cloud.at(8.2, flight.order_if_possible)

@@ -7,7 +7,6 @@ import pickle
 import re
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +16,7 @@ from cloudrc.cli import faults as command
 from cloudrc.cli.main import main
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import Check, Outcome, Scenario
+from cloudrc.faults.scenario import Check, Outcome
 from cloudrc.faults.scenarios import SCENARIOS, find
 from cloudrc.faults.scenarios.intruder import HostileSender
 from cloudrc.records import Counted
@@ -35,14 +34,14 @@ QUICK = ("F6", "F13", "F17", "F40")
     ],
     ids=lambda each: each.name,
 )
-def test_a_fault_passes_its_checks(scenario: Scenario) -> None:
+def test_a_fault_passes_its_checks(scenario):
     outcome = scenario.run(2)
     assert [check.show() for check in outcome.checks if not check.passed] == []
     assert outcome.checks
 
 
 @pytest.mark.promise("one-seed-one-run")
-def test_one_seed_is_one_run() -> None:
+def test_one_seed_is_one_run():
     first, second, other = (find("F13").run(seed) for seed in (3, 3, 4))
     assert first.sha256 == second.sha256 != other.sha256
     assert first.checks == second.checks
@@ -57,16 +56,14 @@ def test_one_seed_is_one_run() -> None:
         ("F13", "cloudrc.faults.invariants.HIGH", (1.2, 1.2, 1.2), "breaches of an invariant"),
     ],
 )
-def test_a_check_fails_if_its_promise_is_broken(
-    name: str, broken: str, value: float, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_check_fails_if_its_promise_is_broken(name, broken, value, said, monkeypatch):
     monkeypatch.setattr(broken, value)
     failed = [check.text for check in find(name).run(1).checks if not check.passed]
     assert any(said in text for text in failed)
 
 
 @pytest.mark.parametrize(("since", "passed"), [(0.0, True), (10.0, False), (12.0, True)])
-def test_a_metric_that_moves_late_is_noticed(since: float, passed: bool) -> None:
+def test_a_metric_that_moves_late_is_noticed(since, passed):
     flight: Any = SimpleNamespace(
         world=SimpleNamespace(clock=SimpleNamespace(at=lambda now_ns: now_ns)),
         of_world=[Counted(round(n * 1e9), "world", "late", n) for n in (1, 16)],
@@ -77,10 +74,10 @@ def test_a_metric_that_moves_late_is_noticed(since: float, passed: bool) -> None
 
 
 @pytest.mark.parametrize("taken", [False, True])
-def test_a_hostile_datagram_that_has_an_effect_is_noticed(taken: bool) -> None:
+def test_a_hostile_datagram_that_has_an_effect_is_noticed(taken):
     flight, heard = Flight().fly(3.0), list[bytes]()
 
-    def tamper(data: bytes, now_ns: int) -> list[bytes]:
+    def tamper(data, now_ns):
         heard.append(data)
         return [data] if now_ns < 3.1e9 else []
 
@@ -92,15 +89,13 @@ def test_a_hostile_datagram_that_has_an_effect_is_noticed(taken: bool) -> None:
 
 
 @pytest.mark.parametrize("relation", ["<=", ">=", "=="])
-def test_what_is_not_measured_has_not_passed(relation: Any) -> None:
+def test_what_is_not_measured_has_not_passed(relation):
     assert Check("", 1.0, relation, 1.0).passed
     assert not any(Check("", float(n), relation, 1.0).passed for n in ("nan", "inf"))
     assert not Outcome().passed
 
 
-def test_the_command_prints_json(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_prints_json(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "F17").mkdir()  # a folder is no schedule
     assert main("faults run F17 -o json".split()) == 0
@@ -109,14 +104,12 @@ def test_the_command_prints_json(
     assert {check["unit"] for check in printed["faults"][0]["checks"]} == {"", "m", "m/s", "yes"}
 
 
-def test_a_result_comes_back_from_another_process() -> None:
+def test_a_result_comes_back_from_another_process():
     assert pickle.dumps(command._run(("F27", 1)))
 
 
-def test_a_failed_check_ends_in_exit_code_1(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def run(outcome: Outcome, seed: int, number: int) -> None:
+def test_a_failed_check_ends_in_exit_code_1(monkeypatch, capsys):
+    def run(outcome, seed, number):
         outcome.same("collisions", 2.0 * (number == 1), 0)
         if number == 2:
             raise ValueError("broken")
@@ -130,7 +123,7 @@ def test_a_failed_check_ends_in_exit_code_1(
     assert "ValueError: broken" in out
 
 
-def test_the_list_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_names_every_fault(capsys):
     assert main(["faults", "list"]) == 0
     listed = re.findall(r"^F(\d+) +([\w-]+)", capsys.readouterr().out, re.MULTILINE)
     assert tuple(int(number) for number, _ in listed) == NUMBERS
@@ -155,9 +148,7 @@ def test_the_list_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
         ("search --store /dev/null", "/dev/null: cannot be written"),
     ],
 )
-def test_bad_input_is_told_in_one_line(
-    words: str, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_told_in_one_line(words, said, capsys):
     assert main(["faults", *words.split()]) == 2
     out, err = capsys.readouterr()
     assert said in err

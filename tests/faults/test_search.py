@@ -1,13 +1,9 @@
 """Schedules in files, random ones, and the search: it stores what it finds, and continues."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,16 +19,14 @@ from tests.conftest import nightly
 
 
 @pytest.mark.parametrize("draw", [compose, choose])
-def test_a_drawn_schedule_is_what_its_file_says(
-    draw: Callable[[int], Schedule], tmp_path: Path
-) -> None:
+def test_a_drawn_schedule_is_what_its_file_says(draw, tmp_path):
     path = tmp_path / "schedule.yaml"
     for seed in range(100):
         path.write_text(dump(draw(seed), "a note\nof two lines"))
         assert load(path) == draw(seed)
 
 
-def test_random_schedules_have_all_faults_and_calm_at_the_end() -> None:
+def test_random_schedules_have_all_faults_and_calm_at_the_end():
     drawn = [compose(seed) for seed in range(400)]
     events = [event for schedule in drawn for event in schedule.events]
     assert {event.kind for event in events} == set(KINDS)
@@ -46,7 +40,7 @@ def test_random_schedules_have_all_faults_and_calm_at_the_end() -> None:
 
 
 @pytest.mark.parametrize("kind", nightly(*KINDS))
-def test_each_kind_of_fault_is_survived(kind: str) -> None:
+def test_each_kind_of_fault_is_survived(kind):
     _, longest, low, high = KINDS[kind]
     events = (Event(kind, 8.0, longest / 2, (low + high) / 2), Event(kind, 14.0, 0.02, high))
     assert fly(Schedule(3, events=events, duration=26.0)).breaches == ()
@@ -64,7 +58,7 @@ def test_each_kind_of_fault_is_survived(kind: str) -> None:
         "seed: 1\nevents: [{kind: blackout, at: 1, way: left}]",
     ],
 )
-def test_a_file_that_is_no_schedule_is_bad_input(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_no_schedule_is_bad_input(tmp_path, text):
     path = tmp_path / "schedule.yaml"
     path.write_text(text)
     with pytest.raises(BadInputError, match=r"schedule\.yaml: is no schedule of faults"):
@@ -72,9 +66,7 @@ def test_a_file_that_is_no_schedule_is_bad_input(tmp_path: Path, text: str) -> N
 
 
 @pytest.mark.parametrize("line", ["policy: nope", "profile: nope"])
-def test_an_unknown_name_in_a_schedule_is_bad_input(
-    line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unknown_name_in_a_schedule_is_bad_input(line, tmp_path, capsys):
     path = tmp_path / "schedule.yaml"
     path.write_text(f"seed: 1\n{line}\n")
     assert main(["faults", "run", str(path)]) == 2
@@ -83,7 +75,7 @@ def test_an_unknown_name_in_a_schedule_is_bad_input(
     assert "nope" in error
 
 
-def test_a_link_fault_keeps_the_time_line_of_the_profile() -> None:
+def test_a_link_fault_keeps_the_time_line_of_the_profile():
     profile = DirectionProfile(changes=(Change(5.0, delay=0.1),))
     silence, waves = Event("blackout", 1.0, 1.0), Event("loss", 1.0, 1.0, 0.5)
     assert shaped(Schedule(1, events=(silence,)), profile, "up").changes == profile.changes
@@ -91,8 +83,8 @@ def test_a_link_fault_keeps_the_time_line_of_the_profile() -> None:
         shaped(Schedule(1, events=(waves,)), profile, "up")
 
 
-def test_a_failing_schedule_is_shrunk_to_what_it_takes() -> None:
-    def fails(schedule: Schedule) -> bool:
+def test_a_failing_schedule_is_shrunk_to_what_it_takes():
+    def fails(schedule):
         kinds = {event.kind for event in schedule.events}
         return {"blackout", "loss"} <= kinds and schedule.seed == 5
 
@@ -107,14 +99,12 @@ BAD, INTERRUPTED = 5, 9
 
 
 @pytest.fixture
-def find(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[dict[str, Any], str]]:
+def find(tmp_path, monkeypatch, capsys):
     """Search with a number of flights that take no time; return the document and stderr."""
     monkeypatch.chdir(tmp_path)
 
-    def run(count: int, *flags: str, code: int) -> tuple[dict[str, Any], str]:
-        def fly(schedule: Schedule) -> Finding:
+    def run(count, *flags, code):
+        def fly(schedule):
             clock[0] += 60.0 / count
             if schedule.seed == INTERRUPTED:
                 os.kill(os.getpid(), signal.SIGTERM)
@@ -132,7 +122,7 @@ def find(
     return run
 
 
-def test_a_search_counts_stores_and_can_continue(find: Callable[..., Any]) -> None:
+def test_a_search_counts_stores_and_can_continue(find):
     told, _ = find(3, code=0)
     assert (told["kind"], told["first"], told["next"], told["count"]) == ("random", 1, 4, 3)
     told, _ = find(3, "--first", "4", code=1)
@@ -152,9 +142,7 @@ def test_a_search_counts_stores_and_can_continue(find: Callable[..., Any]) -> No
     assert [told["invariants"][name]["judged"] for name in ("collision", "fence")] == [0, 1]
 
 
-def test_a_search_and_its_schedule_are_flown_for_real(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_search_and_its_schedule_are_flown_for_real(tmp_path, capsys):
     assert main(["faults", "search", "--minutes", "1e-9", "--store", str(tmp_path / "new")]) == 0
     assert "1 random schedules" in capsys.readouterr().out
     path = tmp_path / "schedule.yaml"

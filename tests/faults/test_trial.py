@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +14,7 @@ from cloudrc.faults.adversary import POLICIES, choose, dishonesty
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import OrderInvariant, checked_in, fly
-from cloudrc.messages import ZERO, Command, GuardState, Request, Start
+from cloudrc.messages import ZERO, GuardState, Request, Start
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
@@ -32,23 +31,23 @@ LONG = [path for path in REGRESSIONS if path not in SHORT]
 
 
 @pytest.mark.parametrize("path", [*SHORT, *nightly(*LONG)], ids=lambda path: path.stem)
-def test_a_schedule_that_found_a_bug_breaks_nothing_now(path: Path) -> None:
+def test_a_schedule_that_found_a_bug_breaks_nothing_now(path):
     assert fly(load(path)).breaches == ()
 
 
 @pytest.mark.parametrize("seed", [1, *nightly(*range(2, 9))])
-def test_random_faults_break_no_invariant(seed: int) -> None:
+def test_random_faults_break_no_invariant(seed):
     assert fly(compose(seed)).breaches == ()
 
 
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("policy", sorted(POLICIES))
-def test_a_hostile_cloud_causes_no_breach(policy: str) -> None:
+def test_a_hostile_cloud_causes_no_breach(policy):
     seed = next(seed for seed in range(1, 30) if choose(seed).policy == policy)
     assert fly(replace(choose(seed), duration=8.0)).breaches == ()
 
 
-def test_a_hostile_cloud_makes_every_request() -> None:
+def test_a_hostile_cloud_makes_every_request():
     _, words = dishonesty(Schedule(27, policy="operators-voice"))
     assert words is not None
     seen: list[Any] = [SimpleNamespace(guard=each, position=(1.0, 1.0, 1.0)) for each in GuardState]
@@ -59,7 +58,7 @@ def test_a_hostile_cloud_makes_every_request() -> None:
 
 @pytest.mark.promise("stays-inside-the-fence")
 @pytest.mark.parametrize("seed", [2, *nightly(*range(3, 40))])
-def test_it_causes_none_with_a_stiffer_low_level_controller(seed: int) -> None:
+def test_it_causes_none_with_a_stiffer_low_level_controller(seed):
     """Three times the default integral removes the steady error of 32 mm."""
     hostile = replace(choose(seed), events=(), duration=15.0)
     assert fly(hostile, "world.low_level.integral_limit_xy=0.30").breaches == ()
@@ -75,15 +74,13 @@ def test_it_causes_none_with_a_stiffer_low_level_controller(seed: int) -> None:
         ((Event("stopped", 5.0),), "greedy", 60.0, set()),
     ],
 )
-def test_a_schedule_is_checked_for_what_it_allows(
-    events: tuple[Event, ...], policy: str, duration: float, kinds: set[str]
-) -> None:
+def test_a_schedule_is_checked_for_what_it_allows(events, policy, duration, kinds):
     schedule = Schedule(1, events=events, policy=policy, duration=duration)
     some = {"collision", "waypoint", "stuck", "alarm", "obeyed"}
     assert checked_in(schedule) & some == kinds
 
 
-def test_a_flight_without_faults_is_clean() -> None:
+def test_a_flight_without_faults_is_clean():
     finding = fly(Schedule(1, "paper-p1", duration=45.0))
     assert (finding.breaches, finding.missions) == ((), 1)
 
@@ -100,33 +97,33 @@ HELD = Schedule(
 """Several HOLDs, a stop, and a LAND."""
 
 
-def limits(**changes: float) -> Callable[[Patch], None]:
+def limits(**changes):
     """Judge by other limits than those of the guard."""
     wrong = Limits(hold_ns=2000 * MS)._replace(**changes)
     return lambda patch: patch.setattr(Limits, "of", lambda guard: wrong)
 
 
-def ignores(owner: object, name: str, value: object = lambda *_: None) -> Callable[[Patch], None]:
+def ignores(owner, name, value=lambda *_: None):
     return lambda patch: patch.setattr(owner, name, value)
 
 
-def needs_no_start(patch: Patch) -> None:
+def needs_no_start(patch):
     accept = Guard.accept_command
 
-    def arm(guard: Guard, command: Command, now_ns: int) -> str | None:
+    def arm(guard, command, now_ns):
         guard.armed = guard.armed or guard.state is GuardState.GROUND
         return accept(guard, command, now_ns)
 
     patch.setattr(Guard, "accept_command", arm)
 
 
-def applies_late_commands(patch: Patch) -> None:
+def applies_late_commands(patch):
     take: Any = Channel.take
     patch.setattr(Channel, "take", lambda *_: USED if (said := take(*_)) == LATE else said)
 
 
-def fails_to_shut_down(patch: Patch) -> None:
-    def fail(service: MissionService, now_ns: int) -> None:
+def fails_to_shut_down(patch):
+    def fail(service, now_ns):
         raise OSError("no way to end")
 
     patch.setattr(MissionService, "pause", fail)
@@ -157,9 +154,7 @@ def fails_to_shut_down(patch: Patch) -> None:
         ),
     ],
 )
-def test_a_broken_part_is_found(
-    breaks: Callable[[Patch], None], kind: str, schedule: Schedule, monkeypatch: Patch
-) -> None:
+def test_a_broken_part_is_found(breaks, kind, schedule, monkeypatch):
     breaks(monkeypatch)
     found = fly(schedule).kinds
     assert kind in found if kind else found == set()
@@ -179,9 +174,7 @@ def test_a_broken_part_is_found(
         ([(3, None), (2, 9)], {"order"}),
     ],
 )
-def test_a_command_is_applied_once_and_in_order(
-    commands: list[tuple[int, int | None]], kinds: set[str]
-) -> None:
+def test_a_command_is_applied_once_and_in_order(commands, kinds):
     flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()), world_starts_ns=[0, 3])
     order = OrderInvariant(flight)
     for at, (epoch, counter) in enumerate(commands):
@@ -194,7 +187,7 @@ def test_a_command_is_applied_once_and_in_order(
     ("waypoints", "kinds"),
     [([0, 1, 2], set()), ([0, 1, 1], {"waypoint"}), ([0, 2], {"waypoint"}), ([1], {"waypoint"})],
 )
-def test_a_waypoint_is_reached_once_and_in_order(waypoints: list[int], kinds: set[str]) -> None:
+def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
     events = [{"mission": "m", "event": "reached", "waypoint": n} for n in waypoints]
     events.append({"mission": "n", "event": "reached", "waypoint": 0})
     book = SimpleNamespace(events_after=lambda number: events)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 
 from cloudrc import assembly
@@ -27,30 +25,30 @@ FLOWING = (Kind.TELEMETRY, Kind.COMMAND)
 class Tapped(Flight):
     """Capture the datagrams to world and to cloud."""
 
-    def __init__(self, life: int = 1) -> None:
+    def __init__(self, life=1):
         super().__init__(*HOVER, life=life)
         self.heard: dict[str, list[bytes]] = {"world": [], "cloud": []}
         self.ends = {"world": self.world, "cloud": self.cloud}
         for name, end in self.ends.items():
             end.tamper = lambda data, now_ns, heard=self.heard[name]: heard.append(data) or [data]
 
-    def replay(self, heard: dict[str, list[bytes]]) -> None:
+    def replay(self, heard):
         for name, end in self.ends.items():
             for data in heard[name]:
                 end.receive_now(data, self.run.now_ns)
 
-    def accepted(self) -> list[int]:
+    def accepted(self):
         """Return the counts of accepted datagrams, and the epochs."""
         names = ("used", "late", "repeated", "busy")
         inner = [end.inner for end in self.ends.values()]
         return [*(end.counts[name] for end in inner for name in names), *(e.epoch for e in inner)]
 
-    def greetings(self, kind: Kind, end: str) -> list[bytes]:
+    def greetings(self, kind, end):
         return [data for data in self.heard[end] if peek(data)[0] == kind]
 
 
 @pytest.fixture(scope="module")
-def first() -> Tapped:
+def first():
     flight = Tapped()
     flight.fly(6.0)
     assert any(isinstance(record, CommandApplied) for record in flight.of_world)
@@ -59,9 +57,7 @@ def first() -> Tapped:
 
 @pytest.mark.promise("old-datagrams-do-nothing")
 @pytest.mark.parametrize("seconds", [0, 0.05, 1, 3])
-def test_a_run_replayed_after_both_restarts_is_not_accepted(
-    first: Tapped, seconds: float, figure: Callable[..., None]
-) -> None:
+def test_a_run_replayed_after_both_restarts_is_not_accepted(first, seconds, figure):
     flight = Tapped(life=2)
     flight.fly(seconds)
     before = flight.accepted()
@@ -77,7 +73,7 @@ def test_a_run_replayed_after_both_restarts_is_not_accepted(
     assert flight.mission.state == "done"
 
 
-def test_a_run_replayed_during_the_run_is_all_repeated() -> None:
+def test_a_run_replayed_during_the_run_is_all_repeated():
     flight = Tapped()
     flight.fly(4.0)
     epoch, heard = flight.world.inner.epoch, flight.heard
@@ -99,9 +95,7 @@ def test_a_run_replayed_during_the_run_is_all_repeated() -> None:
 
 @pytest.mark.parametrize("rate", [0, 18, 100, 500])
 @pytest.mark.parametrize("which", ["old hello", "fresh hello", "all"])
-def test_captured_greetings_do_not_delay_a_restarted_cloud(
-    first: Tapped, which: str, rate: int
-) -> None:
+def test_captured_greetings_do_not_delay_a_restarted_cloud(first, which, rate):
     """Captured greetings keep valid tags; they must not keep out an honest cloud."""
     flight = Tapped(life=2)
     flight.fly(4.0)
@@ -125,7 +119,7 @@ def test_captured_greetings_do_not_delay_a_restarted_cloud(
     assert used[0].stamp_ns - restarted_ns <= within_ns + 200_000_000
 
 
-def test_sealed_and_unsealed_flights_are_the_same_flight() -> None:
+def test_sealed_and_unsealed_flights_are_the_same_flight():
     """Flights in virtual time are unsealed; nothing else may differ."""
     experiment, digests = load_experiment("hover", ["mission.waypoints.0.dwell_s=1"]), set()
     for keys in (None, ring()):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.config.load import ResolvedExperiment, dump, load_experiment
+from cloudrc.config.load import dump, load_experiment
 from cloudrc.record.columns import Recording
 from tests.flights.conftest import digest, records
 
@@ -28,26 +28,26 @@ print(digest(load_experiment('paper', {settings!r})))
 """
 
 
-def short(*settings: str) -> ResolvedExperiment:
+def short(*settings):
     return load_experiment("paper", (*SHORT, *settings))
 
 
 @pytest.mark.promise("one-seed-one-run")
-def test_the_same_seed_gives_the_same_records_in_any_process() -> None:
+def test_the_same_seed_gives_the_same_records_in_any_process():
     command = [sys.executable, "-c", PRINT.format(settings=SHORT)]
     env = os.environ | {"PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)}
     printed = subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
     assert printed.strip() == digest(short()) == digest(short()) != digest(short("seed=2"))
 
 
-def test_the_resolved_experiment_flies_the_same_run_again(tmp_path: Path) -> None:
+def test_the_resolved_experiment_flies_the_same_run_again(tmp_path):
     path, flown = tmp_path / "config.yaml", short("link.profile=lossy", "seed=5")
     path.write_text(dump(flown))
     assert digest(load_experiment(path)) == digest(flown)
 
 
 @pytest.mark.parametrize("offset_ns", [1_234_567_891, 86_400_000_000_000])
-def test_the_clocks_of_the_ends_need_not_agree(offset_ns: int) -> None:
+def test_the_clocks_of_the_ends_need_not_agree(offset_ns):
     """Cloud depends on ages only, never on the value of its clock."""
     shared, apart = records(short()), records(short(), offset_ns=offset_ns)
     ours = Recording.from_records(*shared)
@@ -70,9 +70,7 @@ STEPS: dict[str, Callable[[int, float], float]] = {
 
 
 @pytest.mark.promise("wall-clock-does-not-matter")
-def test_the_flight_is_the_same_whatever_the_wall_clock_does(
-    monkeypatch: pytest.MonkeyPatch, figure: Callable[..., None]
-) -> None:
+def test_the_flight_is_the_same_whatever_the_wall_clock_does(monkeypatch, figure):
     experiment = load_experiment("hover", ["mission.waypoints.0.dwell_s=0.5", "link.profile=wifi"])
     undisturbed, true, calls = digest(experiment), time.time, count()
     for clock in STEPS.values():
@@ -97,7 +95,7 @@ ALLOWED = {
 
 
 @pytest.mark.promise("wall-clock-does-not-matter")
-def test_nothing_on_the_control_path_reads_a_wall_clock() -> None:
+def test_nothing_on_the_control_path_reads_a_wall_clock():
     places = {path.relative_to(ROOT / "cloudrc").as_posix(): path for path in PACKAGE}
     mine = {place: path for place, path in places.items() if place.startswith(CONTROL_PATH)}
     assert len(mine) > 60
@@ -112,5 +110,5 @@ def test_nothing_on_the_control_path_reads_a_wall_clock() -> None:
         *(("datetime.date.today()", True), ("time.monotonic()", False)),
     ],
 )
-def test_the_check_finds_a_wall_clock(code: str, reads: bool) -> None:
+def test_the_check_finds_a_wall_clock(code, reads):
     assert bool(WALL.search(code)) is reads

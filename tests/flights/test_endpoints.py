@@ -1,8 +1,5 @@
 """The contract of both endpoints without a link: sessions, bad datagrams, restarts, stalls."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -28,11 +25,11 @@ SHORT = load_experiment("hover", ["link.profile=ideal", "mission.waypoints.0.dwe
 
 
 @pytest.fixture
-def talk() -> Talk:
+def talk():
     return talking()
 
 
-def test_every_cloud_process_gets_a_new_epoch() -> None:
+def test_every_cloud_process_gets_a_new_epoch():
     talk, epochs = Talk(), []
     talk.wait(100 * MS)
     assert talk.world.take_datagrams() == [], "without a session world is silent"
@@ -45,9 +42,7 @@ def test_every_cloud_process_gets_a_new_epoch() -> None:
 @pytest.mark.parametrize(
     "wakes", [(), (21_300_000,), (20_500_000, 21_300_000), (20 * MS, 20 * MS + 1)]
 )
-def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(
-    talk: Talk, wakes: tuple[int, ...]
-) -> None:
+def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(talk, wakes):
     for wake in wakes:
         talk.world.handle_deadline(wake)
     talk.now_ns = 21_300_000
@@ -77,9 +72,7 @@ def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(
         (lambda data: data[:-1] + bytes([data[-1] ^ 1]), "tag"),
     ],
 )
-def test_a_bad_datagram_is_dropped_and_counted(
-    talk: Talk, spoil: Callable[[bytes], bytes], outcome: str
-) -> None:
+def test_a_bad_datagram_is_dropped_and_counted(talk, spoil, outcome):
     talk.send(spoil(talk.command()))
     assert talk.counts()[outcome] == 1
     assert talk.take(CommandApplied) == []
@@ -87,7 +80,7 @@ def test_a_bad_datagram_is_dropped_and_counted(
 
 @given(st.binary(max_size=300))
 @settings(max_examples=60, deadline=None)
-def test_no_bytes_make_an_end_raise(data: bytes) -> None:
+def test_no_bytes_make_an_end_raise(data):
     for end in GARBAGE_TAKERS:
         end.receive_datagram(data, 0)
 
@@ -95,7 +88,7 @@ def test_no_bytes_make_an_end_raise(data: bytes) -> None:
 GARBAGE_TAKERS = join(EXPERIMENT)[:2]
 
 
-def test_after_a_stall_waiting_commands_are_stale(talk: Talk) -> None:
+def test_after_a_stall_waiting_commands_are_stale(talk):
     data = talk.command()
     talk.now_ns = 60 * MS  # a short delay is caught up
     talk.world.handle_deadline(talk.now_ns)
@@ -109,7 +102,7 @@ def test_after_a_stall_waiting_commands_are_stale(talk: Talk) -> None:
     assert talk.take(CommandApplied) == []
 
 
-def test_one_mission_can_follow_another_from_here() -> None:
+def test_one_mission_can_follow_another_from_here():
     ends = join(SHORT)
     of_world, _ = fly_on(ends.run, 20_000 * MS, lambda: ends.cloud.mission_over)
     opened = [record for record in of_world if isinstance(record, SessionOpened)]

@@ -1,7 +1,5 @@
 """Cloud is silent or killed anywhere in the paper's mission: the robot holds, then finishes it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, partial
 
@@ -31,12 +29,12 @@ KILLED, SILENT = 3.0, 60.5
 
 
 @cache
-def undisturbed(*settings: str) -> Flight:
+def undisturbed(*settings):
     return Flight(*PATIENCE, *settings).fly_mission()
 
 
 @cache
-def mid_pipe(*settings: str) -> list[float]:
+def mid_pipe(*settings):
     """200 instants [s], evenly over the time in which the undisturbed robot is in a pipe."""
     flight = undisturbed(*settings)
     path = flight.trajectory()
@@ -48,7 +46,7 @@ def mid_pipe(*settings: str) -> list[float]:
     return [early[round(k)] for k in np.linspace(0, len(early) - 1, COUNT)]
 
 
-def interrupt(figure: Figure, kill: bool, at: float, *settings: str, calm: float = 1.0) -> None:
+def interrupt(figure, kill, at, *settings, calm=1.0):
     """Kill cloud's process, of which the new one knows nothing; or silence the link."""
     back = at + (KILLED if kill else SILENT)
     flight = cut_off(at, 0.0 if kill else SILENT, *settings)
@@ -73,11 +71,11 @@ def interrupt(figure: Figure, kill: bool, at: float, *settings: str, calm: float
     assert flight.generations == {"world": 1, "cloud": 1 + kill}
 
 
-def cut_off(at: float, duration: float, *settings: str, ways: tuple[str, ...] = BOTH) -> Flight:
+def cut_off(at, duration, *settings, ways=BOTH):
     return Flight(*PATIENCE, *settings, **dict.fromkeys(ways, silent(at, duration)))
 
 
-def is_flown(flight: Flight) -> None:
+def is_flown(flight):
     waypoints = range(len(flight.mission.order.plan.legs))
     assert [event.waypoint for event in flight.events("reached")] == list(waypoints)
     assert flight.mission.state == "done"
@@ -87,25 +85,25 @@ def is_flown(flight: Flight) -> None:
 @pytest.mark.promise("brakes-without-commands")
 @pytest.mark.parametrize("kill", [False, True], ids=["silent", "killed"])
 @pytest.mark.parametrize("k", [13, 93, 173])
-def test_without_its_cloud_the_robot_stops_in_a_pipe(k: int, kill: bool, figure: Figure) -> None:
+def test_without_its_cloud_the_robot_stops_in_a_pipe(k, kill, figure):
     interrupt(figure, kill, mid_pipe(*SLOW)[k], *SLOW)
 
 
 @pytest.mark.parametrize("kill", [False, True], ids=["silent", "killed"])
 @pytest.mark.parametrize("at", ANYWHERE[13::160])
-def test_without_its_cloud_it_stops_outside_too(at: float, kill: bool, figure: Figure) -> None:
+def test_without_its_cloud_it_stops_outside_too(at, kill, figure):
     interrupt(figure, kill, at, *SLOW)
 
 
 @pytest.mark.parametrize("k", [13, 133])
-def test_without_the_cap_stopping_takes_a_little_longer(k: int, figure: Figure) -> None:
+def test_without_the_cap_stopping_takes_a_little_longer(k, figure):
     interrupt(figure, False, mid_pipe()[k], calm=1.4)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("kill", [False, True], ids=["silent", "killed"])
 @pytest.mark.parametrize("k", range(COUNT))
-def test_it_stops_at_any_instant(k: int, kill: bool, figure: Figure) -> None:
+def test_it_stops_at_any_instant(k, kill, figure):
     for at in (mid_pipe(*SLOW)[k], ANYWHERE[k]):
         interrupt(figure, kill, at, *SLOW)
     if not kill:
@@ -117,7 +115,7 @@ def test_it_stops_at_any_instant(k: int, kill: bool, figure: Figure) -> None:
     ("way", "at", "duration"),
     [("uplink", 11.3, 0.3), ("uplink", 22.1, 5.0), ("downlink", 28.85, 20.0)],
 )
-def test_a_silence_of_one_direction_touches_nothing(way: str, at: float, duration: float) -> None:
+def test_a_silence_of_one_direction_touches_nothing(way, at, duration):
     """In pipe 1 at speed, at the second bend, and before the board."""
     flight = cut_off(at, duration, "cloud.controller.speed_max=2", ways=(way,)).fly_mission(200.0)
     is_flown(flight)
@@ -125,7 +123,7 @@ def test_a_silence_of_one_direction_touches_nothing(way: str, at: float, duratio
     assert measures.number(flight, "min_clearance") >= 0.12
 
 
-def test_a_silence_at_the_missions_end_lets_the_robot_hold() -> None:
+def test_a_silence_at_the_missions_end_lets_the_robot_hold():
     (done,) = undisturbed(*SLOW).events("done")
     flight = cut_off(done.stamp_ns * 1e-9 - 0.02, SILENT, *SLOW).fly_mission(200.0)
     is_flown(flight)
@@ -133,13 +131,13 @@ def test_a_silence_at_the_missions_end_lets_the_robot_hold() -> None:
     assert measures.calm_after(flight, hold.stamp_ns * 1e-9, flight.now) <= 1.0
 
 
-def fly_records(*settings: str, until: float = 0.0):
+def fly_records(*settings, until=0.0):
     ends = join(load_experiment("paper", settings))
     limit_ns = round((until or 150) * 1e9)
     return ends, *fly_on(ends.run, limit_ns, lambda: not until and ends.cloud.mission_over)
 
 
-def test_a_silent_downlink_freezes_until_the_echo_is_back() -> None:
+def test_a_silent_downlink_freezes_until_the_echo_is_back():
     """It uses an integral and `commanded_velocity`, which would both drift."""
     _, _, of_cloud = fly_records(
         *PATIENCE,
@@ -166,15 +164,13 @@ def test_a_silent_downlink_freezes_until_the_echo_is_back() -> None:
         (("link.profile=satellite", "guard.hold_max_s=0.1"), 4, ["GROUND", "TRACK"]),
     ],
 )
-def test_a_start_without_commands(
-    setting: tuple[str, ...], until: float, states: list[str]
-) -> None:
+def test_a_start_without_commands(setting, until, states):
     ends, of_world, _ = fly_records(*setting, until=until)
     assert [r.state.name for r in of_world if isinstance(r, GuardChange)] == states
     assert ends.world.robot.guard.state.name == states[-1]
 
 
-def test_a_lost_downlink_lands_the_robot_and_ends_the_run() -> None:
+def test_a_lost_downlink_lands_the_robot_and_ends_the_run():
     lost = "link.downlink.blackouts=[{start_s: 3, duration_s: 1000}]"
     ends, of_world, _ = fly_records(lost, "guard.hold_max_s=1")
     changes = [r for r in of_world if isinstance(r, GuardChange)]
@@ -184,6 +180,6 @@ def test_a_lost_downlink_lands_the_robot_and_ends_the_run() -> None:
     assert ends.run.now_ns < 30e9
 
 
-def test_a_flight_without_faults_never_meets_the_fence() -> None:
+def test_a_flight_without_faults_never_meets_the_fence():
     ends, _, _ = fly_records()
     assert dict(ends.world.robot.guard.counts) == {}

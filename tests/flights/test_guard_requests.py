@@ -1,31 +1,27 @@
 """Operator requests reach the guard, which confirms only those that it acts on."""
 
-from __future__ import annotations
-
 import pytest
 
 from cloudrc.messages import GuardState, Request, Start
 from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
-from tests.flights.conftest import MS, Talk, talking
+from tests.flights.conftest import MS, talking
 
 
 @pytest.fixture
-def talk() -> Talk:
+def talk():
     """Fly; the request to start had number 1."""
     talk = talking()
     fly(talk, 10)
     return talk
 
 
-def fly(talk: Talk, count: int) -> None:
+def fly(talk, count):
     for _ in range(count):
         talk.send(talk.command())
         talk.wait(talk.now_ns + 10 * MS)
 
 
-def ask(
-    talk: Talk, number: int, request: Request, start: Start = Start.HERE
-) -> tuple[GuardState, int]:
+def ask(talk, number, request, start=Start.HERE):
     talk.request(number, request, start)
     talk.wait(talk.now_ns + 20 * MS)
     telemetry = talk.take(TelemetrySent)[-1].telemetry
@@ -34,7 +30,7 @@ def ask(
 
 @pytest.mark.promise("only-the-operator-arms")
 @pytest.mark.parametrize("start", Start)
-def test_a_start_is_refused_until_the_stop_is_acknowledged(talk: Talk, start: Start) -> None:
+def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
     assert ask(talk, 2, Request.ESTOP) == (GuardState.ESTOP, 2)
     sessions = len(talk.take(SessionOpened))
     assert ask(talk, 3, Request.START, start) == (GuardState.ESTOP, 2)
@@ -56,8 +52,8 @@ def test_a_start_is_refused_until_the_stop_is_acknowledged(talk: Talk, start: St
     [(998 * MS, 0, ""), (1_003 * MS, 0, "stale"), (60_000 * MS, 0, "stale"), (0, 3 * MS, "future")],
 )
 def test_a_start_that_was_held_back_on_the_way_starts_nothing(
-    talk: Talk, start: Start, held_back: int, ahead: int, outcome: str
-) -> None:
+    talk, start, held_back, ahead, outcome
+):
     """Its mission may be over by then, so nobody expects the robot to take off."""
     talk.request(2, Request.END, Start.HERE)
     talk.now_ns += ahead
@@ -72,7 +68,7 @@ def test_a_start_that_was_held_back_on_the_way_starts_nothing(
 
 
 @pytest.mark.parametrize("request_", [Request.END, Request.ESTOP])
-def test_a_late_stop_still_stops_the_robot(talk: Talk, request_: Request) -> None:
+def test_a_late_stop_still_stops_the_robot(talk, request_):
     captured = talk.asked(2, request_, Start.HERE)
     talk.wait(talk.now_ns + 20_000 * MS)
     talk.send(captured)
@@ -80,7 +76,7 @@ def test_a_late_stop_still_stops_the_robot(talk: Talk, request_: Request) -> Non
     assert talk.world._orders.number == 2
 
 
-def test_a_start_that_waited_through_a_stall_starts_nothing(talk: Talk) -> None:
+def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
     """World's clock stood still in the meantime, so the age of its basis is meaningless."""
     captured = talk.asked(2, Request.START, Start.SPAWN)
     talk.now_ns += 60_000 * MS
@@ -89,7 +85,7 @@ def test_a_start_that_waited_through_a_stall_starts_nothing(talk: Talk) -> None:
     assert talk.world._orders.number == 1
 
 
-def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk: Talk) -> None:
+def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
     applied = len(talk.take(CommandApplied))
     talk.wait(talk.now_ns + 2_000 * MS)
     echo_ns = talk.take(TelemetrySent)[-1].telemetry.echo_stamp_ns
@@ -104,7 +100,7 @@ def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk: Talk) -> None:
     assert len(talk.take(CommandApplied)) == applied + 1
 
 
-def test_limited_commands_and_a_missions_holds_are_counted(talk: Talk) -> None:
+def test_limited_commands_and_a_missions_holds_are_counted(talk):
     for _ in range(10):
         talk.send(talk.command((0.0, 0.0, 9.0)))
         talk.wait(talk.now_ns + 10 * MS)
@@ -117,7 +113,7 @@ def test_limited_commands_and_a_missions_holds_are_counted(talk: Talk) -> None:
     assert talk.counts()["held_seconds"] == held
 
 
-def test_contacts_are_reported_until_the_next_mission_starts(talk: Talk) -> None:
+def test_contacts_are_reported_until_the_next_mission_starts(talk):
     """Cloud may die right after the touch; the next cloud must learn of it."""
     ask(talk, 2, Request.END)
     talk.world._orders.pipes = 1
@@ -129,7 +125,7 @@ def test_contacts_are_reported_until_the_next_mission_starts(talk: Talk) -> None
         assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == contacts
 
 
-def test_commands_of_an_earlier_cloud_do_not_count(talk: Talk) -> None:
+def test_commands_of_an_earlier_cloud_do_not_count(talk):
     """Nine fresh commands of one cloud and one of another do not prove a link."""
     fly(talk, 100)
     ask(talk, 2, Request.END)

@@ -31,7 +31,7 @@ CALM, END = 30.0, 45.0
 class Two:
     """World and cloud with a random schedule of all faults of their session."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed):
         self.chance = chance = random.Random(seed)
         self.files = dict.fromkeys(ENDS, KeySet(KEYS[0]))
         self.rings: dict[str, KeyRing] = {}
@@ -61,18 +61,18 @@ class Two:
             keys = files[0] if alike else chance.choice(files)
             self.read(end, CALM + chance.uniform(0.0, 3.0), keys)
 
-    def build(self, end: str, start_ns: int) -> Any:
+    def build(self, end, start_ns):
         ring = self.rings[end] = KeyRing(self.files[end])
         nonce = b"%s %d" % (end.encode(), next(self.lives))
         if end == "world":
             return bare_world(nonce, ring=ring, start_ns=start_ns)
         return bare_cloud(nonce, ring, start_ns)
 
-    def when(self) -> tuple[float, float]:
+    def when(self):
         """When something begins, and how long it lasts [s]."""
         return self.chance.uniform(0.2, CALM - 6.0), self.chance.uniform(0.02, 5.0)
 
-    def rotate(self) -> None:
+    def rotate(self):
         """One end reads another key file, or both do, one after the other."""
         chance, (time, later) = self.chance, self.when()
         current, previous = chance.choice(KEYS[:3]), chance.choice((None, None, *KEYS[:2]))
@@ -80,29 +80,29 @@ class Two:
         for end, at in zip(ends, (time, time + later), strict=False):
             self.read(end, at, KeySet(current, previous))
 
-    def read(self, end: str, time: float, keys: KeySet) -> None:
-        def read(now_ns: int) -> None:
+    def read(self, end, time, keys):
+        def read(now_ns):
             self.files[end] = self.rings[end].keys = keys
 
         getattr(self, end).at(time, read)
 
-    def leave(self) -> None:
+    def leave(self):
         """An end restarts or stands still."""
         process, (time, lasts) = getattr(self, self.chance.choice(ENDS)), self.when()
         befalls = self.chance.choice((process.restart, process.freeze))
         process.at(time, lambda now_ns: befalls(now_ns, lasts))
 
-    def start(self) -> None:
+    def start(self):
         """A mission starts from the spawn: world moves on to the next epoch."""
 
-        def ask(now_ns: int) -> None:
+        def ask(now_ns):
             if self.cloud.inner is not None:
                 request = OperatorRequest(next(self.numbers), Request.START, Start.SPAWN)
                 self.cloud.inner.teleop.outputs.append(request)  # type: ignore[attr-defined]
 
         self.cloud.at(self.when()[0], ask)
 
-    def hear_each_other(self) -> bool:
+    def hear_each_other(self):
         self.run.fly(lambda: False, round(END * 1e9), lambda of_world, of_cloud: None)
         world: Any = self.world.inner
         cloud: Any = self.cloud.inner
@@ -114,6 +114,6 @@ class Two:
 
 
 @pytest.mark.parametrize("first", [0, *nightly(1_000)])
-def test_after_the_rotations_both_ends_hear_each_other(first: int) -> None:
+def test_after_the_rotations_both_ends_hear_each_other(first):
     for seed in range(first, 4 * first or 40):
         assert Two(seed).hear_each_other(), f"seed {seed}"

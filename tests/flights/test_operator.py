@@ -1,7 +1,5 @@
 """What teleop says reaches the robot in its own session only; an emergency stop in any."""
 
-from __future__ import annotations
-
 import pytest
 
 from cloudrc import assembly
@@ -11,7 +9,7 @@ from cloudrc.records import GuardChange
 from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
 from cloudrc.tunnel.end import Identity
-from tests.flights.conftest import SHARED_CLOCK, Ends, fly_on, join
+from tests.flights.conftest import SHARED_CLOCK, fly_on, join
 
 HOVER = load_experiment("hover", ["link.profile=ideal"])
 S = 1_000_000_000
@@ -19,14 +17,14 @@ ELSEWHERE = (5.0, 5.0, 1.0)
 ESTOP = GuardState.ESTOP
 
 
-def states(ends: Ends, seconds: float) -> list[GuardState]:
+def states(ends, seconds):
     """Fly on for some time [s]; return the new states of the guard."""
     of_world, _ = fly_on(ends.run, ends.run.now_ns + round(seconds * S))
     return [record.state for record in of_world if isinstance(record, GuardChange)]
 
 
 @pytest.fixture
-def ends() -> Ends:
+def ends():
     """Provide ends in flight."""
     ends = join(HOVER)
     fly_on(ends.run, 4 * S)
@@ -34,14 +32,14 @@ def ends() -> Ends:
     return ends
 
 
-def say(ends: Ends, *words: Setpoint | OperatorRequest) -> list[int]:
+def say(ends, *words):
     """Return the kinds of the datagrams that cloud sends at once."""
     ends.cloud.teleop.outputs.extend(words)
     ends.cloud._take_from_teleop()
     return [peek(data)[0] for data in ends.cloud.take_datagrams()]
 
 
-def test_setpoints_and_starts_are_for_their_own_session(ends: Ends) -> None:
+def test_setpoints_and_starts_are_for_their_own_session(ends):
     """Teleop is slow; in the meantime another cloud may have moved the robot."""
     epoch, before = ends.cloud._session.epoch, ends.cloud._setpoint
     setpoint, start = Setpoint(ELSEWHERE), OperatorRequest(99, Request.START)
@@ -57,19 +55,19 @@ def test_setpoints_and_starts_are_for_their_own_session(ends: Ends) -> None:
 
 
 @pytest.mark.parametrize("request_", [each for each in Request if each is not Request.START])
-def test_requests_that_arm_nothing_are_always_passed_on(ends: Ends, request_: Request) -> None:
+def test_requests_that_arm_nothing_are_always_passed_on(ends, request_):
     epoch = ends.cloud._session.epoch
     said = OperatorRequest(99, request_, epoch=epoch - 1)
     assert say(ends, said, said._replace(epoch=epoch)) == [Kind.OPERATOR] * 2
 
 
-def test_nothing_starts_before_the_first_telemetry(ends: Ends) -> None:
+def test_nothing_starts_before_the_first_telemetry(ends):
     ends.cloud._loop.reset()  # as a new session does
     assert say(ends, OperatorRequest(99, Request.START)) == []
     assert say(ends, OperatorRequest(99, Request.END)) == [Kind.OPERATOR]
 
 
-def test_used_up_numbers_last_until_the_next_session(ends: Ends) -> None:
+def test_used_up_numbers_last_until_the_next_session(ends):
     """A sender with the keys has used the highest number of all."""
     said = OperatorRequest(NUMBER_MAX, Request.END)
     assert say(ends, said) == [Kind.OPERATOR]
@@ -82,7 +80,7 @@ def test_used_up_numbers_last_until_the_next_session(ends: Ends) -> None:
     assert world.robot.guard.state is ESTOP
 
 
-def test_without_a_session_only_an_alarm_waits() -> None:
+def test_without_a_session_only_an_alarm_waits():
     cloud = assembly.build_cloud(HOVER, Identity(SHARED_CLOCK, b"cloud".ljust(16)))
     cloud.teleop.outputs += [OperatorRequest(3, Request.START), ALARM]
     for now_ns in range(0, S, 10_000_000):
@@ -90,7 +88,7 @@ def test_without_a_session_only_an_alarm_waits() -> None:
     assert {peek(data)[0] for data in cloud.take_datagrams()} == {Kind.HELLO}
 
 
-def test_an_early_alarm_keeps_the_robot_on_the_ground() -> None:
+def test_an_early_alarm_keeps_the_robot_on_the_ground():
     ends = join(HOVER)
     ends.cloud.teleop.outputs.append(ALARM)
     assert [each for each in states(ends, 3) if each is not GuardState.GROUND] == [ESTOP]
@@ -98,7 +96,7 @@ def test_an_early_alarm_keeps_the_robot_on_the_ground() -> None:
 
 @pytest.mark.promise("emergency-stop-gets-through")
 @pytest.mark.parametrize("seed", range(1, 6))
-def test_a_link_that_loses_most_loses_no_alarm(seed: int) -> None:
+def test_a_link_that_loses_most_loses_no_alarm(seed):
     ends = join(load_experiment("hover", ["link.profile=ideal", f"seed={seed}"]))
     fly_on(ends.run, 4 * S)
     lossy = ["link.profile=ideal", "link.downlink.loss=0.8", "link.uplink.loss=0.8", f"seed={seed}"]
@@ -107,7 +105,7 @@ def test_a_link_that_loses_most_loses_no_alarm(seed: int) -> None:
     assert states(ends, 4)[-1] is ESTOP
 
 
-def test_an_acknowledgement_ends_the_alarm_and_a_later_stop_holds(ends: Ends) -> None:
+def test_an_acknowledgement_ends_the_alarm_and_a_later_stop_holds(ends):
     teleop = ends.cloud.teleop
     teleop.outputs.append(ALARM)
     assert states(ends, 1) == [ESTOP]

@@ -1,7 +1,5 @@
 """The missions and their required numbers, in virtual time; `-m full` flies more seeds."""
 
-from __future__ import annotations
-
 import re
 from statistics import mean
 
@@ -18,7 +16,7 @@ PROFILES = ("paper-p1", "paper-p2", "paper-p3")
 
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("seed", [1, *nightly(*range(2, 11))])
-def test_the_paper_flies(profile: str, seed: int) -> None:
+def test_the_paper_flies(profile, seed):
     flight = fly("paper", f"link.profile={profile}", f"seed={seed}")
     assert flight.verdict.failures == ()
     n = numbers(flight)
@@ -30,7 +28,7 @@ def test_the_paper_flies(profile: str, seed: int) -> None:
     assert n["waypoints_reached"] == 7
 
 
-def test_verbatim_flies_although_late_commands_win() -> None:
+def test_verbatim_flies_although_late_commands_win():
     flight = fly("paper-verbatim")
     assert flight.verdict.failures == ()
     assert numbers(flight)["loop_delay_mean"] > numbers(fly("paper"))["loop_delay_mean"]
@@ -44,27 +42,25 @@ def test_verbatim_flies_although_late_commands_win() -> None:
         "world.sensors={position_noise_m: 0.005, velocity_noise_mps: 0.02}",
     ],
 )
-def test_the_paper_flies_under_other_conditions_too(setting: str) -> None:
+def test_the_paper_flies_under_other_conditions_too(setting):
     assert fly("paper", setting).verdict.failures == ()
 
 
 @pytest.mark.parametrize(("limit", "low", "high"), [(0.10, 0.030, 0.034), (0.30, 0.0, 0.001)])
-def test_the_steady_error_is_that_of_the_integral_limit(
-    limit: float, low: float, high: float
-) -> None:
+def test_the_steady_error_is_that_of_the_integral_limit(limit, low, high):
     n = numbers(fly("hover", f"world.low_level.integral_limit_xy={limit}"))
     assert low <= n["steady_error_x"] <= high
     assert max(n["steady_error_y"], n["steady_error_z"]) < 1e-4
 
 
-def prediction_error(predictor: str, seeds: range) -> float:
+def prediction_error(predictor, seeds):
     settings = ("link.profile=paper-p3", f"cloud.predictor={predictor}")
     flights = [fly("steps", *settings, f"seed={seed}") for seed in seeds]
     return mean(numbers(flight)["prediction_error_rms"] for flight in flights)
 
 
 @pytest.mark.parametrize("seeds", [range(1, 2), *nightly(range(1, 11))])
-def test_constant_velocity_predicts_far_better_than_nothing(seeds: range) -> None:
+def test_constant_velocity_predicts_far_better_than_nothing(seeds):
     better, worse = (prediction_error(n, seeds) for n in ("constant_velocity", "last_sample"))
     assert better < 0.3 * worse
     if len(seeds) > 1:
@@ -72,7 +68,7 @@ def test_constant_velocity_predicts_far_better_than_nothing(seeds: range) -> Non
         assert 0.045 <= worse <= 0.065
 
 
-def test_split_estimates_the_delay_better_than_the_running_mean() -> None:
+def test_split_estimates_the_delay_better_than_the_running_mean():
     split, mean_ = (
         numbers(fly("steps", f"cloud.estimator={name}"))["delay_estimate_error_rms"]
         for name in ("split", "running_mean")
@@ -83,10 +79,8 @@ def test_split_estimates_the_delay_better_than_the_running_mean() -> None:
 @pytest.mark.parametrize(
     ("position", "scene"), [([9.2, 0.0, 1.0], "empty"), ([0.0, 0.0, 1.0], "pipes")]
 )
-def test_a_point_offered_for_one_that_the_guard_refuses_is_reached(
-    position: list[float], scene: str
-) -> None:
-    def settings(point: list[float]) -> list[str]:
+def test_a_point_offered_for_one_that_the_guard_refuses_is_reached(position, scene):
+    def settings(point):
         waypoint = f"mission.waypoints=[{{position_m: {point}}}]"
         return [waypoint, f"world.scene={scene}", "criteria.time_limit_s=25"]
 

@@ -1,7 +1,5 @@
 """Flights in virtual time: the robot stores its mission's progress, and a stuck leg fails."""
 
-from __future__ import annotations
-
 from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Mission, Waypoint
@@ -14,7 +12,7 @@ from tests.flights.conftest import MS, Talk, records
 ID = 2**62 + 5
 
 
-def test_the_robot_stores_every_waypoint_reached() -> None:
+def test_the_robot_stores_every_waypoint_reached():
     world, cloud = records(load_experiment("paper"))
     reached = [r for r in cloud if isinstance(r, MissionEvent) and r.event == "reached"]
     shown = {}
@@ -26,9 +24,7 @@ def test_the_robot_stores_every_waypoint_reached() -> None:
         assert shown[count] - event.stamp_ns < 300 * MS
 
 
-def ask(
-    talk: Talk, request: Request, number: int = 0, *, start: Start = Start.HERE, **fields: int
-) -> tuple[int, int]:
+def ask(talk, request, number=0, *, start=Start.HERE, **fields):
     """Return the mission and the progress that the robot shows after a request."""
     asked = OperatorRequest(number, request, start, basis_stamp_ns=talk.now_ns, **fields)
     talk.send(talk.cloud.session.seal(Kind.OPERATOR, codec.encode_operator(asked)))
@@ -37,7 +33,7 @@ def ask(
     return telemetry.mission_id, telemetry.reached
 
 
-def test_progress_rises_and_belongs_to_the_mission_started_last() -> None:
+def test_progress_rises_and_belongs_to_the_mission_started_last():
     talk = Talk()
     talk.hello(b"cloud")
     for expected, request, number, fields in (
@@ -59,7 +55,7 @@ def test_progress_rises_and_belongs_to_the_mission_started_last() -> None:
     assert ask(talk, Request.START, 3, mission_id=ID + 1, start=Start.SPAWN) == (ID + 1, 0)
 
 
-def test_the_limit_of_a_leg_defaults_to_three_times_its_time() -> None:
+def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
     points = (
         Waypoint(position_m=(0.0, 0.0, 1.0), dwell_s=0.0),
         Waypoint(position_m=(3.0, 4.0, 1.0), dwell_s=2.0),

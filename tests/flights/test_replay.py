@@ -9,8 +9,8 @@ import pytest
 
 from cloudrc.cli.link_record import TOPICS, one_way
 from cloudrc.config.load import load_experiment
-from cloudrc.link.logs import Direction, Packets, trace_of
-from cloudrc.link.traces import Trace, read_trace, write_trace
+from cloudrc.link.logs import Direction, trace_of
+from cloudrc.link.traces import read_trace, write_trace
 from cloudrc.record.columns import Recording
 from tests.flights.conftest import records
 
@@ -18,15 +18,13 @@ MINUTE = ["mission.steps.count=15", "guard.command_age_max_ms=1000"]
 WAYS: tuple[Direction, ...] = ("uplink", "downlink")
 
 
-def fly(*settings: str) -> tuple[Recording, dict[Direction, Packets]]:
+def fly(*settings):
     recording = Recording.from_records(*records(load_experiment("steps", [*MINUTE, *settings])))
     return recording, {way: one_way(recording, Path("flight"), way) for way in WAYS}
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_replayed_minute_gives_its_delays_and_losses_again(
-    way: Direction, tmp_path: Path
-) -> None:
+def test_a_replayed_minute_gives_its_delays_and_losses_again(way, tmp_path):
     """In virtual time the link begins at 0, so each packet is compared with its row."""
     _, flown = fly("link.profile=lossy")  # jitter, losses and delay in bursts
     path = tmp_path / f"{way}.csv"
@@ -53,5 +51,5 @@ def test_a_replayed_minute_gives_its_delays_and_losses_again(
     assert (lost == (losses[rows] == 1.0))[steady].all()
 
 
-def rows_of(trace: Trace, sent: np.ndarray) -> np.ndarray:
+def rows_of(trace, sent):
     return np.searchsorted(trace.times, sent + 1e-9, side="right") - 1

@@ -1,7 +1,5 @@
 """A key file is rotated in flight; both ends read it at different times, in either order."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest
@@ -25,7 +23,7 @@ HOVER = (
 ENDS = ("world", "cloud")
 
 
-def key(flight: Flight) -> Key:
+def key(flight):
     """The key with which both ends talk in one epoch."""
     world, cloud = (process.inner._session for process in (flight.world, flight.cloud))
     assert world.epoch == cloud.epoch != 0
@@ -33,13 +31,13 @@ def key(flight: Flight) -> Key:
     return world.epoch_key
 
 
-def held(flight: Flight) -> list[float]:
+def held(flight):
     """How long each HOLD lasted [s]."""
     pairs = pairwise(flight.changes)
     return [(b.stamp_ns - a.stamp_ns) * 1e-9 for a, b in pairs if a.state is GuardState.HOLD]
 
 
-def rotated(*steps: tuple[str, KeySet, float]) -> Flight:
+def rotated(*steps):
     """Fly 5 s; then an end reads keys and the flight goes on for some seconds, again and again."""
     flight = Flight(*HOVER).fly(5.0)
     for end, keys, seconds in steps:
@@ -51,7 +49,7 @@ def rotated(*steps: tuple[str, KeySet, float]) -> Flight:
 @pytest.mark.promise("keys-change-in-flight")
 @pytest.mark.parametrize("apart", [0.0, 0.02, 60.0])
 @pytest.mark.parametrize(("first", "second"), [ENDS, ENDS[::-1]])
-def test_a_rotation_costs_one_short_hold_at_most(first: str, second: str, apart: float) -> None:
+def test_a_rotation_costs_one_short_hold_at_most(first, second, apart):
     flight = rotated((first, NEW, apart), (second, NEW, apart + 6.0))
     assert key(flight) == NEW.current
     for end in ENDS:  # and once the old key is dropped, nothing happens
@@ -65,7 +63,7 @@ def test_a_rotation_costs_one_short_hold_at_most(first: str, second: str, apart:
 
 
 @pytest.mark.parametrize(("first", "second"), [ENDS, ENDS[::-1]])
-def test_an_end_that_starts_amid_a_rotation_uses_both_keys(first: str, second: str) -> None:
+def test_an_end_that_starts_amid_a_rotation_uses_both_keys(first, second):
     flight = Flight(*HOVER)
     flight.replace_key(first, NEW)
     assert key(flight.fly(5.0)) == SECRET.current
@@ -76,7 +74,7 @@ def test_an_end_that_starts_amid_a_rotation_uses_both_keys(first: str, second: s
 
 @pytest.mark.promise("old-keys-end")
 @pytest.mark.parametrize("first", ENDS)
-def test_a_dropped_key_ends_its_session_at_once(first: str) -> None:
+def test_a_dropped_key_ends_its_session_at_once(first):
     """The other end still has the old key alone."""
     flight = rotated((first, ONLY, 3.0))
     process = flight.world if first == "world" else flight.cloud

@@ -13,13 +13,13 @@ from tests.flights.conftest import Bare, ring
 Figure = Callable[..., None]
 
 
-def a_session(name: str = "a", bare: Bare | None = None) -> Bare:
+def a_session(name="a", bare=None):
     bare = bare or Bare(ring())
     bare.send(bare.cloud(name).hello())
     return bare
 
 
-def test_a_hello_brings_a_session_in_two_round_trips() -> None:
+def test_a_hello_brings_a_session_in_two_round_trips():
     bare = a_session()
     assert bare.cloud("a").heard == ["CHALLENGE", "ACCEPT"]
     assert bare.cloud("a").session.epoch == bare.world._session.epoch == 1
@@ -27,7 +27,7 @@ def test_a_hello_brings_a_session_in_two_round_trips() -> None:
 
 @pytest.mark.promise("one-cloud-flies")
 @pytest.mark.parametrize("alive", [True, False])
-def test_the_incumbent_keeps_authority_while_it_is_heard(alive: bool) -> None:
+def test_the_incumbent_keeps_authority_while_it_is_heard(alive):
     bare = a_session()
     cloud = bare.cloud("a")
     for _ in range(20):
@@ -44,7 +44,7 @@ def test_the_incumbent_keeps_authority_while_it_is_heard(alive: bool) -> None:
     ("heard", "silence", "epoch"),
     [(True, 250, 1), (True, 251, 2), (False, 1000, 1), (False, 1001, 2)],
 )
-def test_a_silent_incumbent_loses_authority(heard: bool, silence: int, epoch: int) -> None:
+def test_a_silent_incumbent_loses_authority(heard, silence, epoch):
     """At the age limit; a new session has one second to be heard."""
     bare = a_session()
     if heard:
@@ -54,7 +54,7 @@ def test_a_silent_incumbent_loses_authority(heard: bool, silence: int, epoch: in
     assert bare.world._session.epoch == epoch
 
 
-def test_repeated_datagrams_do_not_keep_authority() -> None:
+def test_repeated_datagrams_do_not_keep_authority():
     bare = a_session()
     cloud = bare.cloud("a")
     captured = [cloud.session.seal(Kind.ALIVE, b""), cloud.command(), cloud.start(0)]
@@ -66,7 +66,7 @@ def test_repeated_datagrams_do_not_keep_authority() -> None:
     assert bare.world._session.epoch == 2
 
 
-def test_a_cloud_regains_authority_but_its_old_hello_does_not() -> None:
+def test_a_cloud_regains_authority_but_its_old_hello_does_not():
     bare = a_session()
     captured = list(bare.sent)
     bare.wait(1100)
@@ -80,7 +80,7 @@ def test_a_cloud_regains_authority_but_its_old_hello_does_not() -> None:
     assert bare.cloud("a").session.epoch == bare.world._session.epoch == 3
 
 
-def test_hellos_that_waited_through_a_stall_are_not_answered() -> None:
+def test_hellos_that_waited_through_a_stall_are_not_answered():
     bare = a_session()
     bare.now_ns += 5_000_000_000
     outcome = bare.outcome(bare.cloud("b").hello())
@@ -98,7 +98,7 @@ ACTIONS: dict[str, Callable[[Bare], object]] = {
 }
 
 
-def act(bare: Bare, name: str) -> None:
+def act(bare, name):
     """Let a cloud command if it has a session, and ask for one in any case."""
     cloud = bare.cloud(name)
     if cloud.session.epoch:
@@ -108,14 +108,14 @@ def act(bare: Bare, name: str) -> None:
         bare.send(cloud.hello())
 
 
-def spawn(bare: Bare) -> None:
+def spawn(bare):
     """Let the cloud with the session start a mission from the spawn."""
     for cloud in bare.clouds.values():
         if cloud.session.epoch == bare.world._session.epoch != 0:
             bare.send(cloud.start(bare.world._orders.number + 1))
 
 
-def explore(actions: list[str], depth: int, first: tuple[str, ...] = ()) -> int:
+def explore(actions, depth, first=()):
     """Play all interleavings: applied counters rise, and an epoch belongs to one cloud."""
     played = 0
     for rest in product(actions, repeat=depth):
@@ -136,13 +136,13 @@ BACK = "two-cloud interleavings to depth {}: commands that go back"
 
 
 @pytest.mark.promise("one-cloud-flies")
-def test_no_short_interleaving_reverts_a_command(figure: Figure) -> None:
+def test_no_short_interleaving_reverts_a_command(figure):
     assert explore(BASIC, 5) == 4**5
     assert explore(list(ACTIONS), 4) == 6**4
     figure(BACK.format("5"), 0, "==", 0, count=4**5)
 
 
-def test_the_check_finds_reverted_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_check_finds_reverted_commands(monkeypatch):
     monkeypatch.setattr("cloudrc.tunnel.channel.Channel.take", lambda channel, counter: "used")
     with pytest.raises(AssertionError):
         explore(BASIC, 4)
@@ -150,5 +150,5 @@ def test_the_check_finds_reverted_commands(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.full
 @pytest.mark.parametrize("first", list(product(BASIC, repeat=2)))
-def test_no_interleaving_of_ten_reverts_a_command(first: tuple[str, ...], figure: Figure) -> None:
+def test_no_interleaving_of_ten_reverts_a_command(first, figure):
     figure(BACK.format("10"), 0, "==", 0, count=explore(BASIC, 8, first))

@@ -1,7 +1,5 @@
 """Clearance equals hand-calculated, published and brute-force distances."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -39,7 +37,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
         ((2.8, 0, 0.262), 0.500),  # 3-4-5 from the inner edge
     ],
 )
-def test_distance_to_a_hollow_cylinder(point: tuple[float, ...], distance: float) -> None:
+def test_distance_to_a_hollow_cylinder(point, distance):
     found = distance_to_pipe(ALONG_X, np.array([point], dtype=float))
     assert found == pytest.approx([distance], abs=1e-9)
 
@@ -49,9 +47,7 @@ PLACES = st.tuples(*[st.floats(-4, 4)] * 3)
 
 @settings(max_examples=50, deadline=None)
 @given(PLACES, PLACES)
-def test_distance_changes_no_faster_than_the_point(
-    one: tuple[float, ...], other: tuple[float, ...]
-) -> None:
+def test_distance_changes_no_faster_than_the_point(one, other):
     a, b = distance_to_pipe(PIPES.pipes[1], np.array([one, other]))
     assert abs(a - b) <= math.dist(one, other) + 1e-9
 
@@ -59,9 +55,7 @@ def test_distance_changes_no_faster_than_the_point(
 @pytest.mark.parametrize(
     ("height", "expected"), [(0.8, (0.217, 0.326, 0.320)), (0.7, (0.246, 0.365, 0.320))]
 )
-def test_clearance_on_the_axis_is_that_of_the_plant(
-    height: float, expected: tuple[float, ...]
-) -> None:
+def test_clearance_on_the_axis_is_that_of_the_plant(height, expected):
     """Source: docs/reference/plant.md, "Clearance on the axis", yaw 0."""
     at = [(x, y, height) for x, y, _ in (pipe.centre for pipe in PIPES.pipes)]
     found = clearance(PIPES, at, [LEVEL] * 3)
@@ -69,7 +63,7 @@ def test_clearance_on_the_axis_is_that_of_the_plant(
     assert np.array_equal(np.diag(clearance_per_pipe(PIPES, at, [LEVEL] * 3)), found)
 
 
-def test_clearance_turns_with_the_robot() -> None:
+def test_clearance_turns_with_the_robot():
     """Check that the clearance along each pipe is .320.
 
     Source: docs/reference/plant.md, "Clearance on the axis".
@@ -80,7 +74,7 @@ def test_clearance_turns_with_the_robot() -> None:
         assert clearance(PIPES, pipe.centre, facing) == pytest.approx([0.320], abs=1e-3)
 
 
-def test_the_spawn_trap() -> None:
+def test_the_spawn_trap():
     """Straight above the spawn the rear rotor is in the wall of pipe 1; x = .2 is clear."""
     at = np.array([(0.0, 0.0, height) for height in np.arange(0.1, 1.6, 0.01)])
     for aside, nearest in ((0.0, -0.019), (0.2, 0.162)):
@@ -88,12 +82,12 @@ def test_the_spawn_trap() -> None:
         assert found.min() == pytest.approx(nearest, abs=2e-3)
 
 
-def test_clearance_is_infinite_in_an_empty_scene() -> None:
+def test_clearance_is_infinite_in_an_empty_scene():
     assert clearance(Scene("empty"), [(0, 0, 1), (1, 0, 1)], [LEVEL] * 2).tolist() == [math.inf] * 2
     assert clearance(PIPES, np.empty((0, 3)), np.empty((0, 4))).shape == (0,)
 
 
-def test_a_batch_gives_the_same_as_single_poses() -> None:
+def test_a_batch_gives_the_same_as_single_poses():
     rng = np.random.default_rng(1)
     at = rng.uniform((-2, -8, 0), (9, 4, 2), (333, 3))
     facing = rng.normal(size=(333, 4))
@@ -102,7 +96,7 @@ def test_a_batch_gives_the_same_as_single_poses() -> None:
     assert clearance(PIPES, at, facing)[::50] == pytest.approx(alone, abs=1e-12)
 
 
-def test_points_are_those_of_the_plant_and_turn_with_the_robot() -> None:
+def test_points_are_those_of_the_plant_and_turn_with_the_robot():
     points = key_points()
     assert (points.positions.shape, len(robot_points().radii)) == ((225, 3), 341)
     assert points.positions.max(axis=0) == pytest.approx((0.4, 0.338, 0.18))
@@ -115,7 +109,7 @@ def test_points_are_those_of_the_plant_and_turn_with_the_robot() -> None:
     assert tip == pytest.approx((8.535, -6.422, 0.87))  # at the contact pose
 
 
-def test_inside_a_pipe_is_in_its_bore_and_between_its_ends() -> None:
+def test_inside_a_pipe_is_in_its_bore_and_between_its_ends():
     places = {
         (-1, 2.5, 0.8): 0,
         (-1, 2.501, 0.8): -1,

@@ -1,7 +1,5 @@
 """Positions that overlap a wall, ways that cross one, and missions that are refused for it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -22,21 +20,20 @@ from cloudrc.geometry.placement import (
     outside_fence,
 )
 from cloudrc.geometry.scene import load_scene
-from cloudrc.messages import Vector
 from cloudrc.world.guard.limits import Limits
 
 PIPES = load_scene("pipes")
 
 
-def hit(position: Vector, yaw: float = 0.0) -> int:
+def hit(position, yaw=0.0):
     return int(find_overlapped_pipe(PIPES, np.array([position]), np.array([yaw]))[0])
 
 
-def crossed(start: Vector, end: Vector) -> int:
+def crossed(start, end):
     return int(find_crossed_pipe(PIPES, np.array([start]), np.array([end]))[0])
 
 
-def refusals(*positions: Vector, start: str = "spawn", scene: str = "pipes", **more: float) -> str:
+def refusals(*positions, start="spawn", scene="pipes", **more):
     waypoints = tuple(Waypoint(position_m=position, **more) for position in positions)
     problems = check_mission(Mission(start=start, waypoints=waypoints), load_scene(scene))  # type: ignore[arg-type]
     return "\n".join(map(str, problems))
@@ -58,7 +55,7 @@ def refusals(*positions: Vector, start: str = "spawn", scene: str = "pipes", **m
         ((8.235, -6.422, 0.7), 0, -1),  # behind the board
     ],
 )
-def test_overlaps(position: Vector, yaw: float, pipe: int) -> None:
+def test_overlaps(position, yaw, pipe):
     assert hit(position, yaw) == pipe
 
 
@@ -82,13 +79,13 @@ def test_overlaps(position: Vector, yaw: float, pipe: int) -> None:
         ((-0.78, 0.0, 0.8), (-0.7, 0.0, 0.8), 0),
     ],
 )
-def test_a_straight_way_through_a_wall_is_found(start: Vector, end: Vector, pipe: int) -> None:
+def test_a_straight_way_through_a_wall_is_found(start, end, pipe):
     assert crossed(start, end) == pipe
 
 
 @settings(max_examples=50, deadline=None)
 @given(*[st.tuples(st.floats(-2.8, 9), st.floats(-8.3, 5.3), st.floats(0.4, 2.2))] * 2)
-def test_a_way_is_found_to_touch_a_wall_if_a_piece_of_it_does(start: Vector, end: Vector) -> None:
+def test_a_way_is_found_to_touch_a_wall_if_a_piece_of_it_does(start, end):
     """Fly the way in steps of 1 cm, with the points by which the metrics judge the clearance."""
     if hit(start) >= 0:
         return
@@ -100,10 +97,9 @@ def test_a_way_is_found_to_touch_a_wall_if_a_piece_of_it_does(start: Vector, end
 
 @settings(max_examples=30, deadline=None)
 @given(
-    st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-1, 3)),
-    st.floats(-math.pi, math.pi),
+    st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-1, 3)), st.floats(-math.pi, math.pi)
 )
-def test_the_nearest_legal_point_is_legal(position: Vector, yaw: float) -> None:
+def test_the_nearest_legal_point_is_legal(position, yaw):
     found = find_nearest_legal(PIPES, position, yaw)
     assert found is not None
     assert hit(found, yaw) == -1
@@ -112,7 +108,7 @@ def test_the_nearest_legal_point_is_legal(position: Vector, yaw: float) -> None:
 
 
 @pytest.mark.parametrize("start", ["spawn", "here"])
-def test_a_straight_way_leads_to_the_offered_point(start: str) -> None:
+def test_a_straight_way_leads_to_the_offered_point(start):
     said = refusals((0.0, 0.0, 0.8), start=start)
     x, y, z = (float(word) for word in said.rpartition("[")[2].rstrip("]").split(","))
     assert math.dist((x, y, z), (0.0, 0.0, 0.8)) < 0.15
@@ -131,9 +127,7 @@ def test_a_straight_way_leads_to_the_offered_point(start: str) -> None:
         ((1e300, 0.0, 1.0), 0.1, True),
     ],
 )
-def test_a_waypoint_that_the_guard_keeps_the_robot_from_is_refused(
-    position: Vector, tolerance: float, outside: bool
-) -> None:
+def test_a_waypoint_that_the_guard_keeps_the_robot_from_is_refused(position, tolerance, outside):
     said = refusals(position, start="here", scene="empty", tolerance_m=tolerance)
     assert ("x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]" in said) is outside
     corners = Limits(fence_low=fence.LOW, fence_high=fence.HIGH).inner_corners()
@@ -154,14 +148,12 @@ def test_a_waypoint_that_the_guard_keeps_the_robot_from_is_refused(
         ([], "spawn", "none given"),
     ],
 )
-def test_a_mission_with_a_wall_on_its_way_is_refused(
-    positions: list[Vector], start: str, reason: str
-) -> None:
+def test_a_mission_with_a_wall_on_its_way_is_refused(positions, start, reason):
     said = refusals(*positions, start=start)
     assert reason in said if reason else said == ""
 
 
-def test_every_bad_waypoint_is_named_up_to_a_number() -> None:
+def test_every_bad_waypoint_is_named_up_to_a_number():
     problems = refusals(*[(-1.0, 0.0, 0.7), (-0.6, 0.0, 0.7)] * 30).splitlines()
     assert len(problems) == 21
     assert problems[0].startswith("waypoints.1.position_m: [-0.6, 0, 0.7]: the robot would")
@@ -169,7 +161,7 @@ def test_every_bad_waypoint_is_named_up_to_a_number() -> None:
 
 
 @pytest.mark.parametrize("experiment", ["paper", "steps", "hover"])
-def test_shipped_missions_can_be_flown(experiment: str) -> None:
+def test_shipped_missions_can_be_flown(experiment):
     loaded = load_experiment(experiment)
     assert check_mission(loaded.mission, load_scene(loaded.world.scene)) == []
 
@@ -182,12 +174,12 @@ def test_shipped_missions_can_be_flown(experiment: str) -> None:
         ({}, "pipes", "can end in the wall of pipe_1"),
     ],
 )
-def test_steps_that_can_end_in_a_wall_are_refused(steps: dict, scene: str, reason: str) -> None:  # type: ignore[type-arg]
+def test_steps_that_can_end_in_a_wall_are_refused(steps, scene, reason):  # type: ignore[type-arg]
     (problem,) = check_mission(Mission(steps=Steps(**steps)), load_scene(scene))
     assert problem.path == ("steps",)
     assert reason in problem.reason
 
 
-def test_waypoints_and_steps_together_are_refused() -> None:
+def test_waypoints_and_steps_together_are_refused():
     both = Mission(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps())
     assert "not both" in str(check_mission(both, PIPES)[0])

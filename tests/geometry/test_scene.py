@@ -1,9 +1,6 @@
 """The numbers in a scene file are those of the plant; bad ones are named."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +9,7 @@ from cloudrc.geometry import fence
 from cloudrc.geometry.scene import Board, Scene, load_scene
 
 
-def test_pipes_are_those_of_the_plant() -> None:
+def test_pipes_are_those_of_the_plant():
     """Source: docs/reference/plant.md, "Scene"."""
     scene = load_scene("pipes")
     expected = {
@@ -31,13 +28,13 @@ def test_pipes_are_those_of_the_plant() -> None:
     assert load_scene("empty") == Scene("empty")
 
 
-def scene_file(folder: Path, numbers: str, world: str = "") -> str:
+def scene_file(folder, numbers, world=""):
     path = folder / "mine.xml"
     path.write_text(f"<mujoco><custom>{numbers}</custom><worldbody>{world}</worldbody></mujoco>")
     return str(path)
 
 
-def test_a_scene_of_ones_own_is_read(tmp_path: Path) -> None:
+def test_a_scene_of_ones_own_is_read(tmp_path):
     numbers = (
         '<numeric name="pipe_a" data="0 0 1  0 3 4  2 .5 .6"/>'
         '<numeric name="floor" data="-.1"/><numeric name="other" data="1 2"/>'
@@ -59,19 +56,19 @@ def test_a_scene_of_ones_own_is_read(tmp_path: Path) -> None:
         ("<numeric", "not readable as XML"),
     ],
 )
-def test_bad_numbers_are_named(tmp_path: Path, numbers: str, reason: str) -> None:
+def test_bad_numbers_are_named(tmp_path, numbers, reason):
     with pytest.raises(BadInputError, match=r"scene mine\.xml: .*" + reason):
         load_scene(scene_file(tmp_path, numbers))
 
 
-def test_a_bad_spawn_and_a_missing_scene_are_refused(tmp_path: Path) -> None:
+def test_a_bad_spawn_and_a_missing_scene_are_refused(tmp_path):
     with pytest.raises(BadInputError, match="spawn: data must be 3 numbers: '1 2'"):
         load_scene(scene_file(tmp_path, "", '<frame name="spawn" pos="1 2"/>'))
     with pytest.raises(BadInputError, match="No such file"):
         load_scene("nowhere")
 
 
-def test_the_fence_is_a_closed_box() -> None:
+def test_the_fence_is_a_closed_box():
     assert fence.inside((9.2, 5.5, 2.5))
     assert fence.inside((-3, -8.5, 0))
     assert not fence.inside((0, 0, -1e-9))

@@ -66,14 +66,7 @@ class Log:
             changed = [next(new) if isinstance(each, kind) else each for each in records]
             records[:] = [each for each in changed if each is not None]
 
-    def flight(
-        self,
-        scene=OPEN_AIR,
-        *,
-        contact=False,
-        waypoints=1,
-        time_limit=60.0,
-    ):
+    def flight(self, scene=OPEN_AIR, *, contact=False, waypoints=1, time_limit=60.0):
         criteria = Criteria(contact=contact, time_limit_s=time_limit)
         return Flight(Recording.from_records(*self.ends()), criteria, waypoints, scene)
 

@@ -1,7 +1,5 @@
 """Every shipped metric: numbers computed by hand, and its contract on any recording."""
 
-from __future__ import annotations
-
 from math import hypot, isfinite, nan
 
 import pytest

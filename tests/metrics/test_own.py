@@ -1,7 +1,5 @@
 """A user's own metrics: found by path or installed, measured by a run, checked before it."""
 
-from __future__ import annotations
-
 import json
 import sys
 from importlib.metadata import EntryPoint

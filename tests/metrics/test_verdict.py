@@ -1,7 +1,5 @@
 """Each rule of the verdict: what breaks it, its time and place, and the order of outcomes."""
 
-from __future__ import annotations
-
 import pytest
 
 from cloudrc.messages import GuardState

@@ -15,14 +15,7 @@ from cloudrc.record.merge import clock_offset, merge, world_time_ns
 from cloudrc.record.reader import read_contents
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
-from tests.record.conftest import (
-    MS,
-    SECOND,
-    assert_equal,
-    cloud_records,
-    world_records,
-    write,
-)
+from tests.record.conftest import MS, SECOND, assert_equal, cloud_records, world_records, write
 
 
 def files(folder, world, cloud, ids):

@@ -3,8 +3,6 @@
 Source: Linux, net/sched/sch_netem.c: get_crandom, tabledist, loss_gilb_ell, netem_enqueue.
 """
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 
@@ -113,13 +111,7 @@ OVERHEAD = 8e-5
 """Delay that a good relay and the network stack add [s]."""
 
 
-def rows_of(
-    profile,
-    real,
-    *,
-    stall=0.0,
-    seconds=None,
-):
+def rows_of(profile, real, *, stall=0.0, seconds=None):
     """Probe a link; a relay without CPU delays 30 % of the probes by up to `stall` [s]."""
     netem = isinstance(real, VirtualNetem)
     plan = plan_probes(profile, Flow(SEED, True, PROBE, 203), seconds, drawn=netem)
@@ -147,15 +139,7 @@ def verify(profile, up, down, known):
     return {way: Findings(rows_of(profile, one), known) for way, one in ways.items()}
 
 
-def arrivals(
-    profile,
-    seconds=60.0,
-    *,
-    seed=SEED,
-    overhead=5e-4,
-    uplink=False,
-    netem=False,
-):
+def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False, netem=False):
     """Return what cloud (`uplink`) or world notes of a flight of some seconds.
 
     The ends add `overhead` [s]; NaN: they share no clock. The experiment's seed is 1.

@@ -1,7 +1,5 @@
 """`cloudrc link verify` over real sockets and processes: what it believes, and what it names."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
