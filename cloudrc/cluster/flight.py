@@ -36,6 +36,8 @@ FLUSH = 1.0
 second of records."""
 FETCHES = 4
 """Largest number of attempts to fetch recordings that contain the mission's end."""
+FLYING = re.compile(r"^cloudrc_mission_state [123]\b", re.MULTILINE)
+"""Line of teleop's metrics while a mission is starting, flying or held."""
 FLOWN = (0, 1, 6, 130)
 """Exit codes of a Job whose mission has flown: success, failure, invalid, interrupted."""
 HINTS = {
@@ -150,12 +152,7 @@ def fly_in_cluster(
     """
     from cloudrc.config.load import dump
 
-    if job := job_under_way(release):  # an install would replace both pods
-        raise ClusterError(
-            f"Job '{job}' is under way on release '{release.name}' {release.where}; wait for it, "
-            f"end it: kubectl {' '.join(release.flags)} delete job {job}, or fly on a release of "
-            "your own: --release NAME"
-        )
+    _refuse_a_second_flight(release)
     began = time.monotonic()
     install(release, chart_values(experiment, current_values(release)), timeout, tell)
     took = time.monotonic() - began
@@ -168,6 +165,28 @@ def fly_in_cluster(
     (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     mission = fetch_all(release, folder, tell, want_end=not interrupted)
     return _report(experiment, folder, mission, interrupted)
+
+
+def _refuse_a_second_flight(release: Release) -> None:
+    """Raise an error if a mission is under way; an installation would replace both pods."""
+    if job := job_under_way(release):
+        found, end = f"Job '{job}'", f"kubectl {' '.join(release.flags)} delete job {job}"
+    elif _flies(release):  # a mission that was posted to the API without a Job
+        found, end = "a mission", f"cloudrc mission cancel {' '.join(release.cloudrc_flags)}"
+    else:
+        return
+    raise ClusterError(
+        f"{found} is under way on release '{release.name}' {release.where}; wait for it, "
+        f"end it: {end}, or fly on a release of your own: --release NAME"
+    )
+
+
+def _flies(release: Release) -> bool:
+    """Say whether teleop's metrics show a mission; a release that does not answer has none."""
+    try:
+        return bool(FLYING.search(pods.fetch_metrics(release, "cloud")["teleop"]))
+    except (ClusterError, TimedOutError):
+        return False  # a broken release must not prevent its own repair
 
 
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:

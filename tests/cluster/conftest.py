@@ -118,21 +118,20 @@ class FakeTeleop:
     """The API and the metrics of a cloud pod, with a record of its requests."""
 
     def __init__(self) -> None:
-        self.missions: list[dict[str, str]] = []
         self.posted: list[str] = []
         self.tokens: set[str | None] = set()
-        self.refuses = False
+        self.metrics = 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
         self.server = serve(self._answer)
         self.port = self.server.server_port
 
     def _answer(self, request: BaseHTTPRequestHandler, body: Any) -> tuple[int, Any]:
         if request.path == "/metrics":
-            return 200, 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
+            return 200, self.metrics
         self.tokens.add(request.headers["Authorization"])
         if request.command == "GET":
-            return 200, {"missions": self.missions}
+            return 200, {"missions": []}
         self.posted.append(request.path)
-        return (409, {"detail": "it is over"}) if self.refuses else (200, {})
+        return 200, {}
 
     def forwards(self) -> str:
         """What kubectl prints when it forwards all ports of a pod to this server."""
