@@ -158,7 +158,7 @@ def load_experiment(
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
     """Load an experiment for a process that runs no cloud: plug-ins are not imported nor checked.
 
-    They have only the parameters that the file gives; the config.yaml of a run gives all.
+    The plug-ins have only the parameters that the file gives; the config.yaml of a run gives all.
     """
     return load_experiment(name, settings, build=False)
 
@@ -190,7 +190,7 @@ def dump(experiment: ResolvedExperiment) -> str:
 
 
 def fingerprint(experiment: ResolvedExperiment) -> str:
-    """Return the SHA-256 of the text from `dump`; equal ones give equal flights."""
+    """Return the SHA-256 of the text from `dump`; equal hashes mean equal flights."""
     return hashlib.sha256(dump(experiment).encode()).hexdigest()
 
 

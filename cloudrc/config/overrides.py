@@ -94,9 +94,9 @@ def _check_index(document: Document, path: KeyPath) -> None:
 def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
     """Replace each plug-in of an experiment by a mapping with its name and its parameters.
 
-    With `build`, check all parameters, complete them and build the plug-in once. Without it, import
-    nothing, because file and plug-ins may come from somebody else. Return the problems of names and
-    parameters; the schema finds values of a wrong type.
+    With `build`, check all parameters, complete them and build the plug-in once. Without `build`,
+    import nothing, because file and plug-ins may come from somebody else. Return the problems of
+    names and parameters; the schema finds values of a wrong type.
     """
     found: list[Problem] = []
     for key, kind in KINDS.items():

@@ -137,7 +137,7 @@ class Direction(Section):
     rate_kbit: Positive | None = None
     """Rate of the bottleneck [kbit/s], 28 bytes of headers included; null: none"""
     queue_packets: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
-    """Packets that the bottleneck holds, the one being sent included; further ones are dropped"""
+    """Packets that the bottleneck holds, with the one being sent; further packets are dropped"""
     changes: tuple[Change, ...] = ()
     """Changes of the conditions over time; at_s must rise"""
     trace: str | None = None

@@ -101,9 +101,10 @@ def _first_ns(recording: Recording) -> int:
 
 
 def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Convert instants [ns], shape (n,), from the clock of world's machine to world's, which lags.
+    """Convert instants [ns], shape (n,), from the clock of world's machine to world's clock.
 
-    The lag at each stamp of world's telemetry is interpolated linearly; rising order is kept.
+    World's clock lags the machine's after a stall. The lag is known at each stamp of the telemetry
+    and interpolated linearly between the stamps; rising order is kept.
     """
     lag_ns = telemetry["slip_ns"]
     if not lag_ns.any():
@@ -171,8 +172,8 @@ def _join(world: Contents, cloud: Contents) -> Contents:
 def cut_to_last_mission(mission: Contents) -> bool:
     """Cut a pod's recording, which may hold several missions, down to the last that was started.
 
-    Return whether the recording contains the end of that mission. If it does, the mission is
-    complete, even if the end of the file is missing: a pod still writes its file when it is copied.
+    Return whether the recording contains the end of that mission. If so, the mission is complete,
+    even if the end of the file is missing: a pod still writes its file while the file is copied.
     """
     began, ended = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0
@@ -200,6 +201,6 @@ def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
 
 
 def _table(contents: Contents, topic: str) -> Table:
-    """Decode only one topic; decoding a whole flight takes as long as reading it."""
+    """Decode the messages of one topic; to decode all topics takes as long as to read the file."""
     messages = [message for message in contents.messages if message[0] == topic]
     return Contents(messages).recording()[topic]

@@ -385,9 +385,10 @@ class Recovery:
 
     @property
     def share(self) -> float:
-        """Return the kept share of messages, in [0, 1]; of bytes if that number is unknown.
+        """Return the share of the messages that were kept, in [0, 1].
 
-        The share is below 1 if anything is missing.
+        If the number of messages is unknown, return the share of the bytes. The share is below 1 if
+        anything is missing.
         """
         if self.complete:
             return 1.0

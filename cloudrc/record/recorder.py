@@ -25,11 +25,11 @@ TROUBLE = {
     errno.EROFS: "disk is read-only",
 }
 CAPACITY = 20_000
-"""Number of records that the queue holds; world or cloud needs about 30 s to make as many."""
+"""Number of records that the queue holds; world or cloud makes as many in about 30 s."""
 
 
 class Recorder:
-    """A queue between two threads: one puts records, one drains them. A third may call `sync`.
+    """A queue between a thread that puts records and one that drains them; a third may call `sync`.
 
     Attributes:
         error: Why records are missing from the file, in words; "" without an error.

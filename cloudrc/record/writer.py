@@ -60,7 +60,7 @@ class McapWriter:
         """Open a file, or use a stream that the caller closes; any method may raise an OSError.
 
         The stamps use the clock of the end `clock`, "world" or "cloud". `clock_id` identifies the
-        machine's clock ("" if unknown); files of the same one need no clock offset.
+        machine's clock ("" if unknown); files with the same `clock_id` need no clock offset.
         """
         self._owned = isinstance(target, Path)
         # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.
@@ -100,7 +100,8 @@ class McapWriter:
     def write_message(self, topic: str, log_time_ns: int, data: bytes) -> None:
         """Write the CDR bytes of a message of a topic.
 
-        A `log_time_ns` [ns] that is negative or before the previous message's becomes that one.
+        If `log_time_ns` [ns] is negative or less than that of the previous message, the message
+        gets the previous log time.
         """
         now_ns = self._latest_ns = max(self._latest_ns, log_time_ns)
         if self._chunk_start_ns is None:

@@ -28,8 +28,8 @@ PACKAGES = (
 class Run:
     """Facts about a run that are not in its recording.
 
-    The hash by `record.hash` is of all records in virtual time, of all messages in real time, and
-    None if the recording is incomplete.
+    `records_sha256` is the hash by `record.hash`: of all records of a run in virtual time, of all
+    messages of a run in real time. It is None if the recording is incomplete.
     """
 
     mode: str  # "virtual", "local" or "cluster"
@@ -76,7 +76,7 @@ class Assessment:
 
 
 def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
-    """Describe how cloud's stamps were shifted, by a recording's metadata; None if not at all."""
+    """Describe the clock offset in a recording's metadata; None if no stamps were shifted."""
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
         return None
