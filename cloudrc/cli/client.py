@@ -85,7 +85,7 @@ class Api:
     def _answer(
         self, method: str, path: str, body: bytes | None, limit: float
     ) -> Iterator[http.client.HTTPResponse]:
-        """Send a request; yield an answer that is no refusal."""
+        """Send a request and yield the answer; raise an error if the answer is a refusal."""
         headers, token = {"Content-Type": "application/json"}, self._token()
         if token:
             headers["Authorization"] = f"Bearer {token}"

@@ -30,8 +30,8 @@ PROGRAMS = {
 this machine; a remote cluster needs neither."""
 MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 LATE_SLEEP = 2e-3
-"""Largest lateness that a control loop with a period of 10 ms tolerates [s]; an idle desktop stays
-far below."""
+"""Largest lateness that a control loop with a period of 10 ms tolerates [s]; on an idle desktop the
+lateness is far smaller."""
 MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
     "mujoco.mj_step(m, mujoco.MjData(m))"
@@ -53,7 +53,7 @@ class Check(NamedTuple):
 
 
 def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = ()) -> Check:
-    """Make a check; what is not ok blocks the given modes."""
+    """Make a check; if it is not `ok`, the modes in `modes` cannot run."""
     if ok:
         return Check(name, "ok", found, "", modes)
     return Check(name, "missing" if modes else "warn", found[:120], fix, modes)

@@ -60,7 +60,7 @@ def no_run_error(
 ) -> MissingPrerequisiteError:
     """Add to a cluster's error that no run flies here either, unless the flags name a cluster.
 
-    `flags` are those that name a local run, for the text.
+    `flags` names, for the text, the flags that choose a local run.
     """
     if options.context or options.namespace:
         return error

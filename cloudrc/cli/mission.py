@@ -60,8 +60,8 @@ NO_API = "no run with an API flies there; name another folder, or --api URL"
 POLL_PERIOD = 0.5
 """Pause between two polls of a mission [s]."""
 RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
-"""Longest times for which the API may be unreachable for a person and for a Job [s]; a pod on
-another node first loads its image."""
+"""Longest times for which a person and a Job wait for the API to answer [s]. A Job may have to wait
+until a new cloud pod has loaded its image."""
 TURN_MAX = 30.0
 """Longest time for a request and the pause after it [s]. A longer time means that this process was
 suspended."""
@@ -170,7 +170,7 @@ def read_mission(name: str, shown: str = "") -> Json:
 
 
 class MissionFollower:
-    """Follows one mission, also across restarts of the API, for the cloud pod may be replaced."""
+    """Follows one mission, also if the API restarts because the cloud pod was replaced."""
 
     def __init__(self, api: Api, patience: float) -> None:
         """Store the API; it may be unreachable for `patience` [s]."""
