@@ -48,7 +48,7 @@ container's own traces come from a ConfigMap, which holds at most 1 MiB."""
 PERIOD = 1.0
 """Time between two updates of the relay's counts in the exporter [s]."""
 RELEASED_PERIOD = 2.0
-"""Time between two publications of the lateness of datagrams [s]; the ends read the file as often."""
+"""Time between two publications of the lateness of datagrams [s]; the ends read at this rate."""
 
 
 class Command(NamedTuple):
