@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers
-from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -135,14 +135,11 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """Streams over links of other seeds; at most RUN_LENGTH datagrams each.
-
-        netem realises almost no correlation, so these links have none.
-        """
+        """Streams of up to RUN_LENGTH datagrams over 200 links as netem shapes them."""
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
-        made = replace(self, profile=replace(self.profile, correlation=0.0))
+        made = replace(self, profile=netem_makes(self.profile))
         return [replace(made, flow=self.flow._replace(seed=seed)).draw(sent) for seed in seeds]
 
     @cached_property
@@ -254,6 +251,21 @@ def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
         return np.full(len(sent), timeline.pieces[0].delay_ns * 1e-9)
     times = np.rint(sent * 1e9).astype(np.int64).tolist()
     return np.array([timeline.at(elapsed_ns).delay_ns for elapsed_ns in times]) * 1e-9
+
+
+def netem_makes(profile: DirectionProfile) -> DirectionProfile:
+    """Return the profile with which the model does what netem does with `profile`.
+
+    netem realises almost no correlation of delays. If it draws a loss and a duplicate for a packet,
+    one packet arrives; a copy can be lost, too. Source: Linux, net/sched/sch_netem.c.
+    """
+    loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
+    twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)
+    if isinstance(loss, GilbertElliott):
+        loss = replace(loss, loss_bad=single * loss.loss_bad, loss_good=single * loss.loss_good)
+    else:
+        loss *= single
+    return replace(profile, correlation=0.0, loss=loss, duplicate=twice)
 
 
 def told(name: str, asked: float, measured: float = nan) -> Row:
