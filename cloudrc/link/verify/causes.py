@@ -17,7 +17,7 @@ LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
 """A shaper lacks CPU time above any of these: 99 % quantile of the release error [s], share of
 datagrams that it did not read in time [1], share of CPU periods in which the limit stopped it [1].
 """
-RAISED = ("mean", "round_trip", "deviation", "loss")
+RAISED = ("mean", "deviation", "loss")
 """Quantities that a lack of CPU time raises."""
 PASSED = 0.9
 """If the shaper counts a smaller share of what arrived, the rest takes another way [1]."""
@@ -117,7 +117,6 @@ _BY_NUMBERS = (
     ("rate_ignored", "rate", 1.0, inf, ": the rate is ignored"),
     ("slow", "rate", 0.0, 1.0, ": something is slower"),
     ("wrong_delay", "mean", 0.0, inf, ""),
-    ("wrong_delay", "round_trip", 0.0, inf, ""),
     ("wrong_jitter", "deviation", 0.0, inf, ": another jitter"),
     ("no_loss", "loss", 0.0, 0.05, ": loss is not applied"),
     ("less_loss", "loss", 0.0, 1.0, ""),

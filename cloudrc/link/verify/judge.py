@@ -33,7 +33,6 @@ STILL, SHAPE_FLOOR = 1e-4, 2e-3
 second, the machine itself changes the shape of the distribution."""
 TOLERANCES = {
     "mean": (2e-3, 0.05),
-    "round_trip": (2e-3, 0.05),
     "deviation": (5e-4, 0.10),
     "distribution": (0.05, 0.0),
     "rate": (0.0, 0.25),
@@ -42,7 +41,7 @@ TOLERANCES = {
 the draws are known, the share for the deviation is half of that."""
 SHARE_TOLERANCE = (0.02, 0.25)
 """The same for loss, order and copies."""
-UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
+UNITS = {"mean": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; that of a share is "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
 """Datagrams that a verdict takes at least [1]; tolerances that chance may hide in it [1]."""
@@ -58,12 +57,9 @@ class Flow(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One quantity of one direction; an unknown value is NaN.
+    """One quantity of one direction; its values have the unit `unit`, NaN if unknown."""
 
-    The values asked, measured, low and high have the unit `unit`, so any unit.
-    """
-
-    name: str  # as in `Plan.quantities`, or "round_trip"
+    name: str  # as in `Plan.quantities`
     unit: str  # "s", "1" or "bit/s"
     asked: float  # mean on links of the requested profile
     measured: float
