@@ -14,8 +14,8 @@ from cloudrc.link.sidecar import Near, Told
 from cloudrc.link.verify.judge import Row
 
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
-"""Above any of these limits a shaper lacks CPU time: 99 % quantile of its release error [s], share of
-unread datagrams [1], share of periods in which a CPU limit stopped it [1]."""
+"""Above any of these limits a shaper lacks CPU time: 99 % quantile of its release error [s], share
+of datagrams not read in time [1], share of periods in which a CPU limit stopped the shaper [1]."""
 RAISED = ("mean", "deviation", "loss")
 """Quantities that rise if the shaper lacks CPU time."""
 PASSED = 0.9
