@@ -320,7 +320,7 @@ class Observations:
         return replace(self, slip_began_ns=self.slip_began_ns - self.slip_ns, slip_ns=AWAY)
 
     def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
-        """Yield event and text of each contact since `before`; `elapsed` [s] is the mission's age."""
+        """Yield event and text of each contact since `before`, at `elapsed` [s] of the mission."""
         if self.pipe_touches > before.pipe_touches:
             yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
         if self.touch_speed != before.touch_speed:
