@@ -59,7 +59,10 @@ class Flow(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One quantity of one direction; its values have the unit `unit`, NaN if unknown."""
+    """One quantity of one direction.
+
+    The values asked, measured, low and high have the unit `unit`, so any unit; NaN if unknown.
+    """
 
     name: str  # as in `Plan.quantities`
     unit: str  # "s", "1" or "bit/s"
@@ -271,13 +274,13 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     return replace(profile, correlation=0.0, loss=loss, duplicate=twice)
 
 
-def told(name: str, asked: float, measured: float = nan) -> Row:
-    """Make a row that is not judged; `asked` and `measured` have the unit of the quantity."""
-    return Row(name, UNITS.get(name, "1"), asked, measured, nan, nan, "told")
+def told(name: str, asked: float) -> Row:
+    """Make a row for a quantity `asked` [any unit] that is not judged."""
+    return Row(name, UNITS.get(name, "1"), asked, nan, nan, nan, "told")
 
 
 def tolerance(name: str, asked: float) -> float:
-    """Return the tolerance of a quantity; it and `asked` have the unit of the quantity."""
+    """Return the tolerance of a quantity of which the profile requests `asked` [any unit]."""
     floor, share = TOLERANCES.get(name, SHARE_TOLERANCE)
     return max(floor, share * asked)
 
