@@ -53,8 +53,8 @@ class LinkChecked(NamedTuple):
 
     Attributes:
         uplink: True for the uplink, False for the downlink.
-        quantity: Judged: "mean", "deviation", "loss", "reordered", "duplicated". Not judged:
-            "rate", "correlation".
+        quantity: Judged: "mean", "deviation", "round_trip", "loss", "reordered", "duplicated".
+            Not judged: "time_line", "rate", "correlation".
         asked: Expected value: delays [s], shares in [0, 1].
         measured: Measured value, likewise.
         low: Lowest accepted value, likewise.

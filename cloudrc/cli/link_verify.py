@@ -20,7 +20,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, isnan, nan
+from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -86,8 +86,10 @@ NOT_JUDGED = "NOT JUDGED"
 TOLD = {
     "correlation": f"correlation {NOT_JUDGED}: netem realises almost none of it",
     "rate": f"rate {NOT_JUDGED}: only trains of probes measure it, up to 100 Mbit/s",
+    "time_line": f"its time line {NOT_JUDGED} in flight, only what follows it",
 }
 """Quantity of a row that is not judged -> its note."""
+LOOPS = f"{NOT_JUDGED} in flight: a time line loops; probe it without --mode cluster"
 VERDICTS = {
     "off": ("not believed", "red", "does not match its profile"),
     "open": ("undecided", "yellow", "was not measured for long enough: give more --seconds"),
@@ -356,7 +358,7 @@ def verify_release(title: str, pods: Pods, limit: float) -> Report:
         for way, (_, receiver, _) in WAYS.items():
             if page := fetch(f"{pods[receiver][0]}/link.json"):
                 seen[way] = json.loads(page)
-        decided = len(seen) == len(WAYS) and all(one["verdict"] != "open" for one in seen.values())
+        decided = len(seen) == len(WAYS) and not any(map(_may_change, seen.values()))
         if decided or time.monotonic() >= deadline:
             break
     if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
@@ -377,6 +379,12 @@ def fetch(url: str) -> str:
         return ""
 
 
+def _may_change(found: Mapping[str, Any]) -> bool:
+    """Return whether a verdict may still come; a time line that loops never gets one."""
+    loops = any(row["quantity"] == "time_line" and row.get("measured") for row in found["rows"])
+    return bool(found["verdict"] == "open") and not loops
+
+
 def _findings(found: Mapping[str, Any], link: str) -> Findings:
     """Combine the receiver's verdict with what the sender's link reports at a URL."""
     told, rows = Told("", "", None), []
@@ -395,11 +403,15 @@ def _findings(found: Mapping[str, Any], link: str) -> Findings:
 
 def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
     """Yield a note for everything in one direction that was not judged."""
-    if all(isnan(row.measured) for row in rows):
-        yield f"{way}: nothing to judge yet: fly a mission, and wait for the end of a time line"
-    elif "mean" not in {row.name for row in rows}:
-        yield f"{way}: delays {NOT_JUDGED}: the ends do not share a clock"
-    yield from (f"{way}: {TOLD[row.name]}" for row in rows if row.verdict == "told")
+    judged = {row.name for row in rows if row.verdict != "told"}
+    if not rows:
+        yield f"{way}: no datagrams to measure; fly a mission first"
+    elif judged and "mean" not in judged:
+        yield f"{way}: one-way delays {NOT_JUDGED}: the ends do not share a clock"
+    for row in rows:
+        if row.verdict == "told":
+            loops = row.name == "time_line" and row.measured == 1.0
+            yield f"{way}: {LOOPS if loops else TOLD[row.name]}"
 
 
 def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[str, str]) -> Report:

@@ -200,7 +200,7 @@ _TABLE = (
         "A measured quantity of the link to the end that writes this, and whether it is as asked;"
         " only in `local` and `cluster` mode, clock of its end", (
         _WAY,
-        Field("quantity", "string", "", "mean, deviation, loss..."),
+        Field("quantity", "string", "", "mean, deviation, round_trip, loss..."),
         Field("asked", "float", "s or 1", "expected from the profile: a delay or a share"),
         Field("measured", "float", "s or 1", "measured: a delay or a share"),
         Field("low", "float", "s or 1", "lowest accepted value"),

@@ -130,8 +130,9 @@ def test_a_verdict_off_for_a_moment_does_not_end_the_wait(release, monkeypatch):
 @pytest.mark.parametrize(
     ("told", "notes"),
     [
-        ({}, ["downlink: nothing to judge yet: fly a mission"]),
+        ({}, ["downlink: no datagrams to measure; fly a mission first"]),
         ({"correlation": (0.9, 0.0)}, ["uplink: correlation NOT JUDGED: netem realises"]),
+        ({"time_line": (1.0, 0.0)}, ["uplink: its time line NOT JUDGED in flight"]),
     ],
 )
 def test_what_is_not_judged_is_noted(release, told, notes):
@@ -146,9 +147,14 @@ def test_what_is_not_judged_is_noted(release, told, notes):
     assert partly is bool(told)
 
 
-def test_delays_of_ends_without_a_common_clock_are_noted(release):
-    release.hears(world="ok", cloud="ok", name="reordered")
-    assert "uplink: delays NOT JUDGED: the ends do not share a clock" in as_text(release.ask(0.0))
+def test_nobody_waits_for_a_time_line_that_loops(release):
+    release.hears(world="ok")
+    release.tells("time_line", 1.0, 1.0)
+    said = release.ask(limit=5.0)
+    assert (said["verdict"], release.looks) == ("undecided", 1)
+    assert "NOT JUDGED in flight: a time line loops" in "".join(said["notes"])
+    release.hears(cloud="ok", name="round_trip")
+    assert "do not share a clock" in "".join(release.ask(0.0)["notes"])
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from cloudrc.link.verify.judge import Row
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
 """Above any of these limits a shaper lacks CPU time: 99 % quantile of its release error [s], share
 of datagrams not read in time [1], share of periods in which a CPU limit stopped the shaper [1]."""
-RAISED = ("mean", "deviation", "loss")
+RAISED = ("mean", "round_trip", "deviation", "loss")
 """Quantities that rise if the shaper lacks CPU time."""
 PASSED = 0.9
 """Below this share of the arrived datagrams at the shaper, the others take another way [1]."""
@@ -116,6 +116,7 @@ _BY_NUMBERS = (
     ("rate_ignored", "rate", 1.0, inf, ": the rate is ignored"),
     ("slow", "rate", 0.0, 1.0, ": something is slower"),
     ("wrong_delay", "mean", 0.0, inf, ""),
+    ("wrong_delay", "round_trip", 0.0, inf, ""),
     ("wrong_jitter", "deviation", 0.0, inf, ": another jitter"),
     ("no_loss", "loss", 0.0, 0.05, ": loss is not applied"),
     ("less_loss", "loss", 0.0, 1.0, ""),

@@ -35,6 +35,7 @@ STILL, SHAPE_FLOOR = 1e-4, 2e-3
 below the second, the machine itself changes the shape of the distribution."""
 TOLERANCES = {
     "mean": (2e-3, 0.05),
+    "round_trip": (2e-3, 0.05),
     "deviation": (5e-4, 0.10),
     "distribution": (0.05, 0.0),
     "rate": (0.0, 0.25),
@@ -43,7 +44,7 @@ TOLERANCES = {
 On a relay, the share of the deviation is half of that."""
 SHARE_TOLERANCE = (0.02, 0.25)
 """Tolerance of loss, order and copies: absolute, and as a share of the requested value [1]."""
-UNITS = {"mean": "s", "deviation": "s", "rate": "bit/s"}
+UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; that of a share is "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
 """Fewest datagrams for a verdict [1]; widest half of a band for "ok", in tolerances [1]."""
@@ -59,12 +60,12 @@ class Flow(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One quantity of one direction.
+    """One quantity of one direction; an unknown value is NaN.
 
-    The values asked, measured, low and high have the unit `unit`, so any unit; NaN if unknown.
+    The values asked, measured, low and high have the unit `unit`, so any unit.
     """
 
-    name: str  # as in `Plan.quantities`
+    name: str  # as in `Plan.quantities`, or "round_trip"
     unit: str  # "s", "1" or "bit/s"
     asked: float  # mean on links of the requested profile
     measured: float
@@ -274,9 +275,9 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     return replace(profile, correlation=0.0, loss=loss, duplicate=twice)
 
 
-def told(name: str, asked: float) -> Row:
-    """Make a row for a quantity `asked` [any unit] that is not judged."""
-    return Row(name, UNITS.get(name, "1"), asked, nan, nan, nan, "told")
+def told(name: str, asked: float, measured: float = nan) -> Row:
+    """Make a row with `asked` and `measured` values [any unit] of a quantity that is not judged."""
+    return Row(name, UNITS.get(name, "1"), asked, measured, nan, nan, "told")
 
 
 def tolerance(name: str, asked: float) -> float:

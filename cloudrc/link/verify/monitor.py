@@ -1,7 +1,7 @@
 """Monitor the link in flight: every 5 s compare what an end receives with what is predicted.
 
-World judges the downlink, cloud the uplink. The control loop only hands over its records; a thread
-of the monitor does the rest.
+World judges the downlink, cloud the uplink and, if the ends share no clock, round trips. The loop's
+thread only hands over its records; a thread of the monitor does the rest.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import isnan, nan
+from math import inf, isinf, isnan, nan
 from pathlib import Path
 from typing import TypeAlias
 
@@ -23,8 +23,18 @@ from cloudrc.link.model import Stream
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.state import STATE_MAX, from_text
 from cloudrc.link.verify.causes import describe
-from cloudrc.link.verify.judge import FEWEST, RUN_LENGTH, Flow, Plan, Row, told, verdict_of
-from cloudrc.records import Arrival, Fault, Lateness, LinkChecked, Record
+from cloudrc.link.verify.judge import (
+    FEWEST,
+    RUN_LENGTH,
+    TAIL,
+    Expected,
+    Flow,
+    Plan,
+    Row,
+    told,
+    verdict_of,
+)
+from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
 PERIOD = 0.01
 """Period of telemetry and of commands [s]."""
@@ -32,26 +42,31 @@ CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
 """Time between two verdicts, and from a new session or profile to the first datagram [ns]."""
 KEPT, FINAL = 6000, 128
 """Most datagrams that are judged [1]; a missing datagram counts as lost after FINAL newer ones."""
+ENDS = 2e-3
+"""Largest delay that two punctual ends and a tick of the simulation add to a round trip [s]."""
 FOLLOW_PERIOD = 0.1
-"""Time between two readings of the records and of the link's state file [s]."""
+"""Time between two looks at the records and at the state file of the link [s]."""
+UNJUDGED = {"distribution"}
+"""Quantity that is not judged in flight: the ends' own wake-ups change it."""
 DELAYS = {"mean", "deviation"}
-"""Quantities that are judged only if the ends share a clock."""
+"""Quantities that need a common clock."""
 
 Asked: TypeAlias = tuple[DirectionProfile, DirectionProfile]
 """Profiles of uplink and downlink."""
 Load: TypeAlias = Callable[[object], Asked]
-"""Makes the profiles from the values in the link's state file; raises a CloudrcError."""
+"""Reads the values of a profile's file; raises a CloudrcError."""
 
 
 class LinkMonitor:
-    """Judge the direction of the link that one end receives, from the records of this end."""
+    """Judge what one end receives, by its records."""
 
     def __init__(self, *, uplink: bool, flow: Flow) -> None:
-        """Set the direction and its datagrams; then call `begin` or, without a thread, `follow`."""
+        """Set up for the end that receives a flow: cloud the uplink; then call `follow`."""
         self._uplink, self._flow = uplink, flow
-        self._arrivals, self._lates = deque[Arrival](maxlen=KEPT), deque[float](maxlen=KEPT)
-        self._asked: DirectionProfile | None = None
-        self._plan: Plan | None = None
+        self._arrivals = deque[Arrival](maxlen=KEPT)
+        self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
+        self._asked: Asked | None = None
+        self._plans: list[Plan] = []  # of what is received, and of the other direction
         self._epoch, self._fresh, self._seen = -1, True, ""
         self._since_ns, self._due_ns = 0.0, 0
         self._suspects, self._complained = set[str](), False
@@ -60,19 +75,19 @@ class LinkMonitor:
         self._outbox = queue.SimpleQueue[Record]()
 
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
-        """Start the thread; `asked` holds until the link's state file at `path` reports others."""
+        """Start the thread; profiles `asked` hold until the link's state file reports others."""
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
 
     def follow(self, asked: Asked | None) -> None:
-        """Compare with other profiles from now on; None: with none until they are known."""
-        own = asked and asked[0 if self._uplink else 1]
-        if own != self._asked:
-            self._asked, self._fresh, self._plan = own, True, None
-            if own is not None:
-                sent = np.arange(float(RUN_LENGTH)) * PERIOD
-                self._plan = Plan(settled(own), self._flow, sent, pause=self._pause)
+        """Judge by other profiles from now on; None: by none until they are known."""
+        if asked != self._asked:
+            self._asked, self._fresh, sent = asked, True, np.arange(float(RUN_LENGTH)) * PERIOD
+            ways = () if asked is None else asked if self._uplink else asked[::-1]
+            self._plans = [
+                Plan(settled(profile), self._flow, sent, pause=self._pause) for profile in ways
+            ]
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
         """Take the newest records of this end at `now_ns`; return records about the link."""
@@ -82,7 +97,7 @@ class LinkMonitor:
         return [self._outbox.get_nowait() for _ in range(self._outbox.qsize())]
 
     def look(self, path: Path, load: Load) -> None:
-        """Read the link's state file, and follow the profile in it."""
+        """Follow the state file of the link once."""
         try:
             text = read(path, STATE_MAX).decode()
             if text != self._seen:
@@ -120,12 +135,16 @@ class LinkMonitor:
                 self._arrivals.append(record)
             elif isinstance(record, Lateness):
                 self._lates.append(record.lateness + record.busy)
+            elif isinstance(record, Control) and not isnan(record.rtt):
+                if not self._trips or record.rtt != self._trips[-1]:  # a new echo
+                    self._trips.append(record.rtt)
         if self._asked is None:
             return []
-        if self._fresh:  # a time line that runs is not judged: its start is not known here
+        if self._fresh:  # a time line that runs is not judged: where it began is not known here
+            last_ns = max(Timeline(profile).last_ns for profile in self._asked)
             settled_ns = now_ns + SETTLE_NS
-            self._since_ns = settled_ns + Timeline(self._asked).last_ns
-            self._due_ns, self._fresh, self._suspects = settled_ns + CHECK_NS, False, set()
+            self._since_ns, self._due_ns = settled_ns + last_ns, settled_ns + CHECK_NS
+            self._fresh, self._suspects = False, set()
         if now_ns < self._since_ns:
             self._forget()
         if now_ns < self._due_ns:
@@ -134,11 +153,11 @@ class LinkMonitor:
         return self._report(self._rows(), now_ns)
 
     def _forget(self) -> None:
-        self._arrivals.clear()
-        self._lates.clear()
+        for kept in (self._arrivals, self._trips, self._lates):
+            kept.clear()
 
     def _report(self, rows: list[Row], now_ns: int) -> list[Record]:
-        """Make records of the rows; a row that is off for the first time is measured again."""
+        """Make records; look once more at what is off for the first time before saying so."""
         count, off = len(self._arrivals), {row.name for row in rows if row.verdict == "off"}
         if off - self._suspects:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
@@ -157,14 +176,29 @@ class LinkMonitor:
         return found
 
     def _rows(self) -> list[Row]:
-        """Judge the datagrams since the session or the profile settled."""
+        """Judge by the link's own draws where they fit, otherwise by what netem makes."""
         stream, first, timed = _in_order(self._arrivals)
-        if self._plan is None or len(stream.sent) < FEWEST:  # an older verdict holds no more
-            return [told("loss", nan)._replace(verdict="open")]
-        rows = self._plan.judge(stream, self._epoch, first)
-        # The ends' own wake-ups change the distribution.
-        skipped = {"distribution"} if timed else {"distribution"} | DELAYS
-        return [self._excuse(row) for row in rows if row.name not in skipped]
+        rows, skipped = list[Row](), UNJUDGED if timed else UNJUDGED | DELAYS
+        if len(stream.sent) >= FEWEST:
+            rows = self._plans[0].judge(stream, self._epoch, first)
+        elif self._arrivals:  # of a new session or profile: an older verdict holds no more
+            rows = [told("loss", nan)._replace(verdict="open")]
+        rows = [row for row in rows if row.name not in skipped]
+        if not timed and len(self._trips) >= FEWEST:
+            rows.append(self._round_trip())
+        rows = [self._excuse(row) for row in rows]
+        timelines = [Timeline(one) for one in self._asked or ()]
+        if any(one.only() is None for one in timelines):  # 1: it loops, and is never judged
+            rows.append(told("time_line", 1, float(any(isinf(one.last_ns) for one in timelines))))
+        return rows
+
+    def _round_trip(self) -> Row:
+        """Judge round trips: the newest wins, so datagrams that none overtook make them."""
+        means = np.sum([[_first_come(link) for link in plan.links] for plan in self._plans], axis=0)
+        low, high = np.quantile(means, (TAIL, 1.0 - TAIL)).tolist()
+        bands = {"round_trip": (float(means.mean()), low, high + ENDS)}
+        expected = Expected(bands, np.zeros(0), known=False)
+        return expected.judge("round_trip", float(np.mean(self._trips)))
 
     def _excuse(self, row: Row) -> Row:
         """Leave a too long delay open if late wakes of this machine's loops may explain it.
@@ -203,3 +237,10 @@ def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
     copies[numbers] = times
     sent = np.interp(np.arange(count), numbers, stamps - delays[numbers])
     return Stream(sent, delays, copies), first, timed
+
+
+def _first_come(stream: Stream) -> float:
+    """Return the mean delay [s], without the datagrams that a later one overtook."""
+    arrival = np.where(np.isnan(stream.delays), inf, stream.sent + stream.delays)
+    first = arrival <= np.minimum.accumulate(arrival[::-1])[::-1]
+    return float(stream.delays[first & np.isfinite(arrival)].mean())
