@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, retry, run
-from cloudrc.cluster.jobs import delete_job, follow, follow_limit, job_under_way, run_job
+from cloudrc.cluster.jobs import delete_job, find_flight, follow, follow_limit, run_job
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
@@ -150,11 +150,10 @@ def fly_in_cluster(
     """
     from cloudrc.config.load import dump
 
-    if job := job_under_way(release):  # an install would replace both pods
+    if found := find_flight(release):  # an install would replace both pods
         raise ClusterError(
-            f"Job '{job}' is under way on release '{release.name}' {release.where}; wait for it, "
-            f"end it: kubectl {' '.join(release.flags)} delete job {job}, or fly on a release of "
-            "your own: --release NAME"
+            f"{found[0]} is under way on release '{release.name}' {release.where}; wait for it, "
+            f"end it: {found[1]}, or fly on a release of your own: --release NAME"
         )
     began = time.monotonic()
     install(release, chart_values(experiment, current_values(release)), timeout, tell)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import secrets
 import time
+import urllib.request
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,10 +21,13 @@ import yaml
 
 from cloudrc.cluster.client import ClusterError, Release, chart_folder, retry
 from cloudrc.cluster.pods import (
+    NO_PROXY,
+    api_url,
     container_statuses,
     find_deployment,
     list_pods,
     one_line,
+    operator_token,
     pod_failure,
     pod_log,
     tokens_secret,
@@ -55,7 +59,10 @@ LOOK_PERIOD = 0.5
 """Time between two looks at a Job [s]."""
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives its pod 30 s."""
+API_LIMIT = 10.0
+"""Time limit for the release's API to answer [s]."""
 ENDED = ("complete", "failed")
+"""States of a Job that has ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,10 +178,26 @@ def follow_limit(limit: float, queue: bool) -> float:
     return deadline_of(limit, queue) + END_ALLOWANCE
 
 
-def job_under_way(release: Release) -> str | None:
-    """Return the name of a Job of this release that flies a mission, or waits to; else None."""
-    jobs = [_status(job, None) for job in release.find("jobs", COMPONENT)]
-    return next((job.name for job in jobs if job.state not in ENDED), None)
+def find_flight(release: Release) -> tuple[str, str] | None:
+    """Find a Job that has not ended, or else the API's current mission.
+
+    Returns:
+        The flight in words, and the command that ends it. None if nothing flies, or if the API
+        does not answer: a broken release must not prevent its own repair.
+    """
+    for job in release.find("jobs", COMPONENT):
+        if (status := _status(job, None)).state not in ENDED:
+            kubectl = f"kubectl {' '.join(release.flags)}"
+            return f"Job '{status.name}'", f"{kubectl} delete job {status.name}"
+    with suppress(CloudrcError, OSError, ValueError), api_url(release) as url:
+        headers = {"Authorization": f"Bearer {operator_token(release)}"}
+        request = urllib.request.Request(f"{url}/v1/state", headers=headers)
+        with NO_PROXY.open(request, timeout=API_LIMIT) as answer:
+            mission = json.load(answer)["mission"]
+        if mission is not None:
+            cancel = f"cloudrc mission cancel {mission['id']} {' '.join(release.cloudrc_flags)}"
+            return f"mission {mission['id']}", cancel
+    return None
 
 
 def delete_job(release: Release, name: str) -> None:
@@ -183,7 +206,10 @@ def delete_job(release: Release, name: str) -> None:
     until = time.monotonic() + DELETE_LIMIT
     while any(job.metadata.name == name for job in release.find("jobs", COMPONENT)):
         if time.monotonic() > until:
-            raise TimedOutError(f"Job '{name}' has not ended {DELETE_LIMIT:g} s after its deletion")
+            raise TimedOutError(
+                f"Job '{name}' has not ended {DELETE_LIMIT:g} s after its deletion; "
+                f"see: kubectl {' '.join(release.flags)} describe job {name}"
+            )
         time.sleep(LOOK_PERIOD)
 
 

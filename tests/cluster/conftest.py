@@ -118,10 +118,9 @@ class FakeTeleop:
     """The API and the metrics of a cloud pod, with a record of its requests."""
 
     def __init__(self) -> None:
-        self.missions: list[dict[str, str]] = []
+        self.mission: dict[str, str] | None = None
         self.posted: list[str] = []
         self.tokens: set[str | None] = set()
-        self.refuses = False
         self.server = serve(self._answer)
         self.port = self.server.server_port
 
@@ -130,9 +129,9 @@ class FakeTeleop:
             return 200, 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
         self.tokens.add(request.headers["Authorization"])
         if request.command == "GET":
-            return 200, {"missions": self.missions}
+            return 200, {"missions": [], "mission": self.mission}
         self.posted.append(request.path)
-        return (409, {"detail": "it is over"}) if self.refuses else (200, {})
+        return 200, {}
 
     def forwards(self) -> str:
         """What kubectl prints when it forwards all ports of a pod to this server."""
@@ -159,10 +158,10 @@ def kubeconfig(url: str) -> str:
     )
 
 
-def labels(component: str, release: str = "cloudrc") -> dict[str, str]:
+def labels(component: str) -> dict[str, str]:
     return {
         "app.kubernetes.io/name": "cloudrc",
-        "app.kubernetes.io/instance": release,
+        "app.kubernetes.io/instance": "cloudrc",
         "app.kubernetes.io/component": component,
     }
 
