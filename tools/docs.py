@@ -36,7 +36,7 @@ PARTS = {
     **dict.fromkeys(("uplink", "downlink"), "#one-direction-of-a-link"),
     **dict.fromkeys(KINDS, "#plug-ins-of-the-cloud"),
 }
-"""Keys whose own keys have a section, and its link."""
+"""Key whose value has a section of its own -> link to that section."""
 
 ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
 CLOCKS = {
@@ -191,7 +191,7 @@ def _default(value: Any) -> str:
 
 
 def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
-    """Put what an error message asks for into a cell: shorter, and with a link to its keys."""
+    """Shorten the expectation of an error message for a table, and link a mapping's section."""
     if words.startswith("a list of"):
         item = problems.expectation(model, (*path, "0")).partition(" [")[0]
         words += item.removeprefix("must be a number")
@@ -300,7 +300,7 @@ def _labels(metric: Metric) -> str:
 VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"
 WIDTH = 96
 COMPACT = (Resources, Quantities)
-"""Parts of the values that Kubernetes defines."""
+"""Parts of the values whose keys Kubernetes defines; a part is written on one line."""
 
 
 def _values_text(part: BaseModel, depth: int = 0) -> str:

@@ -69,7 +69,7 @@ class Release:
 
     Attributes:
         context: Context of the kubeconfig; None for the current context.
-        namespace: Namespace of the release; None for that of the context, for kubectl alone.
+        namespace: Namespace of the release; None for the context's own (kubectl only).
         name: Name of the Helm release.
     """
 
@@ -122,7 +122,7 @@ class Release:
     def request(
         self, verb: str, kind: str, *, timeout: float = REQUEST_TIMEOUT, **arguments: Any
     ) -> Any:
-        """Send a request about objects in the release's namespace, with a `timeout` [s].
+        """Send a request about objects in the release's namespace.
 
         Args:
             verb: "list", which returns a list; or "get", "create" or "delete".

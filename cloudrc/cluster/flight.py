@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 
 LOOK_PERIOD = 1.0
-"""Time between two looks at the pods [s]."""
+"""Time between two requests for the state of the pods [s]."""
 HELM_LIMIT = 120.0
 """Time limit for one helm command [s]; helm does not wait for pods."""
 FAILURE_TIME = 5.0
@@ -116,7 +116,7 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
 
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
-    """Describe why a component is not ready, "" if it is ready; and whether waiting is useless."""
+    """Return why a component is not ready ("" if it is), and whether it never will be."""
     deployment = pods.find_deployment(release, component)
     status = deployment.status
     for condition in status.conditions or []:  # for example Pod Security or a quota
@@ -179,7 +179,7 @@ def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> d
 
 
 def refuse_local_files(experiment: ResolvedExperiment) -> None:
-    """Refuse an experiment that names local files, which the images do not contain."""
+    """Refuse an experiment that pods cannot fly: it names local files, or its mission is steps."""
     from cloudrc.config.load import FILE_READERS
 
     cloud, link, world = experiment.cloud, experiment.link, experiment.world
@@ -283,7 +283,7 @@ def _report(
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments, write_report
 
-    # What emulates the link, such as netem, is known to the link containers.
+    # The metrics of the link containers name the shaper: netem or relay.
     texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
     found = re.findall(r'cloudrc_link_info\{[^}]*shaper="(\w+)"', "\n".join(texts))
     shaper = "+".join(sorted(set(found))) or "unknown"

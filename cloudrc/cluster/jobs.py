@@ -35,7 +35,7 @@ from cloudrc.cluster.pods import (
 from cloudrc.errors import CloudrcError, TimedOutError
 
 EXAMPLE = "examples/mission-job.yaml"
-"""The objects of a mission in the chart, for the names of no release."""
+"""File in the chart with the objects of a mission; `run_job` fills in the names of a release."""
 COMPONENT = "mission"
 """Label `component` of missions' Jobs, pods and ConfigMaps."""
 FILE = "mission.yaml"
@@ -44,7 +44,7 @@ UID_LABEL = "batch.kubernetes.io/controller-uid"
 """Label with the Job's UID, which Kubernetes sets on the Job's pod."""
 FROM_POD = ("nodeSelector", "tolerations", "affinity", "imagePullSecrets", "securityContext")
 FROM_CONTAINER = ("image", "imagePullPolicy", "securityContext")
-"""Keys that a mission's pod and container share with the release's teleop."""
+"""Keys that a mission's pod and container take from the release's teleop."""
 START_ALLOWANCE = 120
 """Time to start the pod and to receive the robot's state, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
@@ -56,7 +56,7 @@ END_ALLOWANCE = 60.0
 KEEP_FINISHED = 3600
 """How long Kubernetes keeps a finished Job [s]."""
 LOOK_PERIOD = 0.5
-"""Time between two looks at a Job [s]."""
+"""Time between two requests for the state of a Job [s]."""
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives its pod 30 s."""
 API_LIMIT = 10.0
@@ -131,7 +131,7 @@ def run_job(
 
 
 def _owner(version: str, kind: str, owner: Any) -> dict[str, Any]:
-    """Refer to an object whose deletion deletes another one."""
+    """Build an owner reference: Kubernetes deletes an object together with its owner."""
     metadata = owner.metadata
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
 
@@ -174,7 +174,7 @@ def deadline_of(limit: float, queue: bool) -> int:
 
 
 def follow_limit(limit: float, queue: bool) -> float:
-    """Compute when Kubernetes has ended a Job in any case [s], from its mission's `limit` [s]."""
+    """Compute the time after which a Job has certainly ended [s], from its mission's limit [s]."""
     return deadline_of(limit, queue) + END_ALLOWANCE
 
 

@@ -1,4 +1,4 @@
-"""A cluster for the end-to-end tests, the release in it, what to save on failure, and its cost."""
+"""The cluster and the release of the end-to-end tests; helpers that read and command them."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ CHART = ROOT / "charts" / "cloudrc"
 EXAMPLES = CHART / "examples"
 NAMESPACE = "cloudrc-e2e"
 NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring", f"{NAMESPACE}-bad")
-"""All that these tests make."""
+"""Namespaces that these tests create."""
 NAME = "cloudrc"
 ENDS = ("world", "cloud")
 RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
 SUMMARY: list[str] = []
-"""Lines that are printed at the end."""
+"""Lines that pytest prints after the tests."""
 TIMES: dict[str, float] = {}
-"""Instants of the session [s]."""
+"""Event of the test session -> its time on the monotonic clock [s]."""
 
 
 class CommandFailedError(AssertionError):
-    """A command ended with another code than 0."""
+    """The exit code of a command was not 0."""
 
 
 def command(
     *words: str | Path, given: str = "", timeout: float = 120.0, environ: Mapping[str, str] = {}
 ) -> str:
-    """Run a command; what it wrote."""
+    """Run a command and return its output; raise an error if its exit code is not 0."""
     done = subprocess.run(
         [str(word) for word in words],
         input=given,
@@ -65,12 +65,12 @@ def command(
 
 
 def kubectl(*words: str, given: str = "", timeout: float = 120.0) -> str:
-    """In the namespace of the tests, unless the words name another."""
+    """Run kubectl in the namespace of the tests, unless `words` name another; return its output."""
     return command("kubectl", f"--namespace={NAMESPACE}", *words, given=given, timeout=timeout)
 
 
 def read(*words: str) -> Any:
-    """What `kubectl get` says, as values."""
+    """Return the result of `kubectl get`, parsed."""
     return json.loads(kubectl("get", *words, "--output=json"))
 
 
@@ -87,7 +87,7 @@ def helm(*words: str, timeout: float = 180.0) -> str:
 
 
 def cloudrc(*words: str, timeout: float = 240.0) -> subprocess.CompletedProcess[str]:
-    """Run our own command line, whatever it ends with."""
+    """Run cloudrc; any exit code is accepted."""
     return subprocess.run(
         [sys.executable, "-m", "cloudrc", *words],
         capture_output=True,
@@ -98,14 +98,14 @@ def cloudrc(*words: str, timeout: float = 240.0) -> subprocess.CompletedProcess[
 
 
 def in_release(*words: str, timeout: float = 240.0) -> str:
-    """Run our own command line for the tests' release; what it wrote."""
+    """Run cloudrc for the release of the tests, and return its output."""
     done = cloudrc(*words, "-n", NAMESPACE, "--release", NAME, timeout=timeout)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 def set_link(*words: str) -> dict[str, Any]:
-    """Set the link of the flight by hand; gives what is in force then."""
+    """Run `cloudrc link set` for the release; return its report of the new link."""
     document: dict[str, Any] = json.loads(in_release("link", "set", *words, "-o", "json"))
     return document
 
@@ -113,7 +113,7 @@ def set_link(*words: str) -> dict[str, Any]:
 def eventually(
     look: Callable[[], Any], what: str, timeout: float = 30.0, every: float = 0.5
 ) -> Any:
-    """Look until something is true; what was seen."""
+    """Call `look` until its result is true, and return that; fail after `timeout` [s]."""
     until = time.monotonic() + timeout
     while True:
         seen = look()
@@ -133,13 +133,13 @@ def pods(component: str) -> list[dict[str, Any]]:
 
 
 def pod(component: str) -> dict[str, Any]:
-    """The component's pod that is not about to end."""
+    """Return the component's only pod that is not being deleted."""
     (found,) = [p for p in pods(component) if "deletionTimestamp" not in p["metadata"]]
     return found
 
 
 def identity() -> dict[str, tuple[str, list[int]]]:
-    """What changes when a pod is replaced or a container starts again."""
+    """Return UID and restart counts, which change if a pod is replaced or a container restarts."""
     found = {}
     for component in ENDS:
         one = pod(component)
@@ -153,12 +153,12 @@ Sample = tuple[str, tuple[tuple[str, str], ...]]
 
 
 def scrapes(component: str) -> dict[str, str]:
-    """What each container of a pod answers to a scrape."""
+    """Return the page /metrics of each container of a pod."""
     return fetch_metrics(place(), component)
 
 
 def samples(text: str) -> dict[Sample, float]:
-    """Every sample of a scrape: by name and sorted labels."""
+    """Parse a page of metrics: name and sorted labels -> value."""
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(text)
@@ -167,12 +167,12 @@ def samples(text: str) -> dict[Sample, float]:
 
 
 def metrics(component: str) -> dict[Sample, float]:
-    """Every sample of world or cloud."""
+    """Return the samples of the container world or cloud."""
     return samples(scrapes(component)[component])
 
 
 def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
-    """Sum of the samples of a name whose labels include these."""
+    """Add up the samples of a name whose labels include the given ones."""
     found = [
         number
         for (each, given), number in samples.items()
@@ -183,33 +183,33 @@ def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
 
 
 def missions() -> list[dict[str, Any]]:
-    """All missions that the API knows, oldest first."""
+    """Return all missions that the API knows, the oldest first."""
     token = operator_token(place())
     with api_url(place()) as url:
         return list(Api(url, lambda: token).get("/v1/missions")["missions"])
 
 
 def job_end(name: str, timeout: float = 150.0) -> tuple[JobStatus, str]:
-    """Wait for the end of a Job; its final state and its log."""
+    """Wait for the end of a Job; return its final state and its log."""
     lines: list[str] = []
     return follow(place(), name, lines.append, timeout=timeout), "\n".join(lines)
 
 
 def job_log(name: str) -> str:
-    """What a Job has said so far; "" while its pod does not run."""
+    """Return the log of a Job so far; "" while its pod is pending."""
     pods = read("pod", f"--selector=batch.kubernetes.io/job-name={name}")["items"]
     runs = [each for each in pods if each["status"]["phase"] != "Pending"]
     return kubectl("logs", runs[0]["metadata"]["name"]) if runs else ""
 
 
 def fly(name: str, waypoints: Sequence[Mapping[str, Any]], limit: float = 60.0) -> None:
-    """Fly waypoints by a Job of this name, as `cloudrc mission run` does."""
+    """Start a Job that flies waypoints, as `cloudrc mission run` does."""
     mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints)}
     run_job(place(), mission, name=name, limit=limit)
 
 
 def save(folder: Path) -> None:
-    """Keep what helps to understand a failure: objects, events, logs, recordings."""
+    """Save objects, events, logs and recordings after a failure."""
     names = f"--namespaces={','.join(NAMESPACES)}"
     command("kubectl", "cluster-info", "dump", names, f"--output-directory={folder}")
     for component in ENDS:
@@ -241,13 +241,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def note():
-    """Add a line to the summary."""
+    """A function that adds a line to the summary."""
     return SUMMARY.append
 
 
 @pytest.fixture(scope="session")
 def cluster(request):
-    """A cluster with our images in it: that of KUBECONFIG, or a kind cluster of our own."""
+    """A cluster with the images: the one of KUBECONFIG, or else a new kind cluster."""
     own = "KUBECONFIG" not in os.environ
     missing = [tool for tool in TOOLS if shutil.which(tool) is None]
     if missing:
@@ -289,7 +289,7 @@ def _create() -> None:
 
 
 def _load() -> None:
-    """Load the images where the cluster is one of kind; another has to be able to pull them."""
+    """Load the images into a kind cluster; any other cluster must be able to pull them."""
     context = command("kubectl", "config", "current-context").strip()
     if context.startswith("kind-"):
         name = f"CLUSTER={context.removeprefix('kind-')}"
@@ -318,7 +318,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture(scope="session")
 def values(tmp_path_factory):
-    """What the tests' release is installed with, over the chart's own values."""
+    """The file of values with which the tests install their release."""
     prometheus = {"kubernetes.io/metadata.name": f"{NAMESPACE}-monitoring"}
     given = {
         "link": {"mode": "relay"},
@@ -341,20 +341,20 @@ def installed(cluster, values):
 
 @pytest.fixture(scope="session")
 def prometheus_image(cluster):
-    """A real Prometheus, and promtool with it."""
+    """Name of an image with Prometheus and promtool."""
     found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
     return found.split()[0]
 
 
 def processor_times() -> tuple[float, dict[str, float]]:
-    """Now [s], and what each process of the release says it has used so far [s]."""
+    """Return the monotonic time [s], and the CPU time of each process of the release [s]."""
     texts = {f"{end}/{name}": text for end in ENDS for name, text in scrapes(end).items()}
     name = "process_cpu_seconds_total"
     return time.monotonic(), {each: value(samples(t), name) for each, t in texts.items()}
 
 
 def memory() -> float:
-    """Memory of all containers of the release, as the kubelet counts it [bytes]."""
+    """Return the memory of all containers of the release, as the kubelet counts it [bytes]."""
     node = pod("world")["spec"]["nodeName"]
     summary = command("kubectl", "get", "--raw", f"/api/v1/nodes/{node}/proxy/stats/summary")
     found = {each["podRef"]["uid"]: each["containers"] for each in json.loads(summary)["pods"]}
@@ -362,8 +362,8 @@ def memory() -> float:
     return sum(each["memory"]["workingSetBytes"] for containers in mine for each in containers)
 
 
-@cache  # measured where the release flies; later its pods may just be replaced
+@cache  # measured once, because later a test may have just replaced the pod
 def pace() -> float:
-    """How much slower than nominal the release's own interpreter is at its own work; at least 1."""
+    """Return how much slower than nominal Python is in the world container [1]; at least 1."""
     words = ("exec", pod("world")["metadata"]["name"], "--container=world", "--")
     return slower(kubectl(*words, "python", "-c", WORK))
