@@ -97,7 +97,7 @@ def outputs() -> dict[Path, str]:
 
 def leftovers() -> list[Path]:
     """List the copies in the chart whose originals are gone."""
-    return [path for path in (CHART / "files").glob("*/*.yaml") if path not in outputs()]
+    return sorted({*(CHART / "files").glob("*/*.yaml")} - outputs().keys())
 
 
 def _insert(page: Path, text: str) -> dict[Path, str]:

@@ -213,18 +213,6 @@ def delete_job(release: Release, name: str) -> None:
         time.sleep(LOOK_PERIOD)
 
 
-def read_job(release: Release, name: str) -> tuple[JobStatus, Any]:
-    """Read a Job's state and its pod; None without a pod."""
-    job = release.request("get", "jobs", name=name)
-    pods = list_pods(release, COMPONENT)
-    pod = next((pod for pod in pods if _uid(pod) == job.metadata.uid), None)
-    return _status(job, pod), pod
-
-
-def _uid(pod: Any) -> str:
-    return str((pod.metadata.labels or {}).get(UID_LABEL, ""))
-
-
 def _status(job: Any, pod: Any) -> JobStatus:
     exit_code, message, state = None, "", "pending"
     for container in container_statuses(pod) if pod is not None else ():
@@ -281,7 +269,10 @@ def _log(release: Release, pod: Any) -> list[str]:
 
 def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
     """Read a Job's state and log; raise a ClusterError if its pod will never run."""
-    status, pod = read_job(release, name)
+    job = release.request("get", "jobs", name=name)
+    uids = ((pod, pod.metadata.labels.get(UID_LABEL)) for pod in list_pods(release, COMPONENT))
+    pod = next((pod for pod, uid in uids if uid == job.metadata.uid), None)
+    status = _status(job, pod)
     if status.state != "pending":
         return status, _log(release, pod)
     if pod is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -25,7 +24,6 @@ from tests.cluster.conftest import (
 )
 
 ROOT = Path(__file__).resolve().parents[2]
-Pretend = Callable[[str, str], Path]
 
 
 def test_flags_override_the_kubeconfig(api):

@@ -18,7 +18,6 @@ from cloudrc.report.write import assess
 from tests.cluster.conftest import at_look, end, start_pod, terminated
 from tests.flights.conftest import records
 
-Printed = pytest.CaptureFixture[str]
 SECOND = 1_000_000_000
 NAME, SETTING = "hover", "mission.waypoints.0.dwell_s=1.0"
 LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]

@@ -9,7 +9,7 @@ import pytest
 
 from cloudrc.cluster import jobs
 from cloudrc.cluster.client import ClusterError
-from cloudrc.cluster.jobs import delete_job, find_flight, follow, follow_limit, read_job, run_job
+from cloudrc.cluster.jobs import delete_job, find_flight, follow, follow_limit, run_job
 from cloudrc.errors import TimedOutError
 from tests.cluster.conftest import (
     MISSION,
@@ -125,7 +125,7 @@ def test_follow_ends_when_the_pod_cannot_run(running, release):
 def test_a_deadline_is_named_and_bounded(running, release):
     run_job(release, MISSION, name="first")
     end(running, "first", "Failed", reason="DeadlineExceeded", message="...")
-    assert "activeDeadlineSeconds" in read_job(release, "first")[0].message
+    assert "activeDeadlineSeconds" in follow(release, "first", print, timeout=10.0).message
     assert follow_limit(1e300, queue=True) < 2**31 + 100
 
 

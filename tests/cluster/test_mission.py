@@ -22,7 +22,6 @@ from tests.cluster.conftest import (
     terminated,
 )
 
-Printed = pytest.CaptureFixture[str]
 WAYPOINTS = "waypoints: [{position_m: [0.5, 0.0, 1.0]}]"
 VERDICT = {0: "SUCCESS: all met", 1: "FAILURE: pipe_contact"}
 

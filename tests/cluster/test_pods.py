@@ -3,8 +3,6 @@
 import base64
 import os
 import re
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -14,8 +12,6 @@ from cloudrc.cluster.flight import install, wait_ready
 from cloudrc.cluster.pods import list_pods, operator_token, pod_failure
 from cloudrc.errors import TimedOutError
 from tests.cluster.conftest import TOKEN, deployment, pod
-
-Pretend = Callable[[str, str], Path]
 
 
 def waiting(reason, message=""):

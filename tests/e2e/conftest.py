@@ -106,8 +106,7 @@ def in_release(*words: str, timeout: float = 240.0) -> str:
 
 def set_link(*words: str) -> dict[str, Any]:
     """Run `cloudrc link set` for the release; return its report of the new link."""
-    document: dict[str, Any] = json.loads(in_release("link", "set", *words, "-o", "json"))
-    return document
+    return dict(json.loads(in_release("link", "set", *words, "-o", "json")))
 
 
 def eventually(

@@ -1,8 +1,6 @@
 """CPU limits throttle containers, metrics show this, and a run slower than real time is invalid."""
 
 import json
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import yaml
@@ -15,7 +13,6 @@ RUN_LIMIT = 480.0
 """Time limit of a run [s]; with 0.015 cores, world takes minutes to start."""
 RATIO_MIN = 10.0
 """Smallest ratio of the throttled time with the limit to that without the limit [1]."""
-Constrained = Callable[..., tuple[int, dict[str, Any]]]
 
 
 @pytest.fixture
