@@ -110,7 +110,7 @@ def _insert(page: Path, text: str) -> dict[Path, str]:
 
 
 def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
-    """Write a table in Markdown; `columns` are their heads, with bars between them."""
+    """Write a table in Markdown; `columns` has the heads of the columns, separated by bars."""
     lines = [f"| {columns} |", f"|{'---|' * len(columns.split('|'))}"]
     for row in rows:
         lines.append(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |")

@@ -134,7 +134,7 @@ class FakeTeleop:
         return 200, {}
 
     def forwards(self) -> str:
-        """What kubectl prints when it forwards all ports of a pod to this server."""
+        """Write a fake kubectl that forwards all ports of a pod to this server."""
         ports = (8080, 9100, 9101, 9102)
         lines = (f"echo 'Forwarding from 127.0.0.1:{self.port} -> {port}'" for port in ports)
         return "\n".join([*lines, "exec sleep 60"])

@@ -1,4 +1,4 @@
-"""Pods are explained, waited for and reached; tokens are read and never printed."""
+"""Failures of pods are explained, ports are forwarded, tokens are read and never printed."""
 
 import base64
 import os
