@@ -187,12 +187,13 @@ def test_an_interrupted_flight_cancels_its_mission_and_is_reported(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(flight, "follow", interrupted)
-    # The fixture's recording was made in virtual time, which the verdict says first.
-    assert main([*LINE, "--out", "out"]) == 6
+    merged(tmp_path, [each[: len(each) // 2] for each in flown()], torn=False)
+    assert main([*LINE, "--out", "out"]) == 130
     captured = capsys.readouterr()
     assert "cancelling the mission" in captured.err
     assert "DELETE jobs/" in " ".join(ready.seen)
-    assert json.loads(captured.out)["mode"] == "cluster"
+    report = json.loads(captured.out)
+    assert (report["mode"], report["verdict"]) == ("cluster", "interrupted")
 
 
 def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, capsys):
