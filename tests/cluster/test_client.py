@@ -100,7 +100,7 @@ def away(api, plural, code, times):
             return code, {"message": "etcdserver: leader changed", "code": code}
         return original(method, path, body)
 
-    api.answer = answer  # type: ignore[method-assign]
+    api.answer = answer
     return lambda: left
 
 

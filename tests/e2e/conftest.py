@@ -1,7 +1,5 @@
 """The cluster and the release of the end-to-end tests; helpers that read and command them."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -9,19 +7,17 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc.cli.client import Api
-from cloudrc.cluster.client import Release, connect
+from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
-from cloudrc.cluster.jobs import JobStatus, follow, run_job
+from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import api_url, fetch_metrics, fetch_recording, operator_token
 from cloudrc.errors import CloudrcError
 from tests.drivers.conftest import WORK, slower
@@ -45,9 +41,7 @@ class CommandFailedError(AssertionError):
     """The exit code of a command was not 0."""
 
 
-def command(
-    *words: str | Path, given: str = "", timeout: float = 120.0, environ: Mapping[str, str] = {}
-) -> str:
+def command(*words, given="", timeout=120.0):
     """Run a command and return its output; raise an error if its exit code is not 0."""
     done = subprocess.run(
         [str(word) for word in words],
@@ -56,7 +50,6 @@ def command(
         text=True,
         timeout=timeout,
         cwd=ROOT,
-        env={**os.environ, **environ},
     )
     if done.returncode != 0:
         line = " ".join(map(str, words))
@@ -64,17 +57,17 @@ def command(
     return done.stdout
 
 
-def kubectl(*words: str, given: str = "", timeout: float = 120.0) -> str:
+def kubectl(*words, given="", timeout=120.0):
     """Run kubectl in the namespace of the tests, unless `words` name another; return its output."""
     return command("kubectl", f"--namespace={NAMESPACE}", *words, given=given, timeout=timeout)
 
 
-def read(*words: str) -> Any:
+def read(*words):
     """Return the result of `kubectl get`, parsed."""
     return json.loads(kubectl("get", *words, "--output=json"))
 
 
-def apply(*documents: dict[str, Any]) -> None:
+def apply(*documents):
     """Apply objects, in the namespace of the tests unless they name another."""
     for document in documents:
         if document["kind"] != "Namespace":
@@ -82,11 +75,11 @@ def apply(*documents: dict[str, Any]) -> None:
     command("kubectl", "apply", "--filename=-", given=yaml.safe_dump_all(documents))
 
 
-def helm(*words: str, timeout: float = 180.0) -> str:
+def helm(*words, timeout=180.0):
     return command("helm", f"--namespace={NAMESPACE}", *words, timeout=timeout)
 
 
-def cloudrc(*words: str, timeout: float = 240.0) -> subprocess.CompletedProcess[str]:
+def cloudrc(*words, timeout=240.0):
     """Run cloudrc; any exit code is accepted."""
     return subprocess.run(
         [sys.executable, "-m", "cloudrc", *words],
@@ -97,21 +90,19 @@ def cloudrc(*words: str, timeout: float = 240.0) -> subprocess.CompletedProcess[
     )
 
 
-def in_release(*words: str, timeout: float = 240.0) -> str:
+def in_release(*words, timeout=240.0):
     """Run cloudrc for the release of the tests, and return its output."""
     done = cloudrc(*words, "-n", NAMESPACE, "--release", NAME, timeout=timeout)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def set_link(*words: str) -> dict[str, Any]:
+def set_link(*words):
     """Run `cloudrc link set` for the release; return its report of the new link."""
     return dict(json.loads(in_release("link", "set", *words, "-o", "json")))
 
 
-def eventually(
-    look: Callable[[], Any], what: str, timeout: float = 30.0, every: float = 0.5
-) -> Any:
+def eventually(look, what, timeout=30.0, every=0.5):
     """Call `look` until its result is true, and return that; fail after `timeout` [s]."""
     until = time.monotonic() + timeout
     while True:
@@ -122,22 +113,22 @@ def eventually(
         time.sleep(every)
 
 
-def place() -> Release:
+def place():
     return connect(None, NAMESPACE, NAME)
 
 
-def pods(component: str) -> list[dict[str, Any]]:
+def pods(component):
     selector = f"app.kubernetes.io/instance={NAME},app.kubernetes.io/component={component}"
     return read("pods", f"--selector={selector}")["items"]
 
 
-def pod(component: str) -> dict[str, Any]:
+def pod(component):
     """Return the component's only pod that is not being deleted."""
     (found,) = [p for p in pods(component) if "deletionTimestamp" not in p["metadata"]]
     return found
 
 
-def identity() -> dict[str, tuple[str, list[int]]]:
+def identity():
     """Return UID and restart counts, which change if a pod is replaced or a container restarts."""
     found = {}
     for component in ENDS:
@@ -151,12 +142,12 @@ def identity() -> dict[str, tuple[str, list[int]]]:
 Sample = tuple[str, tuple[tuple[str, str], ...]]
 
 
-def scrapes(component: str) -> dict[str, str]:
+def scrapes(component):
     """Return the page /metrics of each container of a pod."""
     return fetch_metrics(place(), component)
 
 
-def samples(text: str) -> dict[Sample, float]:
+def samples(text):
     """Parse a page of metrics: name and sorted labels -> value."""
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
@@ -165,12 +156,12 @@ def samples(text: str) -> dict[Sample, float]:
     }
 
 
-def metrics(component: str) -> dict[Sample, float]:
+def metrics(component):
     """Return the samples of the container world or cloud."""
     return samples(scrapes(component)[component])
 
 
-def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
+def value(samples, name, **labels):
     """Add up the samples of a name whose labels include the given ones."""
     found = [
         number
@@ -181,33 +172,33 @@ def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
     return sum(found)
 
 
-def missions() -> list[dict[str, Any]]:
+def missions():
     """Return all missions that the API knows, the oldest first."""
     token = operator_token(place())
     with api_url(place()) as url:
         return list(Api(url, lambda: token).get("/v1/missions")["missions"])
 
 
-def job_end(name: str, timeout: float = 150.0) -> tuple[JobStatus, str]:
+def job_end(name, timeout=150.0):
     """Wait for the end of a Job; return its final state and its log."""
     lines: list[str] = []
     return follow(place(), name, lines.append, timeout=timeout), "\n".join(lines)
 
 
-def job_log(name: str) -> str:
+def job_log(name):
     """Return the log of a Job so far; "" while its pod is pending."""
     pods = read("pod", f"--selector=batch.kubernetes.io/job-name={name}")["items"]
     runs = [each for each in pods if each["status"]["phase"] != "Pending"]
     return kubectl("logs", runs[0]["metadata"]["name"]) if runs else ""
 
 
-def fly(name: str, waypoints: Sequence[Mapping[str, Any]], limit: float = 60.0) -> None:
+def fly(name, waypoints, limit=60.0):
     """Start a Job that flies waypoints, as `cloudrc mission run` does."""
     mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints)}
     run_job(place(), mission, name=name, limit=limit)
 
 
-def save(folder: Path) -> None:
+def save(folder):
     """Save objects, events, logs and recordings after a failure."""
     names = f"--namespaces={','.join(NAMESPACES)}"
     command("kubectl", "cluster-info", "dump", names, f"--output-directory={folder}")
@@ -228,11 +219,11 @@ MISSING_PREREQUISITE = 3
 UP = pytest.StashKey[bool]()
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
+def pytest_addoption(parser):
     parser.addoption("--keep", action="store_true", help="leave the kind cluster for a look")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     for item in items:
         if Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.e2e)
@@ -279,7 +270,7 @@ def cluster(request):
                 command("kubectl", "delete", *words)
 
 
-def _create() -> None:
+def _create():
     if CLUSTER in command("kind", "get", "clusters").split():
         command("kind", "export", "kubeconfig", f"--name={CLUSTER}")
         return
@@ -287,7 +278,7 @@ def _create() -> None:
     command("kind", "create", "cluster", f"--name={CLUSTER}", "--config", config, timeout=300)
 
 
-def _load() -> None:
+def _load():
     """Load the images into a kind cluster; any other cluster must be able to pull them."""
     context = command("kubectl", "config", "current-context").strip()
     if context.startswith("kind-"):
@@ -296,7 +287,7 @@ def _load() -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+def pytest_runtest_makereport(item, call):
     report = yield
     if report.failed and item.config.stash.get(UP, False):
         folder = BUILD / re.sub(r"\W+", "-", item.name)
@@ -308,7 +299,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     return report
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+def pytest_terminal_summary(terminalreporter):
     if SUMMARY:
         terminalreporter.section("end to end")
         for line in SUMMARY:
@@ -345,14 +336,14 @@ def prometheus_image(cluster):
     return found.split()[0]
 
 
-def processor_times() -> tuple[float, dict[str, float]]:
+def processor_times():
     """Return the monotonic time [s], and the CPU time of each process of the release [s]."""
     texts = {f"{end}/{name}": text for end in ENDS for name, text in scrapes(end).items()}
     name = "process_cpu_seconds_total"
     return time.monotonic(), {each: value(samples(t), name) for each, t in texts.items()}
 
 
-def memory() -> float:
+def memory():
     """Return the memory of all containers of the release, as the kubelet counts it [bytes]."""
     node = pod("world")["spec"]["nodeName"]
     summary = command("kubectl", "get", "--raw", f"/api/v1/nodes/{node}/proxy/stats/summary")
@@ -362,7 +353,7 @@ def memory() -> float:
 
 
 @cache  # measured once, because later a test may have just replaced the pod
-def pace() -> float:
+def pace():
     """Return how much slower than nominal Python is in the world container [1]; at least 1."""
     words = ("exec", pod("world")["metadata"]["name"], "--container=world", "--")
     return slower(kubectl(*words, "python", "-c", WORK))

@@ -1,10 +1,6 @@
 """Pods beside the release: a foreign pod that tries all ports, and an allowed Prometheus."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Mapping
-from typing import Any
 from urllib.parse import urlencode
 
 from cloudrc.cluster.client import connect
@@ -32,12 +28,12 @@ print(json.dumps(answered))
 """
 
 
-def image() -> str:
+def image():
     """Return the image of the cloud pod, which has Python and is on the node."""
     return str(pod("cloud")["spec"]["containers"][0]["image"])
 
 
-def stranger(name: str, ports: Mapping[str, list[tuple[str, int]]]) -> list[str]:
+def stranger(name, ports):
     """Try ports from a pod without the release's labels; return the TCP ports that answer."""
     cloud = pod("cloud")["spec"]
     container = {
@@ -69,7 +65,7 @@ scrape_configs:
 """
 
 
-def targets() -> str:
+def targets():
     """Find the pods by the usual annotations, as kubernetes_sd_configs does.
 
     Debian builds Prometheus without the discovery of Kubernetes.
@@ -85,7 +81,7 @@ def targets() -> str:
     return json.dumps(found)
 
 
-def install_prometheus(prometheus_image: str) -> None:
+def install_prometheus(prometheus_image):
     """Start a Prometheus in a namespace of its own, and wait until it is ready."""
     metadata = {"name": "prometheus", "namespace": MONITORING}
     config = {"name": "config", "mountPath": "/etc/prometheus"}
@@ -120,7 +116,7 @@ def install_prometheus(prometheus_image: str) -> None:
     kubectl(f"--namespace={MONITORING}", *ready)
 
 
-def promtool(*words: str, given: str = "") -> str:
+def promtool(*words, given=""):
     """Run promtool in the pod of Prometheus, and return its output."""
     where = ("exec", f"--namespace={MONITORING}", "--stdin", "prometheus", "--container=prometheus")
     return kubectl(*where, "--", "promtool", *words, given=given)
@@ -129,15 +125,15 @@ def promtool(*words: str, given: str = "") -> str:
 class Prometheus:
     """Sends queries to the Prometheus of the tests while the block runs."""
 
-    def __enter__(self) -> Prometheus:
+    def __enter__(self):
         self._way = forwarded(connect(None, MONITORING), "prometheus", [9090])
         self._port = self._way.__enter__()[9090]
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error):
         self._way.__exit__(*error)
 
-    def ask(self, query: str) -> list[dict[str, Any]]:
+    def ask(self, query):
         """Return the result of a PromQL query."""
         url = f"http://127.0.0.1:{self._port}/api/v1/query?{urlencode({'query': query})}"
         with NO_PROXY.open(url, timeout=10) as answer:
