@@ -149,7 +149,8 @@ class Teleop:
         self.requests.report(mission_id, 0)
         self.requests.ask(Request.START, plan.start, after=True)
         self._is_pending = True
-        self._select_early()
+        if self.seen:
+            self.see(self.seen, now_ns)  # an earlier teleop may have flown the mission
 
     def continue_mission(self, now_ns: int, mission: Mission) -> None:
         """Take over a mission of an earlier teleop at its current waypoint; do not reset world."""
@@ -256,7 +257,8 @@ class Teleop:
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
             return "taken_over", "somebody else has started another mission"
-        if self._reached_on_board(seen) == MISSION_OVER:
+        repeated = self.state == STARTING and self._from_spawn  # after an earlier teleop
+        if self._reached_on_board(seen) >= (len(self._plan.legs) if repeated else MISSION_OVER):
             text = "the robot reports that the mission is over, but its outcome is lost;"
             return "end_lost", text
         if seen.guard > HOLD:

@@ -1,7 +1,8 @@
 """Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
 
 After a restart of teleop, a mission under way continues at the same waypoint, if world has not
-restarted.
+restarted. If the store says that an emergency stop ended the last mission, but the robot still flies
+that mission, a new teleop sends the stop again.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from cloudrc.teleop.store import (
 from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-LATCHED = LAND, ESTOP
-"""States of the guard that only an acknowledgement ends."""
+LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
+"""States of the guard that only an acknowledgement ends, and states in which rotors may turn."""
 SILENCE = 1.0
 """Age above which telemetry or the last message of cloud counts as too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
@@ -208,6 +209,9 @@ class MissionService:
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Process new telemetry."""
         before, mission = self.seen, self._current
+        if self._inherits_stop and seen.mission_id == self._inherits_stop.number:
+            if seen.guard in AIRBORNE:  # the robot has not heard of the stop
+                self._teleop.stop(now_ns)
         self._heard_ns = self._seen_ns = now_ns
         same_robot = before is not None and before.world == seen.world
         if before is None or not same_robot or before.guard is not seen.guard:
@@ -272,9 +276,15 @@ class MissionService:
         return {**shown, "seen": robot}
 
     @property
+    def _inherits_stop(self) -> Mission | None:
+        """The stopped mission, until the first telemetry shows whether the robot has stopped."""
+        unknown = self.seen is None and not self._teleop.stopping
+        return self.book.stopped() if unknown else None
+
+    @property
     def _blocked(self) -> str:
         """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
-        if self._teleop.stopping:
+        if self._teleop.stopping or self._inherits_stop:
             return "an emergency stop is on its way to the robot"
         seen = self.seen
         if seen is None or seen.guard not in LATCHED:

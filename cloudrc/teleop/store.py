@@ -244,6 +244,12 @@ class MissionStore:
         """Return the missions that have not ended; the first is the one to fly."""
         return [mission for mission in self.missions.values() if not mission.ended]
 
+    def stopped(self) -> Mission | None:
+        """Return the mission that was flown last, if it ended by an emergency stop."""
+        events = {"started", "emergency_stopped"}
+        flown = [each for each in self.missions.values() if each.happened.keys() & events]
+        return flown[-1] if flown and "emergency_stopped" in flown[-1].happened else None
+
     def find(self, mission_id: str) -> Mission:
         """Return a mission; raise UnknownMissionError if none has this id."""
         if mission_id not in self.missions:

@@ -103,6 +103,8 @@ and to the end: create 0.05 A away restart 0.05 B C -> reached=0,1,2 failure= st
 it continues before take-off: create 0.05 A GROUND mark restart see 0.3 -> states=flying asked=START
 with a full disk the robot remembers: create 0.05 A full B 0.1 restart free away C 0.1
   -> states=done reached=0,1,2 failure=
+a flight never stored is not flown again: mute create full link 0.1 A B C 0.2 free restart mark 1
+  -> states=failed failure=end_lost asked=END guard=HOLD reached=
 nor is an end that the robot knows lost: create 0.05 A full B C 0.3 restart free away 0.3
   -> states=done reached=0,1,2 last=done
 nor does it fly before that: create 0.05 A full B C 0.3 mute restart free away 0.1
@@ -150,6 +152,17 @@ a stop on its way forbids to start: create 0.05 queue mute stop 0.2 !queue !goto
 until it is acknowledged: create 0.05 queue stop 0.3 !queue ack 0.5 !ack -> states=failed,flying
 a landing has to be acknowledged, too: create 0.05 LAND 0.05 !create !goto ack 0.3 create 0.1
   -> states=failed,flying
+a stop that was not heard is repeated: create 0.05 A mute stop 0.2 cloud restart !queue link 0.3
+  -> guard=ESTOP failure=emergency_stopped
+also if it is acknowledged before: create 0.05 A mute restart stop 0.2 cloud restart ack link 0.5
+  -> guard=ESTOP last=emergency_stopped
+not after an acknowledgement: create 0.05 A stop 0.2 ack 0.2 mark restart 0.5
+  -> guard=HOLD asked=END
+not after another flight: create 0.05 A stop 0.2 ack 0.2 create 0.2 mark restart 0.5
+  -> states=failed,flying asked=START
+not in another world: create 0.05 A stop 0.2 world mark restart 0.5 -> guard=GROUND asked=
+not of another mission: create 0.05 A stop 0.2 TRACK foreign mark restart 0.5
+  -> guard=TRACK asked=
 a stop before telemetry stops any flight: create 0.05 A TRACK foreign restart stop 0.2
   -> guard=ESTOP failure=emergency_stopped
 a stop after an acknowledgement counts: create 0.05 A stop ack stop 0.3

@@ -246,15 +246,22 @@ def test_missions_are_found_by_id_number_and_key():
     assert (store.find(first.id), store.with_key("key"), store.with_key("")) == (first, first, None)
 
 
-def test_what_is_over_is_known_by_its_number():
+def test_what_is_over_and_what_was_stopped_is_known():
     store = MissionStore(connect(), b"")
     first, second, third = (store.add(Order(PLAN, queue=True)) for _ in range(3))
     store.note(third, "cancelled", "")
+    assert store.stopped() is None
+    store.note(first, "started", "")
     store.note(first, "emergency_stopped", "")
+    for _ in range(SHOWN):
+        store.note(first, "new_session", "")
+    assert store.stopped() is first, "those after it have not begun, and its event is not kept"
     assert [mission.id for mission in store.open()] == ["m2"]
     ended = [store.has_ended(mission.number) for mission in (first, second, third)]
     assert ended == [True, False, True]
     assert not store.has_ended(1)
+    store.note(second, "started", "")
+    assert store.stopped() is None, "the robot has flown since"
 
 
 def finish(flight):
