@@ -1,8 +1,8 @@
 """Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
 
 After a restart of teleop, a mission under way continues at the same waypoint, if world has not
-restarted. If the store says that an emergency stop ended the last mission, but the robot still flies
-that mission, a new teleop sends the stop again.
+restarted. If an emergency stop has ended the last mission, but the robot still flies that mission,
+the new teleop sends the stop again.
 """
 
 from __future__ import annotations

@@ -163,6 +163,8 @@ not after another flight: create 0.05 A stop 0.2 ack 0.2 create 0.2 mark restart
 not in another world: create 0.05 A stop 0.2 world mark restart 0.5 -> guard=GROUND asked=
 not of another mission: create 0.05 A stop 0.2 TRACK foreign mark restart 0.5
   -> guard=TRACK asked=
+unless the new teleop has sent one: create 0.05 A mute stop cloud restart stop ack link 0.5
+  -> guard=GROUND settled=True
 a stop before telemetry stops any flight: create 0.05 A TRACK foreign restart stop 0.2
   -> guard=ESTOP failure=emergency_stopped
 a stop after an acknowledgement counts: create 0.05 A stop ack stop 0.3
