@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import uvicorn
-from fastapi import APIRouter, Depends, FastAPI, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
@@ -245,6 +245,7 @@ def _takes(model: type[Section]) -> dict[str, Any]:
 Body = Annotated[bytes, Depends(_body)]
 Bridged = Annotated[Bridge, Depends(_bridge)]
 After = Annotated[int, Query(ge=0, lt=10**15)]
+LastEvent = Annotated[int, Header(ge=0, lt=10**15)]
 router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUSALS)
 
 
@@ -334,8 +335,14 @@ async def show_state(bridge: Bridged) -> Any:
     response_class=StreamingResponse,
     responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
 )
-async def stream_events(request: Request, bridge: Bridged, after: After = 0) -> StreamingResponse:
-    """Stream the events of all missions after number `after` as server-sent events."""
+async def stream_events(
+    request: Request, bridge: Bridged, after: After = 0, last_event_id: LastEvent = 0
+) -> StreamingResponse:
+    """Stream the events of all missions after number `after` as server-sent events.
+
+    A browser that connects again sends that number as the header Last-Event-ID.
+    """
+    after = max(after, last_event_id)
     await bridge.ask(lambda service, now_ns: None)  # refuse now what cannot be served
     stream, headers = _stream(request, bridge, after), {"Cache-Control": "no-store"}
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)

@@ -88,9 +88,9 @@ class Tokens:
         """
         versions = [version(path) for path in self._paths]
         if versions != self._versions:
-            self._versions, self._known = versions, {}
+            self._known = {}
             with suppress(BadInputError):
-                self._known = self._read()
+                self._known, self._versions = self._read(), versions
         return self._known.get(hashlib.sha256(token.encode()).digest())
 
     def _read(self) -> dict[bytes, Caller]:

@@ -215,7 +215,7 @@ class Teleop:
         if seen.guard is ESTOP:
             self.stopping = False
         new_session = not before or (before.epoch, before.world) != (seen.epoch, seen.world)
-        last, onboard, legs = self._setpoint, self._reached_on_board(seen), self._plan.legs
+        last, onboard, legs = self._setpoint, self._onboard, self._plan.legs
         started = self.requests.see(seen, now_ns) is Request.START and self.state == STARTING
         if self.state == STARTING and not self._expected and self._plan.start is Start.HERE:
             # The order came before the first telemetry.
@@ -258,7 +258,7 @@ class Teleop:
         if self._expected and seen.mission_id not in self._expected:
             return "taken_over", "somebody else has started another mission"
         repeated = self.state == STARTING and self._from_spawn  # after an earlier teleop
-        if self._reached_on_board(seen) >= (len(self._plan.legs) if repeated else MISSION_OVER):
+        if self._onboard >= (len(self._plan.legs) if repeated else MISSION_OVER):
             text = "the robot reports that the mission is over, but its outcome is lost;"
             return "end_lost", text
         if seen.guard > HOLD:
@@ -320,7 +320,7 @@ class Teleop:
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
             self._watch = LegWatch()
-            if self.state == FLYING:
+            if self.state == FLYING and self.leg >= self._onboard:  # not back to earlier waypoints
                 self._select_leg(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
@@ -343,9 +343,11 @@ class Teleop:
         self._select_here()
         self.outcome = self._report(code, waypoint, text, now_ns)
 
-    def _reached_on_board(self, seen: RobotStatus) -> int:
-        """Return how many waypoints of the mission the robot has stored as reached."""
-        return seen.reached if seen.mission_id == self._mission_id != 0 else 0
+    @property
+    def _onboard(self) -> int:
+        """Number of waypoints of the mission that the robot has stored as reached."""
+        seen = self.seen
+        return seen.reached if seen and seen.mission_id == self._mission_id != 0 else 0
 
     @property
     def _from_spawn(self) -> bool:
@@ -365,7 +367,7 @@ class Teleop:
         if not self._is_pending or self.seen is None or self._may_move:
             return
         self._is_pending = False
-        leg = 0 if self._from_spawn else max(self.leg, self._reached_on_board(self.seen))
+        leg = 0 if self._from_spawn else max(self.leg, self._onboard)
         if leg < len(self._plan.legs):
             self._select_leg(leg)
 

@@ -113,6 +113,8 @@ nor is a held place left for it: create 0.05 A hold full resume B 0.3 restart fr
   -> states=held setpoint=away:-1 reached=0,1
 nor a robot taken that flies another mission: create 0.05 A TRACK foreign mark restart 0.3
   -> failure=taken_over asked=
+nor does it fly back to a waypoint that the robot knows: create 0.05 full A B mark restart free 0.1
+  -> states=flying led=-1,2
 it never flies back: create 0.05 A full B 0.1 mute restart free away -> states=flying waypoint=2
 a lost cancel is not flown again: create 0.05 A full cancel 0.3 free mark restart away 1.0
   -> failure=end_lost guard=HOLD asked=END
@@ -208,6 +210,7 @@ def outcome(flight):
         "asked": sorted({said.request.name for said in requests} - {"PROGRESS"}),
         "setpoint": [f"{place(flight.setpoints[-1])}:{flight.setpoints[-1].waypoint}"],
         "waypoint": [str(flight.setpoints[-1].waypoint)],
+        "led": sorted({str(s.waypoint) for s in flight.said[flight.mark :] if type(s) is Setpoint}),
         "onboard": [str(flight.onboard[1])],
         "last": names[-1:],
         "started": [str(sum(mission.happened["started"] for mission in missions))],
