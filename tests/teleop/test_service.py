@@ -356,7 +356,7 @@ def test_the_robot_is_told_of_every_waypoint_reached_until_it_knows():
 
 
 def test_a_restart_with_the_same_options_continues_the_mission():
-    flight, flags = ServiceFlight(), Namespace(start=True, mission=None, api=None)
+    flight, flags = ServiceFlight(), Namespace(start=True, api=None)
     flight.step()
     for _ in range(2):
         assert _start(flags, load_experiment("hover"), flight.teleop)
