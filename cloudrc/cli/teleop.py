@@ -114,7 +114,7 @@ def execute(options: argparse.Namespace) -> int:
 def serve_api(
     options: argparse.Namespace, experiment: ResolvedExperiment, scene: Scene
 ) -> ApiServer:
-    """Start the API, which answers "teleop is starting" until its bridge is opened."""
+    """Start the API; until its bridge is opened, the API answers that teleop is starting."""
     from cloudrc import assembly
     from cloudrc.link.state import publish
     from cloudrc.teleop.api import ApiServer, Bridge, create_app
@@ -150,7 +150,7 @@ def log_line(text: str) -> None:
 
 
 def ending(service: MissionService, asked: Callable[[], bool]) -> Callable[[], bool]:
-    """Return a function that pauses the mission after `asked()` and returns whether to end.
+    """Return a function that returns whether teleop may end; it pauses the mission after `asked()`.
 
     Teleop may end when the robot holds, or after `PAUSE_LIMIT_NS`.
     """

@@ -29,16 +29,16 @@ PATH_MAX = 107
 PERIOD_NS = 20_000_000
 """Period of teleop's state machine [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
-"""Shortest time between two robot states sent to teleop [ns]: every second telemetry message."""
+"""Shortest time between two states for teleop [ns], so that it gets every second telemetry."""
 ALIVE_NS = 200_000_000
-"""Time between two empty datagrams, by which cloud without telemetry shows that it runs [ns]."""
+"""Time between two empty datagrams [ns]; without telemetry they show teleop that cloud runs."""
 STALL_NS = 100_000_000
-"""Delay of the loop above which all datagrams in the socket count as old [ns], because the queue has
-been full since the delay began. Such a delay is a stall."""
+"""Delay of the loop above which all datagrams in the socket count as old [ns], because the socket's
+queue has been full since the delay began. Such a delay is a stall."""
 BLIND_WAKES = 5
 """Number of loop periods that teleop waits for a new datagram after a stall, at most."""
 SILENCE_NS = 1_000_000_000
-"""Time without a datagram from teleop after which teleop counts as away [ns]; it sends at 10 Hz."""
+"""Time without a datagram from teleop after which teleop counts as away [ns]; teleop sends at 10 Hz."""
 EVENTS_KEPT = 256
 """Limit of the events that wait while cloud is away."""
 LAST_WORD_NS = 800_000_000
@@ -89,7 +89,7 @@ class UnixPeer:
         return True
 
     def close(self) -> None:
-        """Close the socket; its path stays, since a successor may already have bound it."""
+        """Close the socket, but keep the socket file, which may already belong to a new process."""
         self._socket.close()
 
 
@@ -123,7 +123,7 @@ class RemoteTeleop:
         """Receive teleop's outputs; report a fault if teleop has telemetry and is silent for 1 s.
 
         After a stall, drop starts and waypoints, because teleop may have withdrawn them in a
-        datagram that the full socket lost. Teleop repeats valid ones, which pass the next time.
+        datagram that the full socket lost. Teleop repeats the valid ones; the next call lets them pass.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS
@@ -156,7 +156,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delay the end of cloud while the robot flies: cloud still forwards teleop's hold request."""
+    """Delay the end of cloud while the robot flies, to forward teleop's last request to hold."""
 
     def __init__(
         self,
@@ -164,7 +164,7 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Keep functions: cloud has to end (`asked`), robot flies (`flies`), time [ns] (`clock`)."""
+        """Wait for `asked()`, then while `flies()`, but not too long by `clock()` [ns]."""
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
 
@@ -220,7 +220,7 @@ def turn(
     late_ns: int,
     now_ns: int,
 ) -> int:
-    """Run one period of teleop's loop: receive states, make the queued calls, handle the deadline.
+    """Run one period of teleop's loop: receive states, make the queued calls, send what is due.
 
     The period begins `late_ns` late, at `now_ns` [ns]. `calls` and `stops` return the queued calls
     and emergency stops. After a stall, teleop only receives datagrams until a new one arrives, for

@@ -87,7 +87,7 @@ class Bridge:
 
     Attributes:
         closed: Why no call is accepted, in words; "" if calls are accepted.
-        alarm: Sends an emergency stop to cloud, past teleop's loop; it does not block.
+        alarm: Function that sends an emergency stop to cloud at once, past teleop's loop.
         overtakings: Number of stops and holds so far.
     """
 
@@ -143,7 +143,7 @@ class Bridge:
             raise UnavailableError(text) from None
 
     async def move(self, call: Call) -> Any:
-        """Queue a call that may move the robot; refuse the call after a newer stop or hold."""
+        """Queue a call that may move the robot; a later stop or hold cancels the call."""
         known = self.overtakings
 
         def checked(service: MissionService, now_ns: int) -> Any:

@@ -175,7 +175,7 @@ class Gate:
     """
 
     def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
-        """Protect an application."""
+        """Create a gate in front of an application."""
         self._app, self.tokens, self.audit = app, tokens, audit
         self._in_flight: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()

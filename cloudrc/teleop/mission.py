@@ -55,7 +55,7 @@ GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
 
 
 class LegWatch:
-    """Measure the flight time of one leg, and detect when the robot has reached its waypoint.
+    """Measure the flight time of one leg, and detect when the robot has reached the waypoint.
 
     Only time in which the robot follows cloud's commands counts.
     """
@@ -74,7 +74,7 @@ class LegWatch:
         return self._flown_ns * 1e-9
 
     def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
-        """Return whether the robot, seen at `now_ns` [ns], has completed the dwell time."""
+        """Return whether the robot, seen at `now_ns` [ns], has stayed for the dwell time."""
         before_ns, self._seen_ns = self._seen_ns, now_ns
         if seen.guard is HOLD:
             self._near_since_ns = NEVER_NS
@@ -100,10 +100,10 @@ class Teleop:
     until the next setpoint or the next session. All times `now_ns` are of the caller's clock [ns].
 
     Attributes:
-        state: State of the mission; "idle" before the first.
+        state: State of the mission; "idle" before the first mission.
         leg: Index of the current waypoint; the number of waypoints once all are reached.
         outcome: Last event of the mission; None before the first mission and during a mission.
-        seen: The newest telemetry; None before the first.
+        seen: The newest telemetry; None before the first telemetry.
         requests: Sender of the requests to the robot.
         stopping: Whether an emergency stop is on its way: telemetry does not show ESTOP yet.
         outputs: Messages since the last `take_outputs`.

@@ -27,7 +27,7 @@ class RequestSender:
 
     A new request replaces the previous request and has a higher number, because the robot acts only
     on rising numbers. The sender is silent before the first telemetry. While no request is pending,
-    it sends the progress of the mission until the robot has stored the progress. Cloud repeats the
+    the sender sends the progress of the mission until the robot has stored the progress. Cloud repeats the
     emergency stop.
     """
 
@@ -50,7 +50,7 @@ class RequestSender:
 
     @property
     def waits(self) -> bool:
-        """Whether the robot ignores commands: it is on the ground or has ended its mission."""
+        """Whether the robot ignores commands, on the ground or after the end of its mission."""
         seen = self._seen
         if seen is None or self._next is not None:
             return False
@@ -115,7 +115,7 @@ class RequestSender:
         return pending._replace(epoch=seen.epoch)
 
     def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
-        """Send the start again if a request of an earlier teleop or another cloud replaced it."""
+        """Send the start again if a request of an earlier teleop or another cloud replaced the start."""
         ours = self._is_started and seen.mission_id == self._progress.mission_id
         if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
             self._flies_ns = now_ns

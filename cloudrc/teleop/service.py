@@ -65,7 +65,8 @@ IN_MISSION = {
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
     """Describe what the robot does next, or what the operator has to do.
 
-    `age` is the age of the telemetry [s], `cloud_age` that of the last message from cloud [s].
+    `age` is the age of the telemetry [s], `cloud_age` the age of the last message from
+    cloud [s].
     `mission` is the state of the mission under way, or None.
     """
     if age > SILENCE:
@@ -107,7 +108,7 @@ class MissionService:
 
     @property
     def seen(self) -> RobotStatus | None:
-        """The newest telemetry; None before the first."""
+        """The newest telemetry; None before the first telemetry."""
         return self._teleop.seen
 
     @property
@@ -121,7 +122,7 @@ class MissionService:
         return self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission, which starts at once or waits; return (mission, whether it is new).
+        """Create a mission, which starts at once or waits; return it, and whether the order was new.
 
         An order with a known key returns the known mission.
         """

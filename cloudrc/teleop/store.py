@@ -71,7 +71,10 @@ class Mission:
     def apply(
         self, number: int, event: str, text: str, *, waypoint: int | None = None, **changed: Any
     ) -> None:
-        """Update the mission with event `number`; `changed` has new values of attributes."""
+        """Update the mission with an event; `changed` has new values of the mission's attributes.
+
+        `number` counts the events of all missions. `waypoint` is an index, by default the current.
+        """
         waypoint = self.waypoint if waypoint is None else waypoint
         for name, value in changed.items():
             setattr(self, name, value)
@@ -258,7 +261,7 @@ class MissionStore:
         return self.missions[mission_id]
 
     def has_ended(self, number: int) -> bool:
-        """Return whether a mission is over; `number` is the number that the robot uses for it."""
+        """Return whether the mission to which the robot gives this number has ended."""
         return any(mission.number == number and mission.ended for mission in self.missions.values())
 
     def with_key(self, key: str) -> Mission | None:
@@ -269,7 +272,7 @@ class MissionStore:
         """Store a new mission; delete the oldest ended missions if there are more than `KEPT`.
 
         Raises:
-            UnavailableError: If the mission cannot be stored; then it does not exist.
+            UnavailableError: If the disk refuses; then there is no new mission.
         """
         mission_id = f"m{int(next(reversed(self.missions), 'm0')[1:]) + 1}"
         digest = hashlib.sha256(self._salt + mission_id.encode()).digest()
