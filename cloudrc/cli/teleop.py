@@ -16,12 +16,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
-from cloudrc.cli.processes import (
-    open_exporter,
-    process_arguments,
-    read_address,
-    warn_if_exposed,
-)
+from cloudrc.cli.processes import open_exporter, process_arguments, read_address, warn_if_exposed
 from cloudrc.drivers.realtime import Address
 
 if TYPE_CHECKING:

@@ -38,7 +38,7 @@ queue has been full since the delay began. Such a delay is a stall."""
 BLIND_WAKES = 5
 """Number of loop periods that teleop waits for a new datagram after a stall, at most."""
 SILENCE_NS = 1_000_000_000
-"""Time without a datagram from teleop after which teleop counts as away [ns]; teleop sends at 10 Hz."""
+"""Teleop, which sends at 10 Hz, counts as away after this time without a datagram [ns]."""
 EVENTS_KEPT = 256
 """Limit of the events that wait while cloud is away."""
 LAST_WORD_NS = 800_000_000
@@ -123,7 +123,8 @@ class RemoteTeleop:
         """Receive teleop's outputs; report a fault if teleop has telemetry and is silent for 1 s.
 
         After a stall, drop starts and waypoints, because teleop may have withdrawn them in a
-        datagram that the full socket lost. Teleop repeats the valid ones; the next call lets them pass.
+        datagram that the full socket lost. Teleop repeats the valid ones; the next call forwards
+        them.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS

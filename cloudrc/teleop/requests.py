@@ -27,8 +27,8 @@ class RequestSender:
 
     A new request replaces the previous request and has a higher number, because the robot acts only
     on rising numbers. The sender is silent before the first telemetry. While no request is pending,
-    the sender sends the progress of the mission until the robot has stored the progress. Cloud repeats the
-    emergency stop.
+    the sender repeats the progress of the mission until the robot has stored the progress. Cloud
+    repeats the emergency stop.
     """
 
     def __init__(self) -> None:
@@ -115,7 +115,7 @@ class RequestSender:
         return pending._replace(epoch=seen.epoch)
 
     def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
-        """Send the start again if a request of an earlier teleop or another cloud replaced the start."""
+        """Send the start again if a request of another teleop or cloud has replaced the start."""
         ours = self._is_started and seen.mission_id == self._progress.mission_id
         if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
             self._flies_ns = now_ns

@@ -19,13 +19,7 @@ from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.store import (
-    ConflictError,
-    Mission,
-    MissionStore,
-    Order,
-    UnavailableError,
-)
+from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -122,7 +116,7 @@ class MissionService:
         return self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission, which starts at once or waits; return it, and whether the order was new.
+        """Create a mission, which starts at once or waits; return it and whether it is new.
 
         An order with a known key returns the known mission.
         """
