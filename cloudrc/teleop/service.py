@@ -209,15 +209,14 @@ class MissionService:
             if seen.guard in AIRBORNE:  # the robot has not heard of the stop
                 self._teleop.stop(now_ns)
         self._heard_ns = self._seen_ns = now_ns
-        same_robot = before is not None and before.world == seen.world
-        if before is None or not same_robot or before.guard is not seen.guard:
+        if before is None or (before.world, before.guard) != (seen.world, seen.guard):
             self._guard_ns = now_ns
         if mission is not None and mission.world and mission.world == seen.world:
             known = mission.witness
             mission.witness = known.see(*_contacts(seen))
             for event, text in mission.witness.news(known, self._teleop.elapsed(now_ns)):
                 self._note(mission, event, text, now_ns)
-            if before is not None and same_robot and before.epoch != seen.epoch:
+            if before is not None and before.epoch != seen.epoch:
                 text = "the controller has a new session, as after a restart; the mission is"
                 text = f"{text} {mission.state} {self._teleop.where}"
                 self._note(mission, "new_session", text, now_ns)

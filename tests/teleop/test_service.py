@@ -125,7 +125,8 @@ an unstarted mission starts in a new world: 0.01 mute create 0.2 world restart l
   -> states=flying reached=
 the next one begins anew: create 0.05 A queue restart 0.05 B C 0.3
   -> states=done,flying started=2
-held stays held: create 0.05 A hold restart due restart away -> states=held setpoint=away:-1
+held stays held: create 0.05 A hold mark restart due restart away
+  -> states=held setpoint=away:-1 led=-1
 and is resumed: create 0.05 A hold restart away 0.05 resume 0.01 -> states=flying waypoint=1
 time goes on: create 0.05 A away 10 B deaf restart 50 -> failure=timed_out
 what waits waits until the robot is seen: create 0.05 A queue LAND away 0.2 restart due 0.2

@@ -54,6 +54,7 @@ def test_missions_are_read_back_exactly(path):
     mission = begun(path)
     store = open_store(path, b"other")
     assert store.missions == {"m1": mission}
+    assert store.missions["m1"].events.maxlen == SHOWN
     assert [event["event"] for event in store.events_after(0)] == ["starting", "reached"]
     assert store.add(ORDER).number != mission.number
     assert (path.stat().st_mode & 0o777, store.notice) == (0o600, "")
