@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from cloudrc.teleop.service import MissionService
     from cloudrc.teleop.store import MissionStore
 
-LOOPBACK = "127.0.0.1"
 FILES_MAX = 8_192
 """Limit of open files; with idle connections there is still room for an emergency stop."""
 LOCK_PERIOD = 0.2
@@ -73,7 +72,7 @@ def api_address(text: str) -> Address | Path:
     if text.startswith("unix:") and len(text) > len("unix:"):
         return Path(text.removeprefix("unix:"))
     host, colon, port = text.rpartition(":")
-    host = host if colon else LOOPBACK
+    host = host if colon else "127.0.0.1"
     return (host.strip("[]"), 0) if host and port == "0" else read_address(f"{host}:{port}")
 
 

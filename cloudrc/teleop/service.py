@@ -244,7 +244,7 @@ class MissionService:
         """Return the state of missions and robot for the API."""
         mission, seen, heard_ns = self._current, self.seen, self._heard_ns
         cloud_age = None if heard_ns is None else (now_ns - heard_ns) * 1e-9
-        shown = {
+        shown: dict[str, Any] = {
             "mission": mission.summary() if mission is not None else None,
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
             "cloud_age_s": cloud_age,
@@ -253,7 +253,7 @@ class MissionService:
         if seen is None or cloud_age is None:
             return shown
         age, state = (now_ns - self._seen_ns) * 1e-9, mission.state if mission else None
-        robot = {
+        shown["seen"] = {
             "age_s": age,
             "epoch": seen.epoch,
             "world": seen.world,
@@ -268,7 +268,7 @@ class MissionService:
             "rtt_s": finite_or_none(seen.rtt),
             "loop_delay_s": finite_or_none(seen.loop_delay),
         }
-        return {**shown, "seen": robot}
+        return shown
 
     @property
     def _inherits_stop(self) -> Mission | None:

@@ -265,16 +265,11 @@ def test_what_is_over_and_what_was_stopped_is_known():
     assert store.stopped() is None, "the robot has flown since"
 
 
-def finish(flight):
-    for point in (B, C):
-        flight.step(position=point, seconds=0.1)
-
-
 def test_a_full_disk_stops_no_flight_and_is_told_once():
     flight, mission_id = service_flying()
     before = flight.kept
     flight.full = True
-    finish(flight)
+    play(flight, "B C")
     assert (flight.view(mission_id)["state"], flight.kept) == ("done", before)
     tried = flight.commits
     flight.step(seconds=3.0)
@@ -293,7 +288,7 @@ def test_a_full_disk_stops_no_flight_and_is_told_once():
 def test_what_was_refused_is_stored_with_the_next_mission():
     flight, mission_id = service_flying()
     flight.full = True
-    finish(flight)
+    play(flight, "B C")
     flight.full = False
     second = flight.create()
     flight.restart_teleop()
