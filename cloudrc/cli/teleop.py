@@ -144,9 +144,9 @@ def log_line(text: str) -> None:
 
 
 def ending(service: MissionService, asked: Callable[[], bool]) -> Callable[[], bool]:
-    """Return a function that returns whether teleop may end; it pauses the mission after `asked()`.
+    """Return a function for teleop's loop, which pauses the mission after `asked()`.
 
-    Teleop may end when the robot holds, or after `PAUSE_LIMIT_NS`.
+    The function returns whether teleop may end: if the robot holds, or after `PAUSE_LIMIT_NS`.
     """
     until_ns: list[int] = []
 

@@ -257,7 +257,7 @@ router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUS
     openapi_extra=_takes(models.MissionRequest),
 )
 async def fly_mission(body: Body, bridge: Bridged, request: Request, response: Response) -> Any:
-    """Fly a mission, or queue it."""
+    """Fly a mission now, or after the missions in the queue."""
     order = await run_in_threadpool(request.app.state.read_order, body)
 
     def call(service: MissionService, now_ns: int) -> tuple[dict[str, Any], bool]:
@@ -287,7 +287,7 @@ async def show_mission(id: str, bridge: Bridged) -> Any:
 
 @router.post("/missions/{id}/cancel", response_model=models.MissionView)
 async def cancel_mission(id: str, bridge: Bridged) -> Any:
-    """End a mission."""
+    """Cancel a mission that flies or waits."""
     return await bridge.ask(lambda service, now_ns: service.cancel(id, now_ns))
 
 

@@ -47,7 +47,7 @@ NO_WAYPOINT = -1
 UNDER_WAY = FLYING, STARTING, HELD
 """States of a mission that has begun and not ended."""
 GAP_MAX_NS = 500_000_000
-"""Longest time between two telemetry messages that counts as time of flight [ns]."""
+"""Of a longer gap between two telemetry messages, only this much is time of flight [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
 """Time without telemetry after which the dwell time starts again [ns]."""
 # Looking up an enum's member is slow, and these are used in every period.

@@ -97,7 +97,7 @@ class Reached(_Answer):
 
 
 class Failure(_Answer):
-    """A rule that was broken."""
+    """A rule that the mission has broken."""
 
     code: str = _field("One word, for programs")
     text: str = _field("Reason in words")
@@ -108,7 +108,7 @@ class Verdict(_Answer):
 
     outcome: Literal["success", "failure", "invalid", "interrupted"] = _field("As in report.json")
     exit_code: int = _field("Exit code of a Job that flies the mission: 0, 1, 6 or 130")
-    failures: list[Failure] = _field("Every rule that was broken")
+    failures: list[Failure] = _field("Every rule that the mission has broken")
 
 
 class Event(_Answer):
@@ -134,7 +134,7 @@ class MissionSummary(_Answer):
     state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"]
     waypoint: int = _field("Index of the waypoint to which the robot flies, from 0")
     waypoints: int = _field("Number of waypoints")
-    reached: list[Reached] = _field("The waypoints that were reached")
+    reached: list[Reached] = _field("The reached waypoints")
     verdict: Verdict | None = _field("Null until the mission has ended")
 
 

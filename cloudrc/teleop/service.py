@@ -116,7 +116,7 @@ class MissionService:
         return self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission, which starts at once or waits; return it and whether it is new.
+        """Create a mission, which starts at once or waits; return the mission, and if it is new.
 
         An order with a known key returns the known mission.
         """

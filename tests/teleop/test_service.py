@@ -198,7 +198,7 @@ def place(setpoint):
 
 
 def outcome(flight):
-    """Describe in words where a flight has come to."""
+    """Describe the state of a flight in words."""
     missions = list(flight.teleop.book.missions.values())
     requests = [said for said in flight.said[flight.mark :] if hasattr(said, "request")]
     names = flight.names("m1") if missions else []
