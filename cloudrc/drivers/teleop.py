@@ -165,7 +165,7 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Ask `asked()` if cloud has to end, and `flies()` if the robot flies; `clock()` is in ns."""
+        """Call `asked` (has cloud to end?), `flies` (does the robot fly?) and `clock` [ns]."""
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
 
