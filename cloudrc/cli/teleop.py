@@ -16,12 +16,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
-from cloudrc.cli.processes import (
-    open_exporter,
-    process_arguments,
-    read_address,
-    warn_if_exposed,
-)
+from cloudrc.cli.processes import open_exporter, process_arguments, read_address, warn_if_exposed
 from cloudrc.drivers.realtime import Address
 
 if TYPE_CHECKING:
@@ -33,18 +28,17 @@ if TYPE_CHECKING:
     from cloudrc.teleop.service import MissionService
     from cloudrc.teleop.store import MissionStore
 
-LOOPBACK = "127.0.0.1"
 FILES_MAX = 8_192
-"""Limit of open files, so high that idle connections leave room for an emergency stop."""
+"""Limit of open files; with idle connections there is still room for an emergency stop."""
 LOCK_PERIOD = 0.2
 """Pause between two attempts to open a journal that another teleop process has locked [s]."""
 PAUSE_LIMIT_NS = 500_000_000
 """Longest time that teleop, before it ends, waits for the robot to hold [ns]."""
 EPILOG = """\
-teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
---start it ends after that mission; otherwise on SIGTERM, on Ctrl-C
-and when its parent process has ended. A flying robot then holds; a new teleop
-with the same --journal resumes the mission.
+teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. It ends
+on SIGTERM, on Ctrl-C and when its parent process has ended; with --start also
+after the mission. A flying robot then holds; a new teleop with the same
+--journal resumes the mission.
 
 /openapi.json describes the API. The API asks for a token, except on a socket
 file, which only its owner can open. To make a token that only you can read:
@@ -78,7 +72,7 @@ def api_address(text: str) -> Address | Path:
     if text.startswith("unix:") and len(text) > len("unix:"):
         return Path(text.removeprefix("unix:"))
     host, colon, port = text.rpartition(":")
-    host = host if colon else LOOPBACK
+    host = host if colon else "127.0.0.1"
     return (host.strip("[]"), 0) if host and port == "0" else read_address(f"{host}:{port}")
 
 
@@ -114,7 +108,7 @@ def execute(options: argparse.Namespace) -> int:
 def serve_api(
     options: argparse.Namespace, experiment: ResolvedExperiment, scene: Scene
 ) -> ApiServer:
-    """Start the API; until its bridge is opened, the API answers that teleop is not ready."""
+    """Start the API; until its bridge is opened, the API answers that teleop is starting."""
     from cloudrc import assembly
     from cloudrc.link.state import publish
     from cloudrc.teleop.api import ApiServer, Bridge, create_app
@@ -150,9 +144,9 @@ def log_line(text: str) -> None:
 
 
 def ending(service: MissionService, asked: Callable[[], bool]) -> Callable[[], bool]:
-    """Return a function that pauses the mission once `asked()`, and says when teleop may end.
+    """Return a function for teleop's loop, which pauses the mission after `asked()`.
 
-    It may end when the robot holds, or after `PAUSE_LIMIT_NS`.
+    The function returns whether teleop may end: if the robot holds, or after `PAUSE_LIMIT_NS`.
     """
     until_ns: list[int] = []
 
@@ -214,7 +208,7 @@ def _fly(
 def _open_store(
     path: Path | None, stop: Callable[[], bool], server: ApiServer | None
 ) -> MissionStore | None:
-    """Open the store once no other teleop has locked it; return None if stopped before."""
+    """Wait until no other teleop locks the store, and open it; return None after `stop()`."""
     from cloudrc.teleop.store import MissionStore, StoreLockedError, connect, open_store
 
     salt, reported = os.urandom(16), False
