@@ -47,11 +47,10 @@ INVARIANTS = {
     "alarm": "false alarms",
     "error": "errors in an end",
 }
-SOMETIMES = {"collision", "obeyed", "waypoint", "stuck", "alarm"}
-"""Invariants that are not checked in every flight."""
+"""Each invariant, and what a breach of it is called in a table."""
 BACK = 10.0  # time of calm in which the robot must have flown [s]
 FORGETFUL = ("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down")
-"""Faults after which there is another robot, or a teleop that need not know of a stop."""
+"""Faults after which another robot flies, or a new teleop that may not know of an earlier stop."""
 PATIENCE_NS = 1_000_000_000  # shortest time between two actions of the operator [ns]
 CAPTURED = 2_000  # number of datagrams that an intruder keeps
 NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)
@@ -105,22 +104,18 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
 
 
 def checked_in(schedule: Schedule) -> frozenset[str]:
-    """Return the invariants that a schedule is checked for.
-
-    With a dishonest cloud a contact is no breach, and nothing has to go on. A robot needs `BACK` of
-    calm to recover. A HOLD, LAND or ESTOP is a false alarm if there are no faults. A stop must be
-    obeyed by the robot that it was meant for, if teleop runs on.
-    """
-    kinds = INVARIANTS.keys() - SOMETIMES
-    if not schedule.policy:
-        kinds |= {"collision", "waypoint"}
-        if schedule.duration - schedule.quiet_from >= BACK:
-            kinds.add("stuck")
-            if schedule.of("stopped") and not schedule.of(*FORGETFUL):
-                kinds.add("obeyed")
-        if not schedule.events:
-            kinds.add("alarm")
-    return frozenset(kinds)
+    """Return the invariants that a flight of this schedule has to keep."""
+    honest = not schedule.policy  # a dishonest cloud may touch things and end the mission
+    recovers = honest and schedule.duration - schedule.quiet_from >= BACK
+    is_stopped = bool(schedule.of("stopped")) and not schedule.of(*FORGETFUL)
+    sometimes = {
+        "collision": honest,
+        "waypoint": honest,
+        "stuck": recovers,
+        "obeyed": recovers and is_stopped,
+        "alarm": honest and not schedule.events,  # a HOLD, LAND or ESTOP without a fault
+    }
+    return frozenset(name for name in INVARIANTS if sometimes.get(name, True))
 
 
 def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Flight:
