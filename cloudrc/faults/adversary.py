@@ -1,4 +1,4 @@
-"""Dishonest clouds: they have valid keys and send whatever they like.
+"""Model dishonest clouds, which have valid keys and send any command.
 
 A policy sees what an honest cloud sees (the newest odometry and its own estimate of the delay) and
 sends any command, properly sealed. Some policies also lie about the odometry that a command was
@@ -126,7 +126,7 @@ CHOICES = {
     GuardState.ESTOP: LATCHED,
 }
 """Probability of each request, by the state of the guard that cloud knows of [1]."""
-PATIENCE_NS = 5_000_000_000  # longest wait for the robot to come near a face of the fence [ns]
+FACE_WAIT_NS = 5_000_000_000  # longest wait for the robot to come near a face of the fence [ns]
 REACHED = (0, 1, 7, MISSION_OVER)
 
 
@@ -138,7 +138,7 @@ def at_bad_moments(rng: Generator) -> Words:
     def words(now_ns: int, seen: RobotStatus) -> OperatorRequest | None:
         nonlocal due_ns, waits
         far = seen.guard is GuardState.TRACK and min(_faces(seen.position))[0] > near
-        if now_ns < (due_ns + PATIENCE_NS if far and waits else due_ns):
+        if now_ns < (due_ns + FACE_WAIT_NS if far and waits else due_ns):
             return None
         due_ns = now_ns + int(rng.exponential(pause) * 1e9)
         waits = bool(rng.random() < 0.5)
@@ -157,7 +157,7 @@ def _faces(position: Vector) -> list[tuple[float, int, float]]:
 
 
 def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
-    """Make the lies and requests of a schedule's policy.
+    """Make the functions by which a schedule's policy changes commands and makes requests.
 
     Raises:
         BadInputError: If there is no such policy; names all policies.
@@ -171,7 +171,7 @@ def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
 
 
 def choose(seed: int) -> Schedule:
-    """Choose the hostile cloud of a seed, alone or amid faults of every kind."""
+    """Make the schedule of a seed: a hostile cloud, with or without random faults."""
     rng, names = generator(seed, 665), sorted(POLICIES)
     profile = ("ideal", *PAPER)[int(rng.integers(4))]
     calm = Schedule(seed, profile, duration=DURATION)

@@ -1,7 +1,4 @@
-"""Schedules: the faults of one flight with their times, as a YAML file holds them.
-
-`compose` makes the random schedule of a seed.
-"""
+"""Describe the faults of one flight with their times, read and write them as YAML, or draw them."""
 
 from __future__ import annotations
 
@@ -71,9 +68,9 @@ WAYS: tuple[Way, ...] = ("both", "up", "down")
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One of `KINDS`, from `at` on for `duration` [s], on one way of the link or both.
+    """One fault, from `at` [s] on for `duration` [s]; a fault of the link hits one `way` or both.
 
-    `value` is its severity, as `KINDS` says [any unit].
+    `KINDS` says what `value` means, in which unit.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -92,7 +89,7 @@ class Event:
 
     @property
     def end(self) -> float:
-        """End [s]."""
+        """When the fault ends [s, virtual time]."""
         return self.at + self.duration
 
 
@@ -100,8 +97,8 @@ class Event:
 class Schedule:
     """All faults of one flight.
 
-    The seed is that of the link, and of everything random in the faults. With `separate`, teleop is
-    a process of its own, as in production.
+    Link and random faults use the seed. With `separate`, teleop is a process of its own, as in
+    production.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -120,7 +117,7 @@ class Schedule:
 
     @property
     def teleop_is_separate(self) -> bool:
-        """Whether teleop is a process of its own, because `separate` or a fault says so."""
+        """Whether teleop is a process of its own; a fault that freezes teleop needs that."""
         return self.separate or bool(self.of("teleop_paused"))
 
     @property

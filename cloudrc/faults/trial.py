@@ -1,8 +1,8 @@
 """Flies one schedule in virtual time, and returns the invariants that broke.
 
-An operator flies one mission after the other, and acknowledges what is latched. In the calm at the
-end the robot must fly again; otherwise it is stuck. The faults of the link are in its conditions:
-see `cloudrc.faults.schedule.shaped`.
+An operator flies one mission after the other, and acknowledges each landing and emergency stop. In
+the calm at the end the robot must fly again; otherwise the robot is stuck. The link's faults change
+the conditions of the link: see `cloudrc.faults.schedule.shaped`.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ IMPOSSIBLE = (nan, inf, -inf)
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of a schedule."""
+    """Result of the flight of a schedule."""
 
     schedule: Schedule
-    breaches: tuple[Breach, ...]  # that were first; none if all invariants held
+    breaches: tuple[Breach, ...]  # the first ones of each kind
     sha256: str = ""  # of all records, if they were kept
     margin: float = 9.0  # smallest distance of the base to the fence's walls and ceiling [m]
     speed: float = 0.0  # largest reference [m/s]
@@ -146,7 +146,7 @@ def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Fligh
 
 
 class Operator:
-    """Keeps ordering missions, and acknowledges what is latched."""
+    """Orders one mission after the other, and acknowledges each landing and emergency stop."""
 
     def __init__(self, flight: Flight, schedule: Schedule) -> None:
         self._flight = flight
@@ -259,7 +259,7 @@ def inject(flight: Flight, schedule: Schedule) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return what happens when [s] in a fault of each kind; `process` is the one that it hits."""
+    """Return the actions of each kind of fault with their times [s]; `process` is the one hit."""
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # for teleop that was asked to end
 

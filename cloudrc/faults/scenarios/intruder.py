@@ -26,11 +26,11 @@ GREETED = ("hello", "unanswered", "accept_ignored")
 """Counts of captured greetings; a challenge is the only answer."""
 FLOOD = 100  # datagrams of garbage per honest one: 10,000 in a second
 SETTLED = 2.0
-"""Time at which a new flight has its session [s]; an answered greeting could open it earlier."""
+"""Time at which a new flight has its session [s], so that an old greeting opens none."""
 
 
 class HostileSender:
-    """Hands over hostile datagrams; counts them, and those `taken`: they had an effect."""
+    """Sends hostile datagrams; counts them as `sent`, and as `taken` if they had an effect."""
 
     def __init__(self) -> None:
         self.sent = self.taken = 0
