@@ -12,7 +12,6 @@ from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import (
-    NEVER_NS,
     UPRIGHT,
     ZERO,
     Cause,
@@ -21,11 +20,10 @@ from cloudrc.messages import (
     OperatorRequest,
     Request,
     Start,
-    Telemetry,
 )
 from cloudrc.record.columns import Recording
 from cloudrc.record.hash import RecordHash
-from cloudrc.records import Counted, Fault, Record
+from cloudrc.records import Counted, Record
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
 from cloudrc.tunnel import codec
@@ -35,6 +33,7 @@ from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import Session
 from cloudrc.world.endpoint import WorldEndpoint
+from tests.cloud.conftest import loop
 
 MS = 1_000_000
 CLOCK = bytes(16)
@@ -67,21 +66,6 @@ def bare_world(
     )
 
 
-class NoLoop:
-    """Stand-in for cloud's loop that only notes the newest telemetry."""
-
-    def __init__(self) -> None:
-        self.faults: list[Fault] = []
-        self.counts: dict[str, int] = {}
-        self.reset()
-
-    def reset(self) -> None:
-        self.ready, self.basis_stamp_ns = False, NEVER_NS
-
-    def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        self.ready, self.basis_stamp_ns = True, telemetry.stamp_ns
-
-
 def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
     """Make cloud's end; it sends the messages in its `teleop.outputs`."""
     teleop = SimpleNamespace(
@@ -90,8 +74,7 @@ def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
     )  # fmt: skip
     teleop.take_outputs = lambda: [teleop.outputs.pop(0) for _ in teleop.outputs[:]]
     identity = Identity(CLOCK, nonce.ljust(16), keys)
-    loop: Any = NoLoop()
-    return CloudEndpoint(loop, teleop, identity, newest_wins=True, start_ns=start_ns)
+    return CloudEndpoint(loop(), teleop, identity, newest_wins=True, start_ns=start_ns)
 
 
 def ring() -> KeyRing:
@@ -229,13 +212,12 @@ class Ends(NamedTuple):
     run: VirtualRun
 
 
-def join(experiment: ResolvedExperiment, *, offset_ns: int = 0) -> Ends:
+def join(experiment: ResolvedExperiment, *, offset_ns: int = 0, keys: KeyRing | None = None):
     """Assemble an experiment; with an offset the two ends have different clocks."""
     world_clock = b"another clock..." if offset_ns else SHARED_CLOCK
-    world = assembly.build_world(experiment, Identity(world_clock, b"world".ljust(16)))
-    cloud = assembly.build_cloud(
-        experiment, Identity(SHARED_CLOCK, b"cloud".ljust(16)), lambda: offset_ns
-    )
+    world = assembly.build_world(experiment, Identity(world_clock, b"world".ljust(16), keys))
+    identity = Identity(SHARED_CLOCK, b"cloud".ljust(16), keys)
+    cloud = assembly.build_cloud(experiment, identity, lambda: offset_ns)
     links = assembly.build_links(experiment)
     return Ends(world, cloud, VirtualRun(world, cloud, *links, cloud_clock_offset_ns=offset_ns))
 
@@ -254,7 +236,7 @@ def fly_on(
     return of_world, of_cloud
 
 
-def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record], list[Record]]:
+def records(experiment: ResolvedExperiment, **options: Any) -> tuple[list[Record], list[Record]]:
     """Fly and return the records of world and of cloud."""
     _, cloud, run = join(experiment, **options)
     return fly_on(run, LIMIT_NS, lambda: cloud.mission_over)
@@ -273,9 +255,9 @@ def numbers(assessment: Assessment) -> dict[str, float]:
     return {name: number.value for name, number in assessment.numbers.items()}
 
 
-def digest(experiment: ResolvedExperiment) -> str:
+def digest(experiment: ResolvedExperiment, **options: Any) -> str:
     """Compute the SHA-256 of all records of a flight."""
     digest = RecordHash()
-    for each in records(experiment):
+    for each in records(experiment, **options):
         digest.update(each)
     return digest.hexdigest()

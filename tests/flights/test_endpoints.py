@@ -18,9 +18,8 @@ from cloudrc.records import (
 )
 from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel import codec
-from tests.flights.conftest import MS, Bare, fly_on, join, ring, talking
+from tests.flights.conftest import HOVER, MS, Bare, fly_on, join, ring, talking
 
-EXPERIMENT = load_experiment("hover", ["link.profile=ideal"])
 SHORT = load_experiment("hover", ["link.profile=ideal", "mission.waypoints.0.dwell_s=0.5"])
 
 
@@ -85,7 +84,7 @@ def test_no_bytes_make_an_end_raise(data):
         end.receive_datagram(data, 0)
 
 
-GARBAGE_TAKERS = join(EXPERIMENT)[:2]
+GARBAGE_TAKERS = join(HOVER)[:2]
 
 
 def test_after_a_stall_waiting_commands_are_stale(talk):
