@@ -16,7 +16,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class Operator(Protocol):
-    """Teleop as cloud sees it: teleop itself, or the socket to its process."""
+    """Teleop as cloud sees it: teleop itself, or the socket to teleop's process."""
 
     @property
     def outputs(self) -> Sequence[Output | Fault]:

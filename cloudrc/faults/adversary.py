@@ -38,15 +38,15 @@ from cloudrc.world.robot import STEP_NS
 
 Generator: TypeAlias = np.random.Generator
 Lie: TypeAlias = Callable[[Command, Control], Command]
-"""Returns what is sent in place of a command; the record has what cloud knew."""
+"""Returns the command that is sent in place of the honest one; the record holds what cloud knew."""
 Policy: TypeAlias = Callable[[Generator], Lie]
 Words: TypeAlias = Callable[[int, RobotStatus], OperatorRequest | None]
-"""Returns a request in the operator's name, if any, at a time of cloud's clock [ns]; the robot is
-as it was last seen. The request's number is not used."""
+"""Returns a request in the operator's name, or None, at a time of cloud's clock [ns]. The status is
+the newest that cloud knows. The request's number is not used."""
 
 
 class DishonestLoop(ControlLoop):
-    """Computes the honest command and sends another one."""
+    """Computes the honest command, and changes it before it is sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any) -> None:
         """Change each command by these lies, one after the other; `plugins` as `ControlLoop`."""
@@ -314,12 +314,12 @@ def _stop_and_go(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Fly by another policy; the requests come from `at_bad_moments`."""
+    """Fly by one of `FASTEST`; `at_bad_moments` makes requests at the same time."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
-    """Fly fast, and sometimes make the guard land; the requests undo that in the air."""
+    """Fly fast, and sometimes make the guard land; requests acknowledge the landing in the air."""
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 
     def lie(command: Command, control: Control) -> Command:

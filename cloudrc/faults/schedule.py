@@ -53,7 +53,7 @@ KINDS = {
     "stopped": Kind("the operator stops the rotors, and acknowledges later"),
     "held": Kind("the operator holds the mission, resumes it after the duration", 5.0),
 }
-"""Every kind of fault."""
+"""Each kind of fault by its name in a schedule's file."""
 SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "teleop_shut_down",
           "pod_shut_down")  # fmt: skip
 """Kinds whose value is a share, in [0, 1]."""
@@ -122,7 +122,7 @@ class Schedule:
 
     @property
     def quiet_from(self) -> float:
-        """End of the last fault [s]."""
+        """When the last fault ends [s, virtual time]; 0 if there is none."""
         return max((event.end for event in self.events), default=0.0)
 
     def of(self, *kinds: str) -> list[Event]:

@@ -243,7 +243,7 @@ def _check_alarms(flight: Flight) -> None:
 
 
 def inject(flight: Flight, schedule: Schedule) -> None:
-    """Schedule all faults on a flight."""
+    """Schedule in a flight all faults but those of the link's conditions."""
     for event in schedule.events:
         process = flight.world if event.kind.startswith("world") else flight.cloud
         if event.kind.endswith("throttled"):

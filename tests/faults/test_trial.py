@@ -13,7 +13,7 @@ from cloudrc.faults import invariants
 from cloudrc.faults.adversary import POLICIES, choose, dishonesty
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
-from cloudrc.faults.trial import OrderInvariant, checked_in, fly
+from cloudrc.faults.trial import FORGETFUL, OrderInvariant, checked_in, fly
 from cloudrc.messages import ZERO, GuardState, Request, Start
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
@@ -72,6 +72,15 @@ def test_it_causes_none_with_a_stiffer_low_level_controller(seed):
         ((Event("blackout", 44.0, 8.0),), "", 61.0, {"collision", "waypoint"}),
         ((Event("stopped", 5.0),), "", 60.0, {"collision", "waypoint", "stuck", "obeyed"}),
         ((Event("stopped", 5.0),), "greedy", 60.0, set()),
+        *(
+            (
+                (Event("stopped", 5.0), Event(kind, 9.0)),
+                "",
+                60.0,
+                {"collision", "waypoint", "stuck"},
+            )
+            for kind in FORGETFUL
+        ),
     ],
 )
 def test_a_schedule_is_checked_for_what_it_allows(events, policy, duration, kinds):

@@ -18,7 +18,7 @@ class RunningMean(Estimator):
     """
 
     def __init__(self, count_max: float = inf) -> None:
-        """Keep the gain at 1/count_max after `count_max` samples [1]; the default sets no end."""
+        """Set the number of samples after which the gain stays at 1/count_max [1]."""
         self._count_max, self._count, self._mean = count_max, 0, 0.0
 
     def update(self, sample: DelaySample) -> None:

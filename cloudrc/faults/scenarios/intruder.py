@@ -21,9 +21,9 @@ from cloudrc.world.endpoint import WorldEndpoint
 Make: TypeAlias = Callable[[bytes], Iterable[bytes]]
 """Makes the hostile datagrams that arrive at an end before an honest one."""
 REFUSED = ("tag", "malformed", "version", "direction", "old_epoch", "repeated")
-"""Counts of refused datagrams."""
+"""Counters of an end for datagrams that it refuses."""
 GREETED = ("hello", "unanswered", "accept_ignored")
-"""Counts of captured greetings; a challenge is the only answer."""
+"""Counters of an end for captured greetings, which it answers with a challenge at most."""
 FLOOD = 100  # datagrams of garbage per honest one: 10,000 in a second
 SETTLED = 2.0
 """Time at which a new flight has its session [s], so that an old greeting opens none."""
