@@ -64,29 +64,24 @@ def test_it_causes_none_with_a_stiffer_low_level_controller(seed):
     assert fly(hostile, "world.low_level.integral_limit_xy=0.30").breaches == ()
 
 
+BLACKOUT, STOPPED = Event("blackout", 44.0, 8.0), Event("stopped", 5.0)
+
+
 @pytest.mark.parametrize(
     ("events", "policy", "duration", "kinds"),
     [
-        ((), "", 60.0, {"collision", "waypoint", "stuck", "alarm"}),
-        ((Event("blackout", 44.0, 8.0),), "", 62.0, {"collision", "waypoint", "stuck"}),
-        ((Event("blackout", 44.0, 8.0),), "", 61.0, {"collision", "waypoint"}),
-        ((Event("stopped", 5.0),), "", 60.0, {"collision", "waypoint", "stuck", "obeyed"}),
-        ((Event("stopped", 5.0),), "greedy", 60.0, set()),
-        *(
-            (
-                (Event("stopped", 5.0), Event(kind, 9.0)),
-                "",
-                60.0,
-                {"collision", "waypoint", "stuck"},
-            )
-            for kind in FORGETFUL
-        ),
+        ((), "", 60.0, "collision waypoint stuck alarm"),
+        ((BLACKOUT,), "", 62.0, "collision waypoint stuck"),
+        ((BLACKOUT,), "", 61.0, "collision waypoint"),
+        ((STOPPED,), "", 60.0, "collision waypoint stuck obeyed"),
+        ((STOPPED,), "greedy", 60.0, ""),
+        *(((STOPPED, Event(n, 9.0)), "", 60.0, "collision waypoint stuck") for n in FORGETFUL),
     ],
 )
 def test_a_schedule_is_checked_for_what_it_allows(events, policy, duration, kinds):
     schedule = Schedule(1, events=events, policy=policy, duration=duration)
     some = {"collision", "waypoint", "stuck", "alarm", "obeyed"}
-    assert checked_in(schedule) & some == kinds
+    assert checked_in(schedule) & some == {*kinds.split()}
 
 
 def test_a_flight_without_faults_is_clean():
