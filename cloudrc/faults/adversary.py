@@ -64,9 +64,9 @@ class DishonestLoop(ControlLoop):
 
 
 class HostileOperator:
-    """Passes teleop's setpoints on, and makes its own requests in place of teleop's; an `Operator`.
+    """An `Operator` that passes teleop's setpoints on, but replaces teleop's requests.
 
-    Until the first setpoint it passes teleop's requests on, so that a mission begins.
+    Before the first setpoint it passes the requests on, too, so that a mission begins.
     """
 
     outcome, settled = None, True
@@ -131,7 +131,7 @@ REACHED = (0, 1, 7, MISSION_OVER)
 
 
 def at_bad_moments(rng: Generator) -> Words:
-    """Make requests after random pauses; every second one waits until the robot is near a face."""
+    """Make requests after random pauses; half of them wait until the robot is near a face."""
     pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
     due_ns, waits = 0, False
 
@@ -302,7 +302,7 @@ def _false_basis(rng: Generator) -> Lie:
 
 
 def _stop_and_go(rng: Generator) -> Lie:
-    """Let commands become stale and fresh again, and dash at every resumption."""
+    """Let commands become stale and fresh again, always with the same random velocity."""
     period_ns = int(rng.uniform(0.3e9, 3e9))
     velocity = rng.uniform(-FAST, FAST, 3).tolist()
 

@@ -119,7 +119,7 @@ class Flight:
         return Order(plan, contact=self.experiment.criteria.contact)
 
     def order_if_possible(self, now_ns: int) -> None:
-        """Order the experiment's mission at `now_ns` [ns, virtual time], unless it is refused."""
+        """Order the experiment's mission at `now_ns` [ns, virtual time]; ignore a refusal."""
         order, own_ns = self.make_order(), self._clock.at(now_ns)
         self.teleop.ask(lambda service, own_ns: service.create(order, own_ns), own_ns)
 
@@ -154,7 +154,7 @@ class Flight:
         return self._hash.hexdigest()
 
     def trajectory(self) -> list[GroundTruth]:
-        """Return the ground truth, every 10 ms."""
+        """Return the records of the ground truth, one every 10 ms."""
         return [record for record in self.of_world if isinstance(record, GroundTruth)]
 
     def count(self, name: str) -> int:

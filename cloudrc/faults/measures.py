@@ -55,7 +55,7 @@ def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Recor
 def reading(
     flight: Flight, role: str, name: str, *labels: str, until: float | None = None
 ) -> float:
-    """Return the value of a metric at `until` [s], the mean of a histogram; NaN if it is absent."""
+    """Return the value of a metric at `until` [s], or a histogram's mean; NaN if there is none."""
     shown = _read(flight, role, name, until)
     if isinstance(shown, Histogram):
         count = shown.cumulative()[-1]
@@ -85,8 +85,8 @@ def moves(
     """Check that metrics change within 5 s of a fault that begins at `since` [s].
 
     The time counts from the fault's end `over` [s] if that is given: a frozen process shows
-    nothing, and a loss is known when newer datagrams arrive. Each metric is a line of its role, its
-    name and its labels: "world guard_transitions_total hold".
+    nothing, and a loss is known when newer datagrams arrive. Each metric is written as role, name
+    and labels: "world guard_transitions_total hold".
     """
     last = (since if over is None else over) + SOON
     end = "" if over is None else " of its end"
@@ -193,7 +193,8 @@ def silence_told(
 ) -> None:
     """Schedule a check, `silent` [s] after `at` [s], that teleop's status tells of a silence.
 
-    The robot is silent; so is cloud, unless `cloud`. The text of each check begins with `what`.
+    The robot is silent. So is cloud, unless `cloud` is true. The text of each check begins with
+    `what`.
     """
 
     def check(now_ns: int) -> None:

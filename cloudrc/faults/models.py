@@ -70,7 +70,7 @@ class RestartableEndpoint:
     sealed = True  # a flight's ends have keys
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
-        """Start the first process; `build` makes an end at an instant of its own clock [ns]."""
+        """Start the first process; `build` makes an end, given the time of its clock [ns]."""
         self._build, self.clock, self._name = build, clock, name
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._scheduled, self._frozen_until_ns = 0, -1
@@ -114,7 +114,7 @@ class RestartableEndpoint:
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Hand a datagram to the process, past `tamper`."""
+        """Hand a datagram to the process without calling `tamper`."""
         if self.inner is None:
             return
         if self._frozen_until_ns <= now_ns:

@@ -211,7 +211,7 @@ ONCE = ("second_cloud", "key_rotated")  # kinds of which a flight has one at mos
 
 
 def compose(seed: int) -> Schedule:
-    """Make the schedule of a seed: up to 12 faults within 45 s, then 15 s without.
+    """Make the schedule of a seed: up to 12 faults within 45 s, then 15 s without faults.
 
     A schedule without faults is flown on a plain link, where any HOLD is a false alarm.
     """

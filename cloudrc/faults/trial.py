@@ -72,7 +72,7 @@ class Finding:
 
     @property
     def kinds(self) -> set[str]:
-        """Kinds of the breaches."""
+        """The invariants that broke."""
         return {breach.kind for breach in self.breaches}
 
 
@@ -170,7 +170,7 @@ class Operator:
             self._flight.watch.note(self._flight.run.now_ns, "obeyed", text)
 
     def _look(self, records: list[Record], now_ns: int) -> None:
-        """Look at the robot, every 100 ms."""
+        """Act on new records of world, every 100 ms."""
         flight = self._flight
         state, _ = flight.guard_now()
         if state is GuardState.TRACK:
@@ -203,7 +203,7 @@ class OrderInvariant:
         flight.listeners.append(self.see)
 
     def see(self, records: list[Record], now_ns: int) -> None:
-        """Check that no command is older than one before, or of an epoch that has ended.
+        """Check that no command is older than an earlier one, or of an epoch that has ended.
 
         A restarted world continues from the last epoch that its cloud knows. If cloud knows none,
         world starts at the first epoch again, which is allowed.
@@ -243,7 +243,7 @@ def _check_alarms(flight: Flight) -> None:
 
 
 def inject(flight: Flight, schedule: Schedule) -> None:
-    """Schedule in a flight all faults but those of the link's conditions."""
+    """Schedule in a flight the faults of processes, datagrams, teleop and the operator."""
     for event in schedule.events:
         process = flight.world if event.kind.startswith("world") else flight.cloud
         if event.kind.endswith("throttled"):

@@ -11,10 +11,10 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 
 
 class RunningMean(Estimator):
-    """Mean of all loop delays since the session began.
+    """Mean of the loop delays since the session began.
 
-    The mean is slow by design: after 60 s it needs another 60 s to follow half of a step of the
-    delay.
+    If every delay counts equally, the mean is slow: after 60 s it needs another 60 s to follow half
+    of a step of the delay. A `count_max` makes the mean follow faster.
     """
 
     def __init__(self, count_max: float = inf) -> None:

@@ -62,8 +62,8 @@ def _check_no_effect(
 ) -> None:
     """Fly with hostile datagrams beside the honest ones; the flight must be the same.
 
-    `makes` make those to world, and perhaps to cloud, from `since` on [s]; the counts `refusals` of
-    world have to rise.
+    From `since` on [s], the first of `makes` makes the datagrams to world, the second those to
+    cloud. World's counters `refusals` have to rise.
     """
     sender, clean, flight = HostileSender(), Flight(seed=seed).fly_mission(), Flight(seed=seed)
 
@@ -117,7 +117,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
     expects="no effect: the same path, bit by bit",
 )
 def _flood(outcome: Outcome, seed: int) -> None:
-    """Send noise; a right head before noise that is too short; one before as much as it takes."""
+    """Send noise alone, and noise after a valid header: too short, and of the right length."""
     rng = generator(seed, 20)
 
     def garbage(data: bytes) -> Iterable[bytes]:
