@@ -97,8 +97,10 @@ class BareCloud:
         body = codec.encode_command(Command(now_ns, basis_ns, 0, velocity, 0.0))
         return self.session.seal(Kind.COMMAND, body)
 
-    def ask(self, number: int, request: Request, start: Start, mission_id=0, basis_ns=0) -> bytes:
-        asked = OperatorRequest(number, request, start, mission_id, basis_stamp_ns=basis_ns)
+    def ask(self, number, request, start, mission_id=0, basis_ns=0, reached=0) -> bytes:
+        asked = OperatorRequest(
+            number, request, start, mission_id, reached, basis_stamp_ns=basis_ns
+        )
         return self.session.seal(Kind.OPERATOR, codec.encode_operator(asked))
 
     def start(self, number: int, basis_ns: int = 0) -> bytes:

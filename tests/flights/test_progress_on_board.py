@@ -3,10 +3,8 @@
 from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Mission, Waypoint
-from cloudrc.messages import OperatorRequest, Request, Start
+from cloudrc.messages import Request, Start
 from cloudrc.records import MissionEvent, TelemetrySent
-from cloudrc.tunnel import codec
-from cloudrc.tunnel.codec import Kind
 from tests.flights.conftest import MS, Bare, records, ring
 
 ID = 2**62 + 5
@@ -26,8 +24,7 @@ def test_the_robot_stores_every_waypoint_reached():
 
 def ask(talk, request, number=0, *, start=Start.HERE, **fields):
     """Return the mission and the progress that the robot shows after a request."""
-    asked = OperatorRequest(number, request, start, basis_stamp_ns=talk.now_ns, **fields)
-    talk.send(talk.speaker.session.seal(Kind.OPERATOR, codec.encode_operator(asked)))
+    talk.send(talk.speaker.ask(number, request, start, basis_ns=talk.now_ns, **fields))
     talk.wait(20)
     telemetry = talk.take(TelemetrySent)[-1].telemetry
     return telemetry.mission_id, telemetry.reached
