@@ -70,10 +70,10 @@ class Flight:
         life: int = 1,  # makes the nonces differ from those of another flight
         lies: Sequence[Lie] = (),  # change cloud's commands, one after the other
         words: Words | None = None,  # takes the operator's place in cloud
-        second: float | None = None,  # when another cloud asks for the robot [s]; None for never
+        second: float | None = None,
         separate: bool = False,  # whether teleop is a process of its own, not in cloud's
     ) -> None:
-        """Prepare a flight; time begins with the first `fly`."""
+        """Prepare a flight; another cloud asks for the robot at `second` [s], if not None."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
