@@ -1,1 +1,0 @@
-"""`make bench-link`: what the relay does, measured against what was asked of it."""
