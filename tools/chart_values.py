@@ -16,8 +16,6 @@ from cloudrc.config.schema import Experiment, Mission, Profile
 Seconds = Annotated[int, Field(ge=0)]
 ObjectName = Annotated[str, Field(pattern=r"^$|^[a-z]([-a-z0-9]*[a-z0-9])?$")]
 Name = Annotated[str, Field(pattern=r"^$|^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")]
-
-
 NotNegative = Annotated[float, Field(ge=0.0)]
 Quantity = (
     Annotated[str, Field(pattern=r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi|T|Ti)?$")] | NotNegative
@@ -26,7 +24,7 @@ Texts = dict[str, str]
 
 
 class Values(BaseModel):
-    """Base class of the parts of the values: keys in camelCase, unknown keys are refused."""
+    """A part of the values, with camelCase keys and no unknown keys."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -40,7 +38,7 @@ class Quantities(Values):
     """Amounts of CPU and memory."""
 
     cpu: Quantity | None = None
-    """CPU [cores; 250m is a quarter of one]"""
+    """CPU [cores; 250m is a quarter of a core]"""
     memory: Quantity | None = None
     """Memory [bytes; 64Mi is 64 * 2^20]"""
 

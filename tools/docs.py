@@ -24,7 +24,7 @@ from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.overrides import KINDS
 from cloudrc.config.schema import Direction, Experiment, Mission, Profile
-from cloudrc.exposition.table import METRICS, ROLES, Metric
+from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.record.topics import TOPICS
 from tools import chart_values
 from tools.chart_values import ChartValues, Quantities, Resources, Values
@@ -36,16 +36,8 @@ PARTS = {
     **dict.fromkeys(("uplink", "downlink"), "#one-direction-of-a-link"),
     **dict.fromkeys(KINDS, "#plug-ins-of-the-cloud"),
 }
-"""Key whose value has a section of its own -> link to that section."""
-
+"""Key of a part that has its own section -> link to the section."""
 ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
-CLOCKS = {
-    "world": "on world's clock",
-    "cloud": "on cloud's clock",
-    "either": "on the clock of the end that wrote the row",
-}
-
-
 _PERIOD = "100 Hz, while there is telemetry and a setpoint"
 _LINK = "once per change; again when a session, a mission or a state of the guard begins"
 _STAMPS = {
@@ -110,7 +102,7 @@ def _insert(page: Path, text: str) -> dict[Path, str]:
 
 
 def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
-    """Write a table in Markdown; `columns` has the heads of the columns, separated by bars."""
+    """Write a table in Markdown; `columns` are the heads of its columns, with bars between them."""
     lines = [f"| {columns} |", f"|{'---|' * len(columns.split('|'))}"]
     for row in rows:
         lines.append(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |")
@@ -176,7 +168,7 @@ def _keys(model: type[BaseModel], chosen: list[str] | None = None) -> str:
 def _row(model: type[BaseModel], path: tuple[str, ...]) -> tuple[str, ...] | None:
     info = problems.field_at(model, path)
     if info is None or not info.description:
-        return None  # a section without a word of its own
+        return None  # a section without its own description
     value, _, unit = problems.expectation(model, path).removeprefix("must be ").partition(" [")
     unit = unit.removesuffix("]")
     meaning = " ".join(info.description.split())
@@ -191,7 +183,7 @@ def _default(value: Any) -> str:
 
 
 def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
-    """Shorten the expectation of an error message for a table, and link a mapping's section."""
+    """Shorten the text of an error message about a value, and link it to the keys of the value."""
     if words.startswith("a list of"):
         item = problems.expectation(model, (*path, "0")).partition(" [")[0]
         words += item.removeprefix("must be a number")
@@ -257,11 +249,14 @@ def _topics() -> str:
     for name, topic in TOPICS.items():
         text = re.sub(r", (world's clock|cloud's clock|clock of its end)", "", topic.text)
         stamp, often = SAMPLING[name]
+        clock = f"{topic.end}'s clock"
+        if topic.end == "either":
+            clock = "the clock of the end that wrote the row"
         blocks += [
             f"## `{name}`\n",
             f"{text}.\n",
             f"- Message: `{topic.ros_type}`, written by {ENDS[topic.end]}, {often}.\n"
-            f"- Stamp: {stamp}, {CLOCKS[topic.end]}.\n",
+            f"- Stamp: {stamp}, on {clock}.\n",
             table(
                 "field | type | unit | meaning",
                 ((f"`{field.name}`", field.kind, field.unit, field.text) for field in topic.fields),
@@ -272,29 +267,20 @@ def _topics() -> str:
 
 def _metrics() -> str:
     """Write the tables of all metrics and of the histograms' buckets."""
-    rows = (
-        (
-            f"`{metric.name}`",
-            metric.kind.value,
-            "all" if metric.roles == ROLES else ", ".join(metric.roles),
-            metric.meaning + _labels(metric),
-        )
-        for metric in METRICS.values()
-    )
+    rows = []
+    for metric in METRICS.values():
+        labels = [
+            f"`{key}`: {', '.join(known) or OPEN[key]}" for key, known in metric.labels.items()
+        ]
+        meaning = metric.meaning + (f" Labels: {'; '.join(labels)}." if labels else "")
+        roles = "all" if metric.roles == ROLES else ", ".join(metric.roles)
+        rows.append((f"`{metric.name}`", metric.kind.value, roles, meaning))
     buckets = [
         f"- `{metric.name}`: {', '.join(f'{bound:g}' for bound in metric.buckets)}\n"
         for metric in METRICS.values()
         if metric.buckets
     ]
     return f"\n{table('metric | type | from | meaning', rows)}\n## Buckets\n\n{''.join(buckets)}"
-
-
-def _labels(metric: Metric) -> str:
-    """Describe the labels of a metric and their values."""
-    sets = [
-        f"`{name}`: {', '.join(values) or OPEN[name]}" for name, values in metric.labels.items()
-    ]
-    return f" Labels: {'; '.join(sets)}." if sets else ""
 
 
 VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"

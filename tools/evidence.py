@@ -1,8 +1,7 @@
 """Write the results of `make nightly`: index.md, numbers.json and environment.json.
 
-`make nightly` runs this module last, with the folder build/evidence, in which the tests,
-`cloudrc faults`, mutmut and the benchmark of the link have left their results. A result that is
-missing there has no section in index.md.
+`make nightly` runs this module last, with the folder in which the tests, `cloudrc faults`, mutmut
+and the bench of the link left their results. The page leaves out commands that did not run.
 """
 
 from __future__ import annotations
@@ -24,21 +23,21 @@ Rows = Iterable[Iterable[object]]
 
 
 def environment() -> dict[str, Any]:
-    """Describe the commit that was measured, and the machine."""
+    """Describe the commit and the machine of the measurement."""
     git = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip()
     return {"commit": commit or "unknown", **environment_document()}
 
 
 def read(folder: Path, names: str) -> Iterator[dict[str, Any]]:
-    """Read the JSON files that match `names`; skip empty files, which failed commands leave."""
+    """Read the JSON files that match `names`; skip empty files, which a broken command left."""
     for path in sorted(folder.glob(names)):
         if text := path.read_text(encoding="utf-8"):
             yield json.loads(text)
 
 
 def numbers(folder: Path) -> list[dict[str, Any]]:
-    """Take the worst value of each number that tests have measured, and add up its cases."""
+    """Keep the worst measurement of each number from the tests, with the sum of its cases."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for path in sorted(folder.glob("numbers/*.jsonl")):
         for row in map(json.loads, path.read_text(encoding="utf-8").splitlines()):
@@ -50,7 +49,7 @@ def numbers(folder: Path) -> list[dict[str, Any]]:
 
 
 def _badness(row: dict[str, Any]) -> float:
-    """Return how far a value misses its bound; a value that was not measured is the worst."""
+    """Rate a measurement for a comparison with others; a missing measurement is the worst."""
     if row["measured"] is None:
         return float("inf")
     badness = row["measured"] - row["asked"]
@@ -58,7 +57,7 @@ def _badness(row: dict[str, Any]) -> float:
 
 
 def number_rows(found: list[dict[str, Any]]) -> Rows:
-    """Format the numbers as rows of a table."""
+    """Yield a table row for each number."""
     for row in found:
         measured = "-" if row["measured"] is None else f"{row['measured']:.4g} {row['unit']}"
         asked = f"{row['relation']} {row['asked']:g} {row['unit']}"
@@ -81,12 +80,12 @@ def fault_rows(folder: Path) -> Rows:
 
 
 def section(title: str, head: Iterable[str], rows: Rows) -> str:
-    """Format a section with a table."""
+    """Format a section of the page: a heading and a table."""
     return f"## {title}\n\n{table(' | '.join(head), rows)}"
 
 
 def page(folder: Path, here: dict[str, Any], found: list[dict[str, Any]]) -> str:
-    """Format the page, with a section for each kind of result."""
+    """Format the page: a section for each kind of results."""
     tests, faults = ("run", "tests", "failed", "errors", "skipped"), ("fault", "name")
     parts = [
         f"# Evidence of commit {here['commit']}\n",
@@ -107,7 +106,7 @@ def page(folder: Path, here: dict[str, Any], found: list[dict[str, Any]]) -> str
 
 
 def write(folder: Path) -> None:
-    """Write the page and its two JSON files."""
+    """Write the page and the JSON files to a folder that holds the results."""
     here, found = environment(), numbers(folder)
     write_json(folder / "environment.json", here)
     write_json(folder / "numbers.json", {"schemaVersion": 1, "numbers": found})

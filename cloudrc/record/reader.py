@@ -209,7 +209,8 @@ class Records:
         if chunk.uncompressed_crc not in (0, checksum := zlib.crc32(data)):
             raise CRCValidationError(chunk.uncompressed_crc, checksum, chunk)
         stream = BytesIO(data)
-        records = StreamReader(stream, skip_magic=True).records
+        # `emit_chunks`: the library would unpack a chunk in a chunk without a bound.
+        records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
         try:
             while stream.tell() < size:  # one at a time: a chunk may hold millions
                 yield next(records)

@@ -1,9 +1,7 @@
 """For each key of the schema: a valid value, and the settings that it needs."""
 
-from __future__ import annotations
-
 import json
-from typing import Any, Literal, get_args, get_origin
+from typing import Literal, get_args, get_origin
 
 import pytest
 
@@ -13,7 +11,7 @@ from cloudrc.config.schema import Experiment
 from cloudrc.errors import BadInputError
 
 LEAVES = {".".join(path): field for path, field in problems.leaves(Experiment)}
-SPECIAL: dict[str, Any] = {
+SPECIAL = {
     "mission": "hover",
     "mission.waypoints.0.position_m": [0.6, 0.1, 0.8],
     "mission.waypoints.0.yaw_deg": 0,  # the only heading that the onboard controller holds

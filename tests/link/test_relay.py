@@ -39,8 +39,18 @@ from cloudrc.link.relay import (
 )
 from cloudrc.tunnel.codec import Kind, encode_header
 from tests.drivers.conftest import FAST
-from tools.bench_link.flow import EPOCH, SEED, SIZE, Flow, judge, run_flow, since_first_ns
-from tools.bench_link.relays import RelayProcess, fifo_allowed, measure_profiles, profiles_of
+from tools.bench_link import (
+    EPOCH,
+    SEED,
+    SIZE,
+    Flow,
+    RelayProcess,
+    judge,
+    measure_profiles,
+    profiles_of,
+    run_flow,
+    since_first_ns,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 20.0
@@ -337,8 +347,7 @@ def test_a_relay_run_draws_the_virtual_sequence(tmp_path, link):
 @pytest.mark.process
 def test_profiles_with_queue_and_kept_order_are_as_drawn(tmp_path):
     """`lte` has a rate and keeps order; `make bench-link` measures all profiles for a minute."""
-    for row in measure_profiles(tmp_path, {"lte": {"profile": "lte"}}, 2.0, fifo=fifo_allowed()):
-        judged = row.judged
+    for judged in measure_profiles(tmp_path, ["lte"], 2.0).values():
         assert judged.wrongly_lost == judged.wrongly_arrived == 0
         assert judged.errors.min() >= 0.0
         assert np.median(judged.errors) < 5e-3

@@ -1,10 +1,8 @@
 """Fixtures: random records (hypothesis) and a short flight of both ends."""
 
-from __future__ import annotations
-
 import math
 from enum import IntEnum
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import get_args, get_origin, get_type_hints
 
 import numpy as np
 from hypothesis import strategies as st
@@ -20,7 +18,7 @@ from cloudrc.records import Record
 
 MS = 1_000_000
 SECOND = 1000 * MS
-CLASSES: tuple[type[Any], ...] = get_args(Record)
+CLASSES = get_args(Record)
 
 _stamps = st.integers(0, 2**31 * SECOND - 1)
 _integers = st.integers(-(2**63), 2**63 - 1)
@@ -56,7 +54,7 @@ def any_record():
 
 def world_records(count, start_ns=0):
     """Make world's records at 100 Hz; each command took 30 ms."""
-    records: list[Record] = [
+    records = [
         rec.SessionOpened(start_ns, "world", 1, "cloud said hello"),
         rec.GuardChange(start_ns, GuardState.TRACK, "mission started"),
     ]
@@ -81,7 +79,7 @@ def world_records(count, start_ns=0):
 
 def cloud_records(count, start_ns=0, up_ns=40 * MS):
     """Make cloud's records at 100 Hz; a command leaves 3 ms after each period."""
-    records: list[Record] = [rec.SessionOpened(start_ns, "cloud", 1, "world said yes")]
+    records = [rec.SessionOpened(start_ns, "cloud", 1, "world said yes")]
     v = (0.1, 0.2, 0.3)
     for n in range(count):
         now = start_ns + n * 10 * MS
@@ -129,7 +127,7 @@ def rewrite(
         shuffle(messages)
         writer = Writer(new, **{"compression": CompressionType.ZSTD} | options)
         writer.start(profile="ros2", library="another")
-        ids: dict[int, int] = {}
+        ids = {}
         for schema, channel, message in messages:
             if channel.id not in ids:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -171,8 +169,7 @@ class Shelf:
     """A sink that stores its records."""
 
     def __init__(self):
-        self.records: list[Record] = []
-        self.closed = False
+        self.records, self.closed = [], False
 
     def write(self, records):
         self.records += records

@@ -1,9 +1,5 @@
 """Columns hold the records' values, from memory and from a file."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -45,8 +41,8 @@ def test_what_does_not_exist_is_answered_with_what_does():
 
 
 def test_rows_of_both_ends_are_in_order_of_time():
-    world: list[Any] = [rec.Counted(t, "world", "sent", t) for t in (0, 10, 20, 20)]
-    cloud: list[Any] = [rec.Counted(t, "cloud", "sent", t) for t in (5, 20, 30)]
+    world = [rec.Counted(t, "world", "sent", t) for t in (0, 10, 20, 20)]
+    cloud = [rec.Counted(t, "cloud", "sent", t) for t in (5, 20, 30)]
     expected = ["world", "cloud", "world", "world", "world", "cloud", "cloud"]
     assert Recording.from_records(world, cloud)["/count"]["end"].tolist() == expected
 

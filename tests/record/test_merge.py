@@ -1,7 +1,5 @@
 """Both ends' recordings are merged on world's clock, with the offset's uncertainty."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,7 +12,6 @@ from cloudrc.record.hash import messages_sha256
 from cloudrc.record.merge import clock_offset, merge, world_time_ns
 from cloudrc.record.reader import read_contents
 from cloudrc.record.writer import McapWriter
-from cloudrc.records import Record
 from tests.record.conftest import MS, SECOND, assert_equal, cloud_records, world_records, write
 
 
@@ -61,8 +58,7 @@ def test_two_clocks_are_related_by_the_packets(tmp_path, start, ahead):
 def test_the_true_offset_is_within_the_uncertainty(ahead, delays):
     """World's clock is `ahead` of cloud's; the fastest packet may come later."""
     telemetry, control = world_records(1)[2], cloud_records(1)[2]
-    world: list[Record] = []
-    cloud: list[Record] = []
+    world, cloud = [], []
     for n, (up, down) in enumerate(delays):
         sent = n * 10 * MS  # on cloud's clock
         world.append(telemetry._replace(stamp_ns=sent + ahead, counter=n))
@@ -138,7 +134,7 @@ def test_nothing_at_all_is_bad_input(tmp_path):
 
 def slipping(records, slips_ns):
     """Make world's records; the n-th telemetry has the n-th slip, later ones the last slip."""
-    slips, slip, found = iter(slips_ns), 0, list[Record]()
+    slips, slip, found = iter(slips_ns), 0, []
     for record in records:
         if isinstance(record, rec.TelemetrySent):
             slip = next(slips, slip)

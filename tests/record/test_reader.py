@@ -9,6 +9,7 @@ from contextlib import suppress
 from random import Random
 
 import pytest
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message
@@ -249,6 +250,19 @@ def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, 
     assert told.count("\n") == 0
     assert ("unpacks to more than 4 times its size" in told) == (stated is None)
     assert peak < 4 * limit << 20
+
+
+def test_a_chunk_in_a_chunk_is_not_unpacked(path):
+    start, end = CHUNKS[0]
+    inner = {
+        "compression": "",
+        "data": WHOLE[start:end] * 2,
+        "uncompressed_size": 2 * (end - start),
+    }
+    outer = Chunk(**inner, message_start_time=0, message_end_time=0, uncompressed_crc=0)
+    outer.write(builder := RecordBuilder())
+    path.write_bytes(WHOLE[:start] + builder.end() + WHOLE[start:end])
+    assert len(read_contents(path).messages) == SIZES[0]
 
 
 def examine(folder, data):

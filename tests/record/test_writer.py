@@ -70,27 +70,24 @@ def test_attachments_and_metadata_come_back(tmp_path):
 
 
 def test_an_hour_of_recording_takes_no_memory(tmp_path):
-    """A chunk every quarter of a second: mcap's own list of them takes 20 MB in an hour."""
+    """A chunk every half a second: mcap's own list of chunks takes 12 MB in an hour."""
     path, records = tmp_path / "long.mcap", world_records(1)
-    grown, count = list[int](), 200
+    grown, count = list[int](), 1000
     tracemalloc.start()
     try:
         with McapWriter(path, clock="world") as writer:
             for n in range(2 * count + 1):
-                stamp_ns = n * SECOND // 4
+                stamp_ns = n * SECOND // 2
                 writer.write([record._replace(stamp_ns=stamp_ns) for record in records])
                 writer.flush()
                 if n % count == 0:
                     grown.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    per_hour = (grown[2] - grown[1]) / count * 4 * 3600
-    assert per_hour < 3e6, "bytes; ours grows in steps"
+    assert (grown[2] - grown[1]) / count * 2 * 3600 < 1e6, "bytes in an hour"
     with path.open("rb") as stream:
         reader = make_reader(stream)
-        summary = reader.get_summary()
-        assert summary is not None
-        assert len(summary.chunk_indexes) == 2 * count + 1
+        assert len(reader.get_summary().chunk_indexes) == 2 * count + 1
         assert sum(1 for _ in reader.iter_messages(["/odometry"])) == 2 * count + 1
 
 

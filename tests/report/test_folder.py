@@ -1,14 +1,10 @@
 """A run's folder gives its report again, or is refused with the reason and stays as it is."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import pytest
 from mcap.writer import CompressionType
@@ -27,7 +23,6 @@ from tests.metrics.conftest import at, good, paper
 from tests.record.conftest import rewrite, write_mission
 
 RUN = Run("virtual", "virtual", "f" * 64)
-Change = Callable[[Path, Path], object]
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +42,7 @@ def run(flown_once, tmp_path):
 
 
 def report(folder):
-    found: dict[str, Any] = json.loads((folder / "report.json").read_text())
-    return found
+    return json.loads((folder / "report.json").read_text())
 
 
 def test_a_run_gives_the_same_report_again(run):
@@ -149,8 +143,7 @@ def test_a_torn_recording_still_gives_a_report(run):
     assert found["notes"][0].startswith("The recording is incomplete: cut short")
     assert 0 < found["numbers"]["duration"]["value"] < 10
     assert "records_sha256" not in found
-    again = write_report(run, *read_run(run), page=False)
-    assert again == found
+    assert write_report(run, *read_run(run), page=False) == found
 
 
 def test_a_hash_is_of_the_recording_beside_it(run):
@@ -166,9 +159,8 @@ def test_an_interrupted_run_stays_interrupted(run):
     write_mission(run / "mission.mcap", world, cloud)
     recording = Recording.from_records(world, cloud)
     stopped = Run("local", "relay", interrupted=True, notes=("the relay died",))
-    assert write_report(run, recording, paper()[0], stopped, page=False)["verdict"] == (
-        "interrupted"
-    )
+    found = write_report(run, recording, paper()[0], stopped, page=False)
+    assert found["verdict"] == "interrupted"
     found = read_run(run)[2]
     assert (found.mode, found.shaper, found.interrupted) == ("local", "relay", True)
     assert (found.notes, len(found.records_sha256 or "")) == (stopped.notes, 64)

@@ -19,11 +19,9 @@ from cloudrc.files import atomic_file, open_file, write_atomically
 from cloudrc.link import traces
 from cloudrc.link.state import publish
 from cloudrc.link.traces import read_trace
-from cloudrc.messages import UPRIGHT, ZERO, Odometry
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
 from cloudrc.record.reader import read_contents, recover
-from cloudrc.records import GroundTruth
 from cloudrc.report.document import write_json
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
@@ -107,9 +105,7 @@ def test_no_file_is_read_beyond_its_size_limit(tmp_path, module, read):
 def run(tmp_path):
     """A run without a report."""
     (tmp_path / "config.yaml").write_text("name: theirs")
-    log = flown()
-    records = (sorted(part, key=lambda record: record.stamp_ns) for part in (log.world, log.cloud))
-    write_mission(tmp_path / "mission.mcap", *records)
+    write_mission(tmp_path / "mission.mcap", *flown().ends())
     return tmp_path
 
 
@@ -133,14 +129,8 @@ def test_an_old_report_is_used_completely_or_not_at_all(run):
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_undrawable_data_gives_one_line_of_error(run):
-    nowhere = Odometry(1, (nan, nan, nan), UPRIGHT, ZERO, ZERO)
-    world = [
-        record._replace(odometry=nowhere._replace(stamp_ns=record.stamp_ns))
-        if isinstance(record, GroundTruth)
-        else record
-        for record in flown().world
-    ]
-    write_mission(run / "mission.mcap", sorted(world, key=lambda each: each.stamp_ns), ())
+    log = flown(lambda seconds: (nan, nan, nan))
+    write_mission(run / "mission.mcap", log.ends()[0], ())
     with pytest.raises(BadInputError, match=r"^[^\n]*cannot be drawn \(ValueError: [^\n]*$"):
         write_report(run, *read_run(run))
     assert json.loads((run / "report.json").read_text())["verdict"] == "failure"

@@ -52,9 +52,7 @@ def run(tmp_path, spy):
     folder.mkdir()
     (folder / "spy.py").write_text(spy)
     (folder / "config.yaml").write_text(CONFIG.format(spy=folder / "spy.py"))
-    log = flown()
-    records = (sorted(part, key=lambda record: record.stamp_ns) for part in (log.world, log.cloud))
-    write_mission(folder / "mission.mcap", *records)
+    write_mission(folder / "mission.mcap", *flown().ends())
     return folder
 
 
@@ -101,8 +99,7 @@ def test_only_cloud_imports_plug_ins(run, trace, monkeypatch, end, config, impor
 
 def test_only_flying_code_loads_an_experiment_with_plug_ins():
     """All other code uses `read_experiment`, which imports none."""
-    flies = {"cli/run.py", "cli/processes.py", "cli/bench.py"}
-    flies |= {"faults/flight.py"}
+    flies = {"cli/run.py", "cli/processes.py", "cli/bench.py", "faults/flight.py"}
     imports = {
         path.relative_to(PACKAGE).as_posix()
         for path in PACKAGE.rglob("*.py")

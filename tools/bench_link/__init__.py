@@ -1,1 +1,0 @@
-"""`make bench-link`: measure how exactly the relay follows its profiles."""
