@@ -34,8 +34,9 @@ CONFIG_DIGITS = 12
 STILL_MAX = 5.0
 """Time without a record after which a loop counts as standing still [s]; a healthy loop makes a
 record every second."""
-CPU_COUNTS = Path("/sys/fs/cgroup/cpu.stat")
-"""File with a container's CPU counts."""
+CGROUP = Path("/sys/fs/cgroup")
+CPU_COUNTS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
+"""Files below CGROUP with a container's CPU counts: of cgroup v2, then two places of cgroup v1."""
 
 
 class Answer(NamedTuple):
@@ -94,23 +95,27 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing: a request comes every few seconds."""
 
 
-def read_throttling(path: Path = CPU_COUNTS) -> Readings:
+def read_throttling(root: Path = CGROUP) -> Readings:
     """Read how much the CPU limit has throttled this container; empty outside a container.
 
-    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us).
+    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
+    Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
     """
-    try:
-        words = (line.split() for line in path.read_text().splitlines())
-    except OSError:
-        return {}
-    counts = {key: int(number) for key, number in words}
-    if "nr_periods" not in counts:
-        return {}
-    return {
-        "cloudrc_cpu_periods_total": unlabelled(counts["nr_periods"]),
-        "cloudrc_cpu_throttled_periods_total": unlabelled(counts["nr_throttled"]),
-        "cloudrc_cpu_throttled_seconds_total": unlabelled(counts["throttled_usec"] * 1e-6),
-    }
+    for name in CPU_COUNTS:
+        try:
+            words = (line.split() for line in (root / name).read_text().splitlines())
+        except OSError:
+            continue
+        counts = {key: int(number) for key, number in words}
+        if "nr_periods" in counts:
+            stopped = counts.get("throttled_usec", 0) * 1e-6
+            stopped += counts.get("throttled_time", 0) * 1e-9
+            return {
+                "cloudrc_cpu_periods_total": unlabelled(counts["nr_periods"]),
+                "cloudrc_cpu_throttled_periods_total": unlabelled(counts["nr_throttled"]),
+                "cloudrc_cpu_throttled_seconds_total": unlabelled(stopped),
+            }
+    return {}
 
 
 class Exporter:

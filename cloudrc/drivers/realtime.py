@@ -18,6 +18,7 @@ from ipaddress import ip_address
 from pathlib import Path
 
 from cloudrc.endpoint import Endpoint
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.files import read, version
 from cloudrc.records import Lateness, Record
 from cloudrc.tunnel.codec import DATAGRAM_MAX
@@ -42,7 +43,7 @@ SINK_PERIOD_NS = 20_000_000
 WAIT_MAX_NS = 100_000_000
 """Longest wait for a datagram [ns]; then the loop calls `stop` again."""
 PORTS = range(20_000, 30_000)
-"""Ports among which `free_ports` chooses."""
+"""The ports from which `free_ports` chooses."""
 ROUTE_PERIOD_NS = 500_000_000
 """Time between two checks of the route file [ns]."""
 
@@ -148,20 +149,24 @@ def bind(listen: Address) -> socket.socket:
 
 
 def free_ports(count: int) -> list[int]:
-    """Find ports on 127.0.0.1 that are unused for both UDP and TCP.
+    """Choose ports on 127.0.0.1 by chance that are unused for both UDP and TCP.
 
     They are below the ports that the kernel gives to connections, which could take them meanwhile.
+    Raise a MissingPrerequisiteError if fewer than `count` ports are unused.
     """
     found: list[int] = []
-    for port in random.SystemRandom().sample(PORTS, 1000):
+    for port in random.SystemRandom().sample(PORTS, len(PORTS)):
         with socket.socket(type=socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
             with suppress(OSError):
                 udp.bind(("127.0.0.1", port))
                 tcp.bind(("127.0.0.1", port))
                 found.append(port)
         if len(found) == count:
-            break
-    return found
+            return found
+    raise MissingPrerequisiteError(
+        f"only {len(found)} of {count} ports from {PORTS[0]} to {PORTS[-1]} of 127.0.0.1 are free;"
+        " end a program that uses them"
+    )
 
 
 def serve(

@@ -145,18 +145,22 @@ def test_a_record_costs_less_than_a_microsecond(end, flight):
 
 
 @pytest.mark.parametrize(
-    ("text", "counts"),
+    ("file", "text", "counts"),
     [
-        ("nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n", [120, 17, 1.25]),
-        ("usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),  # without a limit
-        ("", []),
-        (None, []),
+        ("cpu.stat", "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n", [120, 17, 1.25]),
+        *((file, "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n", [4, 2, 0.5])
+          for file in ("cpu/cpu.stat", "cpu,cpuacct/cpu.stat")),
+        ("cpu.stat", "usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),
+        ("cpu.stat", "", []),
+        (None, "", []),
     ],
-)
-def test_throttling_is_read_from_the_kernel(text, counts, tmp_path):
-    if text is not None:
-        (tmp_path / "cpu.stat").write_text(text)
-    read = read_throttling(tmp_path / "cpu.stat")
+    ids=["limited", "v1", "v1 with a joint mount", "unlimited", "empty", "missing"],
+)  # fmt: skip
+def test_throttling_is_read_from_the_kernel(file, text, counts, tmp_path):
+    if file is not None:
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text(text)
+    read = read_throttling(tmp_path)
     values = [value for reading in read.values() for value in dict(reading).values()]
     assert values == pytest.approx(counts)
 
