@@ -25,15 +25,15 @@ from cloudrc.records import Counted, Record
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """Content type of the text that `generate_latest` makes."""
-PATIENCE = 5.0
+CLIENT_WAIT_MAX = 5.0
 """Longest wait for a client [s]; Prometheus' default scrape timeout is 10 s."""
 KEPT = 0.25
-"""How long a page is reused [s]; making a page takes 1.4 ms and may delay the loop."""
+"""How long a page is reused [s]: making a page takes 1.4 ms and may delay the control loop."""
 CONFIG_DIGITS = 12
 """Length of the shortened hash of the process's configuration [hexadecimal digits]."""
 STILL_MAX = 5.0
-"""Time without a record after which a loop counts as standing still [s]; a healthy loop makes a
-record every second."""
+"""Time without a record after which the control loop counts as standing still [s]. A running loop
+makes a record every second."""
 CGROUP = Path("/sys/fs/cgroup")
 CPU_COUNTS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
 """Files below CGROUP with a container's CPU counts: of cgroup v2, then two places of cgroup v1."""
@@ -48,9 +48,10 @@ class Answer(NamedTuple):
 
 
 class _Server(socketserver.ThreadingTCPServer):
-    """Serves pages by their paths until `close` is called.
+    """Answers each request on a thread of its own with the page of the requested path.
 
-    `http.server.HTTPServer` may wait for a name server. The accept queue is long, for bursts.
+    `http.server.HTTPServer` is not used, because it may wait for a name server. The accept queue is
+    long, so that a burst of connections delays no probe of kubelet.
     """
 
     allow_reuse_address = True
@@ -78,7 +79,7 @@ class _Handler(BaseHTTPRequestHandler):
     """Answers one request and closes the connection."""
 
     server: _Server
-    timeout = PATIENCE
+    timeout = CLIENT_WAIT_MAX
 
     def do_GET(self) -> None:
         """Answer with the page of the requested path, or with 404."""
@@ -144,7 +145,7 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether this process is ready; the records of world and cloud show it for them."""
+        """Set whether a process other than world and cloud is ready. Their records show it."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -159,11 +160,11 @@ class Exporter:
         return self._live.link
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the shaper of a direction from now on, and the requested mode."""
+        """Set the shaper that acts on a direction, "relay" or "netem", and the requested mode."""
         self.link.shaped(shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:
-        """Set the mean delay [s] that the profile in force requests."""
+        """Set the mean delay [s] that the current profile requests for a direction."""
         self.link.asked(direction, delay)
 
     def unresolved(self, count: int) -> None:
