@@ -6,7 +6,9 @@ import socket
 import socketserver
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler
 from math import inf
 from pathlib import Path
@@ -27,6 +29,9 @@ TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """Content type of the text that `generate_latest` makes."""
 CLIENT_WAIT_MAX = 5.0
 """Longest wait for a client [s]; Prometheus' default scrape timeout is 10 s."""
+CONNECTIONS_MAX = 16
+"""Largest number of connections. One more closes the oldest, so that silent clients use up neither
+the files nor the threads of the process."""
 KEPT = 0.25
 """How long a page is reused [s]: making a page takes 1.4 ms and may delay the control loop."""
 CONFIG_DIGITS = 12
@@ -60,7 +65,7 @@ class _Server(socketserver.ThreadingTCPServer):
     request_queue_size = 1_024
 
     def __init__(self, address: tuple[str, int], pages: Mapping[str, Callable[[], Answer]]) -> None:
-        self.pages = pages
+        self.pages, self._newest = pages, deque[socket.socket]()
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, _Handler)
         threading.Thread(target=self.serve_forever, args=(0.25,), daemon=True).start()
@@ -70,6 +75,14 @@ class _Server(socketserver.ThreadingTCPServer):
         if self.address_family == socket.AF_INET6:
             self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         super().server_bind()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer on a new thread; close the oldest connection if there are too many."""
+        self._newest.append(request)
+        if len(self._newest) > CONNECTIONS_MAX:
+            with suppress(OSError):  # it has been answered
+                self._newest.popleft().shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the errors of clients that disconnect early."""

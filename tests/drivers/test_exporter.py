@@ -1,5 +1,6 @@
 """The exporter: valid text in bounds, probes on one port, hostile clients, CPU throttling."""
 
+import select
 import socket
 import threading
 import time
@@ -244,6 +245,9 @@ def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
     for client in waiting[-2:]:
         client.sendall(b"GET /metr")
     assert get(served[1], "/healthz")[0] == 200
+    closed = select.select(waiting, [], [], 0)[0]  # the oldest ones
+    assert closed == waiting[: len(closed)]
+    assert len(closed) == len(waiting) + 1 - exporters.CONNECTIONS_MAX
     for client in waiting:
         client.close()
 
