@@ -115,7 +115,7 @@ class Feed:
         self._write(READY)
 
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Wrap the `stop` that a loop calls in every turn: the loop then writes READY lines, too."""
+        """Wrap the `stop` that a loop calls in every turn: the loop then writes READY lines."""
         due = 0.0
 
         def ask() -> bool:
