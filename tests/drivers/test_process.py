@@ -31,6 +31,7 @@ from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import (
     Counted,
+    Fault,
     GuardChange,
     LinkChanged,
     MissionEvent,
@@ -302,14 +303,17 @@ def test_a_change_of_the_other_direction_is_recorded_but_not_fed(path, pipe):
     assert [line.rpartition("(")[2] for line in said] == ["slower)", "back)"]
 
 
-def test_an_end_tells_of_its_clock_and_of_its_recorders_trouble(pipe):
+def test_an_end_tells_of_its_clock_key_link_and_recorder(path, pipe):
     recorder = SimpleNamespace(error="", dropped=0)
-    keys, exporter = SimpleNamespace(follow=lambda now_ns: []), Exporter("world")
-    run = EndProcess("world", None, recorder, keys, Feed(pipe[1], watched=False), exporter)
+    keys = SimpleNamespace(follow=lambda now_ns: [Fault(now_ns, "key", "new key")])
+    exporter, feed = Exporter("world"), Feed(pipe[1], watched=False)
+    tell(path, STATE)
+    run = EndProcess("world", None, recorder, keys, feed, exporter, link=path)
     slip_ns = 5_000_000_000
     began_ns = time.monotonic_ns() - slip_ns
     noted = run.look_around([], slip_ns, [60.0, -1.0])
-    assert [record.code for record in noted] == ["wall_clock", "wall_clock"]
+    assert [record.code for record in noted[:3]] == ["wall_clock", "wall_clock", "key"]
+    assert [type(record) for record in noted[3:]] == [LinkChanged]
     assert 0 <= noted[0].stamp_ns - began_ns < 1_000_000_000
     run.tell(noted)
     assert "cloudrc_clock_steps_total 2.0" in exporter.text()
