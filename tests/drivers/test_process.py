@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from cloudrc.drivers import process
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.process import (
     PARENT,
@@ -324,3 +325,18 @@ def test_an_end_tells_of_its_clock_key_link_and_recorder(path, pipe):
     said = os.read(pipe[0], 4096).decode()
     assert said.count("wall clock stepped by +60.0 s: ") == 1
     assert said.count(recorder.error) == 1
+
+
+def test_what_an_end_says_is_recorded_fed_and_exported(pipe, monkeypatch):
+    put, exporter = [], Exporter("world")
+    nothing = dict.fromkeys(("flush", "sync"), lambda **_: None)
+    recorder = SimpleNamespace(
+        put=put.extend, drain=lambda most: 0, close=lambda: None, error="", dropped=0, **nothing
+    )
+    keys = SimpleNamespace(follow=lambda now_ns: [Fault(now_ns, "key", "new key")])
+    monkeypatch.setattr(process, "serve", lambda *_, sink, **__: sink([EVENT]))
+    run = EndProcess("world", None, recorder, keys, Feed(pipe[1], watched=False), exporter)
+    run.run(None, lambda: True, lambda: True)
+    assert [type(record) for record in put] == [type(EVENT), Fault, Counted]
+    assert "new key" in os.read(pipe[0], 4096).decode()
+    assert exporter._seen_at is not None
