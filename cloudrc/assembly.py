@@ -36,7 +36,7 @@ CRUISE_SPEED = 1.0
 """Expected speed on a leg, if the guard allows this speed [m/s]."""
 SETTLE_TIME = 4.0
 """Expected extra time for the beginning and the end of a leg [s]."""
-LEG_PATIENCE = 3.0
+LEG_FACTOR = 3.0
 """Limit of a leg, divided by its expected time [1]. Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
 """Mission number of a cloud that flies only one mission."""
@@ -133,7 +133,7 @@ def mission_plan(
 ) -> Plan:
     """Turn a checked mission with a time limit [s] into legs.
 
-    `seed` is that of random steps, `speed_max` the guard's cap [m/s].
+    `seed` is the seed of random steps, `speed_max` is the guard's cap [m/s].
     """
     if mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
@@ -176,7 +176,7 @@ def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: fl
         # The start of the first leg is unknown: assume the longest way.
         way = FENCE_SPAN if start is None else dist(start.position_m, waypoint.position_m)
         expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
-        limit = round(LEG_PATIENCE * expected, 1)
+        limit = round(LEG_FACTOR * expected, 1)
     yaw = radians(waypoint.yaw_deg)
     return Leg(waypoint.position_m, yaw, waypoint.tolerance_m, waypoint.dwell_s, limit)
 

@@ -22,7 +22,7 @@ class TooLongError(ValueError):
 
 
 def version(path: Path | str) -> tuple[int, int, int] | None:
-    """Identify the version of a file with one system call; None if it does not exist."""
+    """Identify the content of a file by one system call; None if the file does not exist."""
     try:
         status = os.stat(path)
     except OSError:

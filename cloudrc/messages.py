@@ -117,7 +117,7 @@ class Telemetry(NamedTuple):
         odometry: Measured pose and twist, with sensor noise if configured.
         tip_force: Force on the touch sensor at the arm's tip [N].
         echo_stamp_ns: Stamp of the newest applied command [ns], cloud's clock; `NEVER_NS` if none.
-        echo_hold_ns: How long world has held that command [ns].
+        echo_hold_ns: Time since world first applied that command [ns].
         slip_ns: Lag of world's clock behind its machine's monotonic clock [ns].
         mission: Number of the last operator request that world carried out; 0 if none.
         guard: State of the guard.
@@ -152,7 +152,7 @@ class Command(NamedTuple):
         stamp_ns: Time of the computation [ns], cloud's clock.
         basis_stamp_ns: Stamp of the odometry from which the command was computed [ns], world's
             clock.
-        basis_hold_ns: How long cloud had held that odometry [ns].
+        basis_hold_ns: Time from the arrival of that odometry at cloud to the computation [ns].
         velocity: Wanted velocity [m/s], world frame, shape (3,).
         yaw_rate: Wanted yaw rate [rad/s].
     """
@@ -172,7 +172,7 @@ class OperatorRequest(NamedTuple):
     """A request of the operator to the robot, repeated until telemetry shows its number.
 
     Attributes:
-        number: Number above that of every request that the robot has carried out.
+        number: A number above those of all requests that the robot has carried out.
         request: Kind of the request.
         start: Where the mission starts from; used with `Request.START` only.
         mission_id: Number of the mission, below 2^63.

@@ -107,8 +107,8 @@ class GroundTruth(NamedTuple):
 class Arrival(NamedTuple):
     """Either end: a telemetry or command datagram arrived, late ones included.
 
-    A repeated datagram is recorded while fewer are repeated than sent; after that it is only
-    counted. Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
+    Once more datagrams were repeated than sent, repeated datagrams are only counted.
+    Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
 
     Attributes:
         uplink: True for telemetry at cloud, False for commands at world.

@@ -6,7 +6,9 @@ import socket
 import socketserver
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler
 from math import inf
 from pathlib import Path
@@ -25,17 +27,21 @@ from cloudrc.records import Counted, Record
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """Content type of the text that `generate_latest` makes."""
-PATIENCE = 5.0
+CLIENT_WAIT_MAX = 5.0
 """Longest wait for a client [s]; Prometheus' default scrape timeout is 10 s."""
+CONNECTIONS_MAX = 16
+"""Largest number of connections. One more closes the oldest, so that silent clients use up neither
+the files nor the threads of the process."""
 KEPT = 0.25
-"""How long a page is reused [s]; making a page takes 1.4 ms and may delay the loop."""
+"""How long a page is reused [s]: making a page takes 1.4 ms and may delay the control loop."""
 CONFIG_DIGITS = 12
 """Length of the shortened hash of the process's configuration [hexadecimal digits]."""
 STILL_MAX = 5.0
-"""Time without a record after which a loop counts as standing still [s]; a healthy loop makes a
-record every second."""
-CPU_COUNTS = Path("/sys/fs/cgroup/cpu.stat")
-"""File with a container's CPU counts."""
+"""Time without a record after which the control loop counts as standing still [s]. A running loop
+makes a record every second."""
+CGROUP = Path("/sys/fs/cgroup")
+CPU_COUNTS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
+"""Files below CGROUP with a container's CPU counts: of cgroup v2, then two places of cgroup v1."""
 
 
 class Answer(NamedTuple):
@@ -47,9 +53,10 @@ class Answer(NamedTuple):
 
 
 class _Server(socketserver.ThreadingTCPServer):
-    """Serves pages by their paths until `close` is called.
+    """Answers each request on a thread of its own with the page of the requested path.
 
-    `http.server.HTTPServer` may wait for a name server. The accept queue is long, for bursts.
+    `http.server.HTTPServer` is not used, because it may wait for a name server. The accept queue is
+    long, so that a burst of connections delays no probe of kubelet.
     """
 
     allow_reuse_address = True
@@ -58,7 +65,7 @@ class _Server(socketserver.ThreadingTCPServer):
     request_queue_size = 1_024
 
     def __init__(self, address: tuple[str, int], pages: Mapping[str, Callable[[], Answer]]) -> None:
-        self.pages = pages
+        self.pages, self._newest = pages, deque[socket.socket]()
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, _Handler)
         threading.Thread(target=self.serve_forever, args=(0.25,), daemon=True).start()
@@ -69,6 +76,14 @@ class _Server(socketserver.ThreadingTCPServer):
             self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         super().server_bind()
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer on a new thread; close the oldest connection if there are too many."""
+        self._newest.append(request)
+        if len(self._newest) > CONNECTIONS_MAX:
+            with suppress(OSError):  # it has been answered
+                self._newest.popleft().shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the errors of clients that disconnect early."""
 
@@ -77,7 +92,7 @@ class _Handler(BaseHTTPRequestHandler):
     """Answers one request and closes the connection."""
 
     server: _Server
-    timeout = PATIENCE
+    timeout = CLIENT_WAIT_MAX
 
     def do_GET(self) -> None:
         """Answer with the page of the requested path, or with 404."""
@@ -94,23 +109,27 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing: a request comes every few seconds."""
 
 
-def read_throttling(path: Path = CPU_COUNTS) -> Readings:
+def read_throttling(root: Path = CGROUP) -> Readings:
     """Read how much the CPU limit has throttled this container; empty outside a container.
 
-    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us).
+    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
+    Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
     """
-    try:
-        words = (line.split() for line in path.read_text().splitlines())
-    except OSError:
-        return {}
-    counts = {key: int(number) for key, number in words}
-    if "nr_periods" not in counts:
-        return {}
-    return {
-        "cloudrc_cpu_periods_total": unlabelled(counts["nr_periods"]),
-        "cloudrc_cpu_throttled_periods_total": unlabelled(counts["nr_throttled"]),
-        "cloudrc_cpu_throttled_seconds_total": unlabelled(counts["throttled_usec"] * 1e-6),
-    }
+    for name in CPU_COUNTS:
+        try:
+            words = (line.split() for line in (root / name).read_text().splitlines())
+        except OSError:
+            continue
+        counts = {key: int(number) for key, number in words}
+        if "nr_periods" in counts:
+            stopped = counts.get("throttled_usec", 0) * 1e-6
+            stopped += counts.get("throttled_time", 0) * 1e-9
+            return {
+                "cloudrc_cpu_periods_total": unlabelled(counts["nr_periods"]),
+                "cloudrc_cpu_throttled_periods_total": unlabelled(counts["nr_throttled"]),
+                "cloudrc_cpu_throttled_seconds_total": unlabelled(stopped),
+            }
+    return {}
 
 
 class Exporter:
@@ -139,7 +158,7 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether this process is ready; the records of world and cloud show it for them."""
+        """Set whether a process other than world and cloud is ready. Their records show it."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -154,11 +173,11 @@ class Exporter:
         return self._live.link
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the shaper of a direction from now on, and the requested mode."""
+        """Set the shaper that acts on a direction, "relay" or "netem", and the requested mode."""
         self.link.shaped(shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:
-        """Set the mean delay [s] that the profile in force requests."""
+        """Set the mean delay [s] that the current profile requests for a direction."""
         self.link.asked(direction, delay)
 
     def unresolved(self, count: int) -> None:

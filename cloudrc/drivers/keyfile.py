@@ -16,7 +16,7 @@ SIZE_MAX = 4096
 
 
 class KeyFile:
-    """The keys of one end; `ring` always holds the valid keys."""
+    """Follows the key file of one end of the tunnel; `ring` always holds the valid keys."""
 
     def __init__(self, path: Path, now_ns: int) -> None:
         """Read the file at `now_ns` [ns, monotonic clock]; raise the errors of `read_keys`."""
@@ -53,7 +53,7 @@ class KeyFile:
 def read_keys(path: Path, named: str = "--key ") -> KeySet:
     """Read a key file without waiting, even if it is a pipe; `named` is the option that names it.
 
-    Raise a BadInputError if the file holds no key; its text has no part of the file.
+    Raise a BadInputError if the file holds no key. The message quotes no part of the file.
     """
     try:
         return parse(read(path, SIZE_MAX))

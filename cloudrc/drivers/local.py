@@ -38,11 +38,11 @@ START_LIMIT = 60.0
 STOP_LIMIT = 1.5
 """Time limit for a process to end after SIGTERM [s]; then the process is killed."""
 SILENCE_LIMIT = 5.0
-"""A process counts as hung when no line of its feed arrives for this long [s]. Every process sends
-a sign of life every second."""
+"""Time without a line from a process after which this process counts as hung [s]. Every process
+sends a line at least once a second."""
 PAUSE = 1.0
-"""If a turn of the supervisor's loop takes longer than this, the supervisor itself stood still [s]:
-it was stopped, or this machine is overloaded."""
+"""Longest turn of the supervisor's loop [s]. A longer turn means that the supervisor itself stood
+still: it was stopped, or this machine is overloaded."""
 SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
 """Longest name of a socket of a run, below the folder for temporary files."""
 API_FILE = "api.json"
@@ -71,7 +71,7 @@ def places() -> list[Path]:
 def announced(run: Path, api: str = "") -> Iterator[bool]:
     """Announce a flight while the block runs; yield whether its flight file could be written.
 
-    `run` is its folder, `api` the address of the operator's API ("" without one).
+    `run` is the folder of the run, `api` the address of the operator's API ("" without an API).
     """
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), "api": api})
     with contextlib.ExitStack() as stack:
@@ -149,13 +149,13 @@ class Child:
         for line in lines:
             self.heard = time.monotonic()
             self.ready |= line == READY.encode()
-            with contextlib.suppress(ValueError):  # a sign of life, or no record
+            with contextlib.suppress(ValueError):  # the line READY, or no record
                 records.append(from_line(line.decode()))
         return records
 
 
 class LocalRun:
-    """The four processes of one run; `notes` are for its report, a sentence each."""
+    """Runs and supervises the four processes of a flight; `notes` has sentences for the report."""
 
     def __init__(
         self, folder: Path, see: Callable[[list[Record]], None], *, api: bool = True

@@ -14,9 +14,10 @@ MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 
 
 def clock_id() -> bytes:
-    """Identify the monotonic clock by the kernel's boot id: processes with equal 16 bytes share it.
+    """Return 16 bytes that identify the monotonic clock: the kernel's boot id.
 
-    Without a boot id the bytes are random, and no one-way delays are reported.
+    Processes with equal bytes share the clock. Without a boot id the bytes are random, and no
+    one-way delays are reported.
     """
     try:
         boot = bytes.fromhex(_boot_id().replace("-", "").strip())
@@ -34,8 +35,8 @@ def _boot_id() -> str:
 def interpreter(*words: str) -> list[str]:
     """Build a command that runs this Python interpreter, for example with `-m cloudrc relay`.
 
-    It imports from the working folder, which may hold a run from somebody else, only if this
-    process does, for example under `python -m`.
+    The working folder may hold a run from somebody else. The new process imports from this folder
+    only if the present process does, for example under `python -m`.
     """
     here = os.getcwd() in sys.path or "" in sys.path
     return [sys.executable, *(() if here else ("-P",)), *words]
@@ -60,7 +61,7 @@ class Deadline:
         self.pause = 0.0
 
     def passed(self) -> bool:
-        """Check whether the limit has passed; call it in every turn of a loop."""
+        """Check whether the limit has passed; to be called in every turn of a loop."""
         now = self._clock()
         turn, self._before = now - self._before, now
         if turn > self._turn_max:

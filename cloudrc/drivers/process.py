@@ -48,9 +48,9 @@ if TYPE_CHECKING:
 PARENT = "CLOUDRC_PARENT"
 """Environment variable that holds the supervisor's process id."""
 READY = "ready"
-"""The line that a process writes when it can receive, and later as a sign of life."""
+"""The line that a process writes when it can receive, and then regularly while its loop runs."""
 ALIVE_PERIOD = 1.0
-"""Time between two signs of life [s]."""
+"""Time between two lines READY [s]."""
 EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
 """Record types of which the feed sends every record."""
 SAMPLED = (TelemetrySent, Control)
@@ -93,9 +93,9 @@ class Feed:
     """Sends selected records to a pipe without blocking; lines that nobody reads are lost."""
 
     def __init__(self, descriptor: int, *, watched: bool = True) -> None:
-        """Make the pipe non-blocking.
+        """Make the pipe `descriptor` non-blocking; `watched` tells whether a supervisor reads it.
 
-        If no supervisor watches it, as in a container, it gets only events, as lines of a log.
+        Without a supervisor, as in a container, the pipe gets only events, as lines of a log.
         """
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
@@ -111,11 +111,11 @@ class Feed:
         return feed
 
     def ready(self) -> None:
-        """Write that the process can receive."""
+        """Tell the supervisor that this process can receive datagrams."""
         self._write(READY)
 
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Wrap the `stop` that a loop calls in every turn: also write signs of life."""
+        """Wrap the `stop` that a loop calls in every turn: the loop then writes READY lines."""
         due = 0.0
 
         def ask() -> bool:
@@ -213,7 +213,7 @@ class LinkNotes:
         self._due_ns = self._released_ns = 0
 
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
-        """Return the records about the link that follow these records of the end.
+        """Return the records about the link that are due after the `records` of this end.
 
         `now_ns` is the machine's monotonic clock, `slip_ns` the lag of the end's own clock [ns].
         """
@@ -263,13 +263,13 @@ class EndProcess:
 
     Attributes:
         end: "world" or "cloud".
-        peer: Its socket.
-        recorder: Writes its records.
+        peer: Socket of the end.
+        recorder: Writes the records of the end.
         keys: Key file, which may get new keys.
-        feed: Tells its supervisor what happens.
+        feed: Sends records to the supervisor.
         exporter: Turns the records into metrics; None for no metrics.
         flights_only: Whether only events are recorded while the robot does not fly.
-        link: State file of the link, whose changes are recorded; None without one.
+        link: State file of the link, to record the link's changes; None without a link.
         check: Compares the link with its profile by the datagrams that this end receives.
     """
 
@@ -318,7 +318,7 @@ class EndProcess:
             thread.stop()
 
     def tell(self, records: list[Record]) -> None:
-        """Feed and export records, and the trouble and the losses of the recorder."""
+        """Send records to the supervisor and to the metrics, with the problems of the recorder."""
         recorder = self.recorder
         self.feed.tell(records)
         if records and recorder.error != self._trouble:
@@ -335,7 +335,7 @@ class EndProcess:
     ) -> list[Record]:
         """Return records of steps of the wall clock [s], new keys and changes of the link.
 
-        They follow the `records` of the end; `slip_ns` is the lag of its clock [ns].
+        `records` are the newest records of the end, `slip_ns` is the lag of the end's clock [ns].
         """
         now_ns = time.monotonic_ns()
         noted: list[Record] = [

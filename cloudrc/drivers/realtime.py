@@ -1,7 +1,7 @@
 """Run one endpoint in real time on a UDP socket and the machine's monotonic clock.
 
 The loop sleeps until the endpoint's next deadline or the next datagram, whichever comes first.
-All datagrams of one wake get the same instant, as the endpoint's contract requires.
+All datagrams of one wake get the same time, as the endpoint's contract requires.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from ipaddress import ip_address
 from pathlib import Path
 
 from cloudrc.endpoint import Endpoint
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.files import read, version
 from cloudrc.records import Lateness, Record
 from cloudrc.tunnel.codec import DATAGRAM_MAX
@@ -27,22 +28,22 @@ Address = tuple[str, int]
 DRAIN_MAX = 256
 """Largest number of datagrams per wake; so a flood cannot delay the loop's deadlines."""
 RECEIVE_BUFFER = 1 << 22
-"""Requested size of the socket's buffer [bytes]; has room for valid datagrams behind a flood."""
+"""Requested size of the socket's buffer [bytes]: room for valid datagrams behind a flood."""
 BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
 """Largest number of datagrams in a wake after a stall. This is more than can wait in the socket:
 Linux doubles the buffer, and a datagram takes at least 768 bytes of the buffer."""
 STALL_NS = 50_000_000
-"""If a wake is later than this, the loop takes all waiting datagrams at once [ns]: they arrived
-before the wake."""
+"""Lateness of a wake above which the loop takes all waiting datagrams at once [ns]: the datagrams
+arrived before the wake."""
 STALL_AGAIN_NS = 1_000_000_000
-"""The limit for the wake after a stall, in place of `STALL_NS` [ns]. It is longer, because
+"""Limit that replaces `STALL_NS` in the wake after a stall [ns]. This limit is longer, because
 receiving a flood takes long and must not look like one stall after another."""
 SINK_PERIOD_NS = 20_000_000
-"""Longest time between two calls of the sink [ns]."""
+"""Longest time between two calls of the function that takes the records [ns]."""
 WAIT_MAX_NS = 100_000_000
 """Longest wait for a datagram [ns]; then the loop calls `stop` again."""
 PORTS = range(20_000, 30_000)
-"""Ports among which `free_ports` chooses."""
+"""The ports from which `free_ports` chooses."""
 ROUTE_PERIOD_NS = 500_000_000
 """Time between two checks of the route file [ns]."""
 
@@ -117,7 +118,7 @@ class Peer:
         return datagrams
 
     def send(self, datagrams: list[bytes]) -> None:
-        """Send datagrams; without an address, or if the socket refuses them, they are lost."""
+        """Send datagrams. A datagram is lost if the address is unknown or the socket refuses it."""
         if self.address is not None:
             for data in datagrams:
                 with suppress(OSError):
@@ -132,7 +133,7 @@ def _reachable(bound: socket.socket, address: Address) -> Address:
 
 
 def bind(listen: Address) -> socket.socket:
-    """Open a UDP socket that does not block; with the host `::`, it also receives IPv4."""
+    """Open a UDP socket that does not block. A socket at the host `::` also receives IPv4."""
     family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
     udp = socket.socket(family, socket.SOCK_DGRAM)
     if listen[0] == "::":
@@ -148,20 +149,24 @@ def bind(listen: Address) -> socket.socket:
 
 
 def free_ports(count: int) -> list[int]:
-    """Find ports on 127.0.0.1 that are unused for both UDP and TCP.
+    """Choose ports on 127.0.0.1 by chance that are unused for both UDP and TCP.
 
     They are below the ports that the kernel gives to connections, which could take them meanwhile.
+    Raise a MissingPrerequisiteError if fewer than `count` ports are unused.
     """
     found: list[int] = []
-    for port in random.SystemRandom().sample(PORTS, 1000):
+    for port in random.SystemRandom().sample(PORTS, len(PORTS)):
         with socket.socket(type=socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
             with suppress(OSError):
                 udp.bind(("127.0.0.1", port))
                 tcp.bind(("127.0.0.1", port))
                 found.append(port)
         if len(found) == count:
-            break
-    return found
+            return found
+    raise MissingPrerequisiteError(
+        f"only {len(found)} of {count} ports from {PORTS[0]} to {PORTS[-1]} of 127.0.0.1 are free;"
+        " end a program that uses them"
+    )
 
 
 def serve(
@@ -179,8 +184,8 @@ def serve(
         endpoint: World or cloud.
         peer: Socket of the endpoint.
         end: "world" or "cloud", for the records.
-        sink: Gets the records, at least every 20 ms; must not block.
-        stop: Called at every wake, at most 100 ms apart.
+        sink: Function that takes the records, at least every 20 ms. It must not block.
+        stop: Function that is called at every wake; wakes are at most 100 ms apart.
         slip_ns: Lag of world's clock [ns].
 
     Raises:

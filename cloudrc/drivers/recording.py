@@ -36,7 +36,7 @@ covers the landing after a loss of the link."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
 """Types of records that are made all the time, with or without a flight."""
 BATCH = 16
-"""Number of records written at a time."""
+"""Largest number of records that are written without a pause."""
 IDLE = 0.1
 """Sleep after the queue was emptied [s]; a wake costs more time than writing a few records."""
 BUSY = 0.001
@@ -47,7 +47,7 @@ _SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the forme
 
 
 class WallClock:
-    """Detects that the wall clock was set, by the clock since boot, which nobody can set."""
+    """Detects when the wall clock was set: the clock since boot, which nobody can set, differs."""
 
     def __init__(self) -> None:
         """Read both clocks for the first time."""
@@ -97,7 +97,7 @@ class RecordingThread:
     """Runs a recorder in the background from `start` to `stop`."""
 
     def __init__(self, recorder: Recorder) -> None:
-        """Store the recorder: the loop puts records into it, only this thread takes them out."""
+        """Store the recorder. The loop puts records in, and only this class takes them out."""
         self._recorder = recorder
         self._stopping, self._flushed, self._over = threading.Event(), threading.Event(), False
         # Daemon threads, so that a hanging disk cannot keep the process from ending.
@@ -107,7 +107,7 @@ class RecordingThread:
         self._wall, self._steps = WallClock(), deque[float]()
 
     def start(self) -> None:
-        """Start to write and to sync."""
+        """Start to write the recording to its file, and to sync the file to the disk."""
         for thread in (self._writing, self._syncing):
             thread.start()
 
@@ -120,7 +120,7 @@ class RecordingThread:
         return [self._steps.popleft() for _ in range(len(self._steps))]
 
     def stop(self, timeout: float = 1.5) -> bool:
-        """End the file; return whether it was complete within `timeout` [s]."""
+        """Complete the file; return whether this took at most `timeout` [s]."""
         self._stopping.set()
         self._writing.join(timeout)
         return not self._writing.is_alive()

@@ -14,10 +14,10 @@ class Channel:
     """Track the received counters of one stream in one epoch."""
 
     def __init__(self, newest_wins: bool) -> None:
-        """Start empty; with `newest_wins` a datagram older than the newest is late.
+        """Start without counters; with `newest_wins`, a datagram older than the newest is late.
 
-        Without it the last datagram to arrive is used, even if it is older (the published code's
-        policy). Repeats are dropped in both cases.
+        Otherwise the last datagram to arrive is used, even if an earlier datagram is newer (the
+        published code's policy). Repeated datagrams are dropped in both cases.
         """
         self._newest_wins = newest_wins
         self.reset()
@@ -30,7 +30,7 @@ class Channel:
 
     @property
     def is_flooded(self) -> bool:
-        """Whether there are more repeats than sent datagrams; no link repeats so many."""
+        """Whether more datagrams were repeated than sent; no link repeats so many."""
         return self._repeats > self._newest + 1
 
     def take(self, counter: int) -> str:

@@ -72,7 +72,8 @@ class Hello(NamedTuple):
     """Cloud's request for a session.
 
     It names the session and cloud's monotonic clock by 16 random bytes each. The cookie of 13 bytes
-    is that of world's challenge, or zeros. World continues from `epoch`, cloud's newest.
+    is that of world's challenge, or zeros. World continues from `epoch`, the newest
+    epoch that cloud knows.
     """
 
     nonce: bytes

@@ -41,9 +41,9 @@ CHALLENGE_NS = 100_000_000
 COOKIE_NS = 2_000_000_000
 """Length of a cookie's time slot [ns]; a cookie is valid in its slot and in the next slot."""
 GRACE_NS = 1_000_000_000
-"""Time for which a cloud keeps a new session although world has not heard it yet [ns]."""
+"""Time for which a cloud keeps a new session although world has not heard that cloud yet [ns]."""
 REPEATS_MAX = 3
-"""How often world repeats its acceptance to a cloud that it does not hear."""
+"""How often world repeats its acceptance to a cloud that world does not hear."""
 CLOUDS_MAX = 64
 """Number of nonces of which world remembers the newest counter."""
 NO_COOKIE = bytes(codec.COOKIE_SIZE)

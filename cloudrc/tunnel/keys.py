@@ -69,7 +69,7 @@ class Key:
 
 
 class KeySet(NamedTuple):
-    """The content of a key file: the key to use, and perhaps its predecessor, still accepted."""
+    """The content of a key file: the key in use, and perhaps an older key, still accepted."""
 
     current: Key
     previous: Key | None = None
@@ -90,7 +90,7 @@ class KeyRing:
 def parse(data: bytes) -> KeySet:
     """Parse a key file: 32 bytes, or the lines `current HEX` and optionally `previous HEX`.
 
-    Raise a ValueError if the file is invalid; its text has no part of the file.
+    Raise a ValueError if the file is invalid. The message quotes no part of the file.
     """
     if len(data) == KEY_SIZE:
         return KeySet(Key(data))

@@ -62,7 +62,7 @@ class Session:
     """
 
     def __init__(self, sends: Direction, ring: KeyRing | None) -> None:
-        """Start without a session; this end sends in the direction `sends` and opens the other one.
+        """Start without a session; this end sends in the direction `sends`.
 
         `ring` holds the pre-shared keys; it is None if both ends are in one process.
         """
@@ -79,7 +79,7 @@ class Session:
         """Begin an epoch: derive new keys and restart the counters.
 
         `nonces` are cloud's nonce, then world's; `key` is the pre-shared key of the handshake.
-        Those that are missing stay as in the previous epoch.
+        A value that is missing stays as in the previous epoch.
         """
         self.epoch = epoch
         self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)

@@ -66,9 +66,9 @@ class Orders:
     def __init__(
         self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
     ) -> None:
-        """Carry out nothing yet; `command_age_max_ns` is the largest age of a command [ns].
+        """Begin without a request; `command_age_max_ns` is the largest age of a command [ns].
 
-        `Orders` counts "start_refused" in `counts`.
+        Refused starts are counted in `counts` as "start_refused".
         """
         self._guard, self._counts = guard, counts
         self._age_max_ns = max(START_AGE_MAX_NS, command_age_max_ns)
@@ -121,11 +121,11 @@ class Orders:
 
 
 REPORT_AGAIN_NS = 10_000_000_000
-"""World reports a slowdown as a new fault if none was seen for longer than this [ns]."""
+"""Time without a slowdown after which world reports the next slowdown as a new fault [ns]."""
 
 
 class PaceMonitor:
-    """Reports a world slower than real time: then the robot is slow, not the network."""
+    """Reports that simulated time passes too slowly; otherwise users would blame the network."""
 
     def __init__(self) -> None:
         self._checked_ns = self._slip_ns = self._slow_ns = NEVER_NS
@@ -173,15 +173,11 @@ class WorldEndpoint(TunnelEnd):
         command_age_max_ns: int,
         start_ns: int = 0,
     ) -> None:
-        """Connect the parts; the guard of `robot` is in GROUND, `sensors` add noise to odometry.
+        """Connect the robot, whose guard is in GROUND, with the tunnel.
 
-        Args:
-            robot: The robot.
-            sensors: The sensors.
-            identity: The identity of this end.
-            newest_wins: Whether late commands are dropped.
-            command_age_max_ns: Longest wait in the socket of a datagram that is not stale [ns].
-            start_ns: The monotonic clock now [ns].
+        `newest_wins` tells whether late commands are dropped. A datagram that may have waited in
+        the socket for longer than `command_age_max_ns` [ns] is stale. `start_ns` is the monotonic
+        clock now [ns].
         """
         super().__init__(identity, Direction.UPLINK, newest_wins)
         self.robot, self._sensors = robot, sensors

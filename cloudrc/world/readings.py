@@ -37,10 +37,11 @@ class Readings(NamedTuple):
 
     @classmethod
     def of(cls, pose: Iterable[float], twist: Iterable[float]) -> Readings:
-        """Make readings from the state of a free joint in MuJoCo, in the world frame.
+        """Make readings from the state of a free joint in MuJoCo.
 
-        `pose` is position [m] and orientation (wxyz, unit), shape (7,); `twist` is velocity [m/s]
-        and angular velocity [rad/s], body frame, shape (6,).
+        `pose` has the position [m], world frame, and the orientation (wxyz, unit), shape (7,).
+        `twist` has the velocity [m/s], world frame, and the angular velocity [rad/s], body frame,
+        shape (6,).
         """
         px, py, pz, w, x, y, z = pose
         vx, vy, vz, p, q, r = twist

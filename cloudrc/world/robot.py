@@ -23,7 +23,7 @@ class Observer(Protocol):
     """Sees what a robot receives and does, and changes nothing. Times are on world's clock [ns]."""
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
-        """Observe a physics step: its begin, and the readings and rotor speeds that it uses."""
+        """Observe a physics step that begins at `now_ns` with these readings and rotor speeds."""
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
         """Observe a command and the guard's answer; `rejection` is None if the guard accepts it."""
@@ -32,11 +32,11 @@ class Observer(Protocol):
         """Observe an operator request after it was carried out."""
 
     def see_session(self, now_ns: int) -> None:
-        """See a new session begin: earlier commands no longer count."""
+        """Observe that a new session begins: earlier commands no longer count."""
 
 
 class Robot:
-    """Runs the ticks of physics, guard and low-level controller, and tells its `observers`."""
+    """Runs the ticks of physics, guard and low-level controller, and informs its `observers`."""
 
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         self.simulator = simulator

@@ -61,9 +61,9 @@ mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 
 def model_path(kind: str, name: str) -> Path:
-    """Find a file of "robots" or "scenes" by its shipped name or the path of an .xml file.
+    """Find a file of a `kind`, "robots" or "scenes", by its shipped name or an .xml file's path.
 
-    Raise a BadInputError, which lists the shipped files, if this one does not exist.
+    If there is no such file, raise a BadInputError that lists the shipped files.
     """
     path = Path(name) if name.endswith(".xml") else FOLDER / kind / f"{name}.xml"
     if not path.is_file():

@@ -86,7 +86,7 @@ class Simulator:
         """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
 
         Thrust and drag use the rotor speeds at the end of the step, and the drag uses the velocity
-        at its beginning.
+        at the beginning of the step.
         """
         before, data = self.readings, self._data
         controls = self._rotors.step(rotor_speeds, before)
@@ -126,9 +126,9 @@ class Simulator:
         return touches
 
     def state(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return a copy of the state of the physics, `mjSTATE_FULLPHYSICS`, shape (n,).
+        """Return the state of the physics, `mjSTATE_FULLPHYSICS`, for `replay`, shape (n,).
 
-        The second array has the accelerations that the contact solver starts from, shape (nv,).
+        The second array has the accelerations from which the contact solver starts, shape (nv,).
         """
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
@@ -169,7 +169,8 @@ def replay(
 ) -> npt.NDArray[np.float64]:
     """Replay a `Simulator.tape` without a reset at the speed of raw `mj_step`, for the benchmark.
 
-    It starts from `Simulator.state()`. Return the physics at the end, which are equal bit by bit.
+    The replay starts from `Simulator.state()`. Return the state of the physics at the end, which is
+    equal to that of the flight, bit by bit.
     """
     from mujoco import rollout
 

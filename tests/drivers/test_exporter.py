@@ -1,5 +1,6 @@
 """The exporter: valid text in bounds, probes on one port, hostile clients, CPU throttling."""
 
+import select
 import socket
 import threading
 import time
@@ -145,18 +146,22 @@ def test_a_record_costs_less_than_a_microsecond(end, flight):
 
 
 @pytest.mark.parametrize(
-    ("text", "counts"),
+    ("file", "text", "counts"),
     [
-        ("nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n", [120, 17, 1.25]),
-        ("usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),  # without a limit
-        ("", []),
-        (None, []),
+        ("cpu.stat", "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n", [120, 17, 1.25]),
+        *((file, "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n", [4, 2, 0.5])
+          for file in ("cpu/cpu.stat", "cpu,cpuacct/cpu.stat")),
+        ("cpu.stat", "usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),
+        ("cpu.stat", "", []),
+        (None, "", []),
     ],
-)
-def test_throttling_is_read_from_the_kernel(text, counts, tmp_path):
-    if text is not None:
-        (tmp_path / "cpu.stat").write_text(text)
-    read = read_throttling(tmp_path / "cpu.stat")
+    ids=["limited", "v1", "v1 with a joint mount", "unlimited", "empty", "missing"],
+)  # fmt: skip
+def test_throttling_is_read_from_the_kernel(file, text, counts, tmp_path):
+    if file is not None:
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text(text)
+    read = read_throttling(tmp_path)
     values = [value for reading in read.values() for value in dict(reading).values()]
     assert values == pytest.approx(counts)
 
@@ -240,6 +245,9 @@ def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
     for client in waiting[-2:]:
         client.sendall(b"GET /metr")
     assert get(served[1], "/healthz")[0] == 200
+    closed = select.select(waiting, [], [], 0)[0]  # the oldest ones
+    assert closed == waiting[: len(closed)]
+    assert len(closed) == len(waiting) + 1 - exporters.CONNECTIONS_MAX
     for client in waiting:
         client.close()
 

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from cloudrc.drivers import process
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.process import (
     PARENT,
@@ -31,6 +32,7 @@ from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import (
     Counted,
+    Fault,
     GuardChange,
     LinkChanged,
     MissionEvent,
@@ -302,14 +304,17 @@ def test_a_change_of_the_other_direction_is_recorded_but_not_fed(path, pipe):
     assert [line.rpartition("(")[2] for line in said] == ["slower)", "back)"]
 
 
-def test_an_end_tells_of_its_clock_and_of_its_recorders_trouble(pipe):
+def test_an_end_tells_of_its_clock_key_link_and_recorder(path, pipe):
     recorder = SimpleNamespace(error="", dropped=0)
-    keys, exporter = SimpleNamespace(follow=lambda now_ns: []), Exporter("world")
-    run = EndProcess("world", None, recorder, keys, Feed(pipe[1], watched=False), exporter)
+    keys = SimpleNamespace(follow=lambda now_ns: [Fault(now_ns, "key", "new key")])
+    exporter, feed = Exporter("world"), Feed(pipe[1], watched=False)
+    tell(path, STATE)
+    run = EndProcess("world", None, recorder, keys, feed, exporter, link=path)
     slip_ns = 5_000_000_000
     began_ns = time.monotonic_ns() - slip_ns
     noted = run.look_around([], slip_ns, [60.0, -1.0])
-    assert [record.code for record in noted] == ["wall_clock", "wall_clock"]
+    assert [record.code for record in noted[:3]] == ["wall_clock", "wall_clock", "key"]
+    assert [type(record) for record in noted[3:]] == [LinkChanged]
     assert 0 <= noted[0].stamp_ns - began_ns < 1_000_000_000
     run.tell(noted)
     assert "cloudrc_clock_steps_total 2.0" in exporter.text()
@@ -320,3 +325,18 @@ def test_an_end_tells_of_its_clock_and_of_its_recorders_trouble(pipe):
     said = os.read(pipe[0], 4096).decode()
     assert said.count("wall clock stepped by +60.0 s: ") == 1
     assert said.count(recorder.error) == 1
+
+
+def test_what_an_end_says_is_recorded_fed_and_exported(pipe, monkeypatch):
+    put, exporter = [], Exporter("world")
+    nothing = dict.fromkeys(("flush", "sync"), lambda **_: None)
+    recorder = SimpleNamespace(
+        put=put.extend, drain=lambda most: 0, close=lambda: None, error="", dropped=0, **nothing
+    )
+    keys = SimpleNamespace(follow=lambda now_ns: [Fault(now_ns, "key", "new key")])
+    monkeypatch.setattr(process, "serve", lambda *_, sink, **__: sink([EVENT]))
+    run = EndProcess("world", None, recorder, keys, Feed(pipe[1], watched=False), exporter)
+    run.run(None, lambda: True, lambda: True)
+    assert [type(record) for record in put] == [type(EVENT), Fault, Counted]
+    assert "new key" in os.read(pipe[0], 4096).decode()
+    assert exporter._seen_at is not None

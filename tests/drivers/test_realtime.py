@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.drivers import realtime
 from cloudrc.drivers.realtime import (
     BACKLOG_MAX,
     DRAIN_MAX,
@@ -20,6 +21,7 @@ from cloudrc.drivers.realtime import (
     serve,
     split_address,
 )
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.tunnel.codec import DATAGRAM_MAX, DecodeError, Direction, Kind
 from cloudrc.tunnel.session import Session, pair
 from tests.flights.conftest import bare_world, ring
@@ -122,6 +124,17 @@ def test_ends_meet_over_ipv6_and_at_both_families(listen, other):
         own.send([b"there"])
         far.send([b"back"])
         assert (far.receive(), own.receive()) == ([b"there"], [b"back"])
+
+
+def test_ports_in_use_are_not_chosen(monkeypatch):
+    with socket.socket() as taken, bind(("127.0.0.1", 0)) as udp:
+        taken.bind(("127.0.0.1", 0))
+        (free,) = realtime.free_ports(1)
+        busy = [taken.getsockname()[1], udp.getsockname()[1]]
+        monkeypatch.setattr(realtime, "PORTS", [*busy, free])
+        assert realtime.free_ports(1) == [free]
+        with pytest.raises(MissingPrerequisiteError, match="only 1 of 2 ports"):
+            realtime.free_ports(2)
 
 
 class Late:

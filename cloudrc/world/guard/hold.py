@@ -70,8 +70,8 @@ class PositionHold:
     def follow(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
         """Return the next reference for braking, holding or descending [m/s], world frame.
 
-        `reference` is that of the last tick [m/s], shape (3,), `dt` ago [s]; `sink` is the speed of
-        the descent [m/s], and 0 holds the height.
+        `reference` is the reference of the last tick, `dt` [s] ago, shape (3,). `sink` is the speed
+        of the descent [m/s]; with 0 the robot keeps its height above the ground.
         """
         if self._hold_point is None:
             return self._brake(reference, readings, sink, dt)
@@ -107,7 +107,8 @@ def brake_start(reference: Vector, velocity: Vector) -> Vector:
     """Return the reference for the start of braking [m/s], which is slower than the robot.
 
     The robot follows late: if the reference were faster, it would first speed up. `reference` is
-    the finite one of the last tick, `velocity` that of the robot [m/s], world frame, shape (3,).
+    the finite reference of the last tick, `velocity` is that of the robot; both are in [m/s], world
+    frame, shape (3,).
     """
     start = velocity if hypot(*velocity) < hypot(*reference) else reference
     speed = hypot(*start)
@@ -136,7 +137,7 @@ class Descent:
     """
 
     def __init__(self, floor: float, speed_max: float) -> None:
-        """Set `floor`, the lowest height of a hold point [m], and the cap `speed_max` [m/s]."""
+        """Set `floor`, the lowest z of a hold point [m], and the speed cap `speed_max` [m/s]."""
         self._floor, self.speed = floor, min(LAND_SPEED, speed_max)
         self._still_speed = min(STILL_SPEED, STILL_SHARE * self.speed)
         self.begin(0)
@@ -153,7 +154,7 @@ class Descent:
     def is_over(self, now_ns: int, reference: Vector, readings: Readings) -> bool:
         """Note the motion of this tick at `now_ns` [ns]; tell whether the robot has touched down.
 
-        `reference` is that of the last tick [m/s].
+        `reference` is the reference of the last tick [m/s].
         """
         if reference[2] > -0.5 * self.speed or abs(readings.velocity[2]) >= self._still_speed:
             self._moved_ns = now_ns

@@ -251,7 +251,10 @@ class Limits:
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
 
     def alone_max_ns(self, flies: bool) -> int:
-        """Return how long a robot in a mission waits for its cloud before LAND [ns]."""
+        """Return how long a robot in a mission waits for its cloud before LAND [ns].
+
+        `flies` tells whether the robot is in the air.
+        """
         return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
 
     def inner_corners(self) -> tuple[Vector, Vector]:

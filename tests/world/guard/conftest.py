@@ -251,7 +251,7 @@ class AtLeast:
     """Any float from `bound` > 0 on, infinity included; z3 takes half a minute for their product.
 
     A correctly rounded sum or product of such floats is monotonic: the result is at least that of
-    the bounds, and never NaN.
+    the bounds, and never NaN. A factor that is zero, negative or NaN fails the assertion.
     """
 
     def __init__(self, bound):
