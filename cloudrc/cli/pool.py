@@ -85,7 +85,8 @@ def map_in_order(
         return
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, _end_with_parent)
+    with _isolated_start():  # starts multiprocessing's resource tracker
+        pool = ProcessPoolExecutor(workers, context, _end_with_parent)
     try:
         with _isolated_start():  # submit() starts the workers
             futures = [pool.submit(function, each) for each in work]

@@ -18,7 +18,7 @@ from cloudrc.cli.main import main
 from cloudrc.cli.pool import WorkerDiedError, _hung_up, interrupt_on_signals, map_in_order
 
 KILLED = 5
-"""The piece of work that kills its process."""
+"""The piece of work at which a worker kills its own process."""
 
 
 @pytest.fixture(autouse=True)
