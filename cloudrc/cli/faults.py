@@ -99,10 +99,7 @@ def _folder(text: str) -> Path:
 JOBS = (read_count, 1, "J", "number of parallel processes, at most one per core (default: 1)")
 STORED = f"folder for failing schedules, after reduction (default: ./{STORE})"
 OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
-    "run": {
-        "--seed": (_seed, 1, "N", "seed (default: 1)"),
-        "--jobs": JOBS,
-    },
+    "run": {"--seed": (_seed, 1, "N", "seed (default: 1)"), "--jobs": JOBS},
     "search": {
         "--minutes": (_minutes, 1.0, "M", "duration (default: 1)"),
         "--first": (_seed, 1, "SEED", "first seed (default: 1)"),

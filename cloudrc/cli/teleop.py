@@ -16,12 +16,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
-from cloudrc.cli.processes import (
-    open_exporter,
-    process_arguments,
-    read_address,
-    warn_if_exposed,
-)
+from cloudrc.cli.processes import open_exporter, process_arguments, read_address, warn_if_exposed
 from cloudrc.drivers.realtime import Address
 
 if TYPE_CHECKING:
@@ -42,9 +37,9 @@ PAUSE_LIMIT_NS = 500_000_000
 """Longest time that an ending teleop waits until the robot holds its position [ns]."""
 EPILOG = """\
 teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
---start it ends after that mission; otherwise on SIGTERM, on Ctrl-C
-and when its parent process has ended. A flying robot then holds; a new teleop
-with the same --journal resumes the mission.
+--start teleop ends after the experiment's mission; otherwise it ends on
+SIGTERM, on Ctrl-C and when its parent process has ended. A flying robot then
+holds; a new teleop with the same --journal resumes the mission.
 
 /openapi.json describes the API. The API asks for a token, except on a socket
 file, which only its owner can open. To make a token that only you can read:
