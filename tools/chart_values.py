@@ -26,7 +26,7 @@ Texts = dict[str, str]
 
 
 class Values(BaseModel):
-    """A part of the values: camelCase keys, no unknown ones."""
+    """Base class of the parts of the values: keys in camelCase, unknown keys are refused."""
 
     model_config = ConfigDict(
         extra="forbid",

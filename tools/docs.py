@@ -36,7 +36,7 @@ PARTS = {
     **dict.fromkeys(("uplink", "downlink"), "#one-direction-of-a-link"),
     **dict.fromkeys(KINDS, "#plug-ins-of-the-cloud"),
 }
-"""Keys whose own keys have a section, and its link."""
+"""Key whose value has a section of its own -> link to that section."""
 
 ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
 CLOCKS = {
@@ -97,7 +97,7 @@ def outputs() -> dict[Path, str]:
 
 def leftovers() -> list[Path]:
     """List the copies in the chart whose originals are gone."""
-    return [path for path in (CHART / "files").glob("*/*.yaml") if path not in outputs()]
+    return sorted({*(CHART / "files").glob("*/*.yaml")} - outputs().keys())
 
 
 def _insert(page: Path, text: str) -> dict[Path, str]:
@@ -110,7 +110,7 @@ def _insert(page: Path, text: str) -> dict[Path, str]:
 
 
 def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
-    """Write a table in Markdown; `columns` are their heads, with bars between them."""
+    """Write a table in Markdown; `columns` has the heads of the columns, separated by bars."""
     lines = [f"| {columns} |", f"|{'---|' * len(columns.split('|'))}"]
     for row in rows:
         lines.append(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |")
@@ -191,7 +191,7 @@ def _default(value: Any) -> str:
 
 
 def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
-    """Put what an error message asks for into a cell: shorter, and with a link to its keys."""
+    """Shorten the expectation of an error message for a table, and link a mapping's section."""
     if words.startswith("a list of"):
         item = problems.expectation(model, (*path, "0")).partition(" [")[0]
         words += item.removeprefix("must be a number")
@@ -300,7 +300,7 @@ def _labels(metric: Metric) -> str:
 VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"
 WIDTH = 96
 COMPACT = (Resources, Quantities)
-"""Parts of the values that Kubernetes defines."""
+"""Parts of the values whose keys Kubernetes defines; a part is written on one line."""
 
 
 def _values_text(part: BaseModel, depth: int = 0) -> str:

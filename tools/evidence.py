@@ -1,7 +1,8 @@
-"""Write the page of a night: index.md, numbers.json and environment.json in build/evidence.
+"""Write the results of `make nightly`: index.md, numbers.json and environment.json.
 
-`make nightly` calls it last, with the folder in which the tests, `cloudrc faults`, mutmut and the
-bench of the link have left their results. The page leaves out what did not run.
+`make nightly` runs this module last, with the folder build/evidence, in which the tests,
+`cloudrc faults`, mutmut and the benchmark of the link have left their results. A result that is
+missing there has no section in index.md.
 """
 
 from __future__ import annotations
@@ -23,21 +24,21 @@ Rows = Iterable[Iterable[object]]
 
 
 def environment() -> dict[str, Any]:
-    """Say which commit was measured, and on what machine."""
+    """Describe the commit that was measured, and the machine."""
     git = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip()
     return {"commit": commit or "unknown", **environment_document()}
 
 
 def read(folder: Path, names: str) -> Iterator[dict[str, Any]]:
-    """Read the JSON files of some names; one that is empty belongs to a command that broke."""
+    """Read the JSON files that match `names`; skip empty files, which failed commands leave."""
     for path in sorted(folder.glob(names)):
         if text := path.read_text(encoding="utf-8"):
             yield json.loads(text)
 
 
 def numbers(folder: Path) -> list[dict[str, Any]]:
-    """Take the worst of each number that tests have noted, and the sum of its cases."""
+    """Take the worst value of each number that tests have measured, and add up its cases."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for path in sorted(folder.glob("numbers/*.jsonl")):
         for row in map(json.loads, path.read_text(encoding="utf-8").splitlines()):
@@ -49,7 +50,7 @@ def numbers(folder: Path) -> list[dict[str, Any]]:
 
 
 def _badness(row: dict[str, Any]) -> float:
-    """Order rows of one number; one that was not measured is the worst."""
+    """Return how far a value misses its bound; a value that was not measured is the worst."""
     if row["measured"] is None:
         return float("inf")
     badness = row["measured"] - row["asked"]
@@ -57,7 +58,7 @@ def _badness(row: dict[str, Any]) -> float:
 
 
 def number_rows(found: list[dict[str, Any]]) -> Rows:
-    """Lay the numbers out in cells."""
+    """Format the numbers as rows of a table."""
     for row in found:
         measured = "-" if row["measured"] is None else f"{row['measured']:.4g} {row['unit']}"
         asked = f"{row['relation']} {row['asked']:g} {row['unit']}"
@@ -80,12 +81,12 @@ def fault_rows(folder: Path) -> Rows:
 
 
 def section(title: str, head: Iterable[str], rows: Rows) -> str:
-    """Lay out a section with a table."""
+    """Format a section with a table."""
     return f"## {title}\n\n{table(' | '.join(head), rows)}"
 
 
 def page(folder: Path, here: dict[str, Any], found: list[dict[str, Any]]) -> str:
-    """Lay out the page, a section for each kind of evidence."""
+    """Format the page, with a section for each kind of result."""
     tests, faults = ("run", "tests", "failed", "errors", "skipped"), ("fault", "name")
     parts = [
         f"# Evidence of commit {here['commit']}\n",
@@ -106,7 +107,7 @@ def page(folder: Path, here: dict[str, Any], found: list[dict[str, Any]]) -> str
 
 
 def write(folder: Path) -> None:
-    """Write the page, and the files that it is made of."""
+    """Write the page and its two JSON files."""
     here, found = environment(), numbers(folder)
     write_json(folder / "environment.json", here)
     write_json(folder / "numbers.json", {"schemaVersion": 1, "numbers": found})

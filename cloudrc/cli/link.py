@@ -81,7 +81,7 @@ RANGES: dict[str, tuple[float, float]] = {
 }
 """Option of `show` -> its least and largest value."""
 ROWS = 1000
-"""Least number of packets for the picture of a trace; a short trace gets several per row."""
+"""Least number of packets in the picture of a trace; a short trace gets several for each row."""
 SECONDS = 30.0
 """Default time that the picture shows [s]; longer if the profile's time line is longer."""
 KINDS = ("png", "svg", "pdf")

@@ -200,7 +200,8 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 def _halves(recording: Recording, path: Path) -> Packets:
     """Estimate each packet's delay as half of a round trip, at the time of sending the command.
 
-    Losses do not show. Telemetry repeats an echo until the next command; the repeats do not count.
+    Losses are not visible. Telemetry repeats an echo until the next command arrives; the repeats
+    do not count.
     """
     from cloudrc.link.logs import Log
 

@@ -44,7 +44,7 @@ TOOL_TIMEOUT = 5.0
 """Time limit of one call of tc or ip [s]."""
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
-"""Command whose answer of one line marks the end of the answer before."""
+"""Command after each other command; its answer of one line marks the end of the answer before."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,8 +1,9 @@
 """Run `cloudrc link verify`: compare a link with its profile, by probes or in flight.
 
-On this machine the link runs as one process per direction; netem runs in two network namespaces,
-joined by a veth pair, as between two pods. In a release each end judges the tunnel's own datagrams
-and serves the result at /link.json of its metrics port; each link container shows what it shapes.
+By default one process per direction shapes a link on this machine; for netem in two network
+namespaces, joined by a veth pair, as between two pods. In a release each end judges the datagrams
+of the flight and serves the verdict at /link.json of its metrics port; the link containers report
+their shapers there.
 """
 
 from __future__ import annotations
@@ -77,11 +78,11 @@ WAYS = {
     "uplink": ("world", "cloud", Kind.TELEMETRY),
     "downlink": ("cloud", "world", Kind.COMMAND),
 }
-"""Direction -> the end that sends in it, the end that receives, and what."""
+"""Direction -> its sending end, its receiving end, and the kind of datagram sent."""
 KEYS = ("asked", "measured", "low", "high")
-"""Values of a row."""
+"""Values of a row, in the order in which a table shows them."""
 NOT_JUDGED = "NOT JUDGED"
-"""Mark in a note: something that the profile asks for was not verified."""
+"""Word in a note that something requested by the profile was not verified."""
 TOLD = {
     "correlation": f"correlation {NOT_JUDGED}: netem realises almost none of it",
     "rate": f"rate {NOT_JUDGED}: only trains of probes measure it, up to 100 Mbit/s",
@@ -120,7 +121,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
-    """Find the experiment; a profile replaces the link of the default experiment."""
+    """Read the experiment `target`, or the default experiment with the profile `target`."""
     experiments, profiles = shipped.names("experiment"), shipped.names("profile")
     is_profile = target not in experiments
     if shipped.is_path(target):
@@ -150,7 +151,7 @@ class Way:
 def verify(
     title: str, experiment: ResolvedExperiment, shaper: str, seconds: float | None
 ) -> Report:
-    """Probe a link for `seconds` [s], None for as long as needed; measure twice what is off."""
+    """Probe a link for `seconds` [s], None for as long as needed; if a row is off, probe again."""
     plans, found = make_plans(experiment, seconds, shaper), dict[str, Findings]()
     longest = max(plan.sent[-1] for plan in plans.values())
     for look in ("sending probes", "measuring again what is off"):
@@ -270,7 +271,7 @@ def _advise(text: str) -> str:
 
 
 def _ended(name: str, code: int, log: str) -> CloudrcError:
-    """Pass on the error of a process: the last line of its log, and its exit code."""
+    """Make the error for a process that ended, from its log and exit code."""
     last = (log.strip().splitlines() or ["it left no message"])[-1]
     text = f"the {name} is not shaped: {_advise(last.removeprefix('cloudrc: error: '))}"
     known = {one.exit_code: one for one in (BadInputError, MissingPrerequisiteError, TimedOutError)}
@@ -326,7 +327,7 @@ def inside(namespace: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _pods(options: argparse.Namespace) -> Iterator[Pods]:
-    """Find the pages of a release's ends, at given hosts or through the cluster's API."""
+    """Yield the URLs of a release's ends: on the hosts of --ends, or through the cluster's API."""
     hosts = options.ends.split(",") if options.ends else []
     if hosts and (len(hosts) != 2 or not all(hosts)):
         raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
@@ -401,7 +402,7 @@ def _findings(found: Mapping[str, Any], link: str) -> Findings:
 
 
 def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
-    """Note what was not judged."""
+    """Yield a note for everything in one direction that was not judged."""
     judged = {row.name for row in rows if row.verdict != "told"}
     if not rows:
         yield f"{way}: no datagrams to measure; fly a mission first"
@@ -414,7 +415,10 @@ def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
 
 
 def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[str, str]) -> Report:
-    """Make plain values in SI units, shares in [0, 1]; unknown values are left out."""
+    """Make the report for JSON, in SI units and shares in [0, 1], without unknown values.
+
+    `probes` describes the measured datagrams of each direction.
+    """
     shapers = {one.evidence.shaper or "an unknown shaper" for one in findings.values()}
     verdicts = {verdict_of(one.rows) for one in findings.values()}
     return {

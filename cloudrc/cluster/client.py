@@ -6,6 +6,7 @@ Errors of the cluster and of the programs become one sentence.
 from __future__ import annotations
 
 import json
+import logging
 import re
 import shutil
 import subprocess
@@ -68,7 +69,7 @@ class Release:
 
     Attributes:
         context: Context of the kubeconfig; None for the current context.
-        namespace: Namespace of the release; None for that of the context, for kubectl alone.
+        namespace: Namespace of the release; None for the context's own (kubectl only).
         name: Name of the Helm release.
     """
 
@@ -112,7 +113,7 @@ class Release:
         from kubernetes import client, config
 
         configuration = client.Configuration()
-        with explain_errors("read the kubeconfig", self.where):
+        with explain_errors("read the kubeconfig", self.where), _login_errors(self.where):
             load: Any = config.load_kube_config  # not annotated
             load(context=self.context, client_configuration=configuration)
         configuration.retries = False  # callers repeat a request themselves, with a message
@@ -121,7 +122,7 @@ class Release:
     def request(
         self, verb: str, kind: str, *, timeout: float = REQUEST_TIMEOUT, **arguments: Any
     ) -> Any:
-        """Send a request about objects in the release's namespace, with a `timeout` [s].
+        """Send a request about objects in the release's namespace.
 
         Args:
             verb: "list", which returns a list; or "get", "create" or "delete".
@@ -146,6 +147,24 @@ class Release:
         selector = ",".join(f"{name}={value}" for name, value in self.labels(component).items())
         found: list[Any] = self.request("list", kind, label_selector=selector)
         return found
+
+
+@contextmanager
+def _login_errors(where: str) -> Iterator[None]:
+    """Raise an error if the kubeconfig's login program fails; the client only logs the failure."""
+
+    def refuse(record: logging.LogRecord) -> bool:
+        raise MissingPrerequisiteError(
+            f"cannot log in to the cluster {where}: the kubeconfig's login program failed: "
+            f"{' '.join(record.getMessage().split())}; install it, or run it by hand to see why"
+        )
+
+    root = logging.getLogger()  # the logger of the client's module for kubeconfigs
+    root.addFilter(refuse)
+    try:
+        yield
+    finally:
+        root.removeFilter(refuse)
 
 
 def connect(

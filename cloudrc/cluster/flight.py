@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, retry, run
-from cloudrc.cluster.jobs import delete_job, follow, follow_limit, job_under_way, run_job
+from cloudrc.cluster.jobs import delete_job, find_flight, follow, follow_limit, run_job
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Tell = Callable[[str], None]
 
 LOOK_PERIOD = 1.0
-"""Time between two looks at the pods [s]."""
+"""Time between two requests for the state of the pods [s]."""
 HELM_LIMIT = 120.0
 """Time limit for one helm command [s]; helm does not wait for pods."""
 FAILURE_TIME = 5.0
@@ -36,8 +36,6 @@ FLUSH = 1.0
 second of records."""
 FETCHES = 4
 """Largest number of attempts to fetch recordings that contain the mission's end."""
-FLYING = re.compile(r"^cloudrc_mission_state [123]\b", re.MULTILINE)
-"""Line of teleop's metrics while a mission is starting, flying or held."""
 FLOWN = (0, 1, 6, 130)
 """Exit codes of a Job whose mission has flown: success, failure, invalid, interrupted."""
 HINTS = {
@@ -118,7 +116,7 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
 
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
-    """Describe why a component is not ready, "" if it is ready; and whether waiting is useless."""
+    """Return why a component is not ready ("" if it is), and whether it never will be."""
     deployment = pods.find_deployment(release, component)
     status = deployment.status
     for condition in status.conditions or []:  # for example Pod Security or a quota
@@ -152,7 +150,11 @@ def fly_in_cluster(
     """
     from cloudrc.config.load import dump
 
-    _refuse_a_second_flight(release)
+    if found := find_flight(release):  # an install would replace both pods
+        raise ClusterError(
+            f"{found[0]} is under way on release '{release.name}' {release.where}; wait for it, "
+            f"end it: {found[1]}, or fly on a release of your own: --release NAME"
+        )
     began = time.monotonic()
     install(release, chart_values(experiment, current_values(release)), timeout, tell)
     took = time.monotonic() - began
@@ -167,28 +169,6 @@ def fly_in_cluster(
     return _report(experiment, folder, mission, interrupted)
 
 
-def _refuse_a_second_flight(release: Release) -> None:
-    """Raise an error if a mission is under way; an installation would replace both pods."""
-    if job := job_under_way(release):
-        found, end = f"Job '{job}'", f"kubectl {' '.join(release.flags)} delete job {job}"
-    elif _flies(release):  # a mission that was posted to the API without a Job
-        found, end = "a mission", f"cloudrc mission cancel {' '.join(release.cloudrc_flags)}"
-    else:
-        return
-    raise ClusterError(
-        f"{found} is under way on release '{release.name}' {release.where}; wait for it, "
-        f"end it: {end}, or fly on a release of your own: --release NAME"
-    )
-
-
-def _flies(release: Release) -> bool:
-    """Say whether teleop's metrics show a mission; a release that does not answer has none."""
-    try:
-        return bool(FLYING.search(pods.fetch_metrics(release, "cloud")["teleop"]))
-    except (ClusterError, TimedOutError):
-        return False  # a broken release must not prevent its own repair
-
-
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
     """Put an experiment with its link into a release's values; the others stay as `before`."""
     link = {**before.get("link", {}), "profile": ""}
@@ -199,7 +179,7 @@ def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> d
 
 
 def refuse_local_files(experiment: ResolvedExperiment) -> None:
-    """Refuse an experiment that names local files, which the images do not contain."""
+    """Refuse an experiment that pods cannot fly: it names local files, or its mission is steps."""
     from cloudrc.config.load import FILE_READERS
 
     cloud, link, world = experiment.cloud, experiment.link, experiment.world
@@ -303,7 +283,7 @@ def _report(
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments, write_report
 
-    # What emulates the link, such as netem, is known to the link containers.
+    # The metrics of the link containers name the shaper: netem or relay.
     texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
     found = re.findall(r'cloudrc_link_info\{[^}]*shaper="(\w+)"', "\n".join(texts))
     shaper = "+".join(sorted(set(found))) or "unknown"

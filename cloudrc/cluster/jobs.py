@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import secrets
 import time
+import urllib.request
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,10 +21,13 @@ import yaml
 
 from cloudrc.cluster.client import ClusterError, Release, chart_folder, retry
 from cloudrc.cluster.pods import (
+    NO_PROXY,
+    api_url,
     container_statuses,
     find_deployment,
     list_pods,
     one_line,
+    operator_token,
     pod_failure,
     pod_log,
     tokens_secret,
@@ -31,7 +35,7 @@ from cloudrc.cluster.pods import (
 from cloudrc.errors import CloudrcError, TimedOutError
 
 EXAMPLE = "examples/mission-job.yaml"
-"""The objects of a mission in the chart, for the names of no release."""
+"""File in the chart with the objects of a mission; `run_job` fills in the names of a release."""
 COMPONENT = "mission"
 """Label `component` of missions' Jobs, pods and ConfigMaps."""
 FILE = "mission.yaml"
@@ -40,7 +44,7 @@ UID_LABEL = "batch.kubernetes.io/controller-uid"
 """Label with the Job's UID, which Kubernetes sets on the Job's pod."""
 FROM_POD = ("nodeSelector", "tolerations", "affinity", "imagePullSecrets", "securityContext")
 FROM_CONTAINER = ("image", "imagePullPolicy", "securityContext")
-"""Keys that a mission's pod and container share with the release's teleop."""
+"""Keys that a mission's pod and container take from the release's teleop."""
 START_ALLOWANCE = 120
 """Time to start the pod and to receive the robot's state, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
@@ -52,10 +56,13 @@ END_ALLOWANCE = 60.0
 KEEP_FINISHED = 3600
 """How long Kubernetes keeps a finished Job [s]."""
 LOOK_PERIOD = 0.5
-"""Time between two looks at a Job [s]."""
+"""Time between two requests for the state of a Job [s]."""
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives its pod 30 s."""
+API_LIMIT = 10.0
+"""Time limit for the release's API to answer [s]."""
 ENDED = ("complete", "failed")
+"""States of a Job that has ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +131,7 @@ def run_job(
 
 
 def _owner(version: str, kind: str, owner: Any) -> dict[str, Any]:
-    """Refer to an object whose deletion deletes another one."""
+    """Build an owner reference: Kubernetes deletes an object together with its owner."""
     metadata = owner.metadata
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
 
@@ -167,14 +174,30 @@ def deadline_of(limit: float, queue: bool) -> int:
 
 
 def follow_limit(limit: float, queue: bool) -> float:
-    """Compute when Kubernetes has ended a Job in any case [s], from its mission's `limit` [s]."""
+    """Compute the time after which a Job has certainly ended [s], from its mission's limit [s]."""
     return deadline_of(limit, queue) + END_ALLOWANCE
 
 
-def job_under_way(release: Release) -> str | None:
-    """Return the name of a Job of this release that flies a mission, or waits to; else None."""
-    jobs = [_status(job, None) for job in release.find("jobs", COMPONENT)]
-    return next((job.name for job in jobs if job.state not in ENDED), None)
+def find_flight(release: Release) -> tuple[str, str] | None:
+    """Find a Job that has not ended, or else the API's current mission.
+
+    Returns:
+        The flight in words, and the command that ends it. None if nothing flies, or if the API
+        does not answer: a broken release must not prevent its own repair.
+    """
+    for job in release.find("jobs", COMPONENT):
+        if (status := _status(job, None)).state not in ENDED:
+            kubectl = f"kubectl {' '.join(release.flags)}"
+            return f"Job '{status.name}'", f"{kubectl} delete job {status.name}"
+    with suppress(CloudrcError, OSError, ValueError), api_url(release) as url:
+        headers = {"Authorization": f"Bearer {operator_token(release)}"}
+        request = urllib.request.Request(f"{url}/v1/state", headers=headers)
+        with NO_PROXY.open(request, timeout=API_LIMIT) as answer:
+            mission = json.load(answer)["mission"]
+        if mission is not None:
+            cancel = f"cloudrc mission cancel {mission['id']} {' '.join(release.cloudrc_flags)}"
+            return f"mission {mission['id']}", cancel
+    return None
 
 
 def delete_job(release: Release, name: str) -> None:
@@ -183,20 +206,11 @@ def delete_job(release: Release, name: str) -> None:
     until = time.monotonic() + DELETE_LIMIT
     while any(job.metadata.name == name for job in release.find("jobs", COMPONENT)):
         if time.monotonic() > until:
-            raise TimedOutError(f"Job '{name}' has not ended {DELETE_LIMIT:g} s after its deletion")
+            raise TimedOutError(
+                f"Job '{name}' has not ended {DELETE_LIMIT:g} s after its deletion; "
+                f"see: kubectl {' '.join(release.flags)} describe job {name}"
+            )
         time.sleep(LOOK_PERIOD)
-
-
-def read_job(release: Release, name: str) -> tuple[JobStatus, Any]:
-    """Read a Job's state and its pod; None without a pod."""
-    job = release.request("get", "jobs", name=name)
-    pods = list_pods(release, COMPONENT)
-    pod = next((pod for pod in pods if _uid(pod) == job.metadata.uid), None)
-    return _status(job, pod), pod
-
-
-def _uid(pod: Any) -> str:
-    return str((pod.metadata.labels or {}).get(UID_LABEL, ""))
 
 
 def _status(job: Any, pod: Any) -> JobStatus:
@@ -255,7 +269,10 @@ def _log(release: Release, pod: Any) -> list[str]:
 
 def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
     """Read a Job's state and log; raise a ClusterError if its pod will never run."""
-    status, pod = read_job(release, name)
+    job = release.request("get", "jobs", name=name)
+    uids = ((pod, pod.metadata.labels.get(UID_LABEL)) for pod in list_pods(release, COMPONENT))
+    pod = next((pod for pod, uid in uids if uid == job.metadata.uid), None)
+    status = _status(job, pod)
     if status.state != "pending":
         return status, _log(release, pod)
     if pod is not None:

@@ -38,7 +38,7 @@ SEND_LIMIT = 25.0
 SIZE_MAX = 1_000_000
 """Largest size of a ConfigMap's files [bytes]; a little less than Kubernetes' limit of 1 MiB."""
 _LOOK_PERIOD = 0.02
-"""Time between two looks at the sidecar's state [s]."""
+"""Time between two reads of the sidecar's state [s]."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 START_LIMIT = 20.0
 """Time limit for kubectl to forward the ports [s]."""
 LOOK_PERIOD = 0.05
-"""Time between two looks at kubectl's output [s]."""
+"""Time between two reads of kubectl's output [s]."""
 COPY_LIMIT, READ_LIMIT = 120.0, 30.0
 """Time limits to copy one recording, and to read the metrics or the log of a container [s]."""
 _FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")

@@ -1,4 +1,4 @@
-"""The current metrics of one process, computed from its records.
+"""Compute the current metrics of one process from its records.
 
 Errors of predictions and delay estimates come from `Control` records alone. Each stamp is compared
 only with stamps of its own clock, so the errors are right without a shared clock.
@@ -68,7 +68,7 @@ COUNTS = {
 }
 """Metric -> name of its count in `Counted`, with the value of its label at {}."""
 ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
-"""Metrics that only the relay or only netem has: absent until counted."""
+"""Metrics that only the relay or only netem has; they are absent until their count exists."""
 PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "cloudrc_link_release_error_seconds": ("release_error", table.RELEASE_PERCENTILES),
     "cloudrc_link_step_lateness_seconds": ("step_lateness", table.STEP_PERCENTILES),
@@ -235,7 +235,7 @@ class End:
 
 
 STEP_NS, STEPS = 1_000_000_000, 10
-"""The real-time factor: time between two samples [ns], and steps over which it is computed [1]."""
+"""Time between two samples for the real-time factor [ns], and number of such times in it [1]."""
 ADMITTED = "cloud said hello"
 """`SessionOpened.cause` of a session that world opens for a newly connected cloud."""
 

@@ -1,4 +1,4 @@
-"""Building blocks of live metrics: a fast histogram, loss counters, judges of predictions.
+"""Compute parts of the live metrics: histograms, lost datagrams, errors of predictions.
 
 A handler of records runs on the loop's thread and has a budget of 1 us. Therefore a handler only
 stores the newest record and counts. `read` does all other work, on the thread that serves the
@@ -177,9 +177,9 @@ class PredictionJudge:
 class DelayJudge:
     """Compares each delay estimate with the true time until the command was applied.
 
-    An echo gives the instant at which world applied the command, on world's clock: the stamp of the
-    echoing odometry minus the hold time. The echo also gives the command's age on cloud's clock,
-    and so the command.
+    World echoes the newest applied command in its telemetry. The stamp of this telemetry's odometry
+    minus the hold time is the instant at which world applied the command, on world's clock. The
+    echo also gives the command's age on cloud's clock, which identifies the command.
 
     Attributes:
         error: Newest error: estimate minus true time [s]; NaN before the first.
@@ -201,11 +201,11 @@ class DelayJudge:
             del self._sent[next(iter(self._sent))]  # the oldest
 
     def echoed(self, control: Control, arrival_ns: int) -> None:
-        """Compute the error of the command that this period's odometry echoed.
+        """Compute the error of the command whose echo arrived with this period's odometry.
 
         Args:
             control: First control period after the echo.
-            arrival_ns: Arrival of that odometry [ns], cloud's clock.
+            arrival_ns: Arrival of the odometry with the echo [ns], cloud's clock.
         """
         sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
         if sent is not None:

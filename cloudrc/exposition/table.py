@@ -36,7 +36,7 @@ PLUGINS = ("estimator", "predictor", "controller")
 GUARD_STATES = ("ground", "track", "hold", "land", "estop")
 """States of the guard, in the order of `cloudrc.messages.GuardState`."""
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
-"""States of a mission."""
+"""States of a mission; the index of a state is the value of `cloudrc_mission_state`."""
 MISSION_OUTCOMES = (
     *("done", "cancelled", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped"),
     *("emergency_stopped", "taken_over", "end_lost", "other"),

@@ -50,7 +50,7 @@ Fate: TypeAlias = tuple[int, ...]
 
 
 class Purpose(IntEnum):
-    """Purpose of a column of draws."""
+    """What a column of draws decides about each packet."""
 
     DELAY = 0
     COPY_DELAY = 1

@@ -31,9 +31,9 @@ PEER_PAUSE = (0.5, 1.0)
 that the links of many releases do not query their name server at the same time.
 Source: docs/reference/faults.md, "F19"."""
 HANDED_FILE = "asked.json"
-"""Name of the document, in the folder of the route file."""
+"""Name of the document with a change from `cloudrc link set`, in the folder of the route file."""
 SIZE_MAX = 1_200_000
-"""Size limit of the document [bytes]: the content of a ConfigMap plus the overhead of JSON."""
+"""Size limit of that document [bytes]: the content of a ConfigMap plus the overhead of JSON."""
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 _KNOWN = 64
@@ -140,14 +140,17 @@ def read_handed(text: str) -> Handed:
 
 
 class _HandedFile(ProfileFile):
-    """The document. One that exists at the start is ignored: the ConfigMap has the same change."""
+    """The document with a change.
+
+    A document that exists at the start is ignored, because the ConfigMap has the same change.
+    """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
         super().__init__(path, load, log)
         self._seen = version(path)
 
     def _read(self) -> Loaded:
-        """Read the document; refuse a ValueError's reason if it belongs to another user.
+        """Read the document; raise a ValueError if the file belongs to another user.
 
         If the sidecar runs as root, the pod's other containers share the folder but do not run as
         root.
@@ -163,7 +166,7 @@ class _HandedFile(ProfileFile):
 
 
 class Profiles:
-    """The profile's file, and a document that may be missing. Each change is applied once."""
+    """Follows the profile's file and the document with a change; applies each change once."""
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]

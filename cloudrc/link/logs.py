@@ -447,7 +447,7 @@ def _csv_delay(row: Row, column: str, loss: str | None) -> float | None:
 
 
 def _without_marks(raw: list[Entry], column: str, decimals: int, log: Log) -> list[Entry]:
-    """Replace the numbers that mark lost packets, and count them.
+    """Replace the delays that mark lost packets by None, and count these packets.
 
     `decimals` is the largest number of decimals in the column; -1 if a column `loss` tells losses.
     """
@@ -574,7 +574,10 @@ class _Ping:
         self._newest = max(self._newest, count)
 
     def _unwrap(self, number: int) -> int:
-        """Count on after 65535, where ping continues with 0; a late reply may be from before."""
+        """Continue the count after 65535, where ping begins again with 0.
+
+        A late reply may belong to the numbers before 65535.
+        """
         count = number + self._wraps * _WRAP
         if self._newest - count > _WRAP // 2:
             self._wraps += 1

@@ -117,9 +117,9 @@ class Stamps:
         self.dropped = 0
 
     def wall_ns(self, ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
-        """Return a datagram's arrival by the wall clock [ns], if stamped; update `dropped`.
+        """Return when a datagram arrived by the wall clock [ns]; None without a stamp.
 
-        `ancillary` are the ancillary data that `recvmsg` returns.
+        `ancillary` are the ancillary data that `recvmsg` returns; they also update `dropped`.
         """
         wall_ns = None
         for _, kind, data in ancillary:

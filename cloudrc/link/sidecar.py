@@ -61,7 +61,7 @@ class Near:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """Report of a link's process about the direction that it shapes.
+    """What the process of a link reports about the direction that it shapes.
 
     Attributes:
         shaper: "relay" or "netem".
@@ -270,7 +270,7 @@ class Sidecar:
         return True
 
     def _change_of(self, profile: Loaded) -> Change:
-        """Return the change of a profile; an unknown change if its number is that of the last."""
+        """Return the change of a profile; an unknown change if the number is the last one's."""
         return profile.change if profile.change.number != self._number else Change()
 
     def _tell(self, shaper: Shaper, profile: Loaded) -> None:

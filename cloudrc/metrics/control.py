@@ -8,10 +8,10 @@ from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentil
 
 
 def round_trips(flight: Flight) -> Columns:
-    """Select the control periods with a new echo.
+    """Select the control periods with a new echo: world reports the newest command it applied.
 
     A period without a new echo repeats the previous values. Counting such periods would give too
-    much weight to a silent downlink, during which the last echo repeats for seconds.
+    much weight to a silent link, during which the last echo repeats for seconds.
     """
     control = flight.control
     pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)
@@ -21,14 +21,14 @@ def round_trips(flight: Flight) -> Columns:
 
 
 def _age_of_information(flight: Flight) -> float | None:
-    """Average the age; only ends that prove that they share a clock record one-way delays."""
+    """Average the age of the odometry [s]; None unless both ends prove that they share a clock."""
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
     return mean((flight.control["stamp_ns"] - flight.control["basis_stamp_ns"]) * 1e-9)
 
 
 def _prediction_error(flight: Flight) -> float | None:
-    """Compare with the truth at the application, so the error of the delay estimate counts, too.
+    """Compare with the truth when a command is applied: errors of the delay estimate count, too.
 
     Source: docs/reference/control.md, "Predictors".
     """
@@ -37,7 +37,7 @@ def _prediction_error(flight: Flight) -> float | None:
 
 
 def _estimate_error(flight: Flight) -> float | None:
-    """Compare with the truth at the horizon: the error of the predictor alone."""
+    """Compare with the truth at the predicted instant: only errors of the predictor count."""
     control = flight.control
     target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return rms(control["position"] - flight.true_position(target_ns))

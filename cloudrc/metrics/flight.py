@@ -149,8 +149,8 @@ class Flight:
     def join_control(self, commands: Columns) -> Columns:
         """Join commands, rows with `epoch` and `counter`, with their control periods.
 
-        Rows without a recorded control period are left out. A column of both keeps the value of the
-        row.
+        Commands without a recorded control period are left out. A column that both have keeps the
+        value of the command.
         """
         keys = zip(self._control["epoch"], self._control["counter"], strict=True)
         rows = {key: row for row, key in enumerate(keys)}
@@ -179,7 +179,7 @@ Measure: TypeAlias = Callable[[Flight], float | None]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A metric, which `measure` computes in `unit`, or as None if the number is unknown."""
+    """A metric; `measure` returns its value in `unit`, or None if the value is unknown."""
 
     name: str  # in report.json
     unit: str  # SI unit as text; "1" for counts and shares

@@ -32,7 +32,7 @@ def first_touch(flight: Flight) -> dict[str, Array] | None:
 
 
 def holds(flight: Flight) -> list[tuple[int, int]]:
-    """List start and end of each interval in HOLD during the flight [ns], world's clock."""
+    """List start and end [ns], world's clock, of each interval in which the guard was in HOLD."""
     if flight.end_ns is None:
         return []
     guard = flight.during("/guard")
@@ -60,13 +60,13 @@ def _tip_speed(flight: Flight) -> float | None:
 
 
 def _peak_force(flight: Flight) -> float | None:
-    """Find the largest force: it depends on the simulator's contact parameters."""
+    """Find the largest force [N], which depends on the simulator's contact parameters."""
     force = flight.during("/contact_force")["tip_force"]
     return None if first_touch(flight) is None or not len(force) else float(force.max())
 
 
 def _steady_force(flight: Flight) -> float | None:
-    """Average the force at the end: it does not depend on the simulator's contact parameters."""
+    """Average the force at the end [N]; the simulator's contact parameters do not change it."""
     touch = first_touch(flight)
     if touch is None or flight.ending is None or flight.ending[1] != "done":
         return None
@@ -111,10 +111,10 @@ def _hold_time(flight: Flight) -> float | None:
 
 
 def _fault_count(flight: Flight) -> float | None:
-    """Count the faults; one that repeats has one record, and its counter has every repetition."""
-    totals = dict.fromkeys(flight.recording["/fault"]["code"], 1)
-    for name in FAILURES:
-        if (total := flight.last_total(name)) is not None:
+    """Count the faults; a fault that repeats has one record, its counter has every repetition."""
+    totals, count = dict.fromkeys(flight.recording["/fault"]["code"], 1), flight.recording["/count"]
+    for name, total in zip(count["name"], count["total"], strict=True):
+        if name in FAILURES:  # the largest total: a cloud that restarts counts from 0
             totals[name] = max(totals.get(name, 0), int(total))
     return flight.count(sum(totals.values()))
 

@@ -80,7 +80,7 @@ class Ending(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What is known of a mission that is over."""
+    """Facts about a finished mission, from which the verdict follows."""
 
     waypoints: int
     reached: int  # number of waypoints reached
@@ -273,12 +273,12 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
 
 
 AWAY = -1
-"""Value that stands for the slip [ns] until this teleop process receives telemetry from world."""
+"""Value for an unknown slip [ns]: after a restart of teleop, until the first telemetry."""
 
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Contacts and slip during a mission, as telemetry shows them."""
+    """Contacts, and the slip of world's clock, during a mission, as telemetry shows them."""
 
     pipe_contacts: int = 0  # last count in telemetry
     pipe_touches: int = 0  # contacts since the mission began
@@ -320,7 +320,7 @@ class Observations:
         return replace(self, slip_began_ns=self.slip_began_ns - self.slip_ns, slip_ns=AWAY)
 
     def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
-        """Yield event and text of each new contact at `elapsed` [s]."""
+        """Yield event and text of each contact since `before`, at `elapsed` [s] of the mission."""
         if self.pipe_touches > before.pipe_touches:
             yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
         if self.touch_speed != before.touch_speed:

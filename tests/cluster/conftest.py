@@ -1,16 +1,12 @@
 """A fake Kubernetes API server with objects in memory, a fake teleop, and fake programs."""
 
-from __future__ import annotations
-
 import base64
 import itertools
 import json
 import os
 import threading
 import uuid
-from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -29,7 +25,7 @@ VERSION_KEYS = (
 class FakeApi:
     """Objects of a namespace by (plural, name); `refuse` maps a method and plural to an error."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.objects: dict[tuple[str, str], dict[str, Any]] = {}
         self.logs: dict[str, str] = {}
         self.refuse: dict[tuple[str, str], tuple[int, str]] = {}
@@ -40,11 +36,11 @@ class FakeApi:
         self.server = serve(lambda request, body: self.answer(request.command, request.path, body))
         self.url = f"http://127.0.0.1:{self.server.server_port}"
 
-    def close(self) -> None:
+    def close(self):
         self.server.shutdown()
         self.server.server_close()
 
-    def put(self, plural: str, body: dict[str, Any]) -> dict[str, Any]:
+    def put(self, plural, body):
         stamp = f"2026-01-01T00:00:{next(self._clock) % 60:02d}Z"
         made = {"uid": str(uuid.uuid4()), "generation": 1, "creationTimestamp": stamp}
         body = {"status": {}, **body, "metadata": {**made, **body["metadata"]}}
@@ -52,10 +48,10 @@ class FakeApi:
             self.objects[plural, body["metadata"]["name"]] = body
         return body
 
-    def get(self, plural: str, name: str) -> dict[str, Any]:
+    def get(self, plural, name):
         return self.objects[plural, name]
 
-    def answer(self, method: str, path: str, body: Any) -> tuple[int, Any]:
+    def answer(self, method, path, body):
         address = urlsplit(path)
         if address.path == "/version/":
             return 200, {**dict.fromkeys(VERSION_KEYS, ""), **self.version}
@@ -85,14 +81,14 @@ class FakeApi:
             return 200, self.objects[plural, name]
 
 
-def serve(answer: Callable[[BaseHTTPRequestHandler, Any], tuple[int, Any]]) -> ThreadingHTTPServer:
+def serve(answer):
     """Serve HTTP on a free port; `answer` gets the request and its JSON, and returns a reply."""
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
         disable_nagle_algorithm = True
 
-        def reply(self) -> None:
+        def reply(self):
             length = int(self.headers.get("Content-Length") or 0)
             code, said = answer(self, json.loads(self.rfile.read(length)) if length else None)
             is_text = isinstance(said, str)
@@ -105,7 +101,7 @@ def serve(answer: Callable[[BaseHTTPRequestHandler, Any], tuple[int, Any]]) -> T
 
         do_GET = do_POST = do_DELETE = reply  # noqa: N815
 
-        def log_message(self, *words: Any) -> None:
+        def log_message(self, *words):
             pass
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
@@ -117,30 +113,30 @@ def serve(answer: Callable[[BaseHTTPRequestHandler, Any], tuple[int, Any]]) -> T
 class FakeTeleop:
     """The API and the metrics of a cloud pod, with a record of its requests."""
 
-    def __init__(self) -> None:
+    def __init__(self):
+        self.mission: dict[str, str] | None = None
         self.posted: list[str] = []
         self.tokens: set[str | None] = set()
-        self.metrics = 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
         self.server = serve(self._answer)
         self.port = self.server.server_port
 
-    def _answer(self, request: BaseHTTPRequestHandler, body: Any) -> tuple[int, Any]:
+    def _answer(self, request, body):
         if request.path == "/metrics":
-            return 200, self.metrics
+            return 200, 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
         self.tokens.add(request.headers["Authorization"])
         if request.command == "GET":
-            return 200, {"missions": []}
+            return 200, {"missions": [], "mission": self.mission}
         self.posted.append(request.path)
         return 200, {}
 
-    def forwards(self) -> str:
-        """What kubectl prints when it forwards all ports of a pod to this server."""
+    def forwards(self):
+        """Write a fake kubectl that forwards all ports of a pod to this server."""
         ports = (8080, 9100, 9101, 9102)
         lines = (f"echo 'Forwarding from 127.0.0.1:{self.port} -> {port}'" for port in ports)
         return "\n".join([*lines, "exec sleep 60"])
 
 
-def kubeconfig(url: str) -> str:
+def kubeconfig(url):
     """Build a kubeconfig with two contexts: `here`, the current one, and `elsewhere`."""
     contexts = [
         {"name": "here", "context": {"cluster": "fake", "user": "me", "namespace": "demo"}},
@@ -158,10 +154,10 @@ def kubeconfig(url: str) -> str:
     )
 
 
-def labels(component: str, release: str = "cloudrc") -> dict[str, str]:
+def labels(component):
     return {
         "app.kubernetes.io/name": "cloudrc",
-        "app.kubernetes.io/instance": release,
+        "app.kubernetes.io/instance": "cloudrc",
         "app.kubernetes.io/component": component,
     }
 
@@ -183,14 +179,14 @@ POD = {
 
 
 def pod(
-    name: str,
-    component: str,
+    name,
+    component,
     *,
-    state: dict[str, Any] | None = None,
-    ready: bool = True,
-    phase: str = "Running",
-    **more: Any,
-) -> dict[str, Any]:
+    state=None,
+    ready=True,
+    phase="Running",
+    **more,
+):
     """Build a pod with one container in a state that the kubelet writes."""
     status = {
         "name": component,
@@ -209,7 +205,7 @@ def pod(
     }
 
 
-def deployment(component: str, **status: Any) -> dict[str, Any]:
+def deployment(component, **status):
     settled = {"observedGeneration": 1, "replicas": 1, "updatedReplicas": 1}
     return {
         "metadata": {"name": f"cloudrc-{component}", "labels": labels(component)},
@@ -266,7 +262,7 @@ def pretend(tmp_path, monkeypatch):
     folder.mkdir()
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
 
-    def make(name: str, script: str) -> Path:
+    def make(name, script):
         path = folder / name
         path.write_text(f"#!/bin/sh\n{script}\n")
         path.chmod(0o755)
@@ -288,36 +284,36 @@ def teleop(running, pretend):
 MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
 
 
-def end(api: FakeApi, name: str, kind: str, **condition: str) -> None:
+def end(api, name, kind, **condition):
     """End a Job: `kind` is "Complete" or "Failed"."""
     ended = {"type": kind, "status": "True", **condition}
     api.get("jobs", name)["status"] = {"conditions": [ended]}
 
 
-def start_pod(api: FakeApi, name: str, **given: Any) -> None:
+def start_pod(api, name, **given):
     """Create the pod of a Job as Kubernetes does."""
     uid = api.get("jobs", name)["metadata"]["uid"]
     api.put("pods", pod(f"{name}-x", "mission", labels={UID_LABEL: uid}, **given))
 
 
-def terminated(exit_code: int, message: str) -> dict[str, Any]:
+def terminated(exit_code, message):
     return {"terminated": {"exitCode": exit_code, "message": message}}
 
 
-def at_look(api: FakeApi, number: int, action: Callable[[], None]) -> None:
+def at_look(api, number, action):
     """Call `action` at the n-th request for the Job."""
     original, looks = api.answer, iter(range(1, 1000))
     lock = threading.Lock()
 
-    def answer(method: str, path: str, body: Any) -> tuple[int, Any]:
+    def answer(method, path, body):
         with lock:
             if method == "GET" and "/jobs/" in path and next(looks) == number:
                 action()
         return original(method, path, body)
 
-    api.answer = answer  # type: ignore[method-assign]
+    api.answer = answer
 
 
-def made(api: FakeApi) -> list[dict[str, Any]]:
+def made(api):
     """Return the Jobs."""
     return [body for (kind, _), body in api.objects.items() if kind == "jobs"]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 
 from cloudrc.cluster import client
 from cloudrc.cluster.client import ClusterError, Release, UnavailableError, connect
@@ -13,10 +13,17 @@ from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import find_pod, list_pods
 from cloudrc.errors import MissingPrerequisiteError, TimedOutError
-from tests.cluster.conftest import CONFIG_PLACE, MISSION, end, pod, start_pod, terminated
+from tests.cluster.conftest import (
+    CONFIG_PLACE,
+    MISSION,
+    end,
+    kubeconfig,
+    pod,
+    start_pod,
+    terminated,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
-Pretend = Callable[[str, str], Path]
 
 
 def test_flags_override_the_kubeconfig(api):
@@ -39,6 +46,21 @@ def test_a_missing_kubeconfig_is_reported_with_a_remedy(tmp_path, monkeypatch, t
     with pytest.raises(MissingPrerequisiteError, match="kind create cluster") as caught:
         connect()
     assert "\n" not in str(caught.value)
+
+
+def test_a_failing_login_program_is_named(tmp_path, monkeypatch):
+    program = tmp_path / "login-to-nowhere"
+    program.write_text("#!/bin/sh\necho no token >&2; exit 7\n")
+    program.chmod(0o755)
+    config = yaml.safe_load(kubeconfig("http://127.0.0.1:9"))
+    version = "client.authentication.k8s.io/v1"
+    login = {"apiVersion": version, "command": str(program), "interactiveMode": "Never"}
+    config["users"][0]["user"] = {"exec": login}
+    (tmp_path / "config").write_text(yaml.safe_dump(config))
+    monkeypatch.setattr(CONFIG_PLACE, str(tmp_path / "config"))
+    words = r"cannot log in to the cluster in namespace 'demo': .* returned 7\..*; install it"
+    with pytest.raises(MissingPrerequisiteError, match=words):
+        list_pods(connect(), "cloud")
 
 
 @pytest.mark.parametrize(
@@ -78,7 +100,7 @@ def away(api, plural, code, times):
             return code, {"message": "etcdserver: leader changed", "code": code}
         return original(method, path, body)
 
-    api.answer = answer  # type: ignore[method-assign]
+    api.answer = answer
     return lambda: left
 
 

@@ -13,7 +13,6 @@ from cloudrc.cli.main import main
 from cloudrc.cluster.client import OLDEST
 from tests.cluster.conftest import CONFIG_PLACE, kubeconfig
 
-Printed = pytest.CaptureFixture[str]
 CHART = Path(__file__).resolve().parents[2] / "charts" / "cloudrc" / "Chart.yaml"
 
 

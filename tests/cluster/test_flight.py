@@ -18,7 +18,6 @@ from cloudrc.report.write import assess
 from tests.cluster.conftest import at_look, end, start_pod, terminated
 from tests.flights.conftest import records
 
-Printed = pytest.CaptureFixture[str]
 SECOND = 1_000_000_000
 NAME, SETTING = "hover", "mission.waypoints.0.dwell_s=1.0"
 LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
@@ -188,20 +187,21 @@ def test_an_interrupted_flight_cancels_its_mission_and_is_reported(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(flight, "follow", interrupted)
-    # The fixture's recording was made in virtual time, which the verdict says first.
-    assert main([*LINE, "--out", "out"]) == 6
+    merged(tmp_path, [each[: len(each) // 2] for each in flown()], torn=False)
+    assert main([*LINE, "--out", "out"]) == 130
     captured = capsys.readouterr()
     assert "cancelling the mission" in captured.err
     assert "DELETE jobs/" in " ".join(ready.seen)
-    assert json.loads(captured.out)["mode"] == "cluster"
+    report = json.loads(captured.out)
+    assert (report["mode"], report["verdict"]) == ("cluster", "interrupted")
 
 
 def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, capsys):
-    teleop.metrics += "cloudrc_mission_state 3.0\n"
+    teleop.mission = {"id": "m7"}
     assert main([*LINE, "--out", "out"]) == 5
     said = capsys.readouterr().err
-    assert "a mission is under way on release 'cloudrc'" in said
-    assert "end it: cloudrc mission cancel --namespace=demo --release=cloudrc, or" in said
+    assert "mission m7 is under way on release 'cloudrc'" in said
+    assert "end it: cloudrc mission cancel m7 --namespace=demo --release=cloudrc, or" in said
     run_job(connect(), {}, name="first")
     assert main([*LINE, "--out", "out"]) == 5
     said = capsys.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 
 from cloudrc.cluster import jobs
 from cloudrc.cluster.client import ClusterError
-from cloudrc.cluster.jobs import delete_job, follow, follow_limit, job_under_way, read_job, run_job
+from cloudrc.cluster.jobs import delete_job, find_flight, follow, follow_limit, run_job
 from cloudrc.errors import TimedOutError
 from tests.cluster.conftest import (
     MISSION,
@@ -125,7 +125,7 @@ def test_follow_ends_when_the_pod_cannot_run(running, release):
 def test_a_deadline_is_named_and_bounded(running, release):
     run_job(release, MISSION, name="first")
     end(running, "first", "Failed", reason="DeadlineExceeded", message="...")
-    assert "activeDeadlineSeconds" in read_job(release, "first")[0].message
+    assert "activeDeadlineSeconds" in follow(release, "first", print, timeout=10.0).message
     assert follow_limit(1e300, queue=True) < 2**31 + 100
 
 
@@ -139,13 +139,13 @@ def test_a_job_that_cannot_be_made_leaves_nothing(running, release):
     assert made(running) == []
 
 
-def test_a_job_is_under_way_until_it_has_ended_or_is_deleted(running, release):
+def test_a_job_is_under_way_until_it_has_ended_or_is_deleted(running, teleop, release):
     for name in ("one", "two"):
         run_job(release, MISSION, name=name)
     end(running, "one", "Complete")
-    assert job_under_way(release) == "two"
+    assert find_flight(release) == ("Job 'two'", "kubectl --namespace=demo delete job two")
     delete_job(release, "two")
-    assert job_under_way(release) is None
+    assert find_flight(release) is None
     with pytest.raises(ClusterError, match='"two" not found'):
         delete_job(release, "two")
 
@@ -157,5 +157,5 @@ def test_a_job_whose_pod_does_not_end_is_named(running, release, monkeypatch):
     running.answer = lambda method, *rest: (
         (200, {}) if method == "DELETE" else answer(method, *rest)
     )
-    with pytest.raises(TimedOutError, match="'first' has not ended"):
+    with pytest.raises(TimedOutError, match=r"'first' has not ended .* see: kubectl"):
         delete_job(release, "first")

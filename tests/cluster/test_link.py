@@ -21,7 +21,6 @@ from cloudrc.errors import BadInputError
 from cloudrc.link.follow import HANDED_FILE, Handed, read_handed, write_handed
 from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
 
-Printed = pytest.CaptureFixture[str]
 PROFILE = "uplink: {delay_ms: 45, jitter_ms: 25}\ndownlink: {delay_ms: 45, jitter_ms: 25}\n"
 TRACE = "time_s,delay_ms\n0,40\n1,60\n"
 LINE = ["link", "set", "downlink.delay_ms=120", "-n", "demo"]

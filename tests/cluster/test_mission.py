@@ -22,7 +22,6 @@ from tests.cluster.conftest import (
     terminated,
 )
 
-Printed = pytest.CaptureFixture[str]
 WAYPOINTS = "waypoints: [{position_m: [0.5, 0.0, 1.0]}]"
 VERDICT = {0: "SUCCESS: all met", 1: "FAILURE: pipe_contact"}
 
@@ -112,7 +111,7 @@ def test_run_waits_until_the_release_is_ready(lands, capsys):
             lands.put("pods", pod("cloud-1", "cloud"))
         return original(method, path, body)
 
-    lands.answer = answer  # type: ignore[method-assign]
+    lands.answer = answer
     assert main(["mission", "run", "pipes"]) == 0
     assert "container cloud is not ready yet" in capsys.readouterr().out
     (job,) = made(lands)

@@ -1,10 +1,8 @@
-"""Pods are explained, waited for and reached; tokens are read and never printed."""
+"""Failures of pods are explained, ports are forwarded, tokens are read and never printed."""
 
 import base64
 import os
 import re
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -14,8 +12,6 @@ from cloudrc.cluster.flight import install, wait_ready
 from cloudrc.cluster.pods import list_pods, operator_token, pod_failure
 from cloudrc.errors import TimedOutError
 from tests.cluster.conftest import TOKEN, deployment, pod
-
-Pretend = Callable[[str, str], Path]
 
 
 def waiting(reason, message=""):

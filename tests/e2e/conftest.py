@@ -1,6 +1,4 @@
-"""A cluster for the end-to-end tests, the release in it, what to save on failure, and its cost."""
-
-from __future__ import annotations
+"""The cluster and the release of the end-to-end tests; helpers that read and command them."""
 
 import json
 import os
@@ -9,19 +7,17 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc.cli.client import Api
-from cloudrc.cluster.client import Release, connect
+from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
-from cloudrc.cluster.jobs import JobStatus, follow, run_job
+from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import api_url, fetch_metrics, fetch_recording, operator_token
 from cloudrc.errors import CloudrcError
 from tests.drivers.conftest import WORK, slower
@@ -31,24 +27,22 @@ CHART = ROOT / "charts" / "cloudrc"
 EXAMPLES = CHART / "examples"
 NAMESPACE = "cloudrc-e2e"
 NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring", f"{NAMESPACE}-bad")
-"""All that these tests make."""
+"""Namespaces that these tests create."""
 NAME = "cloudrc"
 ENDS = ("world", "cloud")
 RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
 SUMMARY: list[str] = []
-"""Lines that are printed at the end."""
+"""Lines that pytest prints after the tests."""
 TIMES: dict[str, float] = {}
-"""Instants of the session [s]."""
+"""Event of the test session -> its time on the monotonic clock [s]."""
 
 
 class CommandFailedError(AssertionError):
-    """A command ended with another code than 0."""
+    """The exit code of a command was not 0."""
 
 
-def command(
-    *words: str | Path, given: str = "", timeout: float = 120.0, environ: Mapping[str, str] = {}
-) -> str:
-    """Run a command; what it wrote."""
+def command(*words, given="", timeout=120.0):
+    """Run a command and return its output; raise an error if its exit code is not 0."""
     done = subprocess.run(
         [str(word) for word in words],
         input=given,
@@ -56,7 +50,6 @@ def command(
         text=True,
         timeout=timeout,
         cwd=ROOT,
-        env={**os.environ, **environ},
     )
     if done.returncode != 0:
         line = " ".join(map(str, words))
@@ -64,17 +57,17 @@ def command(
     return done.stdout
 
 
-def kubectl(*words: str, given: str = "", timeout: float = 120.0) -> str:
-    """In the namespace of the tests, unless the words name another."""
+def kubectl(*words, given="", timeout=120.0):
+    """Run kubectl in the namespace of the tests, unless `words` name another; return its output."""
     return command("kubectl", f"--namespace={NAMESPACE}", *words, given=given, timeout=timeout)
 
 
-def read(*words: str) -> Any:
-    """What `kubectl get` says, as values."""
+def read(*words):
+    """Return the result of `kubectl get`, parsed."""
     return json.loads(kubectl("get", *words, "--output=json"))
 
 
-def apply(*documents: dict[str, Any]) -> None:
+def apply(*documents):
     """Apply objects, in the namespace of the tests unless they name another."""
     for document in documents:
         if document["kind"] != "Namespace":
@@ -82,12 +75,12 @@ def apply(*documents: dict[str, Any]) -> None:
     command("kubectl", "apply", "--filename=-", given=yaml.safe_dump_all(documents))
 
 
-def helm(*words: str, timeout: float = 180.0) -> str:
+def helm(*words, timeout=180.0):
     return command("helm", f"--namespace={NAMESPACE}", *words, timeout=timeout)
 
 
-def cloudrc(*words: str, timeout: float = 240.0) -> subprocess.CompletedProcess[str]:
-    """Run our own command line, whatever it ends with."""
+def cloudrc(*words, timeout=240.0):
+    """Run cloudrc; any exit code is accepted."""
     return subprocess.run(
         [sys.executable, "-m", "cloudrc", *words],
         capture_output=True,
@@ -97,23 +90,20 @@ def cloudrc(*words: str, timeout: float = 240.0) -> subprocess.CompletedProcess[
     )
 
 
-def in_release(*words: str, timeout: float = 240.0) -> str:
-    """Run our own command line for the tests' release; what it wrote."""
+def in_release(*words, timeout=240.0):
+    """Run cloudrc for the release of the tests, and return its output."""
     done = cloudrc(*words, "-n", NAMESPACE, "--release", NAME, timeout=timeout)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def set_link(*words: str) -> dict[str, Any]:
-    """Set the link of the flight by hand; gives what is in force then."""
-    document: dict[str, Any] = json.loads(in_release("link", "set", *words, "-o", "json"))
-    return document
+def set_link(*words):
+    """Run `cloudrc link set` for the release; return its report of the new link."""
+    return dict(json.loads(in_release("link", "set", *words, "-o", "json")))
 
 
-def eventually(
-    look: Callable[[], Any], what: str, timeout: float = 30.0, every: float = 0.5
-) -> Any:
-    """Look until something is true; what was seen."""
+def eventually(look, what, timeout=30.0, every=0.5):
+    """Call `look` until its result is true, and return that; fail after `timeout` [s]."""
     until = time.monotonic() + timeout
     while True:
         seen = look()
@@ -123,23 +113,23 @@ def eventually(
         time.sleep(every)
 
 
-def place() -> Release:
+def place():
     return connect(None, NAMESPACE, NAME)
 
 
-def pods(component: str) -> list[dict[str, Any]]:
+def pods(component):
     selector = f"app.kubernetes.io/instance={NAME},app.kubernetes.io/component={component}"
     return read("pods", f"--selector={selector}")["items"]
 
 
-def pod(component: str) -> dict[str, Any]:
-    """The component's pod that is not about to end."""
+def pod(component):
+    """Return the component's only pod that is not being deleted."""
     (found,) = [p for p in pods(component) if "deletionTimestamp" not in p["metadata"]]
     return found
 
 
-def identity() -> dict[str, tuple[str, list[int]]]:
-    """What changes when a pod is replaced or a container starts again."""
+def identity():
+    """Return UID and restart counts, which change if a pod is replaced or a container restarts."""
     found = {}
     for component in ENDS:
         one = pod(component)
@@ -152,13 +142,13 @@ def identity() -> dict[str, tuple[str, list[int]]]:
 Sample = tuple[str, tuple[tuple[str, str], ...]]
 
 
-def scrapes(component: str) -> dict[str, str]:
-    """What each container of a pod answers to a scrape."""
+def scrapes(component):
+    """Return the page /metrics of each container of a pod."""
     return fetch_metrics(place(), component)
 
 
-def samples(text: str) -> dict[Sample, float]:
-    """Every sample of a scrape: by name and sorted labels."""
+def samples(text):
+    """Parse a page of metrics: name and sorted labels -> value."""
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
         for family in text_string_to_metric_families(text)
@@ -166,13 +156,13 @@ def samples(text: str) -> dict[Sample, float]:
     }
 
 
-def metrics(component: str) -> dict[Sample, float]:
-    """Every sample of world or cloud."""
+def metrics(component):
+    """Return the samples of the container world or cloud."""
     return samples(scrapes(component)[component])
 
 
-def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
-    """Sum of the samples of a name whose labels include these."""
+def value(samples, name, **labels):
+    """Add up the samples of a name whose labels include the given ones."""
     found = [
         number
         for (each, given), number in samples.items()
@@ -182,34 +172,34 @@ def value(samples: Mapping[Sample, float], name: str, **labels: str) -> float:
     return sum(found)
 
 
-def missions() -> list[dict[str, Any]]:
-    """All missions that the API knows, oldest first."""
+def missions():
+    """Return all missions that the API knows, the oldest first."""
     token = operator_token(place())
     with api_url(place()) as url:
         return list(Api(url, lambda: token).get("/v1/missions")["missions"])
 
 
-def job_end(name: str, timeout: float = 150.0) -> tuple[JobStatus, str]:
-    """Wait for the end of a Job; its final state and its log."""
+def job_end(name, timeout=150.0):
+    """Wait for the end of a Job; return its final state and its log."""
     lines: list[str] = []
     return follow(place(), name, lines.append, timeout=timeout), "\n".join(lines)
 
 
-def job_log(name: str) -> str:
-    """What a Job has said so far; "" while its pod does not run."""
+def job_log(name):
+    """Return the log of a Job so far; "" while its pod is pending."""
     pods = read("pod", f"--selector=batch.kubernetes.io/job-name={name}")["items"]
     runs = [each for each in pods if each["status"]["phase"] != "Pending"]
     return kubectl("logs", runs[0]["metadata"]["name"]) if runs else ""
 
 
-def fly(name: str, waypoints: Sequence[Mapping[str, Any]], limit: float = 60.0) -> None:
-    """Fly waypoints by a Job of this name, as `cloudrc mission run` does."""
+def fly(name, waypoints, limit=60.0):
+    """Start a Job that flies waypoints, as `cloudrc mission run` does."""
     mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints)}
     run_job(place(), mission, name=name, limit=limit)
 
 
-def save(folder: Path) -> None:
-    """Keep what helps to understand a failure: objects, events, logs, recordings."""
+def save(folder):
+    """Save objects, events, logs and recordings after a failure."""
     names = f"--namespaces={','.join(NAMESPACES)}"
     command("kubectl", "cluster-info", "dump", names, f"--output-directory={folder}")
     for component in ENDS:
@@ -229,11 +219,11 @@ MISSING_PREREQUISITE = 3
 UP = pytest.StashKey[bool]()
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
+def pytest_addoption(parser):
     parser.addoption("--keep", action="store_true", help="leave the kind cluster for a look")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     for item in items:
         if Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.e2e)
@@ -241,13 +231,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def note():
-    """Add a line to the summary."""
+    """A function that adds a line to the summary."""
     return SUMMARY.append
 
 
 @pytest.fixture(scope="session")
 def cluster(request):
-    """A cluster with our images in it: that of KUBECONFIG, or a kind cluster of our own."""
+    """A cluster with the images: the one of KUBECONFIG, or else a new kind cluster."""
     own = "KUBECONFIG" not in os.environ
     missing = [tool for tool in TOOLS if shutil.which(tool) is None]
     if missing:
@@ -280,7 +270,7 @@ def cluster(request):
                 command("kubectl", "delete", *words)
 
 
-def _create() -> None:
+def _create():
     if CLUSTER in command("kind", "get", "clusters").split():
         command("kind", "export", "kubeconfig", f"--name={CLUSTER}")
         return
@@ -288,8 +278,8 @@ def _create() -> None:
     command("kind", "create", "cluster", f"--name={CLUSTER}", "--config", config, timeout=300)
 
 
-def _load() -> None:
-    """Load the images where the cluster is one of kind; another has to be able to pull them."""
+def _load():
+    """Load the images into a kind cluster; any other cluster must be able to pull them."""
     context = command("kubectl", "config", "current-context").strip()
     if context.startswith("kind-"):
         name = f"CLUSTER={context.removeprefix('kind-')}"
@@ -297,7 +287,7 @@ def _load() -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+def pytest_runtest_makereport(item, call):
     report = yield
     if report.failed and item.config.stash.get(UP, False):
         folder = BUILD / re.sub(r"\W+", "-", item.name)
@@ -309,7 +299,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     return report
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+def pytest_terminal_summary(terminalreporter):
     if SUMMARY:
         terminalreporter.section("end to end")
         for line in SUMMARY:
@@ -318,7 +308,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture(scope="session")
 def values(tmp_path_factory):
-    """What the tests' release is installed with, over the chart's own values."""
+    """The file of values with which the tests install their release."""
     prometheus = {"kubernetes.io/metadata.name": f"{NAMESPACE}-monitoring"}
     given = {
         "link": {"mode": "relay"},
@@ -341,20 +331,20 @@ def installed(cluster, values):
 
 @pytest.fixture(scope="session")
 def prometheus_image(cluster):
-    """A real Prometheus, and promtool with it."""
+    """Name of an image with Prometheus and promtool."""
     found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
     return found.split()[0]
 
 
-def processor_times() -> tuple[float, dict[str, float]]:
-    """Now [s], and what each process of the release says it has used so far [s]."""
+def processor_times():
+    """Return the monotonic time [s], and the CPU time of each process of the release [s]."""
     texts = {f"{end}/{name}": text for end in ENDS for name, text in scrapes(end).items()}
     name = "process_cpu_seconds_total"
     return time.monotonic(), {each: value(samples(t), name) for each, t in texts.items()}
 
 
-def memory() -> float:
-    """Memory of all containers of the release, as the kubelet counts it [bytes]."""
+def memory():
+    """Return the memory of all containers of the release, as the kubelet counts it [bytes]."""
     node = pod("world")["spec"]["nodeName"]
     summary = command("kubectl", "get", "--raw", f"/api/v1/nodes/{node}/proxy/stats/summary")
     found = {each["podRef"]["uid"]: each["containers"] for each in json.loads(summary)["pods"]}
@@ -362,8 +352,8 @@ def memory() -> float:
     return sum(each["memory"]["workingSetBytes"] for containers in mine for each in containers)
 
 
-@cache  # measured where the release flies; later its pods may just be replaced
-def pace() -> float:
-    """How much slower than nominal the release's own interpreter is at its own work; at least 1."""
+@cache  # measured once, because later a test may have just replaced the pod
+def pace():
+    """Return how much slower than nominal Python is in the world container [1]; at least 1."""
     words = ("exec", pod("world")["metadata"]["name"], "--container=world", "--")
     return slower(kubectl(*words, "python", "-c", WORK))

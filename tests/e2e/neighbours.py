@@ -1,10 +1,6 @@
-"""Pods beside the release: a stranger who tries every door, and a Prometheus that is let in."""
-
-from __future__ import annotations
+"""Pods beside the release: a foreign pod that tries all ports, and an allowed Prometheus."""
 
 import json
-from collections.abc import Mapping
-from typing import Any
 from urllib.parse import urlencode
 
 from cloudrc.cluster.client import connect
@@ -12,38 +8,38 @@ from cloudrc.cluster.pods import NO_PROXY, forwarded
 from tests.e2e.conftest import CHART, NAMESPACE, ROOT, apply, kubectl, pod
 
 MONITORING = f"{NAMESPACE}-monitoring"
-KNOCK = """\
+TRY_PORTS = """\
 import json, socket, sys
-doors = json.loads(sys.argv[1])
-open_doors = []
-for host, port in doors["tcp"]:
+ports = json.loads(sys.argv[1])
+answered = []
+for host, port in ports["tcp"]:
     try:
         socket.create_connection((host, port), timeout=2).close()
-        open_doors.append(f"{host}:{port}")
+        answered.append(f"{host}:{port}")
     except ConnectionRefusedError:
-        open_doors.append(f"{host}:{port} (answered)")
+        answered.append(f"{host}:{port} (answered)")
     except OSError:
         pass
 udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-for host, port in doors["udp"]:
+for host, port in ports["udp"]:
     for _ in range(50):
-        udp.sendto(b"knock knock", (host, port))
-print(json.dumps(open_doors))
+        udp.sendto(b"not a datagram", (host, port))
+print(json.dumps(answered))
 """
 
 
-def image() -> str:
-    """An image with Python that is on the node: that of the cloud pod."""
+def image():
+    """Return the image of the cloud pod, which has Python and is on the node."""
     return str(pod("cloud")["spec"]["containers"][0]["image"])
 
 
-def stranger(name: str, doors: Mapping[str, list[tuple[str, int]]]) -> list[str]:
-    """Knock at doors from a pod without our labels in our namespace; those that opened."""
+def stranger(name, ports):
+    """Try ports from a pod without the release's labels; return the TCP ports that answer."""
     cloud = pod("cloud")["spec"]
     container = {
         "name": "stranger",
         "image": image(),
-        "command": ["python", "-c", KNOCK, json.dumps(doors)],
+        "command": ["python", "-c", TRY_PORTS, json.dumps(ports)],
         "securityContext": cloud["containers"][0]["securityContext"],
     }
     spec = {
@@ -69,7 +65,7 @@ scrape_configs:
 """
 
 
-def targets() -> str:
+def targets():
     """Find the pods by the usual annotations, as kubernetes_sd_configs does.
 
     Debian builds Prometheus without the discovery of Kubernetes.
@@ -85,7 +81,7 @@ def targets() -> str:
     return json.dumps(found)
 
 
-def install_prometheus(prometheus_image: str) -> None:
+def install_prometheus(prometheus_image):
     """Start a Prometheus in a namespace of its own, and wait until it is ready."""
     metadata = {"name": "prometheus", "namespace": MONITORING}
     config = {"name": "config", "mountPath": "/etc/prometheus"}
@@ -120,25 +116,25 @@ def install_prometheus(prometheus_image: str) -> None:
     kubectl(f"--namespace={MONITORING}", *ready)
 
 
-def promtool(*words: str, given: str = "") -> str:
-    """What promtool in the pod of Prometheus says."""
+def promtool(*words, given=""):
+    """Run promtool in the pod of Prometheus, and return its output."""
     where = ("exec", f"--namespace={MONITORING}", "--stdin", "prometheus", "--container=prometheus")
     return kubectl(*where, "--", "promtool", *words, given=given)
 
 
 class Prometheus:
-    """The Prometheus of the tests, asked by HTTP while the block lasts."""
+    """Sends queries to the Prometheus of the tests while the block runs."""
 
-    def __enter__(self) -> Prometheus:
+    def __enter__(self):
         self._way = forwarded(connect(None, MONITORING), "prometheus", [9090])
         self._port = self._way.__enter__()[9090]
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error):
         self._way.__exit__(*error)
 
-    def ask(self, query: str) -> list[dict[str, Any]]:
-        """What PromQL answers."""
+    def ask(self, query):
+        """Return the result of a PromQL query."""
         url = f"http://127.0.0.1:{self._port}/api/v1/query?{urlencode({'query': query})}"
         with NO_PROXY.open(url, timeout=10) as answer:
             said = json.load(answer)

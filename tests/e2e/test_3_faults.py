@@ -35,12 +35,12 @@ from tests.e2e.conftest import (
 
 PIPES = [waypoint.model_dump(mode="json") for waypoint in load_mission("pipes").waypoints]
 LINGER = 12
-"""For an old pod to stay beside the new one [s]."""
+"""Time for which an old pod runs beside the new one [s]."""
 ENDS_IN = 2.0
-"""Time for a pod that is asked to end, and for its robot to hold [s].
+"""Time limit for a deleted pod to end, and for its robot to hold [s].
 Source: docs/reference/faults.md, "F33"."""
 COMMANDS_IN = 2.0
-"""Time for a new cloud to command [s]. Source: docs/reference/faults.md, "F13"."""
+"""Time limit for a new cloud to send commands [s]. Source: docs/reference/faults.md, "F13"."""
 POD_START = 10.0
 """Time that Kubernetes needs to replace a pod whose image is on the node [s]. On kind with two busy
 CPUs, 6.3 to 9.5 s were measured from the pod's deletion to the flight."""
@@ -51,11 +51,12 @@ PARTITION = 5.0
 AGE_MAX = 0.252 + 1e-9
 """Largest age of a command's basis at a HOLD [s]."""
 KILL = "import resource; resource.prlimit(1, resource.RLIMIT_CPU, (1, 1))"
-"""Kills a container's first process from within the container: no process in it may send SIGKILL to
-it, but the kernel does once the CPU time of a process [s] is above its limit."""
+"""Python code that kills the first process of its container. No process of the container may send
+SIGKILL to this process, but the kernel does when it has used more CPU time than its limit of 1 s.
+"""
 BURN = """
 import os, time
-child, end = os.fork(), time.monotonic() + 10  # one alone might stay below the limit of a whole CPU
+child, end = os.fork(), time.monotonic() + 10  # one process may stay below a limit of one CPU
 while time.monotonic() < end: pass
 child and os.waitpid(child, 0)
 """
@@ -69,7 +70,7 @@ def _no_mission_is_left(installed):
 
 
 def guard():
-    """State of the guard, by the world's own metrics."""
+    """Return the state of the guard from world's metrics."""
     return GuardState(int(value(metrics("world"), "cloudrc_guard_state"))).name
 
 
@@ -79,14 +80,14 @@ def fly_until(name, line, limit=120.0):
 
 
 def replace(component):
-    """Delete a pod, and wait only until there is a new one."""
+    """Delete a pod, and wait only until a new pod exists."""
     old = pod(component)["metadata"]["name"]
     kubectl("delete", "pod", old, "--wait=false")
     eventually(lambda: any(p["metadata"]["name"] != old for p in pods(component)), "a new pod")
 
 
 def check_completed(name):
-    """The Job completes, and no waypoint was reached twice or left out, across both pods."""
+    """Check that the Job completes, reaches each waypoint once, and that no pipe was touched."""
     end, log = job_end(name)
     assert (end.state, end.exit_code) == ("complete", 0), end
     for number in range(1, 8):
@@ -112,7 +113,7 @@ def test_a_deleted_cloud_is_replaced_and_the_mission_goes_on(installed, note):
 
 @pytest.fixture
 def lingering():
-    """Let a deleted cloud pod fly on for a while, as one on a node that is slow to hear of it."""
+    """Let a deleted cloud pod run on for `LINGER`, as on a node that learns of it late."""
     deployment = f"deployment/{NAME}-cloud"
     hook = {"preStop": {"exec": {"command": ["sleep", str(LINGER)]}}}
     containers = [{"name": name, "lifecycle": hook} for name in ("cloud", "teleop")]
@@ -182,7 +183,7 @@ def test_a_killed_cloud_container_is_replaced(installed):
     fly_until("struck", "waypoint 2 of 7 reached")
     epoch, cloud = value(metrics("world"), "cloudrc_session_epoch"), pod("cloud")
     began = time.monotonic()
-    with suppress(CommandFailedError):  # the messenger is killed, too
+    with suppress(CommandFailedError):  # `kubectl exec` fails, because its container ends
         name = cloud["metadata"]["name"]
         kubectl("exec", name, "--container=cloud", "--", "python", "-c", KILL)
     eventually(
@@ -201,7 +202,7 @@ def test_a_mission_whose_job_is_deleted_is_cancelled(installed):
     follow = ["kubectl", f"--namespace={NAMESPACE}", "logs", "--follow", "job/leaderless"]
     with subprocess.Popen(follow, stdout=subprocess.PIPE, text=True) as reader:
         assert reader.stdout is not None
-        reader.stdout.readline()  # from here on the log is read: it goes with its pod
+        reader.stdout.readline()  # from now on the log is read, which is deleted with the pod
         kubectl("delete", "pod", "--selector=batch.kubernetes.io/job-name=leaderless")
         assert reader.stdout.read().splitlines()[-1].startswith("INTERRUPTED")
     eventually(lambda: guard() == "HOLD", "the robot holds")

@@ -1,4 +1,4 @@
-"""The images, and `cloudrc run --mode cluster`: it leaves what a run leaves, as in virtual time."""
+"""The images; `cloudrc run --mode cluster` has the files and numbers of a run in virtual time."""
 
 import json
 
@@ -10,11 +10,11 @@ from tests.e2e.conftest import cloudrc, command, in_release
 from tests.flights.conftest import fly, numbers
 
 TIME_TOLERANCE = 0.05
-"""Of an instant in the flight, against the virtual run, as a share of it."""
+"""Largest deviation of a time in the flight from that in virtual time, as a share [1]."""
 DELAY_TOLERANCE = 0.002
-"""Of a mean delay, against the virtual run [s]."""
+"""Largest deviation of a mean delay from that in virtual time [s]."""
 SIZES = {"world": 420, "cloud": 320}
-"""At most, uncompressed [MB]."""
+"""Role -> largest size of its image, uncompressed [MB]."""
 LOOK = """\
 import json, os, shutil
 from importlib.util import find_spec
@@ -23,7 +23,7 @@ found += filter(find_spec, ["mujoco", "matplotlib", "pip"])
 found += filter(os.path.exists, ["/root/.cache"])
 print(json.dumps(found))
 """
-"""What a compiler, a big package or pip has left; the base's own pip is not of our Python."""
+"""Python code that lists the compilers, large packages, pip and cache that an image has."""
 
 
 @pytest.mark.parametrize(("role", "holds"), [("world", ["mujoco"]), ("cloud", [])])

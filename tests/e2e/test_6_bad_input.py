@@ -1,4 +1,4 @@
-"""What can be wrong with a cluster ends in one sentence, with the code that belongs to it."""
+"""Each problem of a cluster ends in one sentence and the right exit code."""
 
 import os
 import subprocess
@@ -14,14 +14,14 @@ ELSEWHERE = f"{NAMESPACE}-bad"
 
 @pytest.fixture(scope="module")
 def namespace(cluster):
-    """A namespace that allows everything, for releases that are not meant to work."""
+    """A namespace without restrictions, for releases that do not work."""
     apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": ELSEWHERE}})
     yield ELSEWHERE
     command("kubectl", "delete", "namespace", ELSEWHERE, "--wait=false")
 
 
 def refused(release, *settings):
-    """Install with helm, then let our own command say what is wrong: exit code and message."""
+    """Install with helm, then use cloudrc; return its exit code and error message."""
     command("helm", "install", release, CHART, f"-n={ELSEWHERE}", *settings)
     line = ["run", "hover", "--mode", "cluster", "-n", ELSEWHERE, "--release", release]
     done = cloudrc(*line, "--timeout", "60")
@@ -86,7 +86,7 @@ def test_without_permission_one_sentence_says_so(namespace, tmp_path):
 
 
 def powerless(folder):
-    """A kubeconfig of a service account that may do nothing."""
+    """Write the kubeconfig of a service account without rights."""
     account = {"name": "powerless", "namespace": ELSEWHERE}
     apply({"apiVersion": "v1", "kind": "ServiceAccount", "metadata": account})
     token = command("kubectl", "create", "token", "powerless", f"-n={ELSEWHERE}").strip()

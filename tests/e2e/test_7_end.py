@@ -1,4 +1,4 @@
-"""What helm prints works as printed, `helm test` passes, uninstalling leaves only the Secrets."""
+"""The commands in helm's notes work, `helm test` passes, uninstalling leaves only Secrets."""
 
 import shlex
 
@@ -11,13 +11,13 @@ KINDS = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc,jo
 
 @pytest.mark.full
 def test_the_commands_of_the_notes_work_as_printed(installed):
-    """All three end by themselves; the second flies `pipes`, for half a minute."""
+    """Each command ends by itself; the second one flies `pipes`, for half a minute."""
     printed = [line for line in helm("get", "notes", NAME).splitlines() if line.startswith("  ")]
     wait, mission, logs = (shlex.split(line) for line in printed)
     assert "condition met" in command(*wait)
     done = cloudrc(*mission[1:])
     assert (mission[0], done.returncode) == ("cloudrc", 0), done.stdout + done.stderr
-    assert command(*logs).strip(), "the link says what it is"
+    assert command(*logs).strip(), "the link names its shaper"
 
 
 def test_helm_test_flies_and_passes(installed):
@@ -26,7 +26,7 @@ def test_helm_test_flies_and_passes(installed):
 
 
 def test_uninstalling_leaves_only_the_secrets(installed):
-    """What `cloudrc mission run` has made goes with it; a user's own Job is the user's."""
+    """The Jobs of `cloudrc mission run` are deleted, too; a Job that a user applied is not."""
     kubectl("delete", f"--filename={EXAMPLES / 'mission-paper.yaml'}", "--ignore-not-found")
     helm("uninstall", NAME, "--wait")
 

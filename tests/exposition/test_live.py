@@ -151,12 +151,13 @@ def test_a_count_is_in_its_metric(role, count, name, labels):
 def test_guard_and_contacts_are_counted():
     live = LiveMetrics("world")
     assert value(live, "cloudrc_guard_state") == GuardState.GROUND
-    for state in (GuardState.TRACK, GuardState.HOLD):
+    for state in (GuardState.TRACK, GuardState.HOLD, GuardState.LAND, GuardState.LAND):
         live.see([GuardChange(0, state, "")])
     bodies = ("board", "pipe_1", "pipe_3", "chair")
     live.see([Contact(0, body, ZERO, ZERO, ZERO, True) for body in bodies])
-    assert value(live, "cloudrc_guard_state") == GuardState.HOLD
-    assert value(live, "cloudrc_guard_transitions_total", "hold") == 1
+    assert value(live, "cloudrc_guard_state") == GuardState.LAND
+    for state in ("hold", "land"):  # a touch-down repeats LAND
+        assert value(live, "cloudrc_guard_transitions_total", state) == 1
     found = {body: value(live, "cloudrc_contacts_total", body) for body in table.BODIES}
     assert found == {"board": 1, "pipe": 2, "other": 1, "floor": 0}
 

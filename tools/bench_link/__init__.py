@@ -1,1 +1,1 @@
-"""`make bench-link`: what the relay does, measured against what was asked of it."""
+"""`make bench-link`: measure how exactly the relay follows its profiles."""

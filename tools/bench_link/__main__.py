@@ -1,8 +1,8 @@
 """`make bench-link`: compare the relay with what its model draws, and with a program in C.
 
 Close other programs first, because they delay the relay. The program in C runs in turns with the
-relay and shows how late the machine wakes. Exit codes: 0 all held, 1 something did not, 3 no C
-compiler.
+relay and shows how late the machine wakes. Exit codes: 0 all bounds hold, 1 a bound does not, 3 no
+C compiler.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from cloudrc.link.profile import DirectionProfile
 from tools.bench_link.flow import Array, judge, run_flow
 from tools.bench_link.relays import (
     RelayProcess,
-    compile_anchor,
+    compile_program,
     fifo_allowed,
     measure_profiles,
     wake_lateness,
@@ -36,7 +36,7 @@ DELAY = 0.020
 
 
 class Line(NamedTuple):
-    """One thing that was asked: in words, the bound, the result, whether it is held."""
+    """One row of the result: a quantity, its bound, its value, and whether the bound holds."""
 
     what: str
     asked: str
@@ -53,7 +53,7 @@ def main() -> int:
     rounds, duration, minute = (2, 3.0, 6.0) if options.quick else (5, 20.0, 60.0)
     try:
         with TemporaryDirectory(prefix="bench-link-") as name:
-            lines = releases(Path(name), compile_anchor(Path(name)), rounds, duration)
+            lines = releases(Path(name), compile_program(Path(name)), rounds, duration)
             lines += profiles(Path(name), minute)
     except CloudrcError as error:
         print(f"bench-link: {error}", file=sys.stderr)
@@ -68,9 +68,9 @@ def main() -> int:
 
 
 def releases(folder: Path, program: Path, rounds: int, duration: float) -> list[Line]:
-    """Measure the relay's release errors at 1 kHz and how late C wakes, in turns.
+    """Measure how late the relay releases datagrams at 1 kHz, and in turns how late C wakes.
 
-    Both with SCHED_FIFO if this user may use it.
+    Both programs use SCHED_FIFO if this user has the right to.
     """
     fifo, link = fifo_allowed(), {"profile": "ideal", "uplink": {"delay_ms": DELAY * 1e3}}
     wakes, errors = list[Array](), list[Array]()
@@ -96,7 +96,7 @@ def releases(folder: Path, program: Path, rounds: int, duration: float) -> list[
 
 
 def profiles(folder: Path, seconds: float) -> list[Line]:
-    """Judge all shipped profiles, both ways at 100 Hz, all at the same time."""
+    """Measure all shipped profiles at the same time, in both directions at 100 Hz."""
     links: dict[str, dict[str, object]] = {name: {"profile": name} for name in names("profile")}
     rows = measure_profiles(folder, links, seconds, fifo=fifo_allowed())
     judged = [row.judged for row in rows]

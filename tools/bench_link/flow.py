@@ -36,7 +36,7 @@ _TX_SOFTWARE, _SOFTWARE, _ID, _STAMP_ONLY = 1 << 1, 1 << 4, 1 << 7, 1 << 11
 
 
 class Way(NamedTuple):
-    """Where one direction of a link takes in and delivers to; datagrams come from `source`."""
+    """One direction of a link: `source` sends to `target`, and the link delivers to `sink`."""
 
     uplink: bool
     target: Address
@@ -46,7 +46,7 @@ class Way(NamedTuple):
 
 @dataclass
 class Flow:
-    """Instants [ns], wall clock: of sending by number, and in order of arrival with the number."""
+    """Number -> time of sending, and (time, number) of each arrival [ns, wall clock]."""
 
     uplink: bool
     sent: dict[int, int] = field(default_factory=dict)
@@ -54,9 +54,9 @@ class Flow:
 
 
 class Judged(NamedTuple):
-    """A flow beside the model.
+    """Differences between a flow and the model, as counts of datagrams except `errors`.
 
-    `errors` are measured minus drawn delays of the datagrams that arrived, with copies [s].
+    `errors` are the measured minus the drawn delays of all arrivals, copies included [s].
     """
 
     errors: Array
@@ -99,9 +99,9 @@ def run_flow(
 def since_first_ns(number: int, turn: int, turns: int, period_ns: int) -> int:
     """Return when to send a datagram, as time since the first one [ns].
 
-    The first one starts the link's time. All others stay clear of whole periods since then: if a
-    trace changes just as a datagram leaves, the relay, which receives it a microsecond later, may
-    rightly draw its delay from the next row.
+    The first datagram starts the link's time. No other datagram leaves at a whole period after it,
+    because traces change there. The relay receives a datagram a microsecond after it left, so the
+    relay could correctly draw the delay from the next row.
     """
     if number == turn == 0:
         return 0
@@ -147,7 +147,7 @@ def _open(address: Address) -> socket.socket:
 
 
 def _drain(sink: socket.socket, source: socket.socket, flow: Flow) -> None:
-    """Read what has arrived, and when the kernel sent what was sent."""
+    """Read the arrivals at `sink`, and the kernel's stamps of the datagrams that `source` sent."""
     with suppress(BlockingIOError):
         while True:
             data, ancillary, _, _ = sink.recvmsg(SIZE, 512)

@@ -1,4 +1,4 @@
-"""Start `cloudrc relay` on a link, and measure it; measure how late C wakes."""
+"""Measure the delays of `cloudrc relay`, and how late a program in C wakes."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ Links: TypeAlias = dict[str, dict[str, object]]
 
 
 class RelayProcess:
-    """A running `cloudrc relay`; `ways` tells how to send through it."""
+    """A running `cloudrc relay`; `ways` has the addresses of both directions."""
 
     def __init__(self, folder: Path, link: dict[str, object], *, fifo: bool = False) -> None:
-        """Start it on a link, the section `link` of an experiment file, until it is ready."""
+        """Start a relay and wait until it is ready; `link` is that section of an experiment."""
         config = _write(folder, link)
         world_side, cloud_side, world, cloud = (("127.0.0.1", port) for port in free_ports(4))
         addresses = {
@@ -46,13 +46,13 @@ class RelayProcess:
         self._process.stdout.readline()
 
     def stop(self) -> None:
-        """End it."""
+        """Stop the relay."""
         self._process.terminate()
         self._process.communicate(timeout=10)
 
 
-def compile_anchor(folder: Path) -> Path:
-    """Compile the program `wake_lateness` into a folder.
+def compile_program(folder: Path) -> Path:
+    """Compile wake_lateness.c into a folder, and return the program.
 
     Raises:
         MissingPrerequisiteError: If there is no C compiler.
@@ -68,14 +68,14 @@ def compile_anchor(folder: Path) -> Path:
 
 
 def wake_lateness(program: Path, count: int, *, fifo: bool) -> Array:
-    """Let C sleep until instants 1 ms apart; return how late it woke [s], shape (count,)."""
+    """Let the program sleep until instants 1 ms apart; return its late wakes [s], (count,)."""
     command = [*(("chrt", "-f", "10") if fifo else ()), str(program), str(count)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return np.array(done.stdout.split(), dtype=float) * 1e-9
 
 
 def fifo_allowed() -> bool:
-    """Say whether this user may run programs under SCHED_FIFO."""
+    """Return whether this user may run programs under SCHED_FIFO."""
     if shutil.which("chrt") is None:
         return False
     done = subprocess.run(["chrt", "-f", "10", "true"], capture_output=True, check=False)
@@ -83,7 +83,7 @@ def fifo_allowed() -> bool:
 
 
 class Row(NamedTuple):
-    """One direction of one profile."""
+    """Result of one direction of one profile."""
 
     name: str
     direction: str
@@ -97,7 +97,7 @@ def measure_profiles(folder: Path, links: Links, duration: float, *, fifo: bool)
         Two rows for each link.
     """
     relays = {name: RelayProcess(folder, link, fifo=fifo) for name, link in links.items()}
-    # Once all senders are up: to start one takes 0.6 s of processor time from the others.
+    # Begin when all senders run: the start of a sender takes 0.6 s of CPU time from the others.
     begin = time.monotonic() + 0.6 * (len(links) + 1)
     tasks = [(relay.ways, duration, begin) for relay in relays.values()]
     with ProcessPoolExecutor(len(tasks), mp_context=get_context("spawn")) as pool:
@@ -118,7 +118,7 @@ def _send(task: tuple[list[Way], float, float]) -> list[Flow]:
 
 
 def profiles_of(folder: Path, link: dict[str, object]) -> tuple[DirectionProfile, DirectionProfile]:
-    """Read what a link asks for: uplink, downlink."""
+    """Read the profiles of a link: uplink, downlink."""
     experiment = load_experiment(str(_write(folder, link)))
     return link_profile(experiment.uplink), link_profile(experiment.downlink)
 

@@ -1,6 +1,6 @@
-"""Name why a link is not what was requested, by its rows and by what its machine reports.
+"""Name why a link differs from its profile.
 
-What can be read (qdiscs, counters, release errors) comes before what follows from the numbers.
+Reports of the machine (qdiscs, counters, release errors) come before conclusions from the rows.
 """
 
 from __future__ import annotations
@@ -14,17 +14,16 @@ from cloudrc.link.sidecar import Near, Told
 from cloudrc.link.verify.judge import Row
 
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
-"""A shaper lacks CPU time above any of these: 99 % quantile of the release error [s], share of
-datagrams that it did not read in time [1], share of CPU periods in which the limit stopped it [1].
-"""
+"""Above any of these limits a shaper lacks CPU time: 99 % quantile of its release error [s], share
+of datagrams not read in time [1], share of periods in which a CPU limit stopped the shaper [1]."""
 RAISED = ("mean", "round_trip", "deviation", "loss")
-"""Quantities that a lack of CPU time raises."""
+"""Quantities that rise if the shaper lacks CPU time."""
 PASSED = 0.9
-"""If the shaper counts a smaller share of what arrived, the rest takes another way [1]."""
+"""Below this share of the arrived datagrams at the shaper, the others take another way [1]."""
 
 
 class Evidence(NamedTuple):
-    """What the machine reports about the shaper of one direction; None or "" if it is unknown."""
+    """Report of the machine about the shaper of one direction; None or "" if unknown."""
 
     shaper: str = ""  # "relay", "netem"; "none" if the kernel has none where the flow leaves
     why: str = ""  # why this shaper, in words
@@ -45,9 +44,9 @@ def read_metrics(text: str) -> dict[str, float]:
 
 
 def read_evidence(told: Told, metrics: Mapping[str, float], sent: int | None = None) -> Evidence:
-    """Combine a link process's page /link.json, which names the qdiscs, and its metrics.
+    """Combine the page /link.json of a link's process, which names the qdiscs, and its metrics.
 
-    `sent` is what its end has sent since the process started; None if that was not counted.
+    `sent` is the number of datagrams sent to the process since it started; None if unknown.
     """
     received, unread, stopped, periods = (
         int(metrics.get(name, 0.0))
@@ -80,22 +79,22 @@ def read_evidence(told: Told, metrics: Mapping[str, float], sent: int | None = N
 
 
 class Cause(NamedTuple):
-    """A word for programs, a direction ("uplink", "downlink" or "both"), a sentence."""
+    """One reason why a link differs from its profile."""
 
-    code: str
-    way: str
-    text: str
+    code: str  # one word, for programs
+    way: str  # "uplink", "downlink" or "both"
+    text: str  # for people
 
 
 class Findings(NamedTuple):
-    """What is known about one direction."""
+    """Measurements of one direction, and the report of its machine."""
 
     rows: Sequence[Row]
     evidence: Evidence
 
 
 def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
-    """Name what is wrong with each direction of a link; nothing if no row is off."""
+    """Name the causes for each direction of a link; none if no row is off."""
     found = {way: list(_causes_of(one)) for way, one in findings.items()}
     silent = [way for way, causes in found.items() if causes and causes[0][0] in _UNSHAPED]
     shaped = [way for way in findings if way not in silent]
@@ -126,11 +125,12 @@ _BY_NUMBERS = (
     ("wrong_order", "reordered", 0.0, inf, ""),
     ("wrong_distribution", "distribution", 0.0, inf, ": delays are distributed otherwise"),
 )
-"""Code, quantity, measured by requested value from and to [1], text: the surest first."""
+"""Code, quantity, range of the measured divided by the requested value [1], and text; the surest
+cause comes first."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Give the first cause that holds; beside a lack of CPU time also what the numbers show."""
+    """Yield the surest cause; after a lack of CPU time also the cause that the rows show."""
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
     if off and (read := next(_of_machine(one.evidence, off, lost), None)):
@@ -144,7 +144,7 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
-    """Look at what can be read, the surest first; a share `lost` [1] did not arrive."""
+    """Yield causes that the machine reports, the surest first; a share `lost` [1] is lost."""
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
     sent, unshaped = known.sent or 0, known.shaper == "none"
     passed = sent if known.passed is None else known.passed
@@ -169,7 +169,7 @@ def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterato
 
 
 def _ratio(row: Row) -> float:
-    """Return the measured by the requested value [1]."""
+    """Return the measured divided by the requested value [1]."""
     return row.measured / row.asked if row.asked else inf
 
 

@@ -1,9 +1,10 @@
 """Predict what the datagrams of one direction measure, and judge what they did measure.
 
-Draws are counter-based, so the fate of each datagram on a relay is known. netem draws its own
-numbers, so 200 links with other seeds are simulated, which gives a band for each quantity. A row is
-"ok" within the band, widened by a tolerance, and otherwise "off". It is "open" if chance could hide
-a wrong link, and "told" if the profile asks for something that was not judged.
+The random numbers of a relay depend only on seed and counter, so the delay of each datagram on a
+relay can be predicted. netem has random numbers of its own. For netem, 200 links with other seeds
+are simulated; they give a band for each quantity. A row is "ok" within the band, widened by a
+tolerance, and otherwise "off". A row is "open" if chance could hide a wrong link, and "told" if the
+profile requests something that was not judged.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers
-from cloudrc.link.profile import DirectionProfile, Timeline
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -27,10 +28,11 @@ RUNS, RUN_LENGTH = 200, 1000
 TAIL = 1e-3
 """Share of honest links below a band, and share of them above it [1]."""
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
-"""Least correlation with predicted delays, and share of predicted losses, of a known link [1]."""
+"""Least correlation of measured and predicted delays, and least share of datagrams whose loss or
+arrival was predicted, from which on the link counts as a relay with known random numbers [1]."""
 STILL, SHAPE_FLOOR = 1e-4, 2e-3
-"""Standard deviations of the delay [s]. Below the first, delays tell nothing about draws; below the
-second, the machine itself changes the shape of the distribution."""
+"""Standard deviations of the delay [s]. Below the first, a correlation of delays means nothing;
+below the second, the machine itself changes the shape of the distribution."""
 TOLERANCES = {
     "mean": (2e-3, 0.05),
     "round_trip": (2e-3, 0.05),
@@ -38,23 +40,23 @@ TOLERANCES = {
     "distribution": (0.05, 0.0),
     "rate": (0.0, 0.25),
 }
-"""Quantity -> how far it may be off: in its unit, and as a share of the requested value [1]. Where
-the draws are known, the share for the deviation is half of that."""
+"""Quantity -> tolerance in its unit, and as a share of the requested value [1]: the larger counts.
+On a relay, the share of the deviation is half of that."""
 SHARE_TOLERANCE = (0.02, 0.25)
-"""The same for loss, order and copies."""
+"""Tolerance of loss, order and copies: absolute, and as a share of the requested value [1]."""
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; that of a share is "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
-"""Datagrams that a verdict takes at least [1]; tolerances that chance may hide in it [1]."""
+"""Fewest datagrams for a verdict [1]; widest half of a band for "ok", in tolerances [1]."""
 
 
 class Flow(NamedTuple):
-    """Datagrams of one kind: seed and direction of their draws, UDP payload [bytes]."""
+    """Datagrams of one kind in one direction."""
 
-    seed: int
+    seed: int  # of the experiment
     uplink: bool
-    kind: int
-    size: int
+    kind: int  # as in the tunnel's header
+    size: int  # UDP payload [bytes]
 
 
 class Row(NamedTuple):
@@ -73,14 +75,14 @@ class Row(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """What honest links measure; if their draws are known, chance has no part in it."""
+    """Values that links of the requested profile measure."""
 
-    bands: dict[str, tuple[float, float, float]]  # mean, and what all but TAIL exceed
-    pooled: Floats  # delays minus the requested ones, median 0, rising [s]
-    known: bool
+    bands: dict[str, tuple[float, float, float]]  # mean; a share TAIL is below, TAIL above the rest
+    pooled: Floats  # delays minus the requested delays, with median 0, sorted [s]
+    known: bool  # True if the link's random numbers are known: then a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return how much chance hides of a quantity, in tolerances [1]."""
+        """Return half the width of the band of a quantity, in tolerances [1]."""
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
@@ -99,13 +101,14 @@ class Expected(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """Datagrams of one direction, as probes or in flight, and what they measure on honest links.
+    """Datagrams that measure one direction, and the profile that this direction should have.
 
     Attributes:
         profile: Requested conditions.
         flow: The datagrams.
         sent: When each is sent, since the link came up [s], shape (n,).
-        train: Datagrams per train; each follows as many single ones. 0 without trains.
+        train: Datagrams per train, sent back to back; a train follows as many single datagrams. 0
+            without trains.
         pause: Called every few hundred microseconds, so that other threads run.
     """
 
@@ -116,9 +119,9 @@ class Plan:
     pause: Callable[[], None] = lambda: None
 
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
-        """Draw what the link does to datagrams sent at `sent` [s] with counters from `first` on.
+        """Simulate the link for datagrams sent at `sent` [s], with counters from `first` on.
 
-        A damaged datagram is refused, and so is lost.
+        The receiver refuses damaged datagrams, so they count as lost.
         """
         seed, uplink, kind, size = self.flow
         link, whole = LinkDirection(self.profile, seed, uplink), bytes(size)
@@ -135,23 +138,24 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """Streams over links of other seeds; at most RUN_LENGTH datagrams each.
-
-        netem realises almost no correlation, so these links have none.
-        """
+        """Streams of up to RUN_LENGTH datagrams over 200 links as netem shapes them."""
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
-        made = replace(self, profile=replace(self.profile, correlation=0.0))
+        made = replace(self, profile=netem_makes(self.profile))
         return [replace(made, flow=self.flow._replace(seed=seed)).draw(sent) for seed in seeds]
 
     @cached_property
     def chance(self) -> Expected:
-        """What these links measure."""
+        """Values that `links` measure."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
-        """Expect what the link drew if a stream met its own draws, otherwise what others draw."""
+        """Return the values that an honest link measures with the datagrams of a stream.
+
+        The values are exact if the stream fits the random numbers of a relay. Otherwise they are
+        the band of links with other seeds.
+        """
         drawn = self.draw(measured.sent, epoch, first)
         if self._fits(self._singles(measured), self._singles(drawn)):
             return self._expect([drawn])
@@ -163,7 +167,7 @@ class Plan:
         return self.chance._replace(bands=bands)
 
     def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
-        """Judge a stream; tell what the profile asks for and the stream cannot show."""
+        """Judge a stream; rows "told" name requested properties that the stream cannot show."""
         expected = self.expected(measured, epoch, first)
         found = self.quantities(measured, expected.pooled)
         rows = [expected.judge(name, found[name]) for name in found if name in expected.bands]
@@ -176,12 +180,12 @@ class Plan:
         return rows
 
     def needed(self) -> int:
-        """Return how many datagrams it takes until chance hides no more than the tolerances."""
+        """Return the number of datagrams from which on no band is wider than its tolerances."""
         most = max(map(self.chance.hidden, self.chance.bands))
         return round(len(self.links[0].sent) * max(1.0, most**2))
 
     def quantities(self, stream: Stream, pooled: Floats) -> dict[str, float]:
-        """Compute what is judged of a stream in one pass; an unknown value is NaN.
+        """Compute the judged quantities of a stream; an unknown one is NaN.
 
         The deviation [s] is that from the delay requested at each time, so it shows the jitter
         alone. The "distribution" is the distance of Kolmogorov and Smirnov from `pooled` [1].
@@ -205,7 +209,7 @@ class Plan:
         return measured
 
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
-        """Say whether datagrams met their own draws: by their delays, else by the losses."""
+        """Return whether the predicted delays, or else the predicted losses, were measured."""
         lost = np.isnan(measured.delays), np.isnan(drawn.delays)
         both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)
         pair = [(one.delays - requested)[both] for one in (measured, drawn)]
@@ -230,7 +234,7 @@ class Plan:
         return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
 
     def _shape(self, stream: Stream) -> Floats:
-        """Compute the delays minus those requested at their time, with median 0 [s]."""
+        """Return the delays minus the delays requested at their time, with median 0 [s]."""
         delays = stream.delays - _requested_delay(self.profile, stream.sent)
         there: Floats = delays[np.isfinite(delays)]
         return there - np.median(there) if len(there) else there
@@ -256,24 +260,39 @@ def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
     return np.array([timeline.at(elapsed_ns).delay_ns for elapsed_ns in times]) * 1e-9
 
 
+def netem_makes(profile: DirectionProfile) -> DirectionProfile:
+    """Return the profile with which the model does what netem does with `profile`.
+
+    netem realises almost no correlation of delays. If it draws a loss and a duplicate for a packet,
+    one packet arrives; a copy can be lost, too. Source: Linux, net/sched/sch_netem.c.
+    """
+    loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
+    twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)
+    if isinstance(loss, GilbertElliott):
+        loss = replace(loss, loss_bad=single * loss.loss_bad, loss_good=single * loss.loss_good)
+    else:
+        loss *= single
+    return replace(profile, correlation=0.0, loss=loss, duplicate=twice)
+
+
 def told(name: str, asked: float, measured: float = nan) -> Row:
-    """Return a row that is not judged, with `asked` and `measured` values [any unit]."""
+    """Make a row with `asked` and `measured` values [any unit] of a quantity that is not judged."""
     return Row(name, UNITS.get(name, "1"), asked, measured, nan, nan, "told")
 
 
 def tolerance(name: str, asked: float) -> float:
-    """Return how far a quantity may be off from what was asked [any unit]."""
+    """Return the tolerance of a quantity of which the profile requests `asked` [any unit]."""
     floor, share = TOLERANCES.get(name, SHARE_TOLERANCE)
     return max(floor, share * asked)
 
 
 def look_twice(first: Sequence[Row], second: Sequence[Row]) -> list[Row]:
-    """Combine two measurements of a link: only what is off in both is off."""
+    """Combine two measurements of a link: a row is off only if it is off in both."""
     again = {row.name: row for row in second}
     return [again.get(row.name, row) if row.verdict == "off" else row for row in first]
 
 
 def verdict_of(rows: Iterable[Row]) -> str:
-    """Sum up rows: "off" if one is, else "open" if one is or none is judged, else "ok"."""
+    """Return "off" if a row is off, else "ok" if all judged rows are ok, else "open"."""
     verdicts = {row.verdict for row in rows} - {"told"}
     return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"

@@ -41,7 +41,7 @@ PERIOD = 0.01
 CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
 """Time between two verdicts, and from a new session or profile to the first datagram [ns]."""
 KEPT, FINAL = 6000, 128
-"""Datagrams that are kept, and newer ones after which a missing one counts as lost [1]."""
+"""Most datagrams that are judged [1]; a missing datagram counts as lost after FINAL newer ones."""
 ENDS = 2e-3
 """Largest delay that two punctual ends and a tick of the simulation add to a round trip [s]."""
 FOLLOW_PERIOD = 0.1
@@ -90,7 +90,7 @@ class LinkMonitor:
             ]
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Take the newest records of this end at `now_ns`; return what to record about the link."""
+        """Take the newest records of this end at `now_ns`; return records about the link."""
         if self._inbox is None:
             return self._see(records, now_ns)
         self._inbox.put((records, now_ns))
@@ -201,9 +201,9 @@ class LinkMonitor:
         return expected.judge("round_trip", float(np.mean(self._trips)))
 
     def _excuse(self, row: Row) -> Row:
-        """Leave open a delay that ends that wake late may have added.
+        """Leave a too long delay open if late wakes of this machine's loops may explain it.
 
-        A stall of an end delays all datagrams that arrive meanwhile, hence the cubes.
+        While a loop stalls, datagrams wait for up to its lateness; hence the cubes.
         """
         late = np.array(self._lates or [0.0])
         added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * PERIOD)) ** 0.5
@@ -212,10 +212,10 @@ class LinkMonitor:
 
 
 def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
-    """Order arrivals by their counters, with the lost ones between them.
+    """Order arrivals by their counters, and mark the missing counters between them as lost.
 
-    Returns also the first counter and whether the ends share a clock; if not, delays have an
-    unknown offset.
+    Returns also the first counter, and whether the ends share a clock. Without a common clock the
+    delays have an unknown offset.
     """
     last = max((one.counter for one in arrivals), default=0) - FINAL
     arrivals = [one for one in arrivals if last - KEPT < one.counter <= last]

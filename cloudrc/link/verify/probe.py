@@ -1,7 +1,7 @@
 """Send numbered probes through both directions of a link and note when each copy arrives.
 
-One thread and one clock serve both ends. A probe is stamped just before the kernel takes it, and by
-the kernel when it arrives (SO_TIMESTAMPNS), so what this process waits in between is not measured.
+One thread sends and receives for both ends, with one clock. This thread stamps a probe just before
+sending it; the kernel stamps its arrival (SO_TIMESTAMPNS), so a late thread adds no delay.
 """
 
 from __future__ import annotations
@@ -23,30 +23,32 @@ from cloudrc.link.verify.judge import Flow, Plan
 from cloudrc.tunnel.codec import Direction, encode_header, peek
 
 PROBE = 254
-"""Kind of datagram that only probes have; no tunnel end accepts it."""
+"""Kind of datagram in the header of probes; no end of a tunnel accepts this kind."""
 FIRST_PROBE = 1.0
 """Time from the start of the link to the first probe [s]."""
 COUNT = 1500
-"""Number of probes; more where chance hides more than a tolerance [1]."""
+"""Fewest probes, unless the user gives a time [1]."""
 LONGEST, AFTER = 120.0, 5.0
 """Longest time to probe, and time to probe after the last change of a time line [s]."""
 RATE, LINK_SHARE = 200.0, 0.4
-"""Most probes per second, half as many through netem [1/s], and share of a bottleneck that they
-fill at most, in [0, 1]."""
+"""Most probes per second, half as many through netem [1/s]; largest share of a limited rate that
+single probes use [1]."""
 RATE_MAX = 1e8
-"""Highest rate that this process can measure [bit/s]."""
+"""Highest rate limit that this process can measure [bit/s]."""
 TRAIN_SIZE, TRAIN_SPAN = 1400, 0.06
-"""UDP payload of a probe of a train [bytes], one Ethernet frame, and time of a train [s]."""
+"""UDP payload of a probe if the profile limits the rate [bytes]: one Ethernet frame. Shortest time
+that a train of probes, sent back to back, takes at that rate [s]."""
 _BUFFER = 4_000_000
 
 
 def plan_probes(
     profile: DirectionProfile, flow: Flow, seconds: float | None = None, *, drawn: bool = False
 ) -> Plan:
-    """Choose how many probes to send: for `seconds` [s], else as many as decide.
+    """Plan probes for `seconds` [s]; None: for as long as a verdict needs.
 
-    A time line is probed as a whole. Probes for a bottleneck are large, and half of them leave in
-    trains, which it draws out. `drawn`: the shaper draws its own chance, as netem does.
+    Without `seconds` a time line is probed as a whole. If the profile limits the rate, the probes
+    are large, and half of them are sent in trains, which show the rate. `drawn` is True for a
+    shaper with random numbers of its own: netem.
     """
     timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
     if (rate := min(piece.rate or inf for piece in timeline.pieces)) <= RATE_MAX:
@@ -96,7 +98,7 @@ class ProbeEnd:
             self.socket.sendto(self.probes[number], self.route)
 
     def receive(self, far: socket.socket) -> None:
-        """Note a probe of this end that waits in the other end's socket, and nothing else."""
+        """Read one datagram from the other end's socket `far`; note it if this end sent it."""
         with suppress(OSError, ValueError):  # nobody listened to an earlier probe; foreign data
             data, ancillary, _, _ = far.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
             at_ns, number = self._stamps.wall_ns(ancillary) or time.time_ns(), peek(data)[2]
@@ -106,16 +108,13 @@ class ProbeEnd:
                 self._copies[number] += 1
 
     def stream(self) -> Stream:
-        """Return what was measured."""
+        """Return the measured delays and copies."""
         delays = np.where(self._copies, self._delays, np.nan)
         return Stream((self._sent_ns - self.origin_ns) * 1e-9, delays, self._copies)
 
 
 def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
-    """Send the probes of both ends and listen until none can arrive; return what each measured.
-
-    What the first end sends the second receives, and the other way round.
-    """
+    """Send the probes of both ends, each to the other; return the streams that they measured."""
     heard = {end.socket: other for end, other in zip(ends, reversed(ends), strict=True)}
     drawn = np.concatenate([end.plan.draw(end.plan.sent).delays for end in ends])
     quiet = 0.5 + 2.0 * float(np.max(drawn, initial=0.0, where=drawn > 0.0))

@@ -11,7 +11,7 @@ from cloudrc.config.shipped import names
 from cloudrc.link.netem import check
 from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
-from cloudrc.link.verify.judge import Flow, look_twice, verdict_of
+from cloudrc.link.verify.judge import Flow, look_twice, netem_makes, verdict_of
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from tests.link.verify.conftest import (
     VirtualNetem,
@@ -120,6 +120,18 @@ def test_an_honest_netem_is_believed(name):
 
 
 @pytest.mark.parametrize(
+    "loss", [0.2, GilbertElliott(0.02, 0.2, 0.9, 0.1)], ids=["independent", "in bursts"]
+)
+def test_an_honest_netem_loses_either_a_packet_or_its_copy(loss):
+    profile = DirectionProfile(0.045, loss=loss, duplicate=0.3)
+    rows = rows_of(profile, VirtualNetem(profile, 7), seconds=120.0)
+    assert doubts(rows) == []
+    for row in rows:
+        if row.name in ("loss", "duplicated"):
+            assert row.asked == pytest.approx(row.measured, abs=0.03)
+
+
+@pytest.mark.parametrize(
     ("values", "quantity"),
     [({"delay": 0.09}, "mean"), ({"jitter": 0.026}, "deviation"), ({"loss": 0.05}, "loss")],
 )
@@ -135,12 +147,13 @@ def test_a_wrong_netem_is_off(values, quantity):
         DirectionProfile(0.08, 0.02, correlation=0.9),
         DirectionProfile(0.08, 0.02, "pareto", 0.5, keep_order=True),
         DirectionProfile(0.045, 0.0, loss=0.1, corrupt=0.1),
+        DirectionProfile(0.045, 0.0, loss=0.2, duplicate=0.3),
     ],
 )
-def test_the_model_without_correlation_is_what_the_kernel_draws(profile):
+def test_the_model_does_what_the_kernel_does(profile):
     check(profile)
     plan = plan_probes(profile, Flow(1, True, PROBE, 203), 300.0)
-    made = replace(plan, profile=replace(profile, correlation=0.0))
+    made = replace(plan, profile=netem_makes(profile))
     ours, theirs = (
         plan.quantities(one, np.zeros(0))
         for one in (made.draw(plan.sent), meet(plan, VirtualNetem(profile, 7)))
