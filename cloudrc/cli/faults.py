@@ -17,7 +17,7 @@ from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.faults.scenario import Outcome, Result
+    from cloudrc.faults.scenario import Outcome, Scenario
 
 EPILOG = """\
 examples:
@@ -136,24 +136,25 @@ def print_faults(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Run one fault, all faults, or the faults in the file of a schedule; return the exit code."""
-    from cloudrc.faults.scenario import Result, as_json
     from cloudrc.faults.scenarios import SCENARIOS, find
 
     if isinstance(options.name, Path):
         return fly_file(options)
     chosen = SCENARIOS if options.all else (find(options.name),)
-    results: list[Result] = []
+    outcomes: list[Outcome] = []
 
-    def take(done: tuple[Outcome, float, str]) -> None:
-        results.append(result := Result(chosen[len(results)], *done))
+    def take(outcome: Outcome) -> None:
+        outcomes.append(outcome)
         if options.output == "table":
-            _print_result(result, options.all)
+            _print_outcome(chosen[len(outcomes) - 1], outcome, options.all)
 
     jobs = [(each.name, options.seed) for each in chosen]
     cause, code = take_each(map_in_order(_run, jobs, options.jobs), take)
-    count, failed = len(results), sum(not result.passed for result in results)
+    count, failed = len(outcomes), sum(not outcome.passed for outcome in outcomes)
     if options.output != "table":
-        print(format_document(as_json(results, options.seed), options.output))
+        faults = [each.as_json(done) for each, done in zip(chosen, outcomes, strict=False)]
+        document = {"schemaVersion": 1, "seed": options.seed, "passed": not failed}
+        print(format_document(document | {"faults": faults}, options.output))
     else:
         print(f"\nseed {options.seed}: {count - failed} of {count} passed, {failed} failed")
     if cause:
@@ -162,30 +163,22 @@ def run(options: argparse.Namespace) -> int:
     return code or (FAILED if failed else 0)
 
 
-def _run(job: tuple[str, int]) -> tuple[Outcome, float, str]:
-    """Run the fault with a name and seed, in this process or in a worker process.
-
-    Return the outcome, the elapsed time [s] and the text of an unexpected error, or "".
-    """
-    from cloudrc.faults.scenario import Outcome
+def _run(job: tuple[str, int]) -> Outcome:
+    """Run one fault, by its name and a seed, in this process or in a worker."""
     from cloudrc.faults.scenarios import find
 
     (name, seed), began = job, time.monotonic()
-    outcome, text = Outcome(), ""
-    try:
-        outcome = find(name).run(seed)
-    except Exception as error:  # this scenario fails, the others still run
-        text = f"{type(error).__name__}: {error}"
-    return outcome, time.monotonic() - began, text
+    outcome = find(name).run(seed)
+    outcome.seconds = time.monotonic() - began
+    return outcome
 
 
-def _print_result(result: Result, briefly: bool) -> None:
-    scenario, outcome = result.scenario, result.outcome
-    word = paint(result.word, "green" if result.passed else "red")
+def _print_outcome(scenario: Scenario, outcome: Outcome, briefly: bool) -> None:
+    word = paint(outcome.word, "green" if outcome.passed else "red")
     sha = f"  {outcome.sha256[:12]}" if outcome.sha256 else ""
-    print(f"{word:8} {scenario.id:4} {scenario.name:26} {result.seconds:6.1f} s{sha}")
-    if result.error:
-        print(f"           {escape(result.error)}")
+    print(f"{word:8} {scenario.id:4} {scenario.name:26} {outcome.seconds:6.1f} s{sha}")
+    if outcome.error:
+        print(f"           {escape(outcome.error)}")
     for check in outcome.checks:
         if not (briefly and check.passed):
             print(f"         {'' if check.passed else 'x '}{escape(check.show())}")

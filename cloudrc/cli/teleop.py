@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from cloudrc.teleop.service import MissionService
     from cloudrc.teleop.store import MissionStore
 
-LOOPBACK = "127.0.0.1"
 FILES_MAX = 8_192
 """Limit of open files of this process: idle connections must leave room for an emergency stop."""
 LOCK_PERIOD = 0.2
@@ -36,10 +35,10 @@ LOCK_PERIOD = 0.2
 PAUSE_LIMIT_NS = 500_000_000
 """Longest time that an ending teleop waits until the robot holds its position [ns]."""
 EPILOG = """\
-teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. With
---start teleop ends after the experiment's mission; otherwise it ends on
-SIGTERM, on Ctrl-C and when its parent process has ended. A flying robot then
-holds; a new teleop with the same --journal resumes the mission.
+teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. It ends
+on SIGTERM, on Ctrl-C and when its parent process has ended; with --start also
+after the mission. A flying robot then holds; a new teleop with the same
+--journal resumes the mission.
 
 /openapi.json describes the API. The API asks for a token, except on a socket
 file, which only its owner can open. To make a token that only you can read:
@@ -73,7 +72,7 @@ def api_address(text: str) -> Address | Path:
     if text.startswith("unix:") and len(text) > len("unix:"):
         return Path(text.removeprefix("unix:"))
     host, colon, port = text.rpartition(":")
-    host = host if colon else LOOPBACK
+    host = host if colon else "127.0.0.1"
     return (host.strip("[]"), 0) if host and port == "0" else read_address(f"{host}:{port}")
 
 

@@ -4,9 +4,10 @@ A plug-in may raise an exception, or return values that are not finite or not nu
 uses a safe value (the last good horizon, the last sample, zero velocity). It counts every failure
 and reports the first failure of each plug-in. The loop never stops.
 
-While no echo shows that the robot flies the commands, the loop freezes: it commands zero velocity
-and does not call the controller. Therefore no integral winds up, and no predictor assumes motion
-that the robot did not fly. Only the echo of a new command ends the freeze.
+Telemetry echoes the newest command that world has applied. While no echo shows that the robot flies
+the commands, the loop freezes: it commands zero velocity and does not call the controller.
+Therefore no integral winds up, and no predictor assumes motion that the robot did not fly. Only the
+echo of a new command ends the freeze.
 
 The loop measures all ages on cloud's own clock and compares world's stamps only with each other,
 so it needs no clock synchronisation.

@@ -16,7 +16,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class Operator(Protocol):
-    """Teleop as cloud sees it: teleop itself, or the socket to its process."""
+    """Teleop as cloud sees it: teleop itself, or the socket to teleop's process."""
 
     @property
     def outputs(self) -> Sequence[Output | Fault]:
@@ -34,7 +34,7 @@ class Operator(Protocol):
         """Pass the newest telemetry, received at `now_ns` [ns], to teleop."""
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Do what is due at `now_ns` [ns]."""
+        """Let teleop do what is due at `now_ns` of cloud's clock [ns]."""
 
     def take_outputs(self) -> Sequence[Output | Fault]:
         """Return the messages since the last call."""
@@ -44,7 +44,7 @@ def is_for_session(epoch: int, output: Output | Fault) -> bool:
     """Return whether a message from teleop is valid in the session with this epoch.
 
     Setpoints and starts are valid only in the session for which teleop made them, because another
-    cloud may have moved the robot since. Teleop repeats both. No other message makes it fly.
+    cloud may have moved the robot since. Teleop repeats both. No other message makes the robot fly.
     """
     if isinstance(output, Setpoint) or (
         isinstance(output, OperatorRequest) and output.request is Request.START
@@ -71,7 +71,7 @@ def make_robot_status(
 class EmergencyStopRepeater:
     """Numbers an emergency stop, and repeats it until telemetry shows that the robot obeyed.
 
-    Teleop may ask for it any number of times. Without a session it waits for the next session.
+    Teleop may ask for the stop any number of times. Without a session, the stop waits for one.
 
     Attributes:
         sounds: Whether the stop is being repeated.
@@ -87,7 +87,7 @@ class EmergencyStopRepeater:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
     def restart_numbers(self) -> None:
-        """Start numbering from 0, for a new session: no stop is under way, world has seen none."""
+        """Start numbering from 0, because world counts the requests of each session anew."""
         self._number = self._acted_on = self._due_ns = 0
 
     def see(self, guard: GuardState, acted_on: int) -> None:
@@ -103,7 +103,8 @@ class EmergencyStopRepeater:
     def due(self, asked: int, now_ns: int) -> OperatorRequest | None:
         """Return a copy of the emergency stop if one is due at `now_ns` [ns], else None.
 
-        World acts on rising numbers only: the stop's is above `asked`, the highest so far.
+        World acts on rising numbers only. `asked` is the highest number so far; the stop gets a
+        higher number.
         """
         if not self.sounds or now_ns < self._due_ns:
             return None

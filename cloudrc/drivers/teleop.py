@@ -3,7 +3,7 @@
     cloud process: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  serve_teleop - machine
 
 No call blocks. A datagram is lost if the socket of the other process is full or missing. Either
-process may restart: setpoint and requests are repeated, and events wait until cloud is back.
+process may restart: teleop repeats setpoint and requests, and keeps its events for a new cloud.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 
 DATAGRAM_MAX = 8_192
-"""Size limit of a datagram [bytes]; all our messages are smaller."""
+"""Size limit of a datagram [bytes]; all messages of teleop and cloud are smaller."""
 DRAIN_MAX = 1024
-"""Limit of the datagrams per wake, above the socket's queue (513 under systemd), for a flood."""
+"""Limit of the datagrams of one read; a socket queues fewer of them (513 under systemd)."""
 PATH_MAX = 107
 """Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
 PERIOD_NS = 20_000_000
 """Period of teleop's state machine [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
-"""Shortest time between two robot states sent to teleop [ns]: every second telemetry message."""
+"""Shortest time between two states for teleop [ns], so that it gets every second telemetry."""
 ALIVE_NS = 200_000_000
-"""Time between two empty datagrams that tell teleop that cloud runs, without telemetry [ns]."""
+"""Time between two empty datagrams [ns]; without telemetry they show teleop that cloud runs."""
 STALL_NS = 100_000_000
-"""If a wake is later than this, the socket holds only old datagrams [ns]: its queue has been full
-since the start of the stall."""
+"""Delay of the loop above which all datagrams in the socket count as old [ns], because the socket's
+queue has been full since the delay began. Such a delay is a stall."""
 BLIND_WAKES = 5
-"""Limit of the wakes that wait for a new datagram after a stall."""
+"""Number of loop periods that teleop waits for a new datagram after a stall, at most."""
 SILENCE_NS = 1_000_000_000
-"""Time without a datagram from teleop after which teleop counts as away [ns]; it sends at 10 Hz."""
+"""Teleop, which sends at 10 Hz, counts as away after this time without a datagram [ns]."""
 EVENTS_KEPT = 256
 """Limit of the events that wait while cloud is away."""
 LAST_WORD_NS = 800_000_000
-"""How long cloud, while it ends, still forwards teleop's last hold request [ns]: longer than teleop
-repeats it, and shorter than the 1.5 s that a process has to end."""
+"""Time for which an ending cloud still forwards teleop's request to hold [ns]. Teleop repeats the
+request for a shorter time, and a process has 1.5 s to end."""
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
 """Function that decodes a message; it raises a ValueError if the bytes are not a message."""
@@ -52,10 +52,10 @@ Calls = Callable[[], Iterable[Callable[[int], None]]]
 
 
 class UnixPeer:
-    """Our Unix datagram socket and the path of the other process's socket."""
+    """Exchange datagrams with another process over two Unix sockets."""
 
     def __init__(self, own: Path, other: Path) -> None:
-        """Bind `own` and replace a socket that an earlier process left there.
+        """Bind `own`, which may replace the socket of an earlier process; send to `other`.
 
         Raise a BadInputError if the path cannot be bound.
         """
@@ -89,18 +89,18 @@ class UnixPeer:
         return True
 
     def close(self) -> None:
-        """Close the socket; its path stays, since a successor may already have bound it."""
+        """Close the socket, but keep the socket file, which may already belong to a new process."""
         self._socket.close()
 
 
 class RemoteTeleop:
-    """Represents teleop in cloud's process, which does not end when a mission ends.
+    """Represent teleop in cloud's process: send telemetry to teleop, and receive its outputs.
 
     Attributes:
         outputs: Teleop's outputs since the last call of `take_outputs`.
     """
 
-    outcome = None
+    outcome = None  # cloud does not end when a mission ends
     settled = True
 
     def __init__(self, peer: UnixPeer, encode: Encode, decode: Decode, start_ns: int) -> None:
@@ -120,10 +120,11 @@ class RemoteTeleop:
                 self._heard_ns = now_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Receive teleop's outputs; report a fault once teleop, with telemetry, is silent for 1 s.
+        """Receive teleop's outputs; report a fault if teleop has telemetry and is silent for 1 s.
 
-        After a stall, starts and waypoints are dropped, but not twice in a row: teleop may have
-        withdrawn them in a datagram that the full socket lost. It repeats what is still valid.
+        After a stall, drop starts and waypoints, because teleop may have withdrawn them in a
+        datagram that the full socket lost. Teleop repeats the valid ones; the next call forwards
+        them.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS
@@ -156,7 +157,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud while the robot flies: teleop, which ends too, requests a hold."""
+    """Delay the end of cloud while the robot flies, to forward teleop's last request to hold."""
 
     def __init__(
         self,
@@ -164,12 +165,12 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Note who says whether cloud has to end and whether the robot flies; `clock` is in ns."""
+        """Call `asked` (has cloud to end?), `flies` (does the robot fly?) and `clock` [ns]."""
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
 
     def __call__(self) -> bool:
-        """Return whether cloud may end now; called at every wake."""
+        """Return whether cloud may end now; cloud's loop calls this in every period."""
         if not self._asked():
             return False
         if self._until_ns is None:
@@ -188,16 +189,16 @@ def serve_teleop(
     tell: Callable[[list[MissionEvent | Fault]], None],
     stop: Callable[[], bool],
 ) -> None:
-    """Run teleop's machine at 50 Hz in real time until `stop()`, which is called at every wake.
+    """Run the loop of teleop's process at 50 Hz in real time until `stop()` returns true.
 
-    The machine is a `MissionService` or acts like one: it has hear, see, handle_deadline and
-    take_outputs. `tell` gets the events and faults of each wake, and must not block. For `calls`
-    and `stops` see `turn`.
+    `machine` is a `MissionService`, or has its methods hear, see, handle_deadline and take_outputs.
+    `tell` receives the events and faults of each period, and must not block. For `calls` and
+    `stops` see `turn`.
     """
     unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
     deadline_ns, blind = time.monotonic_ns(), 0
     while not stop():
-        # Datagrams do not wake it: telemetry is twice as frequent, and only the newest counts.
+        # Do not wait for datagrams: telemetry is twice as frequent, and only the newest counts.
         time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
         now_ns = time.monotonic_ns()
         late_ns = now_ns - deadline_ns
@@ -220,12 +221,12 @@ def turn(
     late_ns: int,
     now_ns: int,
 ) -> int:
-    """Run one wake of teleop: receive states, make the queued calls, handle the deadline.
+    """Run one period of teleop's loop: receive states, make the queued calls, send what is due.
 
-    `calls` and `stops` return the queued calls and emergency stops; the wake is `late_ns` [ns] late
-    at `now_ns` [ns]. `blind` is the return value of the last wake, 0 at first: the number of
-    further wakes that wait, after a stall, for a new datagram. If it is above 0, this wake has only
-    received datagrams.
+    The period begins `late_ns` late, at `now_ns` [ns]. `calls` and `stops` return the queued calls
+    and emergency stops. After a stall, teleop only receives datagrams until a new one arrives, for
+    at most `BLIND_WAKES` periods. `blind` is the return value of the last period, at first 0: the
+    number of periods that teleop still waits in this way.
     """
     arrived, was_blind = peer.receive(), blind
     states = [data for data in arrived if data]  # an empty datagram carries no state
@@ -238,7 +239,8 @@ def turn(
     if arrived:
         machine.hear(now_ns)
     # Calls come before the state, which may already show the effect of a call or of its alarm.
-    # After a stall other calls than stops come later, because they may depend on the robot's place.
+    # After a stall, calls come after the state, because they may depend on the robot's position;
+    # only stops do not.
     for stop in stops():
         stop(now_ns)
     seen = _newest(states, decode)
@@ -263,7 +265,7 @@ def send(
             data = encode(output)
             if unsent or not peer.send(data):
                 unsent.append(data)
-        elif not isinstance(output, Fault):  # everything else is repeated anyway
+        elif not isinstance(output, Fault):  # teleop repeats all other outputs
             peer.send(encode(output))
     return [output for output in outputs if isinstance(output, MissionEvent | Fault)]
 

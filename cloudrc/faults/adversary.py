@@ -1,4 +1,4 @@
-"""Dishonest clouds: they have valid keys and send whatever they like.
+"""Model dishonest clouds, which have valid keys and send any command.
 
 A policy sees what an honest cloud sees (the newest odometry and its own estimate of the delay) and
 sends any command, properly sealed. Some policies also lie about the odometry that a command was
@@ -38,15 +38,15 @@ from cloudrc.world.robot import STEP_NS
 
 Generator: TypeAlias = np.random.Generator
 Lie: TypeAlias = Callable[[Command, Control], Command]
-"""Returns what is sent in place of a command; the record has what cloud knew."""
+"""Returns the command that is sent in place of the honest one; the record holds what cloud knew."""
 Policy: TypeAlias = Callable[[Generator], Lie]
 Words: TypeAlias = Callable[[int, RobotStatus], OperatorRequest | None]
-"""Returns a request in the operator's name, if any, at a time of cloud's clock [ns]; the robot is
-as it was last seen. The request's number is not used."""
+"""Returns a request in the operator's name, or None, at a time of cloud's clock [ns]. The status is
+the newest that cloud knows. The request's number is not used."""
 
 
 class DishonestLoop(ControlLoop):
-    """Computes the honest command and sends another one."""
+    """Computes the honest command, and changes it before it is sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any) -> None:
         """Change each command by these lies, one after the other; `plugins` as `ControlLoop`."""
@@ -64,9 +64,9 @@ class DishonestLoop(ControlLoop):
 
 
 class HostileOperator:
-    """Passes teleop's setpoints on, and makes its own requests in place of teleop's; an `Operator`.
+    """An `Operator` that passes teleop's setpoints on, but replaces teleop's requests.
 
-    Until the first setpoint it passes teleop's requests on, so that a mission begins.
+    Before the first setpoint it passes the requests on, too, so that a mission begins.
     """
 
     outcome, settled = None, True
@@ -126,19 +126,19 @@ CHOICES = {
     GuardState.ESTOP: LATCHED,
 }
 """Probability of each request, by the state of the guard that cloud knows of [1]."""
-PATIENCE_NS = 5_000_000_000  # longest wait for the robot to come near a face of the fence [ns]
+FACE_WAIT_NS = 5_000_000_000  # longest wait for the robot to come near a face of the fence [ns]
 REACHED = (0, 1, 7, MISSION_OVER)
 
 
 def at_bad_moments(rng: Generator) -> Words:
-    """Make requests after random pauses; every second one waits until the robot is near a face."""
+    """Make requests after random pauses; half of them wait until the robot is near a face."""
     pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
     due_ns, waits = 0, False
 
     def words(now_ns: int, seen: RobotStatus) -> OperatorRequest | None:
         nonlocal due_ns, waits
         far = seen.guard is GuardState.TRACK and min(_faces(seen.position))[0] > near
-        if now_ns < (due_ns + PATIENCE_NS if far and waits else due_ns):
+        if now_ns < (due_ns + FACE_WAIT_NS if far and waits else due_ns):
             return None
         due_ns = now_ns + int(rng.exponential(pause) * 1e9)
         waits = bool(rng.random() < 0.5)
@@ -157,7 +157,7 @@ def _faces(position: Vector) -> list[tuple[float, int, float]]:
 
 
 def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
-    """Make the lies and requests of a schedule's policy.
+    """Make the functions by which a schedule's policy changes commands and makes requests.
 
     Raises:
         BadInputError: If there is no such policy; names all policies.
@@ -171,7 +171,7 @@ def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
 
 
 def choose(seed: int) -> Schedule:
-    """Choose the hostile cloud of a seed, alone or amid faults of every kind."""
+    """Make the schedule of a seed: a hostile cloud, with or without random faults."""
     rng, names = generator(seed, 665), sorted(POLICIES)
     profile = ("ideal", *PAPER)[int(rng.integers(4))]
     calm = Schedule(seed, profile, duration=DURATION)
@@ -302,7 +302,7 @@ def _false_basis(rng: Generator) -> Lie:
 
 
 def _stop_and_go(rng: Generator) -> Lie:
-    """Let commands become stale and fresh again, and dash at every resumption."""
+    """Let commands become stale and fresh again, always with the same random velocity."""
     period_ns = int(rng.uniform(0.3e9, 3e9))
     velocity = rng.uniform(-FAST, FAST, 3).tolist()
 
@@ -314,12 +314,12 @@ def _stop_and_go(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Fly by another policy; the requests come from `at_bad_moments`."""
+    """Fly by one of `FASTEST`; `at_bad_moments` makes requests at the same time."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
-    """Fly fast, and sometimes make the guard land; the requests undo that in the air."""
+    """Fly fast, and sometimes make the guard land; requests acknowledge the landing in the air."""
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 
     def lie(command: Command, control: Control) -> Command:

@@ -1,7 +1,6 @@
-"""A flight in virtual time in which everything can fail, and every step is checked.
+"""Fly an experiment in virtual time with faults, and check the invariants in every step.
 
-Both ends and their driver are those of production. Around them are the models of processes and of
-teleop, the invariants, and helpers that inject faults and find out what happened.
+Both ends and their driver are those of production; processes and teleop are models.
 """
 
 from __future__ import annotations
@@ -21,12 +20,7 @@ from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, Words
 from cloudrc.faults.invariants import Limits, Watch
-from cloudrc.faults.models import (
-    Clock,
-    EndpointGroup,
-    RestartableEndpoint,
-    TeleopModel,
-)
+from cloudrc.faults.models import Clock, EndpointGroup, RestartableEndpoint, TeleopModel
 from cloudrc.faults.scenario import generator
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, DirectionProfile
@@ -46,20 +40,20 @@ SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
 def conditions(**changes: object) -> Shape:
-    """Replace fields of a direction's profile."""
+    """Return a `Shape` that replaces these fields of a direction's profile."""
     return lambda profile: replace(profile, **changes)  # type: ignore[arg-type]
 
 
 def silent(start: float, duration: float, **changes: object) -> Shape:
-    """Let nothing pass from `start` on for `duration` [s]."""
+    """Return a `Shape` in which no datagram passes, from `start` [s] on for `duration` [s]."""
     return conditions(blackouts=(Blackout(start, duration),), **changes)
 
 
 class Flight:
-    """World, cloud, teleop and link, from the start on.
+    """One flight of world, cloud, teleop and link.
 
-    `rings` are the keys of the running processes, `secrets` the contents of the key files.
-    `listeners` get world's new records and the time [ns] every 100 ms.
+    `rings` are the keys of the running processes, `secrets` the contents of the key files. Every
+    100 ms each of the `listeners` gets world's new records and the virtual time [ns].
     """
 
     def __init__(
@@ -79,7 +73,7 @@ class Flight:
         second: float | None = None,
         separate: bool = False,  # whether teleop is a process of its own, not in cloud's
     ) -> None:
-        """Prepare a flight; another cloud asks for the robot at `second` [s]."""
+        """Prepare a flight; another cloud asks for the robot at `second` [s], if not None."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
@@ -125,7 +119,7 @@ class Flight:
         return Order(plan, contact=self.experiment.criteria.contact)
 
     def order_if_possible(self, now_ns: int) -> None:
-        """Order the experiment's mission at `now_ns` [ns, virtual time], unless it is refused."""
+        """Order the experiment's mission at `now_ns` [ns, virtual time]; ignore a refusal."""
         order, own_ns = self.make_order(), self._clock.at(now_ns)
         self.teleop.ask(lambda service, own_ns: service.create(order, own_ns), own_ns)
 
@@ -150,21 +144,21 @@ class Flight:
         self.secrets[end] = self.rings[end].keys = keys
 
     def end_rival(self) -> None:
-        """End the other cloud; the first one has to get the robot back."""
+        """End the other cloud; the first cloud has to get the robot back."""
         if isinstance(self.cloud.inner, EndpointGroup):
             self.cloud.inner.members = self.cloud.inner.members[:1]
         self._second = None
 
     def sha256(self) -> str:
-        """Hash all records so far; only if they are kept."""
+        """Return the hash of all records so far; without `keep` there are none."""
         return self._hash.hexdigest()
 
     def trajectory(self) -> list[GroundTruth]:
-        """Return the ground truth, every 10 ms."""
+        """Return the records of the ground truth, one every 10 ms."""
         return [record for record in self.of_world if isinstance(record, GroundTruth)]
 
     def count(self, name: str) -> int:
-        """Return how often something happened in world, by its last record of it."""
+        """Return world's newest count of `name` [1], or 0 if world has recorded none."""
         counted = [r.total for r in self.of_world if isinstance(r, Counted) and r.name == name]
         return counted[-1] if counted else 0
 

@@ -5,19 +5,19 @@ fence      The base stays inside the fence while the rotors turn. After an emerg
            again only where the robot lies still inside.
 cap, stop  The reference stays below the caps and can be stopped before the fence; in LAND the floor
            is no limit. After a HOLD the reference grows slowly at first.
-stale      No command with an older basis than the limit is accepted, nor flown in TRACK. HOLD
-           becomes TRACK on `RESUME_COMMANDS` fresh commands within `RESUME_NS`.
+stale      World accepts no command, and flies none in TRACK, that was computed from odometry older
+           than the limit. HOLD ends in TRACK on `RESUME_COMMANDS` fresh commands in `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
            request, after a hit, or where the robot stands.
 collision  With an honest cloud only the arm's tip touches anything, and only the board. A robot
            that lands, or that the operator stopped, may come down on anything: the guard does not
            know what is below.
-latch      TRACK is for missions that the operator has started. What has landed or was stopped stays
-           so until the operator acknowledges it.
-hold       TRACK begins at least `SETTLE_NS` after the last TRACK, and a HOLD for silence as long
-           after the last HOLD, unless commands go back to older odometry. In a mission a robot
-           without commands lands after the configured time, and not before, unless its cloud sends
-           impossible commands.
+latch      TRACK is for missions that the operator has started. LAND and ESTOP last until the
+           operator acknowledges them.
+hold       From one TRACK to the next, and from one HOLD for silence to the next, `SETTLE_NS` pass.
+           Commands from older odometry than before may cause a HOLD sooner. In a mission a robot
+           without commands lands after the configured time; impossible commands make the robot land
+           sooner.
 tick       Each step of the physics has a tick of the guard.
 
 All limits come from the configuration and from docs/, none from the guard: from "Stop rule" and
@@ -56,17 +56,17 @@ STANDS = 0.2  # speed per axis up to which a robot stands when its rotors stop [
 FALL = 1.0
 """Speed of a robot that fell after its rotors stopped [m/s]; a drop from 0.02 m reaches 0.7."""
 REST = 0.5
-"""Length added to the stopping distance without commands [m]: it swings back by up to 0.2."""
+"""Length added to the stopping distance after TRACK [m]; the robot swings back by up to 0.2 m."""
 FALL_MAX = 1.5  # distance from the fence at which people are safe [m]
-BRAKE_NS = 200_000_000  # time in which a descent that the operator has acknowledged is stopped [ns]
+BRAKE_NS = 200_000_000  # time to stop a descent that the operator has acknowledged [ns]
 REELS_NS = 1_000_000_000  # time after a hit in which the hit explains the robot's motion [ns]
 THROWN_NS = 3_000_000_000  # time after a hit in which the robot may be thrown out of the fence [ns]
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
-"""So many fresh commands within this time end a HOLD [ns]."""
+"""Number of fresh commands that end a HOLD, and the time within which they come [ns]."""
 SETTLE_NS = 1_000_000_000
 """Shortest time from one TRACK to the next, and from one HOLD to the next [ns]."""
 INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
-"""So many impossible commands within this time make the robot land [ns]."""
+"""Number of impossible commands that cause a landing, and the time within which they come [ns]."""
 INVALID = ("range", "future")  # reasons for which the guard rejects impossible commands
 GROUND_NS = 10_000_000_000
 """Shortest time for which a robot on the ground waits for a mission's first command [ns]."""
@@ -105,7 +105,7 @@ class Limits(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of all robots of a flight, which follow each other."""
+    """Collects the breaches of a flight; each restart of world brings another robot to check."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
@@ -115,7 +115,7 @@ class Watch:
         self.speed = 0.0  # largest reference [m/s]
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
-        """Check every step of a robot from `start_ns` [ns] on; if `honest`, a hit is a breach."""
+        """Check a robot's steps from `start_ns` [ns] on; if `honest`, contacts are breaches."""
         robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
@@ -126,7 +126,7 @@ class Watch:
 
 
 class RobotInvariants:
-    """Checks what one robot does; an `Observer`."""
+    """Checks one robot after every step of its physics; an `Observer`."""
 
     def __init__(self, robot: Robot, watch: Watch, start_ns: int, honest: bool) -> None:
         self._guard, self._simulator, self._honest = robot.guard, robot.simulator, honest
@@ -293,7 +293,7 @@ class RobotInvariants:
                 self._note(now_ns, "cap", f"{text}{' after a HOLD' if after else ''}")
 
     def _leave_track(self, readings: Readings, now_ns: int) -> None:
-        """From now on the robot may move only as far as it needs to stop."""
+        """Note where TRACK ended, and how far the robot may move from there until it stops."""
         speed = max(hypot(*readings.velocity), hypot(*self._before))
         self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
         if now_ns - self._touched_ns < REELS_NS:
@@ -307,7 +307,7 @@ class RobotInvariants:
     # What it touches, and how its rotors stop.
 
     def _check_touches(self, state: GuardState, now_ns: int) -> None:
-        """Check the contacts that began in this step; they explain what follows."""
+        """Check the contacts that began in this step; after one the robot may leave the fence."""
         touches = self._simulator.touches
         if touches is not self._touches:
             self._touches, self._seen = touches, 0
@@ -350,7 +350,7 @@ class RobotInvariants:
 
     @property
     def _just_touched(self) -> bool:
-        """Whether the robot touches something, or just has."""
+        """Whether the robot has touched something within `REELS_NS`."""
         return self._simulator.touch_age <= REELS_NS * 1e-9
 
     # What the operator allows, the wait for commands, and the way out of HOLD.
@@ -412,7 +412,8 @@ class RobotInvariants:
 def can_stop(speed: float, below: float, above: float) -> bool:
     """Tell whether the robot can stop before the face of the fence that it flies towards.
 
-    Along one axis it has a `speed` [m/s], and distances to the faces `below` and `above` it [m].
+    Along one axis the robot has a `speed` [m/s]; `below` and `above` are the distances to the two
+    faces of the fence [m].
     Source: docs/reference/plant.md, "Stop rule": 0.2 v + v^2/6 <= distance - 0.1.
     """
     if speed > 0.0:

@@ -1,4 +1,4 @@
-"""Questions that scenarios ask about a flight, and the metrics that its processes would show."""
+"""Measure what happened in a flight, and read the metrics that its processes would show."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Recor
 def reading(
     flight: Flight, role: str, name: str, *labels: str, until: float | None = None
 ) -> float:
-    """Return the value of a metric at `until` [s], the mean of a histogram; NaN if it is absent."""
+    """Return the value of a metric at `until` [s], or a histogram's mean; NaN if there is none."""
     shown = _read(flight, role, name, until)
     if isinstance(shown, Histogram):
         count = shown.cumulative()[-1]
@@ -85,8 +85,8 @@ def moves(
     """Check that metrics change within 5 s of a fault that begins at `since` [s].
 
     The time counts from the fault's end `over` [s] if that is given: a frozen process shows
-    nothing, and a loss is known when newer datagrams arrive. Each metric is a line of its role, its
-    name and its labels: "world guard_transitions_total hold".
+    nothing, and a loss is known when newer datagrams arrive. Each metric is written as role, name
+    and labels: "world guard_transitions_total hold".
     """
     last = (since if over is None else over) + SOON
     end = "" if over is None else " of its end"
@@ -101,7 +101,7 @@ def moves(
 
 
 def changes_into(flight: Flight, state: GuardState) -> list[GuardChange]:
-    """Return the changes into a state of the guard; a mission's end is none."""
+    """Return the changes into a state of the guard, without HOLDs at the end of a mission."""
     return [c for c in flight.changes if c.state is state and c.cause != ENDED]
 
 
@@ -111,7 +111,7 @@ def first_into(flight: Flight, state: GuardState) -> float:
 
 
 def held(flight: Flight) -> list[GuardChange]:
-    """Return the HOLDs that are not a mission's end."""
+    """Return the HOLDs, without those at the end of a mission."""
     return changes_into(flight, GuardState.HOLD)
 
 
@@ -126,7 +126,7 @@ def basis_age_at_hold(flight: Flight) -> float:
 
 
 def _ages_at_hold(flight: Flight) -> list[tuple[GuardChange, float]]:
-    """Return every HOLD in a mission with that age [s]; NaN before the first command."""
+    """Return every HOLD in a mission with the age of `basis_age_at_hold` [s]; NaN if unknown."""
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     ages = []
     for change in held(flight):
@@ -164,7 +164,10 @@ def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
 
 
 def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
-    """Check that a flight which held and went on tells why; each text begins with `what`."""
+    """Check that records and telemetry tell the cause of each HOLD and TRACK.
+
+    The text of each check begins with `what`.
+    """
     ages, limit = _ages_at_hold(flight), flight.experiment.guard.command_age_max_ms * 1e-3
     texts = [(c.cause, f"command age {age:.3f} s above {limit:.3f} s") for c, age in ages]
     right = bool(texts) and all(cause == text for cause, text in texts)
@@ -188,9 +191,10 @@ def status(flight: Flight) -> dict[str, Any]:
 def silence_told(
     outcome: Outcome, flight: Flight, at: float, silent: float, what: str = "", *, cloud: bool
 ) -> None:
-    """Schedule a check, `silent` [s] after `at` [s], that the status tells who is silent.
+    """Schedule a check, `silent` [s] after `at` [s], that teleop's status tells of a silence.
 
-    It is the robot alone if `cloud` is heard, else both; each text begins with `what`.
+    The robot is silent. So is cloud, unless `cloud` is true. The text of each check begins with
+    `what`.
     """
 
     def check(now_ns: int) -> None:
@@ -210,14 +214,14 @@ def silence_told(
 
 
 def calm_after(flight: Flight, start: float, end: float) -> float:
-    """Return how long after `start` the robot was last too fast to stand, until `end` [s]."""
+    """Return the delay [s] from `start` until the robot stood still; look until `end` [s]."""
     path = [(r.stamp_ns * 1e-9, hypot(*r.odometry.velocity)) for r in flight.trajectory()]
     fast = [time for time, speed in path if start <= time < end and speed >= STANDS]
     return fast[-1] + SAMPLE - start if fast else 0.0
 
 
 def drift(flight: Flight, start: float, end: float) -> float:
-    """Return the largest distance [m] from the place at `start`, until `end` [s]."""
+    """Return the robot's largest distance [m] from its place at `start`, until `end` [s]."""
     path = [r.odometry for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
     return max((dist(path[0].position, each.position) for each in path), default=nan)
 
@@ -239,7 +243,7 @@ def applied_in_order(flight: Flight) -> bool:
 
 
 def epochs(flight: Flight) -> list[int]:
-    """Return every epoch that world opened."""
+    """Return the epochs that world opened, in order."""
     opened = [r for r in flight.of_world if isinstance(r, SessionOpened)]
     return [record.epoch for record in opened if record.end == "world"]
 

@@ -1,4 +1,4 @@
-"""Models in virtual time of what runs around the two ends: processes, clocks and teleop."""
+"""Model processes, clocks and teleop in virtual time, so that faults can hit them."""
 
 from __future__ import annotations
 
@@ -36,26 +36,26 @@ UNIX_SOCKET_MAX = 11
 """Number of datagrams that wait in a Unix socket: net.unix.max_dgram_qlen, which is 10, plus 1."""
 
 Action: TypeAlias = Callable[[int], None]
-"""Something that happens at an instant [ns, virtual time]."""
+"""Called at an instant of virtual time [ns]; makes a fault begin or end."""
 Tamper: TypeAlias = Callable[[bytes, int], list[bytes]]
-"""Returns what arrives in place of a datagram at an instant [ns, virtual time]."""
+"""Returns the datagrams that arrive in place of one, at an instant of virtual time [ns]."""
 Call: TypeAlias = Callable[[MissionService, int], object]
 """A call of teleop's API; takes the service and its clock [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A monotonic clock: its time at virtual time 0 [ns], and how fast it is [ppm]."""
+    """A monotonic clock of a machine, which may differ from virtual time."""
 
-    offset_ns: int = 0
-    drift_ppm: int = 0
+    offset_ns: int = 0  # what the clock shows at virtual time 0 [ns]
+    drift_ppm: int = 0  # how much faster than virtual time the clock is [ppm]
 
     def at(self, now_ns: int) -> int:
-        """Return its time at `now_ns` of virtual time [ns]."""
+        """Return what this clock shows [ns] at `now_ns` of virtual time [ns]."""
         return now_ns + self.offset_ns + now_ns * self.drift_ppm // 1_000_000
 
     def when(self, own_ns: int) -> int:
-        """Return the first virtual time [ns] at which it has reached `own_ns` [ns]."""
+        """Return the first virtual time [ns] at which this clock shows `own_ns` [ns] or more."""
         now_ns = own_ns - self.offset_ns
         if self.drift_ppm:
             now_ns = now_ns * 1_000_000 // (1_000_000 + self.drift_ppm) - 1
@@ -70,7 +70,7 @@ class RestartableEndpoint:
     sealed = True  # a flight's ends have keys
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
-        """Start the first process; `build` makes an end at an instant of its own clock [ns]."""
+        """Start the first process; `build` makes an end, given the time of its clock [ns]."""
         self._build, self.clock, self._name = build, clock, name
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._scheduled, self._frozen_until_ns = 0, -1
@@ -108,13 +108,13 @@ class RestartableEndpoint:
         self._set_deadline()
 
     def throttle(self, start: float, duration: float, share: float) -> None:
-        """From `start` on for `duration` [s], run for a `share` [1] of each CFS period only."""
+        """Run only for a `share` [1] of each CFS period, from `start` [s] on for `duration` [s]."""
         stall = (1.0 - share) * CFS_PERIOD
         for n in range(int(duration / CFS_PERIOD)):
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Hand a datagram to the process, past `tamper`."""
+        """Hand a datagram to the process without calling `tamper`."""
         if self.inner is None:
             return
         if self._frozen_until_ns <= now_ns:
@@ -178,7 +178,7 @@ class RestartableEndpoint:
 
 
 class EndpointGroup:
-    """Ends that share a socket: each hears all datagrams; an `Endpoint` itself."""
+    """An `Endpoint` of several ends that share a socket: each end receives all datagrams."""
 
     sealed = True
 
@@ -206,7 +206,7 @@ class EndpointGroup:
         return [data for member in self.members for data in member.take_datagrams()]
 
     def take_records(self) -> list[Record]:
-        """See `Endpoint`; only those of the first."""
+        """See `Endpoint`; return the records of the first end only."""
         first, *others = (member.take_records() for member in self.members)
         for records in others:
             self.others += records
@@ -233,10 +233,10 @@ class _Peer(UnixPeer):
 
 
 class TeleopModel:
-    """Teleop with a disk that survives its restarts.
+    """Teleop with a disk that survives restarts.
 
-    In cloud's process it is an `Operator`. As a process of its own it wakes every 20 ms, and two
-    Unix sockets join it to cloud's end, as in production.
+    Teleop runs inside cloud's process, as an `Operator`, or as a process of its own. That process
+    wakes every 20 ms, and two Unix sockets connect it with cloud, as in production.
 
     Attributes:
         service: Teleop itself; None while it is down.
@@ -253,8 +253,8 @@ class TeleopModel:
 
         Args:
             contact_speed_max: Limit of the speed of the arm's tip at the board [m/s].
-            name: Makes its mission numbers differ from those of another teleop.
-            phase_ns: Time of its first wake [ns, virtual time]; None if it runs in cloud's process.
+            name: Makes the mission numbers differ from those of another teleop.
+            phase_ns: First wake of its own process [ns, virtual time]; None for no such process.
         """
         self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
         self._disk = b""  # the bytes of its database
@@ -267,7 +267,7 @@ class TeleopModel:
         self.start()
 
     def start(self, now_ns: int = 0) -> None:
-        """Start a new process; it knows only what is on the disk, and nothing waits for it."""
+        """Start a new process, which knows only what is on the disk; `now_ns` is not used."""
         self._starts += 1
         salt = b"%s %d" % (self._name, self._starts)  # random in production
         self._database = connect()
@@ -283,14 +283,14 @@ class TeleopModel:
         self._free_ns, self._turn_ns, self._blind = 0, NEVER_NS, 0
 
     def kill(self, now_ns: int = 0) -> None:
-        """Kill the process."""
+        """Kill the process, which leaves only the disk; `now_ns` is not used."""
         if self.service is not None:
             self._disk = self._database.serialize()
             self._database.close()
         self.service, self.outputs = None, []
 
     def run_on(self, host: RestartableEndpoint) -> None:
-        """Wake on the machine of `host`, whatever happens to cloud's process."""
+        """Run on the machine of `host`, where teleop's own process wakes even without cloud."""
         self._host = host
         if self._phase_ns is not None:
             host.at(self._phase_ns * 1e-9, self._wake)
@@ -315,17 +315,17 @@ class TeleopModel:
     def ask(self, call: Call, now_ns: int) -> None:
         """Make a call of the API at `now_ns` of cloud's clock [ns]; a refusal is ignored.
 
-        A process of its own makes the call in its next wake.
+        A teleop process of its own makes the call when it wakes next.
         """
-        if self.service is not None and self._phase_ns is not None:
-            self._calls.append(partial(self._call, call))
-        else:
+        if self._phase_ns is None:
             self._call(call, now_ns)
+        else:
+            self._calls.append(partial(self._call, call))
 
     def stop_rotors(self, now_ns: int) -> None:
         """Make an emergency stop at `now_ns` of cloud's clock [ns].
 
-        The alarm of a process of its own goes to cloud at once, past teleop's loop.
+        A teleop process of its own sends an alarm to cloud at once, and stores the stop later.
         """
         if self.service is not None and self._phase_ns is not None:
             self._stops.append(partial(self._call, MissionService.stop_rotors))
@@ -334,7 +334,7 @@ class TeleopModel:
             self._call(MissionService.stop_rotors, now_ns)
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """Stop a process of its own as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
+        """Freeze teleop's own process as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
         if self.service is not None and self._phase_ns is not None and self._host is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
             self._host.at(self._free_ns * 1e-9, self._turn)  # who is late wakes at once

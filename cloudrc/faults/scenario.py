@@ -1,30 +1,30 @@
-"""Named faults, the checks of what has to follow, and their results as JSON and JUnit XML."""
+"""Define a named fault, the checks of the reaction to it, and the result as JSON."""
 
 from __future__ import annotations
 
 import hashlib
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from math import isfinite
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 Relation: TypeAlias = Literal["<=", ">=", "=="]
 _COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
-YES = "yes"  # unit of a check that is a question: its value is 1 for yes, 0 for no
+YES = "yes"  # unit of a check that is a statement: its value is 1 if the statement holds, else 0
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
-    """Make the random generator of one use of a seed."""
+    """Make a random generator; the same seed gives each `use` other random numbers."""
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One thing that has to follow: how `measured` compares with `limit`, both in `unit`."""
+    """One check of a reaction: `measured` compared with `limit`, both in `unit`."""
 
     text: str
     measured: float  # [any unit]
@@ -34,12 +34,12 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether it followed; what could not be measured did not."""
+        """Whether the value keeps its limit; NaN, a value that could not be measured, does not."""
         known = isfinite(self.measured)
         return known and bool(_COMPARE[self.relation](self.measured, self.limit))
 
     def show(self) -> str:
-        """Return one line with the value and its limit."""
+        """Return a line with text, value and limit."""
         if self.unit == YES:
             return f"{self.text}: {'yes' if self.measured else 'NO'}"
         unit = f" {self.unit}" if self.unit else ""
@@ -49,13 +49,15 @@ class Check:
 
 @dataclass(slots=True)
 class Outcome:
-    """Checks of a scenario, in order, and the hash of all records of its flights."""
+    """Result of a scenario: its checks, in order."""
 
     checks: list[Check] = field(default_factory=list)
-    sha256: str = ""
+    sha256: str = ""  # of the records of all its flights
+    seconds: float = 0.0  # how long it ran [s]
+    error: str = ""  # the exception that ended it, if any
 
     def flown(self, sha256: str) -> None:
-        """Add the hash of the records of another flight."""
+        """Add the hash of the records of one flight."""
         both = f"{self.sha256} {sha256}".encode()
         self.sha256 = hashlib.sha256(both).hexdigest() if self.sha256 else sha256
 
@@ -77,17 +79,22 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        """Whether every check passed, and there were some."""
-        return bool(self.checks) and all(check.passed for check in self.checks)
+        """Whether the scenario ran to its end, and all of its checks, at least one, passed."""
+        return not self.error and bool(self.checks) and all(each.passed for each in self.checks)
+
+    @property
+    def word(self) -> str:
+        """One word for a table: passed or FAILED."""
+        return "passed" if self.passed else "FAILED"
 
 
 Inject: TypeAlias = Callable[[Outcome, int], None]
-"""Injects a fault with a seed, and adds the checks to an outcome."""
+"""Injects a fault into a flight with a seed, and adds the checks of the reaction to an outcome."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """A fault and what must follow from it, in words and as checks."""
+    """A fault and the required reaction, in words and as checks."""
 
     number: int  # in docs/reference/faults.md: 13 for F13
     name: str  # on the command line: cloud-killed
@@ -101,51 +108,28 @@ class Scenario:
         return f"F{self.number}"
 
     def run(self, seed: int) -> Outcome:
-        """Inject the fault with a seed, and check."""
+        """Inject the fault with a seed, and check; an exception is noted as `error`."""
         outcome = Outcome()
-        self.inject(outcome, seed)
+        try:
+            self.inject(outcome, seed)
+        except Exception as error:  # the other scenarios still run
+            outcome.error = f"{type(error).__name__}: {error}"
         return outcome
 
-
-def scenario(number: int, name: str, *, injects: str, expects: str) -> Callable[[Inject], Scenario]:
-    """Make a `Scenario` of the function that injects the fault; the arguments are its fields."""
-    return partial(Scenario, number, name, injects, expects)
-
-
-class Result(NamedTuple):
-    """A scenario that was run for `seconds` [s]; `error` is the exception that ended it, or ""."""
-
-    scenario: Scenario
-    outcome: Outcome
-    seconds: float
-    error: str = ""
-
-    @property
-    def passed(self) -> bool:
-        """Whether every check passed."""
-        return not self.error and self.outcome.passed
-
-    @property
-    def word(self) -> str:
-        """One word for a table."""
-        return "passed" if self.passed else "FAILED"
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the result as plain values."""
-        checks = self.outcome.checks
+    def as_json(self, outcome: Outcome) -> dict[str, Any]:
+        """Return one result of this scenario as plain values."""
         return {
-            "id": self.scenario.id,
-            "name": self.scenario.name,
+            "id": self.id,
+            "name": self.name,
             "mode": "virtual",
-            "result": self.word.lower(),
-            "reason": self.error,
-            "seconds": round(self.seconds, 3),
-            "records_sha256": self.outcome.sha256,
-            "checks": [asdict(check) | {"passed": check.passed} for check in checks],
+            "result": outcome.word.lower(),
+            "reason": outcome.error,
+            "seconds": round(outcome.seconds, 3),
+            "records_sha256": outcome.sha256,
+            "checks": [asdict(check) | {"passed": check.passed} for check in outcome.checks],
         }
 
 
-def as_json(results: Sequence[Result], seed: int) -> dict[str, Any]:
-    """Return the results of scenarios as plain values."""
-    passed, faults = all(each.passed for each in results), [each.as_json() for each in results]
-    return {"schemaVersion": 1, "seed": seed, "passed": passed, "faults": faults}
+def scenario(number: int, name: str, *, injects: str, expects: str) -> Callable[[Inject], Scenario]:
+    """Turn the decorated function, which injects the fault, into a `Scenario` with these fields."""
+    return partial(Scenario, number, name, injects, expects)

@@ -1,7 +1,4 @@
-"""Schedules: the faults of one flight with their times, as a YAML file holds them.
-
-`compose` makes the random schedule of a seed.
-"""
+"""Describe the faults of one flight with their times, read and write them as YAML, or draw them."""
 
 from __future__ import annotations
 
@@ -56,7 +53,7 @@ KINDS = {
     "stopped": Kind("the operator stops the rotors, and acknowledges later"),
     "held": Kind("the operator holds the mission, resumes it after the duration", 5.0),
 }
-"""Every kind of fault."""
+"""Each kind of fault by its name in a schedule's file."""
 SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "teleop_shut_down",
           "pod_shut_down")  # fmt: skip
 """Kinds whose value is a share, in [0, 1]."""
@@ -71,9 +68,9 @@ WAYS: tuple[Way, ...] = ("both", "up", "down")
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One of `KINDS`, from `at` on for `duration` [s], on one way of the link or both.
+    """One fault, from `at` [s] on for `duration` [s]; a fault of the link hits one `way` or both.
 
-    `value` is its severity, as `KINDS` says [any unit].
+    `KINDS` says what `value` means, in which unit.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -92,7 +89,7 @@ class Event:
 
     @property
     def end(self) -> float:
-        """End [s]."""
+        """When the fault ends [s, virtual time]."""
         return self.at + self.duration
 
 
@@ -100,8 +97,8 @@ class Event:
 class Schedule:
     """All faults of one flight.
 
-    The seed is that of the link, and of everything random in the faults. With `separate`, teleop is
-    a process of its own, as in production.
+    Link and random faults use the seed. With `separate`, teleop is a process of its own, as in
+    production.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -120,12 +117,12 @@ class Schedule:
 
     @property
     def teleop_is_separate(self) -> bool:
-        """Whether teleop is a process of its own, because `separate` or a fault says so."""
+        """Whether teleop is a process of its own; a fault that freezes teleop needs that."""
         return self.separate or bool(self.of("teleop_paused"))
 
     @property
     def quiet_from(self) -> float:
-        """End of the last fault [s]."""
+        """When the last fault ends [s, virtual time]; 0 if there is none."""
         return max((event.end for event in self.events), default=0.0)
 
     def of(self, *kinds: str) -> list[Event]:
@@ -214,7 +211,7 @@ ONCE = ("second_cloud", "key_rotated")  # kinds of which a flight has one at mos
 
 
 def compose(seed: int) -> Schedule:
-    """Make the schedule of a seed: up to 12 faults within 45 s, then 15 s without.
+    """Make the schedule of a seed: up to 12 faults within 45 s, then 15 s without faults.
 
     A schedule without faults is flown on a plain link, where any HOLD is a false alarm.
     """

@@ -1,4 +1,4 @@
-"""Searches for schedules that break an invariant, for a budget of time; shrinks and stores them.
+"""Search for schedules that break an invariant, for some minutes; shrink and store them.
 
 The seeds are consecutive numbers: a search that ended before seed N continues with `--first N`.
 """

@@ -1,8 +1,8 @@
 """Flies one schedule in virtual time, and returns the invariants that broke.
 
-An operator flies one mission after the other, and acknowledges what is latched. In the calm at the
-end the robot must fly again; otherwise it is stuck. The faults of the link are in its conditions:
-see `cloudrc.faults.schedule.shaped`.
+An operator flies one mission after the other, and acknowledges each landing and emergency stop. In
+the calm at the end the robot must fly again; otherwise the robot is stuck. The link's faults change
+the conditions of the link: see `cloudrc.faults.schedule.shaped`.
 """
 
 from __future__ import annotations
@@ -47,11 +47,10 @@ INVARIANTS = {
     "alarm": "false alarms",
     "error": "errors in an end",
 }
-SOMETIMES = {"collision", "obeyed", "waypoint", "stuck", "alarm"}
-"""Invariants that are not checked in every flight."""
+"""Each invariant, and what a breach of it is called in a table."""
 BACK = 10.0  # time of calm in which the robot must have flown [s]
 FORGETFUL = ("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down")
-"""Faults after which there is another robot, or a teleop that need not know of a stop."""
+"""Faults after which another robot flies, or a new teleop that may not know of an earlier stop."""
 PATIENCE_NS = 1_000_000_000  # shortest time between two actions of the operator [ns]
 CAPTURED = 2_000  # number of datagrams that an intruder keeps
 NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)
@@ -62,10 +61,10 @@ IMPOSSIBLE = (nan, inf, -inf)
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of a schedule."""
+    """Result of the flight of a schedule."""
 
     schedule: Schedule
-    breaches: tuple[Breach, ...]  # that were first; none if all invariants held
+    breaches: tuple[Breach, ...]  # the first ones of each kind
     sha256: str = ""  # of all records, if they were kept
     margin: float = 9.0  # smallest distance of the base to the fence's walls and ceiling [m]
     speed: float = 0.0  # largest reference [m/s]
@@ -73,7 +72,7 @@ class Finding:
 
     @property
     def kinds(self) -> set[str]:
-        """Kinds of the breaches."""
+        """The invariants that broke."""
         return {breach.kind for breach in self.breaches}
 
 
@@ -105,22 +104,18 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
 
 
 def checked_in(schedule: Schedule) -> frozenset[str]:
-    """Return the invariants that a schedule is checked for.
-
-    With a dishonest cloud a contact is no breach, and nothing has to go on. A robot needs `BACK` of
-    calm to recover. A HOLD, LAND or ESTOP is a false alarm if there are no faults. A stop must be
-    obeyed by the robot that it was meant for, if teleop runs on.
-    """
-    kinds = INVARIANTS.keys() - SOMETIMES
-    if not schedule.policy:
-        kinds |= {"collision", "waypoint"}
-        if schedule.duration - schedule.quiet_from >= BACK:
-            kinds.add("stuck")
-            if schedule.of("stopped") and not schedule.of(*FORGETFUL):
-                kinds.add("obeyed")
-        if not schedule.events:
-            kinds.add("alarm")
-    return frozenset(kinds)
+    """Return the invariants that a flight of this schedule has to keep."""
+    honest = not schedule.policy  # a dishonest cloud may touch things and end the mission
+    recovers = honest and schedule.duration - schedule.quiet_from >= BACK
+    is_stopped = bool(schedule.of("stopped")) and not schedule.of(*FORGETFUL)
+    sometimes = {
+        "collision": honest,
+        "waypoint": honest,
+        "stuck": recovers,
+        "obeyed": recovers and is_stopped,
+        "alarm": honest and not schedule.events,  # a HOLD, LAND or ESTOP without a fault
+    }
+    return frozenset(name for name in INVARIANTS if sometimes.get(name, True))
 
 
 def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Flight:
@@ -151,7 +146,7 @@ def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Fligh
 
 
 class Operator:
-    """Keeps ordering missions, and acknowledges what is latched."""
+    """Orders one mission after the other, and acknowledges each landing and emergency stop."""
 
     def __init__(self, flight: Flight, schedule: Schedule) -> None:
         self._flight = flight
@@ -175,7 +170,7 @@ class Operator:
             self._flight.watch.note(self._flight.run.now_ns, "obeyed", text)
 
     def _look(self, records: list[Record], now_ns: int) -> None:
-        """Look at the robot, every 100 ms."""
+        """Act on new records of world, every 100 ms."""
         flight = self._flight
         state, _ = flight.guard_now()
         if state is GuardState.TRACK:
@@ -208,7 +203,7 @@ class OrderInvariant:
         flight.listeners.append(self.see)
 
     def see(self, records: list[Record], now_ns: int) -> None:
-        """Check that no command is older than one before, or of an epoch that has ended.
+        """Check that no command is older than an earlier one, or of an epoch that has ended.
 
         A restarted world continues from the last epoch that its cloud knows. If cloud knows none,
         world starts at the first epoch again, which is allowed.
@@ -248,7 +243,7 @@ def _check_alarms(flight: Flight) -> None:
 
 
 def inject(flight: Flight, schedule: Schedule) -> None:
-    """Schedule all faults on a flight."""
+    """Schedule in a flight the faults of processes, datagrams, teleop and the operator."""
     for event in schedule.events:
         process = flight.world if event.kind.startswith("world") else flight.cloud
         if event.kind.endswith("throttled"):
@@ -264,7 +259,7 @@ def inject(flight: Flight, schedule: Schedule) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return what happens when [s] in a fault of each kind; `process` is the one that it hits."""
+    """Return the actions of each kind of fault with their times [s]; `process` is the one hit."""
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # for teleop that was asked to end
 

@@ -21,7 +21,7 @@ _FAR = 1e3  # [m] limit of coordinates, so that no square overflows
 
 
 def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]:
-    """Tell which positions [m], world frame, shape (n, 3), are where the guard does not fly.
+    """Tell which positions [m], world frame, shape (n, 3), are where the guard lets no robot fly.
 
     Positions up to `slack` [m], shape () or (n,), outside the guard's box still count as inside.
     """

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import uvicorn
-from fastapi import APIRouter, Depends, FastAPI, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
@@ -43,7 +43,7 @@ from cloudrc.teleop.wire import Leg
 LOOK_PERIOD = 0.1
 """Time between two checks for new events [s]."""
 ALIVE_PERIOD = 10.0
-"""Time without an event after which the stream sends a comment [s]: no proxy closes it."""
+"""Time without an event after which a stream sends a comment [s], so that no proxy closes it."""
 ANSWER_LIMIT = 2.0
 """Time limit for the mission service to answer [s]."""
 BODY_MAX = 256 * 1024
@@ -66,13 +66,13 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
     code: {"model": models.Refusal, "description": text} for code, text in REASONS.items()
 }
 ABOUT = """\
-Fly missions, or steer by hand. One mission is flown at a time; a second one is refused with the
-id of the first, or waits if it says `queue`. A mission posted again under the same `key` is not
-made again. Positions are in metres, x forward, y left, z up.
+Fly missions, or steer by hand. Teleop flies one mission at a time. It refuses a second mission and
+names the first, or queues the second with `queue`. Orders with the same `key` make one mission.
+Positions are in metres, x forward, y left, z up.
 
-Every request needs a token: `Authorization: Bearer TOKEN`. A reader's may look, an operator's may
-command. `POST /v1/estop` stops the rotors at once. It and `POST /v1/hold` are served even while
-other requests are refused as too many.
+Every request needs a token: `Authorization: Bearer TOKEN`. A reader's token may only read; an
+operator's token may also command. `POST /v1/estop` stops the rotors at once. Teleop serves
+`POST /v1/estop` and `POST /v1/hold` even while it refuses other requests as too many.
 """
 STARTING = "teleop is starting"
 Call: TypeAlias = Callable[[MissionService, int], Any]
@@ -87,7 +87,7 @@ class Bridge:
 
     Attributes:
         closed: Why no call is accepted, in words; "" if calls are accepted.
-        alarm: Sends an emergency stop to cloud, past teleop's loop; it does not block.
+        alarm: Function that sends an emergency stop to cloud at once, past teleop's loop.
         overtakings: Number of stops and holds so far.
     """
 
@@ -110,12 +110,12 @@ class Bridge:
             stops.popleft()[1].set_exception(UnavailableError(why))
 
     def submit(self, call: Call, urgent: Urgent = "") -> Future[Any]:
-        """Queue a call; an urgent one has a lane of its own.
+        """Queue a call for teleop's loop, which makes urgent calls before other calls.
 
         While teleop starts, the bridge accepts only a stop.
 
         Raises:
-            UnavailableError: If no call is accepted.
+            UnavailableError: If the bridge is closed.
         """
         if self.closed and not (urgent == "stop" and self.closed == STARTING):
             raise UnavailableError(self.closed)
@@ -128,8 +128,8 @@ class Bridge:
         """Queue a call and return its result; a stop also sends the alarm.
 
         Raises:
-            UnavailableError: As `submit`, or if there is no result within `ANSWER_LIMIT`. Then an
-                urgent call stays queued, and any other is withdrawn.
+            UnavailableError: If the bridge is closed, or if the loop does not answer within
+                `ANSWER_LIMIT`. Then an urgent call stays queued; any other call is withdrawn.
         """
         try:  # a stop is queued before the robot can be seen to have stopped
             asked = asyncio.wrap_future(self.submit(call, urgent))
@@ -143,7 +143,7 @@ class Bridge:
             raise UnavailableError(text) from None
 
     async def move(self, call: Call) -> Any:
-        """Make a call that may set the robot in motion, unless a stop or a hold overtakes it."""
+        """Queue a call that may move the robot; a later stop or hold cancels the call."""
         known = self.overtakings
 
         def checked(service: MissionService, now_ns: int) -> Any:
@@ -158,7 +158,7 @@ class Bridge:
         return [call for lane in self._lanes for call in self._take(lane)]
 
     def take_stops(self) -> list[Callable[[int], None]]:
-        """Return queued stops, which the loop makes before it processes new telemetry."""
+        """Return the queued stops, which the loop makes before it processes new telemetry."""
         return self._take("stop")
 
     def _take(self, lane: str) -> list[Callable[[int], None]]:
@@ -245,6 +245,7 @@ def _takes(model: type[Section]) -> dict[str, Any]:
 Body = Annotated[bytes, Depends(_body)]
 Bridged = Annotated[Bridge, Depends(_bridge)]
 After = Annotated[int, Query(ge=0, lt=10**15)]
+LastEvent = Annotated[int, Header(ge=0, lt=10**15)]
 router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUSALS)
 
 
@@ -256,7 +257,7 @@ router = APIRouter(prefix="/v1", dependencies=[Depends(BEARER)], responses=REFUS
     openapi_extra=_takes(models.MissionRequest),
 )
 async def fly_mission(body: Body, bridge: Bridged, request: Request, response: Response) -> Any:
-    """Fly a mission, or queue it."""
+    """Fly a mission now, or after the missions in the queue."""
     order = await run_in_threadpool(request.app.state.read_order, body)
 
     def call(service: MissionService, now_ns: int) -> tuple[dict[str, Any], bool]:
@@ -280,52 +281,52 @@ async def list_missions(bridge: Bridged) -> Any:
 
 @router.get("/missions/{id}", response_model=models.MissionView)
 async def show_mission(id: str, bridge: Bridged) -> Any:
-    """Show one mission as it is."""
+    """Show one mission with its events."""
     return await bridge.ask(lambda service, now_ns: service.book.find(id))
 
 
 @router.post("/missions/{id}/cancel", response_model=models.MissionView)
 async def cancel_mission(id: str, bridge: Bridged) -> Any:
-    """End a mission."""
+    """Cancel a mission that flies or waits."""
     return await bridge.ask(lambda service, now_ns: service.cancel(id, now_ns))
 
 
 @router.post("/hold", response_model=models.MissionView)
 async def hold(bridge: Bridged) -> Any:
-    """Stop where the robot is, 0.35 m up at least."""
+    """Hold the robot at its position, at least 0.35 m above the floor."""
     return await bridge.ask(MissionService.hold, "hold")
 
 
 @router.post("/resume", response_model=models.MissionView)
 async def resume(bridge: Bridged) -> Any:
-    """Go straight on to the next waypoint; a pipe's wall in the way is refused (409)."""
+    """Fly straight to the next waypoint; 409 if the wall of a pipe is in the way."""
     return await bridge.move(MissionService.resume)
 
 
 @router.post("/goto", response_model=models.MissionView, openapi_extra=_takes(models.GoToRequest))
 async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
-    """Fly straight to a point: a new mission, or a new place for a held one; see resume."""
+    """Fly straight to a point, during a held mission or as a new one; 409 as for `resume`."""
     leg = await run_in_threadpool(request.app.state.read_goto, body)
     return await bridge.move(lambda service, now_ns: service.go_to(leg, now_ns))
 
 
 @router.post("/estop", response_model=models.Stopped)
 async def stop_rotors(bridge: Bridged) -> Any:
-    """Stop the rotors at once: the robot falls, and stays off until acknowledged."""
+    """Stop the rotors at once. The robot falls, and needs an acknowledgement to fly again."""
     mission = await bridge.ask(MissionService.stop_rotors, "stop")
     return {"id": mission["id"] if mission else None, "state": "stopping"}
 
 
 @router.post("/acknowledge", response_model=models.Acknowledged)
 async def acknowledge(bridge: Bridged) -> Any:
-    """Release a robot that was stopped or has landed; the next mission arms it."""
+    """Allow the robot to fly the next mission after an emergency stop or a landing."""
     await bridge.move(MissionService.acknowledge)
     return {"state": "acknowledged"}
 
 
 @router.get("/state", response_model=models.StateView)
 async def show_state(bridge: Bridged) -> Any:
-    """Show how things are."""
+    """Show the mission under way, the queue, and the newest telemetry."""
     return await bridge.ask(MissionService.state)
 
 
@@ -334,15 +335,21 @@ async def show_state(bridge: Bridged) -> Any:
     response_class=StreamingResponse,
     responses={200: {"content": {"text/event-stream": {}}, "description": "A stream"}},
 )
-async def stream_events(request: Request, bridge: Bridged, after: After = 0) -> StreamingResponse:
-    """Stream the events of all missions after number `after` as server-sent events."""
+async def stream_events(
+    request: Request, bridge: Bridged, after: After = 0, last_event_id: LastEvent = 0
+) -> StreamingResponse:
+    """Stream the events of all missions after number `after` as server-sent events.
+
+    A browser that connects again sends the number as the header Last-Event-ID.
+    """
+    after = max(after, last_event_id)
     await bridge.ask(lambda service, now_ns: None)  # refuse now what cannot be served
     stream, headers = _stream(request, bridge, after), {"Cache-Control": "no-store"}
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
 async def _stream(request: Request, bridge: Bridge, number: int) -> AsyncIterator[str]:
-    """Yield the events after `number` until the client, its token or teleop is gone."""
+    """Yield events after `number` until the client leaves, the token is invalid or teleop ends."""
 
     def call(service: MissionService, now_ns: int) -> list[Event]:
         return service.book.events_after(number)
@@ -369,7 +376,8 @@ class ApiServer(uvicorn.Server):
 
     Attributes:
         url: "http://HOST:PORT", or "unix:PATH" for a Unix socket.
-        bridge, gate: As given.
+        gate: Application that the server serves.
+        bridge: Queue of calls to teleop's loop.
     """
 
     def __init__(self, gate: Gate, bridge: Bridge, address: Address) -> None:

@@ -30,7 +30,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import read, readable_by_others, version
 
 OPERATOR, READER = "operator", "reader"
-"""Roles; the name of a token file is its role."""
+"""Roles of callers; each role has a token file of this name."""
 BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a reader's for GET")
 TOKEN_SIZE_MAX = 4096
 """Largest token file [bytes], including white space around the token."""
@@ -52,18 +52,18 @@ HEADERS = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}}
 IN_FLIGHT_MAX = 32
 """Limit of the requests of one role that are answered at the same time, including streams."""
 AUDIT_MAX = 8 << 20
-"""Size at which the audit log is renamed to NAME.1 and a new one begins [bytes]."""
+"""Largest audit log [bytes]; then the log is renamed to NAME.1, and a new log begins."""
 
 
 class Caller(NamedTuple):
-    """A known caller: role, and name of the token; the name does not reveal the token."""
+    """A known caller: the role, and a name that does not reveal the token."""
 
     role: str
     name: str
 
 
 LOCAL = Caller(OPERATOR, "local")
-"""The caller through a socket file, which only its owner can open."""
+"""Caller that connects through a socket file, which only the file's owner can open."""
 
 
 class Tokens:
@@ -73,7 +73,7 @@ class Tokens:
         """Read the tokens; `warn` receives one line for each file that other users can read.
 
         Raises:
-            BadInputError: If a file cannot be used; the text does not contain the token.
+            BadInputError: If a file cannot be used; the message does not contain the token.
         """
         self._folder, self._paths = folder, [folder / role for role in (READER, OPERATOR)]
         self._versions = [version(path) for path in self._paths]
@@ -84,13 +84,13 @@ class Tokens:
     def caller(self, token: str) -> Caller | None:
         """Return the caller with this token, or None.
 
-        A file that has changed is read again. An unusable file admits nobody.
+        A changed file counts at once. While a file is unusable, no token is valid.
         """
         versions = [version(path) for path in self._paths]
         if versions != self._versions:
-            self._versions, self._known = versions, {}
+            self._known = {}
             with suppress(BadInputError):
-                self._known = self._read()
+                self._known, self._versions = self._read(), versions
         return self._known.get(hashlib.sha256(token.encode()).digest())
 
     def _read(self) -> dict[bytes, Caller]:
@@ -117,7 +117,7 @@ def _read_token(path: Path) -> bytes:
 
 
 class Audit(RotatingFileHandler):
-    """Log commands as lines of JSON, in a thread of its own; only the owner can read the files.
+    """Log commands as lines of JSON in a separate thread; only the files' owner can read them.
 
     Attributes:
         dropped: Number of lines that could not be written.
@@ -132,7 +132,7 @@ class Audit(RotatingFileHandler):
         self._listener.start()
 
     def note(self, caller: Caller, scope: Mapping[str, Any], answer: Mapping[str, Any]) -> None:
-        """Queue a line about a command and the status and body of its answer."""
+        """Queue a log line about a command and its answer."""
         said = json.loads(answer.get("body") or b"{}")
         line = {
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -166,7 +166,7 @@ class Audit(RotatingFileHandler):
 
 
 class Gate:
-    """Admit callers to an application; the check covers every path.
+    """Check the token and the role of every request before the application gets the request.
 
     Attributes:
         tokens: The known tokens; None if everybody who can connect may command.
@@ -175,15 +175,15 @@ class Gate:
     """
 
     def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
-        """Protect an application."""
+        """Create a gate in front of an application."""
         self._app, self.tokens, self.audit = app, tokens, audit
         self._in_flight: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request; ignore a slash at the end of its path."""
+        """Refuse a request or pass it on; ignore a slash at the end of its path."""
         scope["path"] = scope["path"].rstrip("/") or "/"
-        # An event stream calls this again, because it can last longer than its token is valid.
+        # An event stream calls `caller` again, because the stream can outlast its token.
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)
         status = self._refusal(caller, scope)
         if caller is None or status:

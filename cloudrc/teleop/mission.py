@@ -7,8 +7,8 @@
                                                      HELD
 
 Cancel leads from STARTING, FLYING and HELD to CANCELLED. A time limit, a restart of world, a guard
-in LAND or an emergency stop lead to FAILED. At every end teleop asks the robot to hold and leaves
-the setpoint at the robot's position, because an armed robot flies to the last setpoint.
+in LAND or an emergency stop lead to FAILED. At the end of a mission teleop asks the robot to hold,
+and makes the robot's position the setpoint, because an armed robot flies to the last setpoint.
 """
 
 from __future__ import annotations
@@ -39,24 +39,25 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
 
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
-"""Lowest height of a hold setpoint [m]; at lower heights the robot would scrape along the floor.
+"""Lowest z at which teleop holds the robot [m], world frame; the floor is at 0. At a lower z the
+robot would scrape along the floor.
 Source: docs/safety.md, "The guard"."""
 NO_WAYPOINT = -1
 """Waypoint index of a setpoint or event without a waypoint."""
 UNDER_WAY = FLYING, STARTING, HELD
 """States of a mission that has begun and not ended."""
 GAP_MAX_NS = 500_000_000
-"""Limit of the time of flight that counts between two telemetry messages [ns]."""
+"""Of a longer gap between two telemetry messages, only this much is time of flight [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
-"""Longest gap between two telemetry messages [ns] that does not restart the dwell time."""
+"""Time without telemetry after which the dwell time starts again [ns]."""
 # Looking up an enum's member is slow, and these are used in every period.
 GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
 
 
 class LegWatch:
-    """Measure the time of a leg and detect when its waypoint is reached.
+    """Measure the flight time of one leg, and detect when the robot has reached the waypoint.
 
-    The time counts only while the robot flies on cloud's commands.
+    Only time in which the robot follows cloud's commands counts.
     """
 
     def __init__(self) -> None:
@@ -73,13 +74,13 @@ class LegWatch:
         return self._flown_ns * 1e-9
 
     def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
-        """Return whether the robot, seen at `now_ns` [ns], has been at the waypoint long enough."""
+        """Return whether the robot, seen at `now_ns` [ns], has stayed for the dwell time."""
         before_ns, self._seen_ns = self._seen_ns, now_ns
         if seen.guard is HOLD:
             self._near_since_ns = NEVER_NS
             return False
         if before_ns >= 0:
-            if seen.guard is not GROUND:  # where it waits until it may take off
+            if seen.guard is not GROUND:  # where the robot waits for take-off
                 self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
             if now_ns - before_ns > UNSEEN_MAX_NS:
                 self._near_since_ns = NEVER_NS  # the robot's path in the gap is unknown
@@ -94,22 +95,22 @@ class LegWatch:
 class Teleop:
     """State machine that flies missions one after the other.
 
-    Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, and a verb for each wish of
-    the operator. After every one of these calls, call `take_outputs`. A setpoint is valid until the
-    next one, within its session. All times `now_ns` are of the caller's clock [ns].
+    Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, and another method for each
+    command of the operator. After each of these calls, call `take_outputs`. A setpoint is valid
+    until the next setpoint or the next session. All times `now_ns` are of the caller's clock [ns].
 
     Attributes:
-        state: State of the mission; "idle" before the first.
+        state: State of the mission; "idle" before the first mission.
         leg: Index of the current waypoint; the number of waypoints once all are reached.
         outcome: Last event of the mission; None before the first mission and during a mission.
-        seen: The newest telemetry; None before the first.
-        requests: Requests to the robot.
-        stopping: Whether an emergency stop is pending: telemetry does not show it yet.
+        seen: The newest telemetry; None before the first telemetry.
+        requests: Sender of the requests to the robot.
+        stopping: Whether an emergency stop is on its way: telemetry does not show ESTOP yet.
         outputs: Messages since the last `take_outputs`.
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission; `ended` returns whether the mission with a number is over."""
+        """Begin without a mission; `ended` returns whether the mission with this number is over."""
         self.state, self.leg = "idle", 0
         self.outcome: MissionEvent | None = None
         self.outputs: list[Output] = []
@@ -118,9 +119,9 @@ class Teleop:
         self._is_ended = ended
         self.seen: RobotStatus | None = None
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
-        self._continued = self._was_held = False  # whether an earlier teleop began or held it
+        self._continued = self._was_held = False  # whether an earlier teleop began it or held it
         self._world = ""  # in which the mission started; "": any
-        self._expected: tuple[int, ...] = ()  # missions that may be on board; empty: any
+        self._expected: tuple[int, ...] = ()  # missions that the robot may report; empty: any
         self._watch = LegWatch()
         self._setpoint: Setpoint | None = None
         self._is_pending = False  # whether the mission's first setpoint has not been sent yet
@@ -141,7 +142,7 @@ class Teleop:
         return outputs
 
     def start(self, now_ns: int, plan: Plan, mission_id: int = 0) -> None:
-        """Fly a plan; the robot stores its progress under `mission_id`, unless this is 0."""
+        """Fly a plan; the robot stores the progress under `mission_id`, unless this number is 0."""
         self._order(plan, mission_id, now_ns)
         here = None if plan.start is Start.SPAWN else self.seen
         self._world = here.world if here else ""
@@ -149,10 +150,11 @@ class Teleop:
         self.requests.report(mission_id, 0)
         self.requests.ask(Request.START, plan.start, after=True)
         self._is_pending = True
-        self._select_early()
+        if self.seen:
+            self.see(self.seen, now_ns)  # an earlier teleop may have flown the mission
 
     def continue_mission(self, now_ns: int, mission: Mission) -> None:
-        """Take over a mission of an earlier teleop at its current waypoint; do not reset world."""
+        """Continue the mission of an earlier teleop process at the current waypoint."""
         self._order(mission.order.plan, mission.number, now_ns - round(mission.elapsed * 1e9))
         self.leg, self._world, self._expected = mission.waypoint, mission.world, (mission.number,)
         self._continued, self._was_held = True, mission.state == "held"
@@ -163,7 +165,7 @@ class Teleop:
             self.see(self.seen, now_ns)  # the mission may be over, or the world another one
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
-        """Move the robot to a point; raise BadInputError unless the mission is held."""
+        """Fly to a point during a held mission; raise BadInputError unless the mission is held."""
         self._check("goto", HELD)
         x, y, z = leg.position
         self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
@@ -175,7 +177,7 @@ class Teleop:
         self._hold(now_ns)
 
     def resume(self, now_ns: int) -> None:
-        """Continue the held leg; raise BadInputError unless the mission is held."""
+        """Continue a held mission; raise BadInputError unless the mission is held."""
         self._check("resume", HELD)
         self._watch.pause()
         self._select_leg(self.leg)
@@ -188,8 +190,8 @@ class Teleop:
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once in any state, and drop all earlier requests to the robot.
 
-        `ALARM` is sent at least once, and until telemetry shows ESTOP. Cloud then repeats it until
-        the robot has acted on it, also if the robot was stopped before.
+        Teleop sends `ALARM` to cloud now, and repeats `ALARM` until telemetry shows ESTOP. Cloud
+        repeats the stop until the robot has acted on it, even if the robot was stopped before.
         """
         if self.state in UNDER_WAY:
             self._end("emergency_stopped", "emergency stop", now_ns, where=True)
@@ -202,19 +204,19 @@ class Teleop:
         self.requests.ask(Request.ACKNOWLEDGE, after=True)
 
     def pause(self, now_ns: int) -> None:
-        """Ask the robot to hold until the next teleop continues the mission."""
+        """Ask the robot to hold until the next teleop process continues the mission."""
         self._report("paused", self.leg, f"paused by shutdown {self.where}", now_ns)
         self.requests.ask(Request.END)
         self._select_here()  # cloud keeps this setpoint if the request is lost
         self._stays = True
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Process new telemetry at its arrival."""
+        """Process telemetry that has arrived at `now_ns`."""
         before, self.seen = self.seen, seen
         if seen.guard is ESTOP:
             self.stopping = False
         new_session = not before or (before.epoch, before.world) != (seen.epoch, seen.world)
-        last, onboard, legs = self._setpoint, self._reached_on_board(seen), self._plan.legs
+        last, onboard, legs = self._setpoint, self._onboard, self._plan.legs
         started = self.requests.see(seen, now_ns) is Request.START and self.state == STARTING
         if self.state == STARTING and not self._expected and self._plan.start is Start.HERE:
             # The order came before the first telemetry.
@@ -256,7 +258,8 @@ class Teleop:
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
             return "taken_over", "somebody else has started another mission"
-        if self._reached_on_board(seen) == MISSION_OVER:
+        repeated = self.state == STARTING and self._from_spawn  # after an earlier teleop
+        if self._onboard >= (len(self._plan.legs) if repeated else MISSION_OVER):
             text = "the robot reports that the mission is over, but its outcome is lost;"
             return "end_lost", text
         if seen.guard > HOLD:
@@ -293,7 +296,7 @@ class Teleop:
         self._continued = self._was_held = False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
-        """Begin the mission after telemetry shows its start; start the times of mission and leg."""
+        """Begin the mission after telemetry shows its start; measure its time from now on."""
         self._world, self._expected = seen.world, (self._mission_id,)
         self._watch = LegWatch()
         if not self._continued:
@@ -318,7 +321,7 @@ class Teleop:
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
             self._watch = LegWatch()
-            if self.state == FLYING:
+            if self.state == FLYING and self.leg >= self._onboard:  # not back to earlier waypoints
                 self._select_leg(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
@@ -328,7 +331,7 @@ class Teleop:
         self._report("held", self.leg, f"held {self.where}", now_ns)
 
     def _end(self, code: str, text: str, now_ns: int, *, where: bool = False) -> None:
-        """End the mission, and ask the robot to hold its position; `where` adds it to the text."""
+        """End the mission, and ask the robot to hold; `where` adds the waypoint to the text."""
         text = f"{text} {self.where}" if where else text
         waypoint = min(self.leg, len(self._plan.legs) - 1)
         if code != "done" and self._mission_id:
@@ -341,9 +344,11 @@ class Teleop:
         self._select_here()
         self.outcome = self._report(code, waypoint, text, now_ns)
 
-    def _reached_on_board(self, seen: RobotStatus) -> int:
-        """Return how many waypoints of the mission the robot has stored as reached."""
-        return seen.reached if seen.mission_id == self._mission_id != 0 else 0
+    @property
+    def _onboard(self) -> int:
+        """Number of waypoints of the mission that the robot has stored as reached."""
+        seen = self.seen
+        return seen.reached if seen and seen.mission_id == self._mission_id != 0 else 0
 
     @property
     def _from_spawn(self) -> bool:
@@ -352,25 +357,25 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether the robot may still fly an earlier mission while this one begins at the spawn."""
+        """Whether the robot may still fly an earlier mission when this mission begins."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self) -> None:
-        """Select the waypoint before telemetry shows the start, so that the first command is right.
+        """Select the first waypoint already before telemetry shows the start of the mission.
 
-        Wait while the robot may move: it would fly to the waypoint at once.
+        Select nothing while the robot may move, because the robot would fly there at once.
         """
         if not self._is_pending or self.seen is None or self._may_move:
             return
         self._is_pending = False
-        leg = 0 if self._from_spawn else max(self.leg, self._reached_on_board(self.seen))
+        leg = 0 if self._from_spawn else max(self.leg, self._onboard)
         if leg < len(self._plan.legs):
             self._select_leg(leg)
 
     def _repeat_setpoint(self) -> None:
-        """Send the setpoint again in a new session, because cloud forgets it with the old session.
+        """Send the setpoint again in a new session, because cloud keeps none from the old session.
 
-        If the mission still waits for its start, a robot that may move has to stay where it is.
+        If the mission has not started and the robot may move, select the robot's position.
         """
         if self.state == STARTING and self._may_move:
             self._is_pending = True
@@ -403,7 +408,7 @@ class Teleop:
 
     @property
     def where(self) -> str:
-        """Place of the robot in the mission, in words."""
+        """Current waypoint in words, for events."""
         return f"on the way to {self._leg_name}"
 
     @property

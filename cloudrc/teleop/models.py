@@ -1,7 +1,7 @@
 """Define requests and answers of the API, and check the orders in requests.
 
-The OpenAPI document comes from these models. Orders have the form of sections of a configuration
-file: the same code checks them and describes their problems.
+The OpenAPI document comes from these models. An order has the form of a section of a configuration
+file, so that the same code checks both and describes the problems.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ ONE_LINE = "one line of printable characters"
 class MissionRequest(Section):
     """Order to fly a mission."""
 
-    name: Text = Field("", description=f"For people: {ONE_LINE}")
+    name: Text = Field("", description=f"Shown to people; {ONE_LINE}")
     description: str = Field("", description="One line, not kept")
     start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
     time_limit_s: TimeLimit | None = Field(
-        None, description="For the whole mission, held time counted [s]; default: the experiment's"
+        None, description="For the whole mission, with its holds [s]; default: as in the experiment"
     )
     waypoints: tuple[Waypoint, ...] = Field(
         (), max_length=MAX_WAYPOINTS, description="Points, in order"
@@ -92,57 +92,57 @@ class _Answer(BaseModel):
 class Reached(_Answer):
     """Waypoint that was reached."""
 
-    waypoint: int = _field("Its index, from 0")
-    time_s: float = _field("When, since the mission began [s]")
+    waypoint: int = _field("Index of the waypoint, from 0")
+    time_s: float = _field("Time since the mission began [s]")
 
 
 class Failure(_Answer):
-    """A rule that was broken."""
+    """A rule that the mission has broken."""
 
     code: str = _field("One word, for programs")
-    text: str = _field("The same for people")
+    text: str = _field("Reason in words")
 
 
 class Verdict(_Answer):
     """Result of a mission that has ended."""
 
     outcome: Literal["success", "failure", "invalid", "interrupted"] = _field("As in report.json")
-    exit_code: int = _field("Of a Job that flew it: 0, 1, 6 or 130")
-    failures: list[Failure] = _field("Every rule that was broken")
+    exit_code: int = _field("Exit code of a Job that flies the mission: 0, 1, 6 or 130")
+    failures: list[Failure] = _field("Every rule that the mission has broken")
 
 
 class Event(_Answer):
     """An event of a mission."""
 
-    id: int = _field("Rises with every event of all missions")
-    mission: str = _field("Whose")
+    id: int = _field("Number of the event; all missions share one count")
+    mission: str = _field("Id of the mission")
     event: str = _field(
         "queued, starting, started, reached, held, resumed, goto, restarted, new_session, "
         f"board_touched, pipe_touched, paused; at the end done, cancelled, {', '.join(FAILURES)}"
     )
-    waypoint: int = _field("Index of the waypoint concerned")
-    text: str = _field("The same in words")
-    time_s: float = _field("Since the mission began [s]")
+    waypoint: int = _field("Index of the waypoint, from 0")
+    text: str = _field("Event in words")
+    time_s: float = _field("Time since the mission began [s]")
 
 
 class MissionSummary(_Answer):
     """A mission, without its events."""
 
-    id: str = _field("Given by teleop")
-    name: str = _field("Given by its sender")
-    key: str = _field("Likewise")
+    id: str = _field("Id, given by teleop")
+    name: str = _field("Name in the order")
+    key: str = _field("Key in the order")
     state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"]
     waypoint: int = _field("Index of the waypoint to which the robot flies, from 0")
     waypoints: int = _field("Number of waypoints")
-    reached: list[Reached] = _field("The waypoints that were reached")
+    reached: list[Reached] = _field("The reached waypoints")
     verdict: Verdict | None = _field("Null until the mission has ended")
 
 
 class MissionView(MissionSummary):
     """A mission with its events."""
 
-    events: list[Event] = Field(max_length=SHOWN, description="The newest of them, oldest first")
-    events_left_out: int = _field("How many there were before those")
+    events: list[Event] = Field(max_length=SHOWN, description="The newest events, oldest first")
+    events_left_out: int = _field("Number of older events")
 
 
 class MissionList(_Answer):
@@ -154,28 +154,28 @@ class MissionList(_Answer):
 class Seen(_Answer):
     """The newest telemetry."""
 
-    age_s: float = _field("Since it arrived [s]")
+    age_s: float = _field("Time since the telemetry arrived [s]")
     epoch: int = _field("Number of the session between cloud and world")
     world: str = _field("Identifies world's process")
-    position_m: list[float | None] = _field("Of the base, measured [m], world frame")
+    position_m: list[float | None] = _field("Measured position of the base [m], world frame")
     guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = _field(
         "State of the guard on board"
     )
     cause: str = _field("Why the guard is in this state; after a landing, why the robot landed")
-    guard_for_s: float | None = _field("Time in this state [s]; null if `age_s` is above 1 s")
+    guard_for_s: float | None = _field("Time in this guard state [s]; null if `age_s` is above 1 s")
     next_step: str = _field("What the robot does next, or what the operator has to do")
-    pipe_contacts: int = _field("How often a pipe has been touched so far")
-    touch_speed_mps: float | None = _field("Of the tip at the board [m/s]")
-    horizon_s: float | None = _field("How far cloud looks ahead [s]")
-    rtt_s: float | None = _field("Last round trip, hold excluded [s]")
-    loop_delay_s: float | None = _field("The same, hold included [s]")
+    pipe_contacts: int = _field("Number of contacts with pipes so far")
+    touch_speed_mps: float | None = _field("Speed of the arm's tip when it touched the board [m/s]")
+    horizon_s: float | None = _field("Time by which cloud predicts ahead [s]")
+    rtt_s: float | None = _field("Last round trip, without the waiting time on board [s]")
+    loop_delay_s: float | None = _field("Last round trip, with the waiting time on board [s]")
 
 
 class StateView(_Answer):
     """The present state of missions and robot."""
 
-    mission: MissionSummary | None = _field("The one under way")
-    queue: list[str] = _field("Ids of those that wait")
+    mission: MissionSummary | None = _field("The mission under way")
+    queue: list[str] = _field("Ids of the missions that wait")
     cloud_age_s: float | None = _field(
         "Age of the last message from cloud [s], which sends one every 0.2 s; null before the first"
     )
@@ -186,7 +186,7 @@ class Stopped(_Answer):
     """Answer to an emergency stop, which is under way to the robot."""
 
     id: str | None = _field("The mission that was under way and has failed")
-    state: Literal["stopping"] = _field("Until the guard on board is in ESTOP")
+    state: Literal["stopping"] = _field("Lasts until the guard on board is in ESTOP")
 
 
 class Acknowledged(_Answer):
@@ -202,21 +202,21 @@ class Problem(_Answer):
     """One value that cannot be used."""
 
     path: str = _field("Keys down to the value, joined by dots")
-    index: int | None = _field("Of the waypoint concerned; null if it is none")
-    value: str = _field("In words; empty if it is not there")
-    reason: str = _field("What it must be, and what to do")
+    index: int | None = _field("Index of the waypoint with the problem; null without a waypoint")
+    value: str = _field("Value in words; empty if missing")
+    reason: str = _field("Rule for the value, and remedy")
 
 
 class Refusal(_Answer):
     """Reason why a request is refused."""
 
-    detail: str = _field("In words")
+    detail: str = _field("Reason in words")
     id: str | None = Field(None, description="The mission that is in the way")
     problems: list[Problem] | None = Field(None, description="Every value that cannot be used")
 
 
 class RefusedError(BadInputError):
-    """Report a request that cannot be used; `problems` say why."""
+    """Report a request that cannot be used; `problems` lists the reasons."""
 
     def __init__(self, problems: list[ConfigProblem]) -> None:
         super().__init__("; ".join(map(str, problems[:3])))
@@ -236,8 +236,8 @@ def read_order(
 ) -> Order:
     """Read a mission, check it, and plan it; raise RefusedError with all its problems.
 
-    `time_limit` [s] and `contact` (the board has to be touched if the mission leads there) are for
-    missions that do not say so; `plan` makes a plan from a mission and its time limit [s].
+    `time_limit` [s] and `contact` are defaults. If the default `contact` is true, the arm has to
+    touch the board if a waypoint is there. `plan` makes a plan from a mission and a time limit [s].
     """
     with suppress(ValueError, TypeError, KeyError):  # `_parse` describes these errors
         count = len(from_json(body)["waypoints"])

@@ -10,24 +10,25 @@ REPEAT_NS = 100_000_000
 UNNUMBERED = 0
 """Number of a request before it gets its final number."""
 NOT_ENDED = (-1, 0)
-"""Epoch and number that mean: the robot has acted on no request that ends a mission."""
+"""Epoch and number of a request that does not exist: the robot has ended no mission."""
 IDLE_NS = 3_000_000_000
-"""Longest time for which a started robot may hold or stand while its telemetry arrives [ns]; then
-another sender has given it another request, and teleop sends the start again."""
+"""Longest time for which a robot holds its position or stands after its start [ns]. Then teleop
+sends the start again, because another sender has probably stopped the robot."""
 PREDECESSORS = 1_000
-"""How many numbers are reserved for the last requests of an earlier teleop process, which may not
-show in telemetry yet. Since every process reserves as many, the first number also rises with the
-machine's clock."""
+"""Distance from the newest request number in telemetry to the first number of a new teleop process.
+Between them is room for requests of the earlier process that telemetry does not show yet."""
 CLOCK_MAX = 65_536
-"""Limit of the clock's part of the first number: a session has numbers for many processes."""
+"""Limit of a second part of the first number. This part rises by 1 every 100 ms on the machine's
+clock, so that the numbers of two new processes differ."""
 
 
 class RequestSender:
     """Repeat the newest request at 10 Hz until telemetry shows that the robot has acted on it.
 
-    A new request replaces the previous one and has a higher number; the robot acts only on rising
-    numbers. Before the first telemetry nothing is sent. Without a request, the progress of the
-    mission is sent until the robot has stored it. The emergency stop is cloud's to repeat.
+    A new request replaces the previous request and has a higher number, because the robot acts only
+    on rising numbers. The sender is silent before the first telemetry. While no request is pending,
+    the sender repeats the progress of the mission until the robot has stored the progress. Cloud
+    repeats the emergency stop.
     """
 
     def __init__(self) -> None:
@@ -37,8 +38,8 @@ class RequestSender:
         self._progress = OperatorRequest(UNNUMBERED, Request.PROGRESS)
         self._number = UNNUMBERED
         self._asked_epoch = 0
-        self._ended = NOT_ENDED  # epoch and number of the last end acted on, unless a start follows
-        self._is_started = False  # whether a start was the last request, and was acted on
+        self._ended = NOT_ENDED  # epoch and number of the last END acted on, unless a START follows
+        self._is_started = False  # whether the robot has acted on a START as the last request
         self._flies_ns = 0  # when the robot last flew its mission
         self._due_ns = 0
 
@@ -49,14 +50,17 @@ class RequestSender:
 
     @property
     def waits(self) -> bool:
-        """Whether commands move no robot: it is on the ground, or was told to end its mission."""
+        """Whether the robot ignores commands, on the ground or after the end of its mission."""
         seen = self._seen
         if seen is None or self._next is not None:
             return False
         return seen.guard is GuardState.GROUND or (seen.epoch, seen.mission) == self._ended
 
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
-        """Begin to repeat a request; with `after`, once the robot has acted on the pending one."""
+        """Begin to repeat a request, which replaces the pending request.
+
+        With `after`, the new request waits until the robot has acted on the pending request.
+        """
         asked = self._progress._replace(request=request, start=start)
         if self._pending is None or not after:
             self._pending, self._next = asked, None
@@ -69,13 +73,13 @@ class RequestSender:
         self._pending = self._next = None
 
     def report(self, mission_id: int, reached: int) -> None:
-        """Set the number of reached waypoints of a mission, which every request carries."""
+        """Set the mission and its number of reached waypoints, which every request carries."""
         self._progress = self._progress._replace(mission_id=mission_id, reached=reached)
         if self._pending is None:
             self._due_ns = 0
 
     def see(self, seen: RobotStatus, now_ns: int) -> Request | None:
-        """Process new telemetry at `now_ns` [ns]; return the request that it acknowledges."""
+        """Process telemetry of `now_ns` [ns]; return a request that the robot has now acted on."""
         self._seen, pending = seen, self._pending
         if pending is None:
             self._repeat_start_if_lost(seen, now_ns)
@@ -98,8 +102,8 @@ class RequestSender:
             return None
         if pending is None:
             return self._progress_due(seen, now_ns)
-        # The robot has acted on a higher number, for example an emergency stop, or on the same
-        # number from an earlier teleop: ours would be acknowledged by now.
+        # Telemetry shows a higher number, for example of an emergency stop, or the same number of
+        # an earlier teleop: ours would be acknowledged by now.
         if pending.number == UNNUMBERED or seen.mission >= pending.number:
             rise = 1 if self._number else PREDECESSORS + now_ns // REPEAT_NS % CLOCK_MAX
             self._number = max(self._number, seen.mission) + rise
@@ -111,7 +115,7 @@ class RequestSender:
         return pending._replace(epoch=seen.epoch)
 
     def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
-        """Send the start again if a request of an earlier teleop or another cloud replaced it."""
+        """Send the start again if a request of another teleop or cloud has replaced the start."""
         ours = self._is_started and seen.mission_id == self._progress.mission_id
         if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
             self._flies_ns = now_ns

@@ -1,7 +1,8 @@
-"""Serve missions: keep, queue and fly orders, carry out verbs, and report the robot's state.
+"""Queue and fly missions, carry out the operator's commands, and report the robot's state.
 
 After a restart of teleop, a mission under way continues at the same waypoint, if world has not
-restarted.
+restarted. If an emergency stop has ended the last mission, but the robot still flies that mission,
+the new teleop sends the stop again.
 """
 
 from __future__ import annotations
@@ -18,22 +19,16 @@ from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.store import (
-    ConflictError,
-    Mission,
-    MissionStore,
-    Order,
-    UnavailableError,
-)
+from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-LATCHED = LAND, ESTOP
-"""States of the guard that only an acknowledgement ends."""
+LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
+"""States of the guard that only an acknowledgement ends, and states in which rotors may turn."""
 SILENCE = 1.0
 """Age above which telemetry or the last message of cloud counts as too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
-"""Time between two copies of the setpoint [ns], for a cloud or teleop that restarts."""
+"""Time between two copies of the setpoint [ns]; a cloud that has restarted needs the copies."""
 QUEUE_MAX = 16
 """Limit of the missions that wait for the one under way."""
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
@@ -64,8 +59,9 @@ IN_MISSION = {
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
     """Describe what the robot does next, or what the operator has to do.
 
-    `age` and `cloud_age` are those of telemetry and of the last message from cloud [s]; `mission`
-    is the state of the mission under way, or None.
+    `age` is the age of the telemetry [s], `cloud_age` the age of the last message from
+    cloud [s].
+    `mission` is the state of the mission under way, or None.
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
@@ -77,8 +73,9 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 class MissionService:
     """Keep and fly all missions of one robot, one after the other.
 
-    Each verb takes the time `now_ns` of the own clock [ns]. It raises ConflictError if the state of
-    mission or robot forbids it, and UnavailableError if the store refuses or this process ends.
+    All times `now_ns` are of this process's monotonic clock [ns]. An operator's command raises
+    ConflictError if the state of mission or robot forbids the command, and UnavailableError if the
+    disk refuses it or this process ends.
 
     Attributes:
         book: The missions.
@@ -87,15 +84,15 @@ class MissionService:
     def __init__(
         self, contact_speed_max: float, book: MissionStore, scene: Scene | None = None
     ) -> None:
-        """Begin with the missions of a store; nothing flies before the first deadline.
+        """Begin with the missions of a store; nothing flies before the first `handle_deadline`.
 
-        `contact_speed_max` limits the speed of the arm's tip at the board [m/s]. Pipes of `scene`
-        may be in the way.
+        `contact_speed_max` limits the speed of the arm's tip at the board [m/s]. With a `scene`,
+        the service refuses straight ways through the walls of pipes.
         """
         self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
         self.book, self._teleop = book, Teleop(book.has_ended)
-        self._heard_ns: int | None = None  # when the last message from cloud came; None: never
+        self._heard_ns: int | None = None  # when the last message from cloud arrived
         self._seen_ns = self._guard_ns = 0  # times of telemetry and of the guard's last change
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
@@ -105,7 +102,7 @@ class MissionService:
 
     @property
     def seen(self) -> RobotStatus | None:
-        """The newest telemetry; None before the first."""
+        """The newest telemetry; None before the first telemetry."""
         return self._teleop.seen
 
     @property
@@ -119,7 +116,7 @@ class MissionService:
         return self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission, which starts at once or waits; return it, and whether it is new.
+        """Create a mission, which starts at once or waits; return the mission, and if it is new.
 
         An order with a known key returns the known mission.
         """
@@ -159,7 +156,7 @@ class MissionService:
         return mission
 
     def hold(self, now_ns: int) -> Mission:
-        """Hold the robot at its position; it must fly a mission."""
+        """Hold the robot, which must fly a mission, at its position."""
         return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
@@ -170,7 +167,7 @@ class MissionService:
         return self._operate(self._teleop.resume, now_ns)
 
     def go_to(self, leg: Leg, now_ns: int) -> Mission:
-        """Fly straight to a point: the new place of a held mission, else a new mission."""
+        """Fly straight to a point, during a held mission or as a new mission."""
         self._check_can_fly()
         waiting = self.book.open()
         if not waiting:
@@ -182,7 +179,7 @@ class MissionService:
         return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
-        """Stop the rotors at once in any state; return the mission that this ends, if any."""
+        """Stop the rotors at once in any state; return the mission that the stop ends."""
         mission = self._start_next(now_ns)
         self._teleop.stop(now_ns)
         self._collect(now_ns)
@@ -202,22 +199,24 @@ class MissionService:
             self._operate(self._teleop.pause, now_ns)
 
     def hear(self, now_ns: int) -> None:
-        """Note a message from cloud."""
+        """Note that a message from cloud has arrived at `now_ns`."""
         self._heard_ns = now_ns
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Process new telemetry."""
+        """Process telemetry that has arrived at `now_ns`."""
         before, mission = self.seen, self._current
+        if self._inherits_stop and seen.mission_id == self._inherits_stop.number:
+            if seen.guard in AIRBORNE:  # the robot has not heard of the stop
+                self._teleop.stop(now_ns)
         self._heard_ns = self._seen_ns = now_ns
-        same_robot = before is not None and before.world == seen.world
-        if before is None or not same_robot or before.guard is not seen.guard:
+        if before is None or (before.world, before.guard) != (seen.world, seen.guard):
             self._guard_ns = now_ns
         if mission is not None and mission.world and mission.world == seen.world:
             known = mission.witness
             mission.witness = known.see(*_contacts(seen))
             for event, text in mission.witness.news(known, self._teleop.elapsed(now_ns)):
                 self._note(mission, event, text, now_ns)
-            if before is not None and same_robot and before.epoch != seen.epoch:
+            if before is not None and before.epoch != seen.epoch:
                 text = "the controller has a new session, as after a restart; the mission is"
                 text = f"{text} {mission.state} {self._teleop.where}"
                 self._note(mission, "new_session", text, now_ns)
@@ -245,7 +244,7 @@ class MissionService:
         """Return the state of missions and robot for the API."""
         mission, seen, heard_ns = self._current, self.seen, self._heard_ns
         cloud_age = None if heard_ns is None else (now_ns - heard_ns) * 1e-9
-        shown = {
+        shown: dict[str, Any] = {
             "mission": mission.summary() if mission is not None else None,
             "queue": [waits.id for waits in self.book.open() if waits is not mission],
             "cloud_age_s": cloud_age,
@@ -254,7 +253,7 @@ class MissionService:
         if seen is None or cloud_age is None:
             return shown
         age, state = (now_ns - self._seen_ns) * 1e-9, mission.state if mission else None
-        robot = {
+        shown["seen"] = {
             "age_s": age,
             "epoch": seen.epoch,
             "world": seen.world,
@@ -269,12 +268,18 @@ class MissionService:
             "rtt_s": finite_or_none(seen.rtt),
             "loop_delay_s": finite_or_none(seen.loop_delay),
         }
-        return {**shown, "seen": robot}
+        return shown
+
+    @property
+    def _inherits_stop(self) -> Mission | None:
+        """The last mission, if an earlier teleop stopped it; None after the first telemetry."""
+        unknown = self.seen is None and not self._teleop.stopping
+        return self.book.stopped() if unknown else None
 
     @property
     def _blocked(self) -> str:
         """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
-        if self._teleop.stopping:
+        if self._teleop.stopping or self._inherits_stop:
             return "an emergency stop is on its way to the robot"
         seen = self.seen
         if seen is None or seen.guard not in LATCHED:
@@ -316,10 +321,10 @@ class MissionService:
         return mission
 
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
-        """Make the first open mission the current one; return the current mission, if any.
+        """Fly the first mission that has not ended; return the mission under way, if any.
 
-        If the mission has begun, it continues. If it waits, it starts only with `queued`, and
-        once that is stored.
+        A mission that has begun continues. A waiting mission starts only with `queued`, and only
+        after the disk has stored its start.
         """
         waiting = self.book.open()
         if self._current is not None or not waiting:

@@ -1,10 +1,10 @@
 """Store missions and their progress in an SQLite file; read them after a restart.
 
-A mission is one row: its order, written once, and its status, written with each event. A waypoint
-cannot be stored twice as reached, because mission and index are the key of a row. A transaction is
-on the disk when it returns, so a process that is killed at any instant loses at most the event that
-it is writing. If the disk refuses, flights continue, no new mission starts, and the events stay in
-memory until the disk works again.
+A mission is one row with an order and a status; each event changes the status. Each reached
+waypoint is one more row, with mission and index as its key, so that no waypoint is stored twice.
+The data of a transaction is on the disk when the transaction returns. A killed process therefore
+loses at most the newest event. If the disk refuses, flights continue, no new mission starts, and
+the events stay in memory until the disk works again.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, as the API shows it."""
 SHOWN = 100
-"""Limit of the events that are kept per mission; the newest are kept."""
+"""Number of the newest events that the store keeps for each mission."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Order of a mission; its plan has been checked."""
+    """Order to fly a mission; the plan has been checked."""
 
     plan: Plan
-    name: str = ""  # for people
+    name: str = ""  # shown to people
     key: str = ""  # a second order with the same key, unless "", makes no second mission
     contact: bool = False  # whether the arm has to touch the board
     queue: bool = False  # whether the order waits for the mission under way; else it is refused
@@ -71,7 +71,10 @@ class Mission:
     def apply(
         self, number: int, event: str, text: str, *, waypoint: int | None = None, **changed: Any
     ) -> None:
-        """Update the mission with an event; `changed` are new values of its attributes."""
+        """Update the mission with an event; `changed` has new values of the mission's attributes.
+
+        `number` counts the events of all missions. `waypoint` is an index, by default the current.
+        """
         waypoint = self.waypoint if waypoint is None else waypoint
         for name, value in changed.items():
             setattr(self, name, value)
@@ -106,7 +109,7 @@ class UnknownMissionError(CloudrcError):
 
 
 class UnavailableError(CloudrcError):
-    """Report that teleop cannot serve now: its journal is locked or refuses, or teleop ends."""
+    """Report that teleop cannot serve now: the journal is locked or read-only, or teleop ends."""
 
 
 class StoreLockedError(CloudrcError):
@@ -124,7 +127,7 @@ class ConflictError(CloudrcError):
 
 
 APPLICATION, VERSION = 0x43524A32, 1
-"""Numbers in the head of the file: of cloudrc's files, and of the version of the tables."""
+"""Numbers in the head of the file: one for all files of cloudrc, and the version of the tables."""
 SCHEMA = f"""
 BEGIN;
 CREATE TABLE mission (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL);
@@ -139,7 +142,7 @@ COMMIT;
 def open_store(path: Path, salt: bytes) -> MissionStore:
     """Open the file of missions and lock it; make a new file if there is none.
 
-    A damaged file is renamed, and `MissionStore.notice` says so.
+    The function renames a damaged file, and `MissionStore.notice` says so.
 
     Raises:
         StoreLockedError: If another process has locked the file.
@@ -180,7 +183,7 @@ def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqli
         sqlite3.OperationalError: If the file is locked or its volume fails.
         sqlite3.DatabaseError: If the file is damaged.
     """
-    # The thread that serves missions may be another one than that which opens the file.
+    # One thread opens the file; another thread may serve the missions.
     how: dict[str, Any] = {"timeout": 0, "isolation_level": None, "check_same_thread": False}
     db: sqlite3.Connection = sqlite3.connect(path or ":memory:", factory=factory, **how)
     try:
@@ -223,9 +226,10 @@ class MissionStore:
     """
 
     def __init__(self, db: sqlite3.Connection, salt: bytes, notice: str = "") -> None:
-        """Read the missions of a connection; if that fails, close it and raise DatabaseError.
+        """Read all missions of `db`; if that fails, close `db` and raise DatabaseError.
 
-        Ids begin again with a new file. `salt`, random bytes, makes the numbers on board differ.
+        A new file begins with the id "m1" again. The random bytes `salt` make the numbers that the
+        robot stores differ from those of an earlier file.
         """
         self._db, self._salt, self.notice = db, salt, notice
         self.missions: dict[str, Mission] = {}
@@ -241,8 +245,14 @@ class MissionStore:
             raise sqlite3.DatabaseError(f"a row cannot be read: {error!r}") from error
 
     def open(self) -> list[Mission]:
-        """Return the missions that have not ended; the first is the one to fly."""
+        """Return the missions that have not ended, in the order in which they fly."""
         return [mission for mission in self.missions.values() if not mission.ended]
+
+    def stopped(self) -> Mission | None:
+        """Return the mission that was flown last, if it ended by an emergency stop."""
+        events = {"started", "emergency_stopped"}
+        flown = [each for each in self.missions.values() if each.happened.keys() & events]
+        return flown[-1] if flown and "emergency_stopped" in flown[-1].happened else None
 
     def find(self, mission_id: str) -> Mission:
         """Return a mission; raise UnknownMissionError if none has this id."""
@@ -251,7 +261,7 @@ class MissionStore:
         return self.missions[mission_id]
 
     def has_ended(self, number: int) -> bool:
-        """Return whether a mission is over; `number` is the number that the robot uses for it."""
+        """Return whether the mission to which the robot gives this number has ended."""
         return any(mission.number == number and mission.ended for mission in self.missions.values())
 
     def with_key(self, key: str) -> Mission | None:
@@ -262,7 +272,7 @@ class MissionStore:
         """Store a new mission; delete the oldest ended missions if there are more than `KEPT`.
 
         Raises:
-            UnavailableError: If the mission cannot be stored; then it does not exist.
+            UnavailableError: If the disk refuses; then there is no new mission.
         """
         mission_id = f"m{int(next(reversed(self.missions), 'm0')[1:]) + 1}"
         digest = hashlib.sha256(self._salt + mission_id.encode()).digest()
@@ -295,13 +305,13 @@ class MissionStore:
 
     def events_after(self, number: int) -> list[Event]:
         """Return the events of all missions after the event with this number, oldest first."""
-        if number > self._events:  # of a file that is gone
+        if number > self._events:  # the reader knows an earlier file
             number = 0
         if number == self._events:
             return []
         kept = (event for mission in self.missions.values() for event in mission.events)
         found = sorted((e for e in kept if e["id"] > number), key=lambda event: event["id"])
-        if number:  # without a number nobody has missed anything
+        if number:  # a new reader has missed nothing
             self.dropped += self._events - number - len(found)
         return found
 

@@ -1,4 +1,4 @@
-"""Define teleop's messages and plans; encode the messages between cloud's and teleop's process.
+"""Define teleop's plans and messages; encode messages between the processes of cloud and teleop.
 
 Each datagram is a JSON list: the name of the message's type and its fields in order.
 """
@@ -29,7 +29,8 @@ from cloudrc.records import MissionEvent
 class Leg:
     """One waypoint and the conditions for reaching it.
 
-    With an infinite tolerance, the leg always lasts `dwell`; missions of random steps use this.
+    If `tolerance` is infinite, the leg ends after the time `dwell`, wherever the robot is. Missions
+    of random steps use such legs.
     """
 
     position: Vector  # [m], world frame, shape (3,)
@@ -41,7 +42,7 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The plan of a mission."""
+    """Waypoints of a mission, with start and time limit."""
 
     legs: tuple[Leg, ...]  # in order; at least one
     start: Start = Start.SPAWN  # the spawn (world is reset), or the robot's position
@@ -58,7 +59,7 @@ class RobotStatus(NamedTuple):
     Numbers that are not known yet are NaN.
     """
 
-    epoch: int  # of the session; a restart of cloud changes it
+    epoch: int  # number of the session with world; a restart of cloud changes the number
     position: Vector  # measured position of the base [m], world frame, shape (3,)
     guard: GuardState
     mission: int  # number of the last operator request that world has acted on; 0 if none
@@ -71,11 +72,11 @@ class RobotStatus(NamedTuple):
     loop_delay: float = nan  # last round trip with the hold time on board [s]
     mission_id: int = 0  # number of the mission of the last start request; 0 if none
     reached: int = 0  # waypoints that world has stored as reached, or `MISSION_OVER`
-    cause: Cause = Cause.SPAWN  # of the guard's state
+    cause: Cause = Cause.SPAWN  # why the guard is in its state
 
 
 QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
-"""States of a mission that has not ended; STARTING lasts until telemetry shows the start."""
+"""States of a mission that has not ended; STARTING ends when telemetry shows the start."""
 ENDED = "done", "failed", "cancelled"
 """States of a mission that has ended."""
 FAILURES = (
@@ -95,7 +96,7 @@ Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 """Messages from teleop to cloud."""
 Message: TypeAlias = RobotStatus | Output
 ALARM = OperatorRequest(0, Request.ESTOP)
-"""Emergency stop; it does not wait for teleop's state machine, and cloud gives it a number."""
+"""Emergency stop. It can bypass teleop's state machine, and cloud gives the stop a number."""
 _KINDS: dict[str, TypeAdapter[Message]] = {
     kind.__name__: TypeAdapter(kind)
     for kind in (RobotStatus, Setpoint, OperatorRequest, MissionEvent)
@@ -108,7 +109,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> Message:
-    """Decode a message; raise ValueError if the datagram is none."""
+    """Decode a message; raise ValueError if the datagram is not a message."""
     try:
         name, fields = json.loads(data)
         return _KINDS[name].validate_python(fields)

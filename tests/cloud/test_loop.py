@@ -50,11 +50,7 @@ def test_split_counts_how_long_cloud_has_held_the_odometry():
 
 @pytest.mark.parametrize(("horizon", "clamped"), [(3.0, 1.0), (-0.5, 0.0)])
 def test_a_horizon_out_of_range_is_clamped_and_counted(horizon, clamped):
-    class Wild(Estimator):
-        def horizon(self, age):
-            return horizon
-
-    a_loop = loop(estimator=Wild, heard_ms=1090)
+    a_loop = loop(estimator=returns(horizon), heard_ms=1090)
     assert command(a_loop, 1094)[1].horizon == clamped
     assert a_loop.counts == {"horizon_clamped": 1}
 
@@ -101,23 +97,32 @@ def test_the_first_echo_has_as_much_time():
 # Plug-ins may raise and return anything.
 
 
-class Bad(Estimator, Predictor, Controller):
-    """A plug-in of every kind that raises `error`."""
+def raises(error):
+    """Make a plug-in of every kind that raises an error."""
 
-    error: BaseException | type[BaseException] = RuntimeError("out of\nluck")
+    class Bad(Estimator, Predictor, Controller):
+        def update(self, *arguments):
+            raise error
 
-    def update(self, *arguments):
-        raise self.error
+        horizon = observe = predict = update
 
-    horizon = observe = predict = update
-
-
-class Leaving(Bad):
-    error = SystemExit("enough")
+    return Bad
 
 
-class Closing(Bad):
-    error = GeneratorExit
+def returns(horizon=0.0, output=None, **changes):
+    """Make a plug-in of every kind that returns something, the odometry with changes."""
+
+    class Odd(Estimator, Predictor, Controller):
+        def horizon(self, age):
+            return horizon
+
+        def predict(self, odometry, horizon):
+            return odometry._replace(**changes)
+
+        def update(self, *arguments):
+            return output
+
+    return Odd
 
 
 class WordlessError(Exception):
@@ -125,37 +130,14 @@ class WordlessError(Exception):
         raise SystemExit("no words")
 
 
-class Speechless(Bad):
-    error = WordlessError
+ERRORS = (RuntimeError("out of\nluck"), SystemExit("enough"), GeneratorExit, WordlessError)
+LONG = ValueError("no caf\udce9 " + "x" * 100_000)
+ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
+OUT_OF_SHAPE = returns((0.1,), ANY._replace(velocity=(0.1, 0.2)), position=(1.0, 2.0))
+NOT_FINITE = returns(nan, ANY._replace(velocity=(0.0, nan, 0.0)), position=(inf, 0.0, 0.0))
 
 
-class Verbose(Bad):
-    error = ValueError("no caf\udce9 " + "x" * 100_000)
-
-
-class OutOfShape(Bad):
-    def horizon(self, age):
-        return (0.1,)
-
-    def predict(self, odometry, horizon):
-        return odometry._replace(position=(1.0, 2.0), velocity=(0.0, 0.0, 0.0, 0.0))
-
-    def update(self, *arguments):
-        return ControlOutput((0.1, 0.2), 0.0, proportional=(1.0, 2.0, 3.0, 4.0))
-
-
-class NotFinite(OutOfShape):
-    def horizon(self, age):
-        return nan
-
-    def predict(self, odometry, horizon):
-        return odometry._replace(position=(inf, 0.0, 0.0))
-
-    def update(self, *arguments):
-        return ControlOutput((0.0, nan, 0.0), 0.0)
-
-
-@pytest.mark.parametrize("bad", [Bad, Leaving, Closing, Speechless, Verbose, OutOfShape, NotFinite])
+@pytest.mark.parametrize("bad", [*map(raises, (*ERRORS, LONG)), OUT_OF_SHAPE, NOT_FINITE])
 @pytest.mark.parametrize("kind", ["estimator", "predictor", "controller"])
 def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     a_loop = loop(**{kind: bad if kind == "estimator" else bad()})
@@ -172,7 +154,6 @@ def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     assert fault.text.endswith(f"fix cloud.{kind} or choose another")
 
 
-ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
 VECTORS = ("velocity", "proportional", "integral", "derivative")
 WRONG = ((0.1, 0.2), (0.1, 0.2, 0.3, 0.4), "abc", None, (None,) * 3)
 
@@ -185,20 +166,13 @@ WRONG = ((0.1, 0.2), (0.1, 0.2, 0.3, 0.4), "abc", None, (None,) * 3)
     ],
 )
 def test_an_output_that_is_not_three_numbers_is_not_flown(output):
-    class Odd(Controller):
-        def update(self, *arguments):
-            return output
-
-    a_loop = loop(controller=Odd(), heard_ms=1090)
+    a_loop = loop(controller=returns(output=output)(), heard_ms=1090)
     assert command(a_loop, 1094)[0].velocity == ZERO
     assert a_loop.counts["controller_failed"] == 1
 
 
 def test_arrays_and_generators_become_plain_numbers():
-    class Arrays(Estimator, Predictor, Controller):
-        def horizon(self, age):
-            return np.float32(0.5)
-
+    class Arrays(returns(np.float32(0.5))):
         def update(self, *arguments):
             return ANY._replace(velocity=np.array([1, 2, 3]), integral=(n for n in (4, 5, 6)))
 
@@ -247,8 +221,5 @@ def test_a_failing_reset_is_reported_with_the_next_telemetry():
 
 
 def test_ctrl_c_in_a_plug_in_ends_the_program():
-    class Interrupted(Bad):
-        error = KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        command(loop(controller=Interrupted(), heard_ms=1090), 1094)
+        command(loop(controller=raises(KeyboardInterrupt)(), heard_ms=1090), 1094)

@@ -13,7 +13,7 @@ from cloudrc.faults import invariants
 from cloudrc.faults.adversary import POLICIES, choose, dishonesty
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
-from cloudrc.faults.trial import OrderInvariant, checked_in, fly
+from cloudrc.faults.trial import FORGETFUL, OrderInvariant, checked_in, fly
 from cloudrc.messages import ZERO, GuardState, Request, Start
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
@@ -64,20 +64,24 @@ def test_it_causes_none_with_a_stiffer_low_level_controller(seed):
     assert fly(hostile, "world.low_level.integral_limit_xy=0.30").breaches == ()
 
 
+BLACKOUT, STOPPED = Event("blackout", 44.0, 8.0), Event("stopped", 5.0)
+
+
 @pytest.mark.parametrize(
     ("events", "policy", "duration", "kinds"),
     [
-        ((), "", 60.0, {"collision", "waypoint", "stuck", "alarm"}),
-        ((Event("blackout", 44.0, 8.0),), "", 62.0, {"collision", "waypoint", "stuck"}),
-        ((Event("blackout", 44.0, 8.0),), "", 61.0, {"collision", "waypoint"}),
-        ((Event("stopped", 5.0),), "", 60.0, {"collision", "waypoint", "stuck", "obeyed"}),
-        ((Event("stopped", 5.0),), "greedy", 60.0, set()),
+        ((), "", 60.0, "collision waypoint stuck alarm"),
+        ((BLACKOUT,), "", 62.0, "collision waypoint stuck"),
+        ((BLACKOUT,), "", 61.0, "collision waypoint"),
+        ((STOPPED,), "", 60.0, "collision waypoint stuck obeyed"),
+        ((STOPPED,), "greedy", 60.0, ""),
+        *(((STOPPED, Event(n, 9.0)), "", 60.0, "collision waypoint stuck") for n in FORGETFUL),
     ],
 )
 def test_a_schedule_is_checked_for_what_it_allows(events, policy, duration, kinds):
     schedule = Schedule(1, events=events, policy=policy, duration=duration)
     some = {"collision", "waypoint", "stuck", "alarm", "obeyed"}
-    assert checked_in(schedule) & some == kinds
+    assert checked_in(schedule) & some == {*kinds.split()}
 
 
 def test_a_flight_without_faults_is_clean():

@@ -12,7 +12,6 @@ from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import (
-    NEVER_NS,
     UPRIGHT,
     ZERO,
     Cause,
@@ -21,11 +20,10 @@ from cloudrc.messages import (
     OperatorRequest,
     Request,
     Start,
-    Telemetry,
 )
 from cloudrc.record.columns import Recording
 from cloudrc.record.hash import RecordHash
-from cloudrc.records import Arrival, Counted, Fault, Record
+from cloudrc.records import Counted, Record
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
 from cloudrc.tunnel import codec
@@ -35,6 +33,7 @@ from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import Session
 from cloudrc.world.endpoint import WorldEndpoint
+from tests.cloud.conftest import loop
 
 MS = 1_000_000
 CLOCK = bytes(16)
@@ -67,21 +66,6 @@ def bare_world(
     )
 
 
-class NoLoop:
-    """Stand-in for cloud's loop that only notes the newest telemetry."""
-
-    def __init__(self) -> None:
-        self.faults: list[Fault] = []
-        self.counts: dict[str, int] = {}
-        self.reset()
-
-    def reset(self) -> None:
-        self.ready, self.basis_stamp_ns = False, NEVER_NS
-
-    def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        self.ready, self.basis_stamp_ns = True, telemetry.stamp_ns
-
-
 def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
     """Make cloud's end; it sends the messages in its `teleop.outputs`."""
     teleop = SimpleNamespace(
@@ -90,8 +74,7 @@ def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
     )  # fmt: skip
     teleop.take_outputs = lambda: [teleop.outputs.pop(0) for _ in teleop.outputs[:]]
     identity = Identity(CLOCK, nonce.ljust(16), keys)
-    loop: Any = NoLoop()
-    return CloudEndpoint(loop, teleop, identity, newest_wins=True, start_ns=start_ns)
+    return CloudEndpoint(loop(), teleop, identity, newest_wins=True, start_ns=start_ns)
 
 
 def ring() -> KeyRing:
@@ -114,8 +97,10 @@ class BareCloud:
         body = codec.encode_command(Command(now_ns, basis_ns, 0, velocity, 0.0))
         return self.session.seal(Kind.COMMAND, body)
 
-    def ask(self, number: int, request: Request, start: Start, mission_id=0, basis_ns=0) -> bytes:
-        asked = OperatorRequest(number, request, start, mission_id, basis_stamp_ns=basis_ns)
+    def ask(self, number, request, start, mission_id=0, basis_ns=0, reached=0) -> bytes:
+        asked = OperatorRequest(
+            number, request, start, mission_id, reached, basis_stamp_ns=basis_ns
+        )
         return self.session.seal(Kind.OPERATOR, codec.encode_operator(asked))
 
     def start(self, number: int, basis_ns: int = 0) -> bytes:
@@ -141,15 +126,23 @@ class BareCloud:
         return None
 
 
-class Bare:
-    """One world and some clouds, connected by a link without loss and delay."""
+HOVER = load_experiment("hover", ["link.profile=ideal"])
 
-    def __init__(self, keys: KeyRing) -> None:
-        self.keys, self.now_ns = keys, 0
-        self.world = bare_world(ring=keys)
+
+class Bare:
+    """A sealed world and some clouds that the test controls; no datagram is lost or late.
+
+    The last cloud that said `hello` is `speaker`: requests and commands come from it.
+    """
+
+    def __init__(self, keys: KeyRing, *, flies: bool = False) -> None:
+        """Start world, with a simulated robot if it `flies`."""
+        identity = Identity(CLOCK, b"world".ljust(16), keys)
+        self.world = assembly.build_world(HOVER, identity) if flies else bare_world(ring=keys)
+        self.keys, self.now_ns, self.born = keys, 0, 0
         self.clouds: dict[str, BareCloud] = {}
         self.sent: list[bytes] = []  # everything that any cloud has ever sent
-        self.born = 0
+        self.records: list[Record] = []
 
     def cloud(self, name: str) -> BareCloud:
         if name not in self.clouds:
@@ -157,38 +150,56 @@ class Bare:
             self.clouds[name] = BareCloud(b"%d" % self.born, self.keys)
         return self.clouds[name]
 
-    def send(self, data: bytes | None) -> None:
+    def hello(self, name: str) -> int:
+        """Greet as this cloud; return the epoch that it got, 0 if none."""
+        self.speaker = self.cloud(name)
+        self.send(self.speaker.hello())
+        return self.speaker.session.epoch
+
+    def send(self, data: bytes) -> None:
         """Deliver to world, and every answer to every cloud, until all is quiet."""
-        waiting = [data] if data else []
+        waiting = [data]
         while waiting:
-            one = waiting.pop()
-            self.sent.append(one)
-            self.world.receive_datagram(one, self.now_ns)
-            for answer in self.world.take_datagrams():
-                for cloud in self.clouds.values():
-                    reply = cloud.receive(answer)
-                    if reply:
-                        waiting.append(reply)
+            self.sent.append(waiting.pop())
+            self.world.receive_datagram(self.sent[-1], self.now_ns)
+            answers = self.world.take_datagrams()
+            replies = [cloud.receive(each) for each in answers for cloud in self.clouds.values()]
+            waiting += filter(None, replies)
 
     def wait(self, ms: float) -> None:
-        """Let time pass in world, in steps that are no stall."""
-        end_ns = self.now_ns + round(ms * MS)
-        while self.now_ns < end_ns:
-            self.now_ns = min(self.now_ns + 100 * MS, end_ns)
-            self.world.handle_deadline(self.now_ns)
+        """Let time pass in world; its telemetry is lost."""
+        self.now_ns += round(ms * MS)
+        while self.world.next_deadline_ns() <= self.now_ns:
+            self.world.handle_deadline(self.world.next_deadline_ns())
         self.world.take_datagrams()
 
-    def used(self) -> list[tuple[int, int]]:
-        """Epoch and counter of the commands that were let through, in that order."""
-        records = self.world.take_records()
-        return [(r.epoch, r.counter) for r in records if isinstance(r, Arrival) and r.used]
+    def asked(self, number: int, request: Request, start: Start, mission_id: int = 0) -> bytes:
+        """A request that is passed on now."""
+        world_ns = self.now_ns - self.world.slip_ns
+        return self.speaker.ask(number, request, start, mission_id, world_ns)
 
-    def outcome(self, data: bytes) -> dict[str, int]:
-        """What this datagram is counted under."""
-        before = dict(self.world._counts)
-        self.world.receive_datagram(data, self.now_ns)
-        after = self.world._counts
-        return {n: after[n] - before.get(n, 0) for n in after if after[n] != before.get(n, 0)}
+    def request(self, number: int, request: Request, start: Start, mission_id: int = 0) -> None:
+        self.send(self.asked(number, request, start, mission_id))
+
+    def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None) -> bytes:
+        return self.speaker.command(self.now_ns, basis_ns, velocity)
+
+    def take(self, kind: type) -> list:
+        self.records += self.world.take_records()
+        return [record for record in self.records if isinstance(record, kind)]
+
+    def counts(self) -> dict[str, int]:
+        self.wait(1000)
+        return {record.name: record.total for record in self.take(Counted)}
+
+
+def talking() -> Bare:
+    """A cloud that has a session, and a mission that has been started where the robot stands."""
+    talk = Bare(ring(), flies=True)
+    talk.hello("cloud")
+    talk.wait(20)
+    talk.request(1, Request.START, Start.HERE)
+    return talk
 
 
 SHARED_CLOCK = b"one clock for all"[:16]
@@ -203,13 +214,12 @@ class Ends(NamedTuple):
     run: VirtualRun
 
 
-def join(experiment: ResolvedExperiment, *, offset_ns: int = 0) -> Ends:
+def join(experiment: ResolvedExperiment, *, offset_ns: int = 0, keys: KeyRing | None = None):
     """Assemble an experiment; with an offset the two ends have different clocks."""
     world_clock = b"another clock..." if offset_ns else SHARED_CLOCK
-    world = assembly.build_world(experiment, Identity(world_clock, b"world".ljust(16)))
-    cloud = assembly.build_cloud(
-        experiment, Identity(SHARED_CLOCK, b"cloud".ljust(16)), lambda: offset_ns
-    )
+    world = assembly.build_world(experiment, Identity(world_clock, b"world".ljust(16), keys))
+    identity = Identity(SHARED_CLOCK, b"cloud".ljust(16), keys)
+    cloud = assembly.build_cloud(experiment, identity, lambda: offset_ns)
     links = assembly.build_links(experiment)
     return Ends(world, cloud, VirtualRun(world, cloud, *links, cloud_clock_offset_ns=offset_ns))
 
@@ -228,7 +238,7 @@ def fly_on(
     return of_world, of_cloud
 
 
-def records(experiment: ResolvedExperiment, **options: int) -> tuple[list[Record], list[Record]]:
+def records(experiment: ResolvedExperiment, **options: Any) -> tuple[list[Record], list[Record]]:
     """Fly and return the records of world and of cloud."""
     _, cloud, run = join(experiment, **options)
     return fly_on(run, LIMIT_NS, lambda: cloud.mission_over)
@@ -247,68 +257,9 @@ def numbers(assessment: Assessment) -> dict[str, float]:
     return {name: number.value for name, number in assessment.numbers.items()}
 
 
-def digest(experiment: ResolvedExperiment) -> str:
+def digest(experiment: ResolvedExperiment, **options: Any) -> str:
     """Compute the SHA-256 of all records of a flight."""
     digest = RecordHash()
-    for each in records(experiment):
+    for each in records(experiment, **options):
         digest.update(each)
     return digest.hexdigest()
-
-
-HOVER = load_experiment("hover", ["link.profile=ideal"])
-
-
-class Talk:
-    """A sealed world with clouds that the test controls; `cloud` is the one that speaks."""
-
-    def __init__(self, nonce: bytes = b"world") -> None:
-        identity = Identity(CLOCK, nonce.ljust(16), ring())
-        self.world = assembly.build_world(HOVER, identity)
-        self.now_ns, self.records = 0, []
-        self.clouds: dict[bytes, BareCloud] = {}
-
-    def wait(self, until_ns: int) -> None:
-        while self.world.next_deadline_ns() <= until_ns:
-            self.world.handle_deadline(self.world.next_deadline_ns())
-        self.now_ns = until_ns
-
-    def send(self, data: bytes) -> None:
-        self.world.receive_datagram(data, self.now_ns)
-
-    def hello(self, nonce: bytes) -> int:
-        """Greet as this cloud, which speaks from here on; the epoch that it got, 0 if none."""
-        self.cloud = self.clouds.setdefault(nonce, BareCloud(nonce, ring()))
-        self.send(self.cloud.hello())
-        for _ in range(2):
-            for data in self.world.take_datagrams():
-                if (reply := self.cloud.receive(data)) is not None:
-                    self.send(reply)
-        return self.cloud.session.epoch
-
-    def request(self, number: int, request: Request, start: Start, mission_id: int = 0) -> None:
-        self.send(self.asked(number, request, start, mission_id))
-
-    def asked(self, number: int, request: Request, start: Start, mission_id: int = 0) -> bytes:
-        """A request that is passed on now."""
-        world_ns = self.now_ns - self.world.slip_ns
-        return self.cloud.ask(number, request, start, mission_id, world_ns)
-
-    def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None) -> bytes:
-        return self.cloud.command(self.now_ns, basis_ns, velocity)
-
-    def take(self, kind: type) -> list:
-        self.records += self.world.take_records()
-        return [record for record in self.records if isinstance(record, kind)]
-
-    def counts(self) -> dict[str, int]:
-        self.wait(self.now_ns + 1000 * MS)
-        return {record.name: record.total for record in self.take(Counted)}
-
-
-def talking() -> Talk:
-    """A cloud that has a session, and a mission that has been started where the robot stands."""
-    talk = Talk()
-    talk.hello(b"cloud")
-    talk.wait(20 * MS)
-    talk.request(1, Request.START, Start.HERE)
-    return talk

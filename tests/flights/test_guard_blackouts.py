@@ -1,6 +1,5 @@
 """Cloud is silent or killed anywhere in the paper's mission: the robot holds, then finishes it."""
 
-from collections.abc import Callable
 from functools import cache, partial
 
 import numpy as np
@@ -11,10 +10,9 @@ from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, silent
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import load_scene
-from cloudrc.records import Control, GuardChange, MissionEvent
-from tests.flights.conftest import fly_on, join
+from cloudrc.records import Control, GuardChange
+from tests.flights.conftest import MS, fly_on, join
 
-Figure = Callable[..., None]
 COUNT = 200
 LAST = 27.0
 """Uncapped the board is touched 1 s later; at 1.5 m/s 4.9 s later, 2.2 s after pipe 3's mouth."""
@@ -131,28 +129,22 @@ def test_a_silence_at_the_missions_end_lets_the_robot_hold():
     assert measures.calm_after(flight, hold.stamp_ns * 1e-9, flight.now) <= 1.0
 
 
-def fly_records(*settings, until=0.0):
-    ends = join(load_experiment("paper", settings))
-    limit_ns = round((until or 150) * 1e9)
-    return ends, *fly_on(ends.run, limit_ns, lambda: not until and ends.cloud.mission_over)
-
-
 def test_a_silent_downlink_freezes_until_the_echo_is_back():
     """It uses an integral and `commanded_velocity`, which would both drift."""
-    _, _, of_cloud = fly_records(
+    flight = Flight(
         *PATIENCE,
         "cloud.predictor=commanded_velocity",
         "cloud.controller={name: pid, gain_i: [0.1, 0.1, 0.1], speed_max: 2}",
         "link.downlink.blackouts=[{start_s: 11.3, duration_s: 20}]",
-    )
-    control = [r for r in of_cloud if isinstance(r, Control)]
+    ).fly_mission()
+    control = [r for r in flight.of_cloud if isinstance(r, Control)]
     silence = [r for r in control if 12.5e9 < r.stamp_ns < 31.3e9]
     assert len(silence) > 1800
     assert {r.command for r in silence} == {(0.0, 0.0, 0.0)}
     before = [r for r in control if 11.0e9 < r.stamp_ns < 11.3e9][-1]
     after = next(r for r in control if r.stamp_ns > 31.3e9 and any(r.command))
     assert max(abs(a - b) for a, b in zip(after.integral, before.integral, strict=True)) < 0.1
-    assert [r for r in of_cloud if isinstance(r, MissionEvent)][-1].event == "done"
+    assert flight.mission.state == "done"
 
 
 @pytest.mark.parametrize(
@@ -165,21 +157,21 @@ def test_a_silent_downlink_freezes_until_the_echo_is_back():
     ],
 )
 def test_a_start_without_commands(setting, until, states):
-    ends, of_world, _ = fly_records(*setting, until=until)
-    assert [r.state.name for r in of_world if isinstance(r, GuardChange)] == states
-    assert ends.world.robot.guard.state.name == states[-1]
+    flight = Flight(*setting).fly(until)
+    assert [change.state.name for change in flight.changes] == states
+    assert flight.guard_now()[0].name == states[-1]
 
 
 def test_a_lost_downlink_lands_the_robot_and_ends_the_run():
     lost = "link.downlink.blackouts=[{start_s: 3, duration_s: 1000}]"
-    ends, of_world, _ = fly_records(lost, "guard.hold_max_s=1")
+    ends = join(load_experiment("paper", [lost, "guard.hold_max_s=1"]))
+    of_world, _ = fly_on(ends.run, 30_000 * MS, lambda: ends.cloud.mission_over)
     changes = [r for r in of_world if isinstance(r, GuardChange)]
     assert [r.state.name for r in changes[-3:]] == ["HOLD", "LAND", "LAND"]
     assert changes[-1].cause == "touched down, rotors stopped"
     assert ends.cloud.teleop.outcome.event == "guard_stopped"
-    assert ends.run.now_ns < 30e9
+    assert ends.cloud.mission_over
 
 
 def test_a_flight_without_faults_never_meets_the_fence():
-    ends, _, _ = fly_records()
-    assert dict(ends.world.robot.guard.counts) == {}
+    assert dict(undisturbed().robot.guard.counts) == {}

@@ -9,9 +9,8 @@ from cloudrc.records import GuardChange
 from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
 from cloudrc.tunnel.end import Identity
-from tests.flights.conftest import SHARED_CLOCK, fly_on, join
+from tests.flights.conftest import HOVER, SHARED_CLOCK, fly_on, join
 
-HOVER = load_experiment("hover", ["link.profile=ideal"])
 S = 1_000_000_000
 ELSEWHERE = (5.0, 5.0, 1.0)
 ESTOP = GuardState.ESTOP

@@ -3,11 +3,9 @@
 from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Mission, Waypoint
-from cloudrc.messages import OperatorRequest, Request, Start
+from cloudrc.messages import Request, Start
 from cloudrc.records import MissionEvent, TelemetrySent
-from cloudrc.tunnel import codec
-from cloudrc.tunnel.codec import Kind
-from tests.flights.conftest import MS, Talk, records
+from tests.flights.conftest import MS, Bare, records, ring
 
 ID = 2**62 + 5
 
@@ -26,16 +24,15 @@ def test_the_robot_stores_every_waypoint_reached():
 
 def ask(talk, request, number=0, *, start=Start.HERE, **fields):
     """Return the mission and the progress that the robot shows after a request."""
-    asked = OperatorRequest(number, request, start, basis_stamp_ns=talk.now_ns, **fields)
-    talk.send(talk.cloud.session.seal(Kind.OPERATOR, codec.encode_operator(asked)))
-    talk.wait(talk.now_ns + 20 * MS)
+    talk.send(talk.speaker.ask(number, request, start, basis_ns=talk.now_ns, **fields))
+    talk.wait(20)
     telemetry = talk.take(TelemetrySent)[-1].telemetry
     return telemetry.mission_id, telemetry.reached
 
 
 def test_progress_rises_and_belongs_to_the_mission_started_last():
-    talk = Talk()
-    talk.hello(b"cloud")
+    talk = Bare(ring(), flies=True)
+    talk.hello("cloud")
     for expected, request, number, fields in (
         ((0, 0), Request.PROGRESS, 0, {"mission_id": ID, "reached": 3}),
         ((ID, 0), Request.START, 1, {"mission_id": ID}),
@@ -46,8 +43,8 @@ def test_progress_rises_and_belongs_to_the_mission_started_last():
         ((ID, 2), Request.START, 3, {"mission_id": ID}),  # the same mission continues
     ):
         assert ask(talk, request, number, **fields) == expected
-    talk.wait(talk.now_ns + 2_000 * MS)  # the first cloud is not fresh any more
-    talk.hello(b"another cloud")
+    talk.wait(2_000)  # the first cloud is not fresh any more
+    talk.hello("another")
     assert ask(talk, Request.END, 1) == (ID, 2)
     assert ask(talk, Request.START, 2, mission_id=ID + 1) == (ID + 1, 0)
     ask(talk, Request.PROGRESS, mission_id=ID + 1, reached=2)

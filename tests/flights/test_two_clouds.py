@@ -7,85 +7,78 @@ from itertools import product
 
 import pytest
 
+from cloudrc.records import Arrival
 from cloudrc.tunnel.codec import Kind
 from tests.flights.conftest import Bare, ring
 
-Figure = Callable[..., None]
 
-
-def a_session(name="a", bare=None):
-    bare = bare or Bare(ring())
-    bare.send(bare.cloud(name).hello())
+@pytest.fixture
+def bare():
+    """Provide a world with a session of the cloud "a"."""
+    bare = Bare(ring())
+    bare.hello("a")
     return bare
 
 
-def test_a_hello_brings_a_session_in_two_round_trips():
-    bare = a_session()
-    assert bare.cloud("a").heard == ["CHALLENGE", "ACCEPT"]
-    assert bare.cloud("a").session.epoch == bare.world._session.epoch == 1
+def test_a_hello_brings_a_session_in_two_round_trips(bare):
+    assert bare.speaker.heard == ["CHALLENGE", "ACCEPT"]
+    assert bare.speaker.session.epoch == bare.world.epoch == 1
 
 
 @pytest.mark.promise("one-cloud-flies")
 @pytest.mark.parametrize("alive", [True, False])
-def test_the_incumbent_keeps_authority_while_it_is_heard(alive):
-    bare = a_session()
-    cloud = bare.cloud("a")
+def test_the_incumbent_keeps_authority_while_it_is_heard(bare, alive):
+    cloud = bare.speaker
     for _ in range(20):
         bare.wait(200)
         bare.send(cloud.session.seal(Kind.ALIVE, b"") if alive else cloud.command(bare.now_ns))
-        bare.send(bare.cloud("b").hello())
-    assert bare.cloud("b").session.epoch == 0
+        assert bare.hello("b") == 0
     assert "BUSY" in bare.cloud("b").heard
     assert bare.world._counts["busy"] == 20
-    assert bare.world._session.epoch == 1
+    assert bare.world.epoch == 1
 
 
 @pytest.mark.parametrize(
     ("heard", "silence", "epoch"),
     [(True, 250, 1), (True, 251, 2), (False, 1000, 1), (False, 1001, 2)],
 )
-def test_a_silent_incumbent_loses_authority(heard, silence, epoch):
+def test_a_silent_incumbent_loses_authority(bare, heard, silence, epoch):
     """At the age limit; a new session has one second to be heard."""
-    bare = a_session()
     if heard:
-        bare.send(bare.cloud("a").command())
+        bare.send(bare.command())
     bare.wait(silence)
-    bare.send(bare.cloud("b").hello())
-    assert bare.world._session.epoch == epoch
+    bare.hello("b")
+    assert bare.world.epoch == epoch
 
 
-def test_repeated_datagrams_do_not_keep_authority():
-    bare = a_session()
-    cloud = bare.cloud("a")
+def test_repeated_datagrams_do_not_keep_authority(bare):
+    cloud = bare.speaker
     captured = [cloud.session.seal(Kind.ALIVE, b""), cloud.command(), cloud.start(0)]
     for wait in (200, 100):
         for data in captured:
             bare.send(data)
         bare.wait(wait)
-    bare.send(bare.cloud("b").hello())
-    assert bare.world._session.epoch == 2
+    assert bare.hello("b") == 2
 
 
-def test_a_cloud_regains_authority_but_its_old_hello_does_not():
-    bare = a_session()
+def test_a_cloud_regains_authority_but_its_old_hello_does_not(bare):
     captured = list(bare.sent)
     bare.wait(1100)
-    a_session("b", bare)
+    bare.hello("b")
     for wait in (1100, 5000):  # b is silent; at first the cookie is still valid
         bare.wait(wait)
         for data in captured:
             bare.world.receive_datagram(data, bare.now_ns)
-        assert bare.world._session.epoch == 2
-    bare.send(bare.cloud("a").hello())
-    assert bare.cloud("a").session.epoch == bare.world._session.epoch == 3
+        assert bare.world.epoch == 2
+    assert bare.hello("a") == bare.world.epoch == 3
 
 
-def test_hellos_that_waited_through_a_stall_are_not_answered():
-    bare = a_session()
+def test_hellos_that_waited_through_a_stall_are_not_answered(bare):
+    hellos = bare.world.counts["hello"]
     bare.now_ns += 5_000_000_000
-    outcome = bare.outcome(bare.cloud("b").hello())
-    assert outcome["stale"] == 1
-    assert "hello" not in outcome
+    bare.hello("b")
+    assert bare.world.counts["stale"] == 1
+    assert bare.world.counts["hello"] == hellos
 
 
 ACTIONS: dict[str, Callable[[Bare], object]] = {
@@ -104,14 +97,14 @@ def act(bare, name):
     if cloud.session.epoch:
         bare.send(cloud.command(bare.now_ns))
         bare.sent.append(cloud.command(bare.now_ns))  # the link delays it until the replay
-    if cloud.session.epoch != bare.world._session.epoch or not cloud.session.epoch:
+    if cloud.session.epoch != bare.world.epoch or not cloud.session.epoch:
         bare.send(cloud.hello())
 
 
 def spawn(bare):
     """Let the cloud with the session start a mission from the spawn."""
     for cloud in bare.clouds.values():
-        if cloud.session.epoch == bare.world._session.epoch != 0:
+        if cloud.session.epoch == bare.world.epoch != 0:
             bare.send(cloud.start(bare.world._orders.number + 1))
 
 
@@ -119,13 +112,13 @@ def explore(actions, depth, first=()):
     """Play all interleavings: applied counters rise, and an epoch belongs to one cloud."""
     played = 0
     for rest in product(actions, repeat=depth):
-        bare, applied, owner = Bare(ring()), [], {}
+        bare, owner = Bare(ring()), {}
         for name in (*first, *rest):
             ACTIONS[name](bare)
-            applied += bare.used()
             for cloud in bare.clouds.values():
                 if cloud.session.epoch:
                     assert owner.setdefault(cloud.session.epoch, cloud) is cloud, first + rest
+        applied = [(r.epoch, r.counter) for r in bare.take(Arrival) if r.used]
         assert applied == sorted(set(applied)), first + rest
         played += 1
     return played

@@ -39,7 +39,7 @@ PLAN = Plan((Leg(A, yaw=0.3), Leg(B, tolerance=0.2, dwell=0.0), Leg(C)))
 
 
 class Flight:
-    """Teleop, the robot that it steers, and everything that it has said."""
+    """Teleop, its robot, and all outputs of teleop."""
 
     def __init__(self):
         self.teleop = Teleop()
@@ -189,7 +189,7 @@ class Disk(sqlite3.Connection):
 
 
 class ServiceFlight(Flight):
-    """A flight with a service in the machine's place, which may be restarted."""
+    """Flight with a `MissionService` in place of `Teleop`; the service can be restarted."""
 
     def __init__(self, scene=None):
         super().__init__()
@@ -198,12 +198,12 @@ class ServiceFlight(Flight):
         self.restart_teleop()
 
     def restart_teleop(self, image=None):
-        """A new process, that has nothing but what is on the disk, or was at a commit."""
+        """Start a new service with the missions on the disk, or in an `image` of the disk."""
         self.killed_before = self.killed_after = None  # number of a commit
         self.teleop = MissionService(0.25, self.stored(image), self.scene)
 
     def stored(self, image=None):
-        """What another process reads from the disk."""
+        """Return the store that a new process reads from the disk, or from an image."""
         disk = store.connect(None, Disk)
         disk.flight = self
         if image is None and self.images:
@@ -297,7 +297,7 @@ def asked(flight, since=0):
 
 
 DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-"""Never by a proxy: `urlopen` keeps the one that was named when a process first called it."""
+"""Opener without a proxy: `urlopen` keeps the proxy that the environment named at first."""
 LIMIT = 5.0
 OPERATOR, READER = "operator-token-of-the-tests", "reader-token-of-the-tests"
 
@@ -371,12 +371,12 @@ class Running:
         return urllib.request.Request(self.url + path, data, headers, method=method)
 
     def post(self, path, body=b"", token=OPERATOR):
-        """Status and answer, whatever it is; `body` may be bytes."""
+        """Return the status and the answer of a POST; `body` may be bytes."""
         data = body if isinstance(body, bytes) else json.dumps(body).encode()
         return self.send(self.request(path, data, token, "POST"))
 
     def post_local(self, path, body=None):
-        """Over the socket file."""
+        """Post over the socket file."""
         return Api(self.url).post(path, body)
 
     def send(self, request):
@@ -388,7 +388,7 @@ class Running:
             return answer.status, json.loads(answer.read() or "null")
 
     def audited(self):
-        """What the audit log has, once every request is done with; nothing is served after."""
+        """Stop the server, and return the lines of the audit log."""
         self.server.stop()
         self.server.stop = lambda: None
         return [json.loads(line) for line in self.audit_file.read_text().splitlines()]

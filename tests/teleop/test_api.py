@@ -117,9 +117,10 @@ def test_requests_and_refusals_become_metrics(api):
 # Events
 
 
-def read_events(api, count, after=0):
+def read_events(api, count, after=0, last=0):
     events, numbers = [], []
-    with DIRECT.open(api.request(f"/v1/events?after={after}"), timeout=5.0) as stream:
+    request = api.request(f"/v1/events?after={after}", headers={"Last-Event-ID": str(last)})
+    with DIRECT.open(request, timeout=5.0) as stream:
         for line in stream:
             key, _, value = line.decode().strip().partition(": ")
             if key == "id":
@@ -141,6 +142,7 @@ def test_events_are_streamed_and_resumed_where_one_left(api):
     assert numbers == [event["id"] for event in events] == [1, 2, 3, 4, 5, 6]
     assert [event["event"] for event in events[:2]] == ["starting", "started"]
     assert read_events(api, 2, after=4)[0] == [5, 6]
+    assert read_events(api, 1, after=4, last=5)[0] == [6]
     assert read_events(api, 1, after=999)[0] == [1]  # of a journal that is gone
     for after in ("rubbish", "-1", "9" * 16):
         assert api.send(api.request(f"/v1/events?after={after}"))[0] == 422

@@ -1,9 +1,11 @@
 """Who may do what, the gate before the API, and the log of who commanded what."""
 
+import errno
 import json
 import os
 import stat
 import subprocess
+from unittest.mock import Mock
 
 import pytest
 
@@ -85,7 +87,7 @@ def test_a_token_file_that_others_can_read_is_warned_of(tmp_path, monkeypatch, m
     assert warnings == (expected if told else [])
 
 
-def test_a_changed_token_file_counts_at_once():
+def test_a_changed_token_file_counts_at_once(monkeypatch):
     with running() as api:
 
         def role(token):
@@ -99,7 +101,10 @@ def test_a_changed_token_file_counts_at_once():
         api.until(lambda: role(READER) == 401)
         api.token_file.write_text("short")  # an unusable file admits nobody
         api.until(lambda: role(ANOTHER) == 401)
-        api.token_file.write_text(OPERATOR)
+        with monkeypatch.context() as patch:  # without a free file descriptor
+            patch.setattr(auth, "read", Mock(side_effect=OSError(errno.EMFILE, "no descriptor")))
+            api.token_file.write_text(OPERATOR)
+            assert role(OPERATOR) == 401
         api.until(lambda: role(OPERATOR) == 200)
 
 

@@ -103,6 +103,8 @@ and to the end: create 0.05 A away restart 0.05 B C -> reached=0,1,2 failure= st
 it continues before take-off: create 0.05 A GROUND mark restart see 0.3 -> states=flying asked=START
 with a full disk the robot remembers: create 0.05 A full B 0.1 restart free away C 0.1
   -> states=done reached=0,1,2 failure=
+a flight never stored is not flown again: mute create full link 0.1 A B C 0.2 free restart mark 1
+  -> states=failed failure=end_lost asked=END guard=HOLD reached=
 nor is an end that the robot knows lost: create 0.05 A full B C 0.3 restart free away 0.3
   -> states=done reached=0,1,2 last=done
 nor does it fly before that: create 0.05 A full B C 0.3 mute restart free away 0.1
@@ -111,6 +113,8 @@ nor is a held place left for it: create 0.05 A hold full resume B 0.3 restart fr
   -> states=held setpoint=away:-1 reached=0,1
 nor a robot taken that flies another mission: create 0.05 A TRACK foreign mark restart 0.3
   -> failure=taken_over asked=
+nor does it fly back to a waypoint that the robot knows: create 0.05 full A B mark restart free 0.1
+  -> states=flying led=-1,2
 it never flies back: create 0.05 A full B 0.1 mute restart free away -> states=flying waypoint=2
 a lost cancel is not flown again: create 0.05 A full cancel 0.3 free mark restart away 1.0
   -> failure=end_lost guard=HOLD asked=END
@@ -121,7 +125,8 @@ an unstarted mission starts in a new world: 0.01 mute create 0.2 world restart l
   -> states=flying reached=
 the next one begins anew: create 0.05 A queue restart 0.05 B C 0.3
   -> states=done,flying started=2
-held stays held: create 0.05 A hold restart due restart away -> states=held setpoint=away:-1
+held stays held: create 0.05 A hold mark restart due restart away
+  -> states=held setpoint=away:-1 led=-1
 and is resumed: create 0.05 A hold restart away 0.05 resume 0.01 -> states=flying waypoint=1
 time goes on: create 0.05 A away 10 B deaf restart 50 -> failure=timed_out
 what waits waits until the robot is seen: create 0.05 A queue LAND away 0.2 restart due 0.2
@@ -150,6 +155,19 @@ a stop on its way forbids to start: create 0.05 queue mute stop 0.2 !queue !goto
 until it is acknowledged: create 0.05 queue stop 0.3 !queue ack 0.5 !ack -> states=failed,flying
 a landing has to be acknowledged, too: create 0.05 LAND 0.05 !create !goto ack 0.3 create 0.1
   -> states=failed,flying
+a stop that was not heard is repeated: create 0.05 A mute stop 0.2 cloud restart !queue link 0.3
+  -> guard=ESTOP failure=emergency_stopped
+also if it is acknowledged before: create 0.05 A mute restart stop 0.2 cloud restart ack link 0.5
+  -> guard=ESTOP last=emergency_stopped
+not after an acknowledgement: create 0.05 A stop 0.2 ack 0.2 mark restart 0.5
+  -> guard=HOLD asked=END
+not after another flight: create 0.05 A stop 0.2 ack 0.2 create 0.2 mark restart 0.5
+  -> states=failed,flying asked=START
+not in another world: create 0.05 A stop 0.2 world mark restart 0.5 -> guard=GROUND asked=
+not of another mission: create 0.05 A stop 0.2 TRACK foreign mark restart 0.5
+  -> guard=TRACK asked=
+unless the new teleop has sent one: create 0.05 A mute stop cloud restart stop ack link 0.5
+  -> guard=GROUND settled=True
 a stop before telemetry stops any flight: create 0.05 A TRACK foreign restart stop 0.2
   -> guard=ESTOP failure=emergency_stopped
 a stop after an acknowledgement counts: create 0.05 A stop ack stop 0.3
@@ -180,7 +198,7 @@ def place(setpoint):
 
 
 def outcome(flight):
-    """Describe in words where a flight has come to."""
+    """Describe the state of a flight in words."""
     missions = list(flight.teleop.book.missions.values())
     requests = [said for said in flight.said[flight.mark :] if hasattr(said, "request")]
     names = flight.names("m1") if missions else []
@@ -193,6 +211,7 @@ def outcome(flight):
         "asked": sorted({said.request.name for said in requests} - {"PROGRESS"}),
         "setpoint": [f"{place(flight.setpoints[-1])}:{flight.setpoints[-1].waypoint}"],
         "waypoint": [str(flight.setpoints[-1].waypoint)],
+        "led": sorted({str(s.waypoint) for s in flight.said[flight.mark :] if type(s) is Setpoint}),
         "onboard": [str(flight.onboard[1])],
         "last": names[-1:],
         "started": [str(sum(mission.happened["started"] for mission in missions))],
@@ -338,7 +357,7 @@ def test_the_robot_is_told_of_every_waypoint_reached_until_it_knows():
 
 
 def test_a_restart_with_the_same_options_continues_the_mission():
-    flight, flags = ServiceFlight(), Namespace(start=True, mission=None, api=None)
+    flight, flags = ServiceFlight(), Namespace(start=True, api=None)
     flight.step()
     for _ in range(2):
         assert _start(flags, load_experiment("hover"), flight.teleop)

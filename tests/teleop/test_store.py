@@ -54,6 +54,7 @@ def test_missions_are_read_back_exactly(path):
     mission = begun(path)
     store = open_store(path, b"other")
     assert store.missions == {"m1": mission}
+    assert store.missions["m1"].events.maxlen == SHOWN
     assert [event["event"] for event in store.events_after(0)] == ["starting", "reached"]
     assert store.add(ORDER).number != mission.number
     assert (path.stat().st_mode & 0o777, store.notice) == (0o600, "")
@@ -246,27 +247,29 @@ def test_missions_are_found_by_id_number_and_key():
     assert (store.find(first.id), store.with_key("key"), store.with_key("")) == (first, first, None)
 
 
-def test_what_is_over_is_known_by_its_number():
+def test_what_is_over_and_what_was_stopped_is_known():
     store = MissionStore(connect(), b"")
     first, second, third = (store.add(Order(PLAN, queue=True)) for _ in range(3))
     store.note(third, "cancelled", "")
+    assert store.stopped() is None
+    store.note(first, "started", "")
     store.note(first, "emergency_stopped", "")
+    for _ in range(SHOWN):
+        store.note(first, "new_session", "")
+    assert store.stopped() is first, "those after it have not begun, and its event is not kept"
     assert [mission.id for mission in store.open()] == ["m2"]
     ended = [store.has_ended(mission.number) for mission in (first, second, third)]
     assert ended == [True, False, True]
     assert not store.has_ended(1)
-
-
-def finish(flight):
-    for point in (B, C):
-        flight.step(position=point, seconds=0.1)
+    store.note(second, "started", "")
+    assert store.stopped() is None, "the robot has flown since"
 
 
 def test_a_full_disk_stops_no_flight_and_is_told_once():
     flight, mission_id = service_flying()
     before = flight.kept
     flight.full = True
-    finish(flight)
+    play(flight, "B C")
     assert (flight.view(mission_id)["state"], flight.kept) == ("done", before)
     tried = flight.commits
     flight.step(seconds=3.0)
@@ -285,7 +288,7 @@ def test_a_full_disk_stops_no_flight_and_is_told_once():
 def test_what_was_refused_is_stored_with_the_next_mission():
     flight, mission_id = service_flying()
     flight.full = True
-    finish(flight)
+    play(flight, "B C")
     flight.full = False
     second = flight.create()
     flight.restart_teleop()

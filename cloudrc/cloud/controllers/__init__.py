@@ -30,7 +30,7 @@ class ControlOutput(NamedTuple):
 
 
 class Controller:
-    """Track a setpoint."""
+    """Computes the velocity commands that lead the robot to a setpoint."""
 
     def reset(self) -> None:
         """Reset the controller at the start of a session or mission."""

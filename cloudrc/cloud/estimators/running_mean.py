@@ -11,14 +11,14 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 
 
 class RunningMean(Estimator):
-    """Mean of all loop delays since the session began.
+    """Mean of the loop delays since the session began.
 
-    The mean is slow by design: after 60 s it needs another 60 s to follow half of a step of the
-    delay.
+    If every delay counts equally, the mean is slow: after 60 s it needs another 60 s to follow half
+    of a step of the delay. A `count_max` makes the mean follow faster.
     """
 
     def __init__(self, count_max: float = inf) -> None:
-        """Keep the gain at 1/count_max after `count_max` samples [1]; the default sets no end."""
+        """Set the number of samples after which the gain stays at 1/count_max [1]."""
         self._count_max, self._count, self._mean = count_max, 0, 0.0
 
     def update(self, sample: DelaySample) -> None:

@@ -18,7 +18,7 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 
 
 class Split(Estimator):
-    """Exact age of the newest odometry, plus an exponential average of `applied_minus_stamp`."""
+    """Adds the exact age of the newest odometry and the average of `applied_minus_stamp`."""
 
     def __init__(self, gain: float) -> None:
         """Set the weight of a new sample of the downlink, `gain` [1]."""

@@ -14,7 +14,7 @@ from cloudrc.messages import ZERO, Odometry, Vector
 
 
 class ConstantAcceleration(Predictor):
-    """Measured velocity plus the acceleration between the ends of a short window."""
+    """Predicts with the measured velocity and the mean acceleration in a short window."""
 
     def __init__(self, window: float) -> None:
         """Set `window`, the longest time between the two compared velocities [s]."""

@@ -21,16 +21,16 @@ from cloudrc.world.endpoint import WorldEndpoint
 Make: TypeAlias = Callable[[bytes], Iterable[bytes]]
 """Makes the hostile datagrams that arrive at an end before an honest one."""
 REFUSED = ("tag", "malformed", "version", "direction", "old_epoch", "repeated")
-"""Counts of refused datagrams."""
+"""Counters of an end for datagrams that it refuses."""
 GREETED = ("hello", "unanswered", "accept_ignored")
-"""Counts of captured greetings; a challenge is the only answer."""
+"""Counters of an end for captured greetings, which it answers with a challenge at most."""
 FLOOD = 100  # datagrams of garbage per honest one: 10,000 in a second
 SETTLED = 2.0
-"""Time at which a new flight has its session [s]; an answered greeting could open it earlier."""
+"""Time at which a new flight has its session [s], so that an old greeting opens none."""
 
 
 class HostileSender:
-    """Hands over hostile datagrams; counts them, and those `taken`: they had an effect."""
+    """Sends hostile datagrams; counts them as `sent`, and as `taken` if they had an effect."""
 
     def __init__(self) -> None:
         self.sent = self.taken = 0
@@ -62,8 +62,8 @@ def _check_no_effect(
 ) -> None:
     """Fly with hostile datagrams beside the honest ones; the flight must be the same.
 
-    `makes` make those to world, and perhaps to cloud, from `since` on [s]; the counts `refusals` of
-    world have to rise.
+    From `since` on [s], the first of `makes` makes the datagrams to world, the second those to
+    cloud. World's counters `refusals` have to rise.
     """
     sender, clean, flight = HostileSender(), Flight(seed=seed).fly_mission(), Flight(seed=seed)
 
@@ -117,7 +117,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
     expects="no effect: the same path, bit by bit",
 )
 def _flood(outcome: Outcome, seed: int) -> None:
-    """Send noise; a right head before noise that is too short; one before as much as it takes."""
+    """Send noise alone, and noise after a valid header: too short, and of the right length."""
     rng = generator(seed, 20)
 
     def garbage(data: bytes) -> Iterable[bytes]:

@@ -155,12 +155,8 @@ def _bursts(outcome: Outcome, seed: int) -> None:
             measures.done(outcome, flight)
         outcome.true("the mission has ended", flight.mission.ended)
         # Most bursts do nothing: the fault is the first one that is too long.
-        moves(
-            outcome,
-            flight,
-            HOLDS,
-            since=measures.first_into(flight, GuardState.HOLD) - measures.AGE_MAX,
-        )
+        since = measures.first_into(flight, GuardState.HOLD) - measures.AGE_MAX
+        moves(outcome, flight, HOLDS, since=since)
         text, busiest = f"bursts of {packets * 10} ms", measures.busiest_second(flight.changes)
         outcome.most(f"{text}: changes of the guard in any second", busiest, 2)
         told, held = measures.number(flight, "hold_count"), len(measures.held(flight))
