@@ -108,7 +108,7 @@ def execute(options: argparse.Namespace) -> int:
 def serve_api(
     options: argparse.Namespace, experiment: ResolvedExperiment, scene: Scene
 ) -> ApiServer:
-    """Start the API, which answers "not ready" until `_fly` connects the API to the missions."""
+    """Start the API; until `_fly` adds the missions, the API answers that teleop is starting."""
     from cloudrc import assembly
     from cloudrc.link.state import publish
     from cloudrc.teleop.api import ApiServer, Bridge, create_app
