@@ -1,7 +1,7 @@
 """`cloudrc bench`: measure what the closed loop costs on this machine.
 
-The loop is compared with `mj_step` in C (`mujoco.rollout`, one thread). The parts are measured in
-turns; the fastest time of each part counts.
+The reference is the same physics alone: `mj_step` in C (`mujoco.rollout`, one thread). The flights
+and the reference are measured in turns, and the fastest time of each counts.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 STEP = 0.002
 """Step of the physics [s]."""
 LIMIT_NS = 120_000_000_000
-"""Time limit of a flight [ns]."""
+"""Time limit of a measured flight, in its virtual time [ns]."""
 EPILOG = """\
 'raw mj_step' replays the thrusts and the drag of the same flight in C and must
 end in the same bits. Close other programs before you compare two machines; the
@@ -39,7 +39,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Measure and print."""
+    """Measure the closed loop and the raw physics; print the processor time of both."""
     require("the bench", ("world",))
     from cloudrc.config.load import load_experiment
 
@@ -62,7 +62,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _measure(experiment: ResolvedExperiment, repeats: int) -> dict[str, float]:
-    """Measure flights and the replay in turns: processor time per physics step [s], by part."""
+    """Return the least processor time per physics step [s] of each measured part, by its name."""
     from cloudrc.record.hash import RecordHash
 
     replay = _replay(experiment)
@@ -83,7 +83,10 @@ def _measure(experiment: ResolvedExperiment, repeats: int) -> dict[str, float]:
 
 
 def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
-    """Fly once, record the controls, and return the function that replays them."""
+    """Fly once and record the inputs of the physics; return a function that replays these inputs.
+
+    The returned function returns its number of physics steps.
+    """
     import numpy as np
 
     from cloudrc.cli.run import assemble
@@ -106,7 +109,10 @@ def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
 def _flight(
     experiment: ResolvedExperiment, keep: Callable[[list[Record]], object]
 ) -> Callable[[], int]:
-    """Prepare a flight whose records go to `keep`; return the function that flies it."""
+    """Prepare a flight whose records go to `keep`; return a function that flies.
+
+    The returned function returns its number of physics steps.
+    """
     from cloudrc.cli.run import assemble
 
     _, cloud, run = assemble(experiment)

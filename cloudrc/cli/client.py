@@ -1,7 +1,7 @@
 """Call teleop's API over HTTP, at http://HOST:PORT with a token, or at unix:PATH.
 
-PATH is a socket file that only its owner can open. The token comes from a file, so that it appears
-neither in the list of processes nor in a shell's history.
+PATH is a socket file that only its owner can open. The token comes from a file, so that the token
+appears neither in the list of processes nor in a shell's history.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ STREAM_TIMEOUT = 30.0
 """Longest silence of an event stream before the client gives up [s]; the API sends an event or a
 comment every 10 s."""
 RETRY_STATUSES = (408, 429, 502, 503, 504)
-"""HTTP status codes that mean: a later attempt may succeed."""
+"""HTTP status codes after which a later attempt may succeed."""
 UNIX = "unix:"
 VARIABLE = "CLOUDRC_TOKEN_FILE"
 _TOKEN = re.compile(rb"[!-~]{16,512}")
@@ -60,22 +60,24 @@ class Api:
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH") from None
 
     def get(self, path: str) -> Any:
-        """Send a GET request; raise the same errors as `post`."""
+        """Send a GET request; return and raise the same as `post`."""
         with self._answer("GET", path, None, REQUEST_TIMEOUT) as answer:
             return json.loads(answer.read())
 
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
-        """Send a POST request.
+        """Send a POST request; return the decoded JSON of the answer.
 
-        An UnreachableError says that there is no answer, or that teleop is not ready or busy. A
-        BadInputError says that a value is invalid, an ApiError that the API refuses the request.
+        Raises:
+            UnreachableError: If there is no answer, or if teleop is busy or not ready yet.
+            BadInputError: If a value is invalid.
+            ApiError: If the API refuses the request for another reason.
         """
         data = b"" if body is None else json.dumps(body).encode()
         with self._answer("POST", path, data, REQUEST_TIMEOUT) as answer:
             return json.loads(answer.read())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
-        """Yield the events after number `after` as they happen, until teleop ends."""
+        """Yield missions' events with an id above `after` as they happen, until teleop ends."""
         with self._answer("GET", f"/v1/events?after={after}", None, STREAM_TIMEOUT) as stream:
             for line in stream:
                 if line.startswith(b"data: "):
@@ -85,7 +87,10 @@ class Api:
     def _answer(
         self, method: str, path: str, body: bytes | None, limit: float
     ) -> Iterator[http.client.HTTPResponse]:
-        """Send a request and yield the answer; raise an error if the answer is a refusal."""
+        """Send a request and yield the answer; raise an error if the status is not 2xx.
+
+        `limit` is the longest wait for the server [s].
+        """
         headers, token = {"Content-Type": "application/json"}, self._token()
         if token:
             headers["Authorization"] = f"Bearer {token}"
@@ -101,7 +106,7 @@ class Api:
                 raise UnreachableError(f"the API at {self.url} does not answer ({why})") from None
 
     def _connection(self, limit: float) -> http.client.HTTPConnection:
-        """Make a connection; use no proxy, because the API is on this machine or in the cluster."""
+        """Make a connection without a proxy: the API is on this machine or in the cluster."""
         if self.url.startswith(UNIX):
             return _UnixConnection(self.url.removeprefix(UNIX), limit)
         parts = urlsplit(self.url)
@@ -164,7 +169,7 @@ def token_file(options: argparse.Namespace) -> Path | None:
 
 
 def token_reader(path: Path | None) -> Callable[[], str]:
-    """Make a function that reads the token from its file at each call; "" without a file.
+    """Return a function that reads the token anew at each call, or returns "" if `path` is None.
 
     Warn at once if other users can read the file.
     """

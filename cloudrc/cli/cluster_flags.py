@@ -1,4 +1,4 @@
-"""The flags that name a release in a cluster."""
+"""The flags that name a release of the chart in a Kubernetes cluster."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def timeout_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def release_from_flags(options: argparse.Namespace) -> Release:
-    """Return the release that the flags name.
+    """Return the release that the flags name, or the default release of the current context.
 
     Raises:
         MissingPrerequisiteError: If the Kubernetes client or a kubeconfig is missing.

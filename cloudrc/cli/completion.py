@@ -1,6 +1,7 @@
-"""`cloudrc completion SHELL`: print a static script, so that Tab starts no Python.
+"""`cloudrc completion SHELL`: print a script that completes command lines on the Tab key.
 
-The script knows the commands, their options, and the names that this installation ships.
+The script contains the commands, their options, and the names that this installation ships. Thus
+the Tab key does not start Python.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Print the script."""
+    """Print the completion script for the given shell."""
     if importlib.util.find_spec("shtab") is None:
         raise MissingPrerequisiteError(
             "completion needs shtab, which is not installed; run: pip install shtab"
@@ -75,7 +76,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _settings() -> Iterator[str]:
-    """Yield the completions of `--set`: KEY=, or KEY=NAME for a key whose value is a known name."""
+    """Yield what completes `--set`: KEY=, or KEY=NAME for each name that a key accepts."""
     from cloudrc import plugins
     from cloudrc.config import problems, shipped
     from cloudrc.config.overrides import KINDS
@@ -103,7 +104,10 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 
 
 def _candidates(name: str, words: Sequence[str], *, files: bool = False) -> dict[str, Any]:
-    """Write completion candidates for shtab, in the syntax of each shell."""
+    """Return code for shtab that completes one of `words`, in the syntax of each shell.
+
+    `name` distinguishes the shell functions. With `files`, paths are completed too.
+    """
     function, joined = f"_cloudrc_{name}", " ".join(words)
     bash = zsh = fish = ""
     if files:

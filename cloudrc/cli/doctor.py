@@ -1,4 +1,4 @@
-"""`cloudrc doctor`: check whether flights work on this machine; explain how to fix problems."""
+"""`cloudrc doctor`: check whether this machine can fly; print how to fix each problem."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ PROGRAMS = {
     "docker": (f"{HELPFUL}https://docs.docker.com/engine/install", ()),
     "kind": (f"{HELPFUL}https://kind.sigs.k8s.io", ()),
 }
-"""Program -> its installation page, and the modes that need it. Docker and kind make a cluster on
-this machine; a remote cluster needs neither."""
+"""Program -> its installation page, and the modes that need the program. Docker and kind make a
+cluster on this machine; a remote cluster needs neither."""
 MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 LATE_SLEEP = 2e-3
-"""Largest lateness that a control loop with a period of 10 ms tolerates [s]; on an idle desktop the
-lateness is far smaller."""
+"""Largest lateness of a sleep at which real-time flights still work [s]. The control loop has a
+period of 10 ms; an idle desktop stays far below this limit."""
 MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
     "mujoco.mj_step(m, mujoco.MjData(m))"
@@ -40,9 +40,9 @@ COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 
 
 class Check(NamedTuple):
-    """The result of one check: what it has found, and what the user should do.
+    """The result of one check: the text `found`, and the advice `fix`.
 
-    If `state` is "missing", the modes in `modes` cannot run. If it is "warn", flights work.
+    If `state` is "missing", the modes in `modes` cannot run. If `state` is "warn", they can.
     """
 
     name: str
@@ -53,14 +53,14 @@ class Check(NamedTuple):
 
 
 def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = ()) -> Check:
-    """Make a check; if it is not `ok`, the modes in `modes` cannot run."""
+    """Make the result of a check; a failed check blocks the given modes, or warns without modes."""
     if ok:
         return Check(name, "ok", found, "", modes)
     return Check(name, "missing" if modes else "warn", found[:120], fix, modes)
 
 
 def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Check]:
-    """Run every check, in the order of display; only mode "cluster" contacts a cluster."""
+    """Yield the results in the order of display; contact a cluster only in mode "cluster"."""
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
     yield mujoco_steps()
@@ -75,7 +75,7 @@ def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Chec
 
 
 def packages(extra: str) -> Check:
-    """Check the packages of one extra."""
+    """Check whether the packages of one extra, such as "world", are installed."""
     name, modes = f"extra {extra}", tuple(mode for mode, needs in MODES.items() if extra in needs)
     if absent := missing(extra):
         fix = f"pip install 'cloudrc[{extra}]'"
@@ -94,7 +94,7 @@ def mujoco_steps() -> Check:
 
 
 def udp_loopback() -> Check:
-    """Send a datagram over 127.0.0.1."""
+    """Check whether a datagram that is sent to 127.0.0.1 arrives."""
     fix = "allow UDP on 127.0.0.1 (a sandbox or a firewall blocks it)"
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as loopback:
@@ -108,7 +108,7 @@ def udp_loopback() -> Check:
 
 
 def timer(rounds: int = 100) -> Check:
-    """Measure how late a sleep of 1 ms ends."""
+    """Measure how late `rounds` sleeps of 1 ms end."""
     late = []
     for _ in range(rounds):
         start = time.monotonic()
@@ -120,7 +120,6 @@ def timer(rounds: int = 100) -> Check:
 
 
 def _cores() -> Check:
-    """Compare the machine's load with the number of cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
     count, load = len(affinity(0)) if affinity else os.cpu_count() or 1, os.getloadavg()[0]
     fix = "real time needs two cores without other load: close programs, or use --mode virtual"
@@ -128,7 +127,7 @@ def _cores() -> Check:
 
 
 def _cluster(context: str | None) -> Iterator[Check]:
-    """Check the kubeconfig, and check whether its cluster answers and is new enough."""
+    """Check the kubeconfig, and whether the cluster answers and is new enough for the chart."""
     from cloudrc.cluster.client import OLDEST, connect, server_version
 
     name = "kubeconfig"

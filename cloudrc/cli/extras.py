@@ -1,4 +1,4 @@
-"""The optional dependencies, the modes that need them, and how to install them."""
+"""The optional dependencies, the modes that need them, and how to install missing ones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "kube": ("kubernetes",),
     "api": ("fastapi", "uvicorn"),
 }
-"""Extra of pyproject.toml -> its modules; the distributions have the same names."""
+"""Extra in pyproject.toml -> its modules; their packages on PyPI have the same names."""
 MODES: dict[str, tuple[str, ...]] = {
     "local": ("world", "record", "report"),
     "virtual": ("world", "record", "report"),
@@ -29,7 +29,10 @@ def missing(extra: str) -> list[str]:
 
 
 def require(purpose: str, extras: Iterable[str]) -> None:
-    """Check that extras are installed, for a purpose such as "mode virtual"."""
+    """Raise a MissingPrerequisiteError unless all `extras` are installed.
+
+    `purpose`, such as "mode virtual", is for the error text.
+    """
     absent = {extra: found for extra in extras if (found := missing(extra))}
     if absent:
         modules = ", ".join(module for names in absent.values() for module in names)

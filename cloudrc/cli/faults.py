@@ -32,7 +32,7 @@ examples:
 exit codes: 0 all checks passed, 1 a check failed, 2 bad input,
   6 a worker was killed, 130 interrupted"""
 SEED_MAX = 2**53 - 1 - COUNT_MAX
-"""Largest first seed: the seeds counted from it must stay below 2^53."""
+"""Largest seed that is accepted; a search that counts up from this seed stays below 2^53."""
 MINUTES_MAX = 10_000.0
 """Longest search [min]: a week."""
 ACTIONS = {
@@ -99,10 +99,7 @@ def _folder(text: str) -> Path:
 JOBS = (read_count, 1, "J", "number of parallel processes, at most one per core (default: 1)")
 STORED = f"folder for failing schedules, after reduction (default: ./{STORE})"
 OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
-    "run": {
-        "--seed": (_seed, 1, "N", "seed (default: 1)"),
-        "--jobs": JOBS,
-    },
+    "run": {"--seed": (_seed, 1, "N", "seed (default: 1)"), "--jobs": JOBS},
     "search": {
         "--minutes": (_minutes, 1.0, "M", "duration (default: 1)"),
         "--first": (_seed, 1, "SEED", "first seed (default: 1)"),
@@ -110,7 +107,7 @@ OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
         "--store": (_folder, STORE, "DIR", STORED),
     },
 }
-"""Options of each action: how a value is read, the default, its name in the help, the help."""
+"""Options of each action: function that reads the value, default, metavar, help text."""
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -124,7 +121,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def print_faults(options: argparse.Namespace) -> int:
-    """Print the list of faults."""
+    """Print all faults with their injection and the expected reaction."""
     from cloudrc.faults.scenarios import SCENARIOS
 
     names = ("id", "name", "injects", "expects")
@@ -138,7 +135,7 @@ def print_faults(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run one fault, all, or those of a schedule's file."""
+    """Run one fault, all faults, or the faults in the file of a schedule; return the exit code."""
     from cloudrc.faults.scenarios import SCENARIOS, find
 
     if isinstance(options.name, Path):
@@ -188,7 +185,7 @@ def _print_outcome(scenario: Scenario, outcome: Outcome, briefly: bool) -> None:
 
 
 def fly_file(options: argparse.Namespace) -> int:
-    """Fly the schedule of a file; an invariant that breaks is a failed check."""
+    """Fly the schedule in a file; exit with 1 if a safety invariant breaks."""
     from cloudrc.faults.schedule import load
     from cloudrc.faults.trial import fly
 
@@ -211,7 +208,7 @@ def fly_file(options: argparse.Namespace) -> int:
 
 
 def search(options: argparse.Namespace) -> int:
-    """Search for some minutes, and say how to continue."""
+    """Fly random schedules for `--minutes`; print the failures and the command to continue."""
     from cloudrc.faults.search import Search, search_rows, search_summary
 
     kind, shown = "adversarial" if options.adversarial else "random", options.output == "table"

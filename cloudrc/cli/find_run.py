@@ -19,7 +19,7 @@ KUBECTL_PLUGIN = "kubectl-cloudrc"
 
 
 def run_argument(parser: argparse.ArgumentParser) -> None:
-    """Declare `--run`."""
+    """Declare the flag `--run`, which names a run on this machine."""
     about = "folder of a run that is flying on this machine"
     parser.add_argument("--run", type=Path, metavar="DIR", help=about)
 
@@ -30,8 +30,8 @@ def find_local_run(
     """Find the API or the link of the run of `--run`, of ./runs/latest, or of the only other run.
 
     `look` returns the API or the link of the run in a folder, or None if no run is flying there.
-    `nobody` is the error text if no run is flying in the folder of `--run`. The result is None if
-    the flags name a cluster, or if no run is flying.
+    `nobody` is the error text if no run is flying in the folder of `--run`. The function returns
+    None if the flags name a cluster, or if no run is flying on this machine.
     """
     from cloudrc.drivers.local import under_way
 
@@ -58,9 +58,10 @@ def find_local_run(
 def no_run_error(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
-    """Add to a cluster's error that no run flies here either, unless the flags name a cluster.
+    """Add to `error`, about a cluster, that no run flies on this machine either.
 
-    `flags` names, for the text, the flags that choose a local run.
+    If the flags name a cluster, return the error unchanged. `flags` lists the flags that name a
+    local run.
     """
     if options.context or options.namespace:
         return error
@@ -72,7 +73,7 @@ def no_run_error(
 def link_folder_of(run: Path) -> Path | None:
     """Return the folder that controls the relay of a run; None if the run is not flying.
 
-    The folder alone does not prove a flight, because a killed run leaves the folder behind.
+    The folder alone does not prove a flight, because it stays after a run was killed.
     """
     from cloudrc.drivers.local import LINK_FOLDER, under_way
 

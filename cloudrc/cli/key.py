@@ -34,7 +34,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Make a key, or drop the previous key."""
+    """Make or rotate a key, or remove the previous key from the file."""
     from cloudrc.drivers.keyfile import read_keys
     from cloudrc.files import write_atomically
     from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write

@@ -26,7 +26,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Print the requested kinds."""
+    """Print the names and descriptions of the requested kind, or of all kinds."""
     found = {kind: describe_all(kind) for kind in ([options.what] if options.what else KINDS)}
     if options.output == "table":
         blocks = []
@@ -44,7 +44,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def describe_all(kind: str) -> dict[str, str]:
-    """Return name -> description for all entries of a kind, sorted by name."""
+    """Return name -> description of all entries of a kind such as "profiles", sorted by name."""
     from cloudrc import plugins
     from cloudrc.config import shipped
 
@@ -65,7 +65,7 @@ def describe_all(kind: str) -> dict[str, str]:
 
 
 def _comment(kind: str, name: str) -> str:
-    """Read the first sentence of the first comment of an MJCF file."""
+    """Return the first sentence of the first comment in a robot's or scene's MuJoCo file."""
     from cloudrc.config import shipped
 
     text = (shipped.FOLDERS[kind] / f"{name}.xml").read_text("utf-8")

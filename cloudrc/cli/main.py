@@ -1,4 +1,4 @@
-"""The command `cloudrc`: run a command and report its errors in one line."""
+"""The program `cloudrc`: run one of its commands and report an error in one line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command line, by default that of this process; return the exit code."""
+    """Run the command in `arguments` (default: those of this process); return the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(given)

@@ -1,7 +1,8 @@
 """Run `cloudrc mission`: fly and steer missions, in a local run or in a cluster.
 
-Verbs go to teleop's API. In a cluster `run` makes a Kubernetes Job, whose pod posts the mission to
-that API. A command that follows a mission exits with the code of the verdict.
+Each verb is a request to the API of teleop, the process that commands missions. Only `run` in a
+cluster makes a Kubernetes Job, whose pod posts the mission to that API. A command that follows a
+mission exits with the code of the verdict.
 """
 
 from __future__ import annotations
@@ -60,16 +61,16 @@ NO_API = "no run with an API flies there; name another folder, or --api URL"
 POLL_PERIOD = 0.5
 """Pause between two polls of a mission [s]."""
 RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
-"""Longest times for which a person and a Job wait for the API to answer [s]. A Job may have to wait
-until a new cloud pod has loaded its image."""
+"""Longest times to wait for an unreachable API [s]: in a person's command, and in a Job. The pod of
+the API may first have to load its image."""
 TURN_MAX = 30.0
-"""Longest time for a request and the pause after it [s]. A longer time means that this process was
-suspended."""
+"""Longest time for a request and the pause after it [s]. If more time has passed, this process was
+suspended, and its time limit starts anew."""
 TERMINATION_LOG = Path("/dev/termination-log")
-"""File in a pod; `kubectl describe` shows its text after the container has ended."""
+"""File in a pod for its last message; `kubectl describe` shows the text after the pod has ended."""
 LIMIT_MAX = 86_400.0
-"""Time limit of the Job of a mission that has no limit [s]; teleop ends such a mission at the limit
-of the release's experiment."""
+"""Time limit of a Job whose mission has no time limit [s]. Teleop ends the mission earlier, at the
+limit of the release's experiment."""
 
 _Answer = TypeVar("_Answer")
 Json = dict[str, Any]
@@ -104,7 +105,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     output_argument(add("list", "list all missions"))
     status = add("status", "show the robot's state, or the state of a mission")
     output_argument(status)
-    status.add_argument("id", nargs="?", metavar="ID", help="mission (default: the robot)")
+    status.add_argument("id", nargs="?", metavar="ID", help="mission (default: show the robot)")
     cancel = add("cancel", "cancel a mission; the robot holds its position")
     cancel.add_argument("id", nargs="?", metavar="ID", help="mission (default: the current one)")
     logs = add("logs", "show the events of missions")
@@ -156,10 +157,12 @@ def _read(name: str) -> Document:
 
 
 def read_mission(name: str, shown: str = "") -> Json:
-    """Read a mission that cloudrc ships, or a mission file; the API checks the content.
+    """Read a mission file, or a mission that cloudrc ships; the API checks the content.
+
+    `shown` is the name for people, by default the name of the file.
 
     Raises:
-        BadInputError: If the file does not exist, or if it holds no mission.
+        BadInputError: If the file does not exist, or if it contains no mission.
     """
     mission = dict(_read(name).tree)
     if mission.pop("steps", None) is not None:
@@ -170,17 +173,16 @@ def read_mission(name: str, shown: str = "") -> Json:
 
 
 class MissionFollower:
-    """Follows one mission, also if the API restarts because the cloud pod was replaced."""
+    """Follows one mission until its verdict, also while the API restarts in a new pod."""
 
     def __init__(self, api: Api, patience: float) -> None:
-        """Store the API; it may be unreachable for `patience` [s]."""
+        """Store the API; `patience` is the longest time without an answer [s]."""
         self._api, self._patience, self._last_event = api, patience, 0
 
     def post(self, mission: Mapping[str, Any]) -> str:
-        """Wait until the API answers, and post a mission; raise the errors of `Api.post`.
+        """Wait until the API answers, and post a mission; return the mission's id.
 
-        Returns:
-            The mission's id.
+        Raise the errors of `Api.post`, but a TimedOutError if the API stays unreachable.
         """
         view = self._retry(lambda: self._api.post("/v1/missions", mission))
         print_line(f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}")
@@ -215,14 +217,14 @@ class MissionFollower:
 
 
 def describe_verdict(verdict: Mapping[str, Any]) -> str:
-    """Describe a verdict in one line."""
+    """Return the outcome of a mission and the reasons, as one line of text."""
     failures = [f"{failure['code']}: {failure['text']}" for failure in verdict["failures"]]
     reasons = "; also ".join(failures) or "every waypoint reached, every criterion met"
     return f"{verdict['outcome'].upper()}: {reasons}"
 
 
 def _fly(options: argparse.Namespace) -> int:
-    """Post a mission and follow it until its verdict; cancel it on Ctrl-C."""
+    """Post a mission and follow the mission until its verdict; cancel the mission on Ctrl-C."""
     if options.api is None:
         raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
     interrupt_on_signals()
@@ -248,7 +250,7 @@ def _fly(options: argparse.Namespace) -> int:
 
 
 def _write_termination_message(text: str) -> None:
-    """Write the termination message for Kubernetes, if this is a pod."""
+    """Write the last message of a pod for Kubernetes; do nothing outside a pod."""
     with suppress(OSError):  # Kubernetes then takes the last line of the log, which says the same
         if TERMINATION_LOG.exists():
             TERMINATION_LOG.write_text(text + "\n", encoding="utf-8")
@@ -326,7 +328,7 @@ def _logs(options: argparse.Namespace, api: Api) -> int:
 
 
 def _order(options: argparse.Namespace, api: Api) -> int:
-    """Hold, resume, or go to a point."""
+    """Send one of the requests hold, resume and goto."""
     point = None
     if options.verb == "goto":
         point = {"position_m": [options.x, options.y, options.z]}
@@ -365,7 +367,6 @@ API_VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
 
 
 def _print_state(mission: Json) -> None:
-    """Print the state of a mission in one line."""
     where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
     name = f" ({mission['name']})" if mission["name"] else ""
     verdict = f"; {describe_verdict(mission['verdict'])}" if mission["verdict"] else ""
@@ -373,7 +374,10 @@ def _print_state(mission: Json) -> None:
 
 
 def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
-    """Print what the newest telemetry tells, and the age of cloud's last message [s], if any."""
+    """Print the robot's state, and the age of cloud's last message [s].
+
+    `seen` has the values of the newest telemetry. Both arguments are None before the first message.
+    """
     heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
     if seen is None:
         print(f"no telemetry from the robot yet; is the link up? cloud heard {heard}")
@@ -415,7 +419,7 @@ def _release(options: argparse.Namespace) -> Release:
 
 @contextmanager
 def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
-    """Forward a port to a release's API while the block runs."""
+    """Make the API of a release reachable, by a forwarded port, while the block runs."""
     release, path = _release(options), token_file(options)
     from cloudrc.cluster.pods import api_url, operator_token
 

@@ -21,13 +21,13 @@ _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
 
 def output_argument(parser: argparse.ArgumentParser, what: str = "output format") -> None:
-    """Declare `--output`; `what` describes further effects of the format."""
+    """Declare the flag `--output`; `what` is its help text."""
     forms, about = ("table", "json", "yaml"), f"{what} (default: table)"
     parser.add_argument("-o", "--output", choices=forms, default="table", help=about)
 
 
 def format_document(document: object, form: str) -> str:
-    """Write plain values as "json" or "yaml"."""
+    """Return plain values as text; `form` is "json" or "yaml"."""
     text = json.dumps(document, indent=2, ensure_ascii=False)
     if form == "json":  # escaped: a terminal must not obey control characters
         return re.sub("[\x7f-\x9f]", lambda found: f"\\u{ord(found[0]):04x}", text)
@@ -60,7 +60,7 @@ def discard_output(stream: TextIO) -> None:
 
 
 def paint(text: str, colour: str) -> str:
-    """Colour a text if stdout is a terminal with colour."""
+    """Return the text with colour codes if stdout is a terminal, else unchanged."""
     if os.environ.get("NO_COLOR") or not is_live(sys.stdout):
         return text
     return f"\x1b[{_CODES[colour]}m{text}\x1b[0m"
@@ -83,9 +83,9 @@ def console(stream: TextIO) -> Console:
 
 
 def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """Align rows of equal length in columns, one line per row without trailing blanks.
+    """Align rows of equal length in columns; return one line per row.
 
-    The cells are escaped. The columns with an index in `right` are aligned right.
+    The cells are escaped. The columns whose index is in `right` are aligned right.
     """
     from rich.table import Table
     from rich.text import Text
@@ -101,17 +101,17 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
 
 
 def escape(text: str) -> str:
-    """Escape unprintable characters: the text stays in its line and cannot control a terminal."""
+    """Escape unprintable characters, so that a text cannot break its line or control a terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def print_line(line: str, stream: TextIO | None = None) -> None:
-    """Escape a line, print it (default: on stdout) and flush at once."""
+    """Print a line with unprintable characters escaped (default: on stdout), and flush at once."""
     print(escape(line), file=stream, flush=True)
 
 
 def format_number(value: float) -> str:
-    """Write a value (any unit) with four significant digits, without exponent if possible."""
+    """Return a value of any unit as text with four significant digits; write counts in full."""
     if float(value).is_integer() and abs(value) < 1e5:
         return f"{value:.0f}"  # counts
     if 1e-4 <= abs(value) < 1e5:

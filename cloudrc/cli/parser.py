@@ -1,4 +1,4 @@
-"""The parser of all commands, built from a table of their names and help lines."""
+"""The parser of the command line, built from a table of the commands and their help lines."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ GROUPS: dict[str, dict[str, str]] = {
         "relay": "the emulated link between world and cloud",
     },
 }
-"""Command -> help line, by group; the module of a command is `cloudrc/cli/<name>.py`."""
+"""Group of commands -> command -> help line. A command's module is `cloudrc/cli/<name>.py`."""
 PROCESSES = ("world", "cloud", "relay")
-"""Commands whose module is `cloudrc/cli/processes.py` instead."""
+"""Commands without a module of their own: `cloudrc/cli/processes.py` contains them."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 COUNT_MAX = 10_000
-"""Largest number of repeats that a flag accepts. Before Python 3.11.6, a pool of processes hangs if
-it gets more than 16,384 tasks (cpython issue 105829)."""
+"""Largest number of repeats, seeds or processes that a flag accepts. Before Python 3.11.6, a pool
+hangs if it gets more than 16,384 tasks (cpython issue 105829)."""
 
 ABOUT = "Fly a simulated drone from a simulated cloud, over an emulated network."
 EXAMPLES = """\
@@ -59,20 +59,20 @@ exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
 
 
 class Parser(argparse.ArgumentParser):
-    """Parse a command line; raise errors of argparse as one line, which `main` prints."""
+    """Parse a command line; raise errors as BadInputError, which `main` prints in one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise the error; name the help page that explains it."""
+        """Raise an error with the message of argparse and the command that prints the help."""
         raise BadInputError(f"{message}; see '{self.prog} --help'")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Suggest the most similar choice; argparse itself lists them all."""
+        """Suggest the most similar choice, where argparse itself would list all choices."""
         if action.choices is not None and value not in action.choices:
             raise argparse.ArgumentError(action, describe_unknown(value, action.choices))
 
 
 def describe_unknown(given: str, names: Iterable[str]) -> str:
-    """Return an error text about an unknown name, with the most similar known name or all names."""
+    """Return an error text about an unknown name: suggest a similar name, or list all `names`."""
     known = sorted(names)
     if near := difflib.get_close_matches(given, known, n=1, cutoff=0.5):
         return f"no '{given}'; did you mean '{near[0]}'?"
@@ -97,9 +97,10 @@ def input_file(text: str) -> Path:
 
 
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
-    """Build the parser with the arguments of the `wanted` commands, and the names of the others.
+    """Build the parser of all commands, but declare arguments for the `wanted` commands only.
 
-    The help lists the commands in groups. For completion, argparse itself lists them.
+    Thus the modules of the other commands are not imported. The help lists the commands in groups.
+    `for_completion` also makes argparse list the commands, for the completion script.
     """
     common, about = Parser(add_help=False), "show the traceback of an error"
     common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)
@@ -133,7 +134,7 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
 
 
 def _find_command(name: str) -> Any:
-    """Import what declares the arguments of a command and executes it."""
+    """Return the module or object with a command's functions `arguments` and `execute`."""
     if name in PROCESSES:
         return getattr(importlib.import_module("cloudrc.cli.processes"), name)
     return importlib.import_module(f"cloudrc.cli.{name}")

@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 
 
 class WorkerDiedError(InvalidRunError):
-    """Report that somebody has killed a process of the pool."""
+    """Report that a worker process was killed."""
 
 
 def interrupt_on_signals() -> None:
@@ -40,7 +40,7 @@ def _hung_up(number: int, frame: FrameType | None) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this worker when its parent has ended, even if the parent was killed."""
+    """End this worker process when the parent process has ended, even by a kill."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -55,9 +55,9 @@ def _end_with_parent() -> None:
 def _isolated_start() -> Iterator[None]:
     """Isolate worker processes that start inside the block.
 
-    The workers ignore the terminal's signals, since ignored signals stay ignored in a new program;
-    the parent ends the workers. The workers import no Python from the working folder, because its
-    files may come from somebody else.
+    The workers ignore the terminal's signals, because a new process inherits ignored signals; the
+    parent process ends the workers. The workers import no Python from the working folder, because
+    the files there may come from somebody else.
     """
     before = {n: signal.signal(n, signal.SIG_IGN) for n in (signal.SIGINT, signal.SIGHUP)}
     safe_path = os.environ.get("PYTHONSAFEPATH", "")
@@ -75,9 +75,9 @@ def map_in_order(
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    At most `jobs` processes work, and at most one for each core; a single job runs in the present
-    process. The function is at module level, because worker processes call it. Ctrl-C or closing
-    the generator ends the running calls and drops the others.
+    At most `jobs` worker processes run, and at most one for each core. With one job or one core,
+    this process does the work. The function must be at module level, so that a worker can import
+    it. Ctrl-C, or closing the generator, ends the running calls and drops the others.
     """
     workers = min(jobs, len(work), os.cpu_count() or 1)
     if workers <= 1:
@@ -85,10 +85,11 @@ def map_in_order(
         return
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
-    with _isolated_start():
+    with _isolated_start():  # starts multiprocessing's resource tracker
         pool = ProcessPoolExecutor(workers, context, _end_with_parent)
-        futures = [pool.submit(function, each) for each in work]
     try:
+        with _isolated_start():  # submit() starts the workers
+            futures = [pool.submit(function, each) for each in work]
         for future in futures:
             yield future.result()
     except BrokenProcessPool as error:
@@ -105,7 +106,7 @@ def map_in_order(
 def take_each(
     results: Generator[Result, Any, None], take: Callable[[Result], None]
 ) -> tuple[str, int]:
-    """Take all results; return what ended them early and its exit code, or "" and 0."""
+    """Take all results; return why the work ended early and the exit code, or "" and 0."""
     try:
         with closing(results):
             for result in results:

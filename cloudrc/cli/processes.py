@@ -1,10 +1,10 @@
 """Run `cloudrc world`, `cloudrc cloud` and `cloudrc relay`: the processes of a local run or a pod.
 
-With `--link DIR` the relay follows the changes of `cloudrc link set` and publishes its state:
+With `--link DIR` the relay applies the changes of `cloudrc link set` and publishes its state:
 
     DIR/profile.json, change.json            requested profile; missing before the first change
-    DIR/uplink.json, downlink.json           state in force (`cloudrc/link/state.py`)
-    DIR/uplink.released, downlink.released   how late datagrams left so far, written every 2 s
+    DIR/uplink.json, downlink.json           applied state of the link (`cloudrc/link/state.py`)
+    DIR/uplink.released, downlink.released   lateness of the datagrams so far, written every 2 s
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ if TYPE_CHECKING:
     from cloudrc.record.recorder import Recorder
 
 TRACE_MAX = 2 << 20
-"""Maximum size of a trace file that the state file of the link container names [bytes]. The
-container's own traces come from a ConfigMap, which holds at most 1 MiB."""
+"""Maximum size of a trace file that an end reads because the link container names it [bytes]. An
+honest container's traces come from a ConfigMap, which holds at most 1 MiB."""
 PERIOD = 1.0
 """Time between two updates of the relay's counts in the exporter [s]."""
 RELEASED_PERIOD = 2.0
-"""Time between two publications of the lateness of datagrams [s]; the ends read at this rate."""
+"""Period in which the relay writes, and the ends read, the lateness of datagrams [s]."""
 
 
 class Command(NamedTuple):
-    """One of the commands of this module: declares its arguments, and runs."""
+    """A command of this module, as the pair of functions that other commands' modules have."""
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
@@ -61,13 +61,13 @@ class Command(NamedTuple):
 def _add(
     parser: argparse._ActionsContainer, flag: str, kind: str, text: str, *, required: bool = False
 ) -> None:
-    """Declare a flag; its kind is the name of its value in the help."""
+    """Declare a flag; `kind` is the kind of its value, and the metavar in the help."""
     read: Callable[[str], object] = {"HOST:PORT": read_address, "SIZE": read_size}.get(kind, Path)
     parser.add_argument(flag, type=read, metavar=kind, help=text, required=required)
 
 
 def process_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags of every process."""
+    """Declare the flags that world, cloud, relay and teleop have in common."""
     _add(parser, "--config", "FILE", "experiment file (YAML)", required=True)
     feed = "write status for a supervisor to stdout (default: print events only)"
     parser.add_argument("--feed", action="store_true", help=feed)
@@ -116,9 +116,9 @@ def _relay_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def read_address(text: str) -> Address:
-    """Read HOST:PORT, with an IPv6 address in brackets, as a type for argparse.
+    """Read HOST:PORT for argparse; an IPv6 address is in brackets.
 
-    [::] means all IPv4 and IPv6 addresses; on a machine without IPv6, all IPv4 addresses.
+    [::] means all IPv4 and IPv6 addresses, or, on a machine without IPv6, all IPv4 addresses.
     """
     try:
         host, port = split_address(text)
@@ -153,10 +153,10 @@ def read_size(text: str) -> float:
 
 
 def ipv4_addresses(name: str) -> list[str]:
-    """Return the IPv4 addresses of a host name; relay and netem shape only IPv4.
+    """Return the IPv4 addresses of a host name, since relay and netem shape IPv4 only.
 
     Raises:
-        OSError: If the name has no IPv4 address; the text tells if it has only IPv6 addresses.
+        OSError: If the name has no IPv4 address; the text says so if it has IPv6 addresses.
     """
     try:
         return _addresses(name, socket.AF_INET)
@@ -181,12 +181,13 @@ def _addresses(name: str, family: int) -> list[str]:
 
 
 def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0)) -> Address:
-    """Resolve an address once, before the loop starts: the loop must not wait for a name server.
+    """Resolve an address before the control loop starts, so that the loop never waits for DNS.
 
-    The result has the family of `listen`, the process's own address; [::] reaches both families.
+    The result has the address family of `listen`, the process's own address. If `listen` is [::],
+    the result may have either family. `flag` is for the error text.
 
     Raises:
-        BadInputError: If the host cannot be resolved; the text names the flag.
+        BadInputError: If the host cannot be resolved.
     """
     host, port = where
     family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
@@ -201,14 +202,14 @@ def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0))
 
 
 def warn_if_exposed(listen: Address) -> None:
-    """Write a warning if other machines can send to an address."""
+    """Print a warning if other machines can send to the address `listen`."""
     if not listen[0].startswith("127.") and listen[0] not in ("localhost", "::1"):
         print(f"cloudrc: warning: {listen[0]} can be reached from outside", file=sys.stderr)
 
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn of an exposed address; name flag and address if opening a socket in the block fails."""
+    """Warn of an exposed address; name flag and address if the block cannot open a socket."""
     warn_if_exposed(listen)
     try:
         yield
@@ -269,7 +270,7 @@ def _run_cloud(options: argparse.Namespace) -> int:
 def open_end(
     options: argparse.Namespace, name: str
 ) -> tuple[ResolvedExperiment, bytes, EndProcess]:
-    """Open all that the end "world" or "cloud" needs; an error names the flag.
+    """Open the files and sockets of the end `name`, "world" or "cloud".
 
     Returns:
         The experiment, the identity of the machine's clock, and the process of the end.
@@ -307,7 +308,7 @@ def open_end(
 
 
 def open_peer(options: argparse.Namespace) -> Peer:
-    """Bind the socket of an end; the socket sends to the peer or to the address of the route."""
+    """Bind the socket of an end; it sends to `--peer`, or to the address in the file `--route`."""
     if options.route is None:
         target: Address | Path = resolve_address("--peer", options.peer, options.listen)
     else:
@@ -319,10 +320,11 @@ def open_peer(options: argparse.Namespace) -> Peer:
 
 
 def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
-    """Make the recorder of an end; without a file the recorder writes to /dev/null.
+    """Make the recorder of an end; without `--record` the recorder writes to /dev/null.
 
-    The recording of the previous process is kept as NAME.before.mcap: it shows why that process
-    ended. Both recordings together have the size limit.
+    The recording of the previous process is renamed to NAME.before.mcap, because it may show why
+    that process ended. The size limit `--record-max` holds for both recordings together. `clock`
+    names the clock of the recording's stamps, and `clock_id` identifies the machine's clock.
     """
     from cloudrc.record.recorder import Recorder
     from cloudrc.record.writer import McapWriter
@@ -344,7 +346,7 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
 
 
 def _link_state(options: argparse.Namespace) -> Path | None:
-    """Return the state file of the link's process; None without flags for the link."""
+    """Return the file in which the link publishes its state; None if no flag names the file."""
     if options.link is None and options.route is not None:
         return Path(options.route).with_name("link.json")
     return options.link  # type: ignore[no-any-return]
@@ -353,7 +355,10 @@ def _link_state(options: argparse.Namespace) -> Path | None:
 def link_monitor(
     options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
 ) -> LinkMonitor:
-    """Make the monitor of the direction that an end receives; it follows changes of the profile."""
+    """Make the monitor that compares received datagrams with the link's profile.
+
+    `uplink` says which direction the end receives. The monitor follows changes of the profile.
+    """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
     from cloudrc.link.traces import SIZE_MAX
@@ -375,7 +380,7 @@ def link_monitor(
 
 
 def _run_relay(options: argparse.Namespace) -> int:
-    """Forward datagrams until stopped."""
+    """Forward datagrams until a signal stops the process."""
     stop, exporter = StopSignal(), open_exporter(options, "link")
     from cloudrc import assembly
     from cloudrc.config.load import fingerprint, read_experiment
@@ -411,10 +416,10 @@ def _run_relay(options: argparse.Namespace) -> int:
 def open_relay(
     options: argparse.Namespace, uplink: LinkDirection, downlink: LinkDirection
 ) -> Relay:
-    """Make the relay between the addresses of the command line.
+    """Open the relay's sockets at the addresses of the command line; return the relay.
 
     Raises:
-        BadInputError: If an address is not usable; the text names the flags.
+        BadInputError: If an address cannot be used.
     """
     from cloudrc.link.relay import Relay
     from cloudrc.tunnel.codec import peek
@@ -441,7 +446,7 @@ def open_relay(
 
 
 def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
-    """Return the profiles that the relay starts with, by direction."""
+    """Return the profiles at the start of the relay, by direction: "uplink" and "downlink"."""
     from cloudrc.assembly import link_profile
 
     ways = {"uplink": experiment.uplink, "downlink": experiment.downlink}
@@ -450,7 +455,7 @@ def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
 
 
 def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
-    """Make a function that returns `stop()` and, once a second, exports the relay's counts."""
+    """Wrap `stop` in a function that also exports the relay's counts every `PERIOD`."""
     due = 0.0
 
     def ask() -> bool:
@@ -465,9 +470,9 @@ def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Cal
 
 
 class RelayControl:
-    """Applies the changes of the profile file in a folder to both directions of a relay.
+    """Applies the changes of `cloudrc link set`, in a folder, to both directions of a relay.
 
-    A thread reads and writes the files; the relay's loop only replaces the profiles.
+    A thread reads and writes the files. Only the relay's loop replaces the profiles.
     """
 
     def __init__(
@@ -482,9 +487,9 @@ class RelayControl:
 
         Args:
             folder: Folder of the profile and of the link's state; created if missing.
-            links: The links "uplink" and "downlink".
-            first: The profiles that the links have started with.
-            asked: Called with a direction and its newly requested mean delay [s].
+            links: The links, by direction: "uplink" and "downlink".
+            first: The profiles at the start, by direction.
+            asked: Called with a direction and the requested mean delay [s] at each change.
             relay: The relay of the links.
         """
         from cloudrc.cli.link_run import make_profile_loader
@@ -500,7 +505,7 @@ class RelayControl:
             self._publish(way, loaded, time.monotonic_ns())
 
     def stop_after(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Return a function for the relay's loop: apply pending changes, then call `stop`."""
+        """Wrap `stop` in a function for the relay's loop that first applies pending changes."""
 
         def ask() -> bool:
             if self._pending:
@@ -518,13 +523,13 @@ class RelayControl:
             self._applied.append((way, loaded, time.monotonic_ns()))
 
     def follow(self) -> None:
-        """Look at the folder for ever."""
+        """Check the folder for changes, without end."""
         while True:
             self.look()
             time.sleep(PROFILE_PERIOD / 2 if self._pending else PROFILE_PERIOD)
 
     def look(self) -> None:
-        """Check once for a requested change; publish applied changes and lateness."""
+        """Check the folder once for requested changes; publish applied changes and lateness."""
         changes = {way: file.poll() for way, file in self._files.items()}
         self._pending += [(way, loaded) for way, loaded in changes.items() if loaded is not None]
         with suppress(OSError):  # such as a full disk: the next check tries again

@@ -27,10 +27,10 @@ ENDINGS = ("done", "cancelled", "timed_out")
 
 
 class FlightView:
-    """Show a flight on a stream, as a status line and one line per event."""
+    """Shows a flight on a stream: one line per event and, on a terminal, a status line."""
 
     def __init__(self, stream: TextIO, waypoints: int) -> None:
-        """Prepare the view of a mission with `waypoints` waypoints; write nothing yet."""
+        """Prepare the view; write nothing yet. `waypoints` is the mission's number of waypoints."""
         self._stream, self._waypoints = stream, waypoints
         self._first_ns = self._now_ns = NEVER_NS
         self._began = self._seen = monotonic()
@@ -43,7 +43,7 @@ class FlightView:
             self._status = Live(console=terminal, transient=True, get_renderable=self.line)
 
     def see(self, records: Iterable[Record]) -> None:
-        """Process records of world or cloud, oldest first."""
+        """Show the next records of world or cloud, which are sorted by time."""
         if self._status:
             self._status.start()
         for record in records:

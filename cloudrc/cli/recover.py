@@ -1,4 +1,4 @@
-"""`cloudrc recover FILE`: copy a torn recording into a complete file, up to the first damage."""
+"""`cloudrc recover FILE`: copy a damaged recording, up to the first damage, into a valid file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cloudrc.cli.parser import input_file
 from cloudrc.errors import BadInputError
 
 LOSSY = 1
-"""Exit code if data is lost."""
+"""Exit code if the copy lacks data of the recording."""
 EPILOG = """\
 examples:
   cloudrc recover runs/latest/world.mcap
@@ -31,7 +31,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Recover a recording; print what the copy keeps and what is lost."""
+    """Copy a damaged recording; print the kept share and the known losses."""
     require("a recovery", ("record",))
     from cloudrc.record.reader import recover
 

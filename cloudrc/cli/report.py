@@ -1,4 +1,4 @@
-"""`cloudrc report RUN`: rewrite the report of a recorded run; print reports."""
+"""`cloudrc report RUN`: write the report of a recorded run again, and print its summary."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAIN = {
     "hold_count": "times in HOLD",
     "real_time_factor": "real-time factor",
 }
-"""The most important numbers and their labels; report.html and report.json have all numbers."""
+"""Number in the summary -> its label; report.html and report.json contain all numbers."""
 EPILOG = """\
 examples:
   cloudrc report runs/latest
@@ -70,7 +70,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def summary(report: Mapping[str, Any], folder: Path) -> str:
-    """Write the verdict, the failures, the main numbers and, on the last line, the page's path."""
+    """Return the verdict, the failures, the main numbers and the path of report.html as text."""
     from cloudrc.metrics import Number
     from cloudrc.report.page import readable
 

@@ -1,4 +1,4 @@
-"""`cloudrc run`: fly an experiment, write its run folder and print the verdict."""
+"""`cloudrc run`: fly an experiment, write recording and report into a folder, print the verdict."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
     from cloudrc.world.endpoint import WorldEndpoint
 
 Flight = Callable[[Path], dict[str, Any]]
-"""Function that flies and fills a run folder; it returns the content of report.json."""
+"""Function that flies and writes all files of a run into a folder; returns the report's content."""
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
 
 GRACE = 30.0
-"""Time after the mission's time limit at which the program ends a flight that still runs [s]."""
+"""Time from the mission's time limit until the program itself ends the flight [s]."""
 CLOCK = bytes(16)
-"""Identity of the clock that both ends share in virtual time."""
+"""Identity of the clock that world and cloud share in virtual time."""
 EPILOG = """\
 modes:
   local    real time: four processes, UDP on 127.0.0.1
@@ -87,7 +87,7 @@ def _seed(text: str) -> int:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Fly once or many times."""
+    """Fly once, or once per seed with `--seeds`; return the exit code."""
     interrupt_on_signals()  # an interrupted flight still gets its report
     mode = options.mode or ("virtual" if options.seeds else "local")
     if options.seeds and mode != "virtual":
@@ -101,7 +101,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
-    """Load an experiment by its name or path; check the user's metrics that it names."""
+    """Load an experiment by name or path, change keys (KEY=VALUE), check the user's metrics."""
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
 
@@ -153,8 +153,10 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
 def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
     """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
-    With `latest`, `runs/latest` points to the new folder from now on. A BadInputError says that
-    `out` exists and is not an empty folder, or that the folder cannot be made.
+    With `latest`, the link `runs/latest` points to the new folder afterwards.
+
+    Raises:
+        BadInputError: If `out` exists and is not an empty folder, or if no folder can be made.
     """
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise BadInputError(
@@ -185,7 +187,7 @@ def _next_folder(name: str) -> Path:
 
 
 def point_latest_to(folder: Path) -> None:
-    """Point `runs/latest` to the newest run, if the file system supports symbolic links."""
+    """Point the link `runs/latest` to `folder`, if the file system supports symbolic links."""
     latest = folder.parent / "latest"
     with contextlib.suppress(OSError):
         if latest.is_symlink():
@@ -196,7 +198,7 @@ def point_latest_to(folder: Path) -> None:
 def _local_flight(
     experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int
 ) -> Flight:
-    """Return the function that flies on this machine and shows the progress on a stream."""
+    """Return a function that flies on this machine and shows the progress on a stream."""
     from cloudrc.cli.progress import FlightView
 
     if stream is sys.stderr and not is_live(stream):
@@ -212,7 +214,7 @@ def _local_flight(
 def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
-    """Return the function that flies in the cluster that the flags name."""
+    """Return a function that flies in the cluster that the flags name."""
     from cloudrc.cluster.client import program
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files
 
@@ -235,11 +237,11 @@ def fly(
     *,
     page: bool = True,
 ) -> dict[str, Any]:
-    """Fly in mode "virtual" or "local", fill the empty run folder, and return the report.
+    """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
-    During the flight `see` gets records: all in virtual mode, a selection in local mode. If the
-    flight breaks off, the recording stays, and its report says "interrupted". Without `page` the
-    report has numbers only, no HTML page.
+    During the flight `see` is called with new records: in virtual mode with all records, in local
+    mode with a selection. If the flight is interrupted, the recording stays, and the report's
+    verdict is "interrupted". Without `page` no report.html is written.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
@@ -256,7 +258,7 @@ def fly(
 
 
 def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
-    """Assemble both ends and their run in virtual time."""
+    """Make world, cloud, and the virtual-time run that connects them, but do not fly yet."""
     from cloudrc import assembly
     from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.tunnel.end import Identity
@@ -270,7 +272,10 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
 def _record_virtual(
     experiment: ResolvedExperiment, folder: Path, see: See
 ) -> Iterator[tuple[Recording, Run]]:
-    """Fly in virtual time; attach the report that the block writes to the recording."""
+    """Fly in virtual time and yield the recording, so that the block writes the report.
+
+    After the block, attach the written report to the file of the recording.
+    """
     from cloudrc.record.columns import Recording, merged
     from cloudrc.record.hash import RecordHash
     from cloudrc.record.writer import McapWriter
@@ -309,7 +314,10 @@ def _record_virtual(
 def _record_local(
     experiment: ResolvedExperiment, folder: Path, see: See
 ) -> Iterator[tuple[Recording, Run]]:
-    """Fly in processes; merge their recordings, and attach the report that the block writes."""
+    """Fly in processes, merge the recordings, and yield the result, for the block's report.
+
+    After the block, write the merged recording with the report attached.
+    """
     from cloudrc.drivers.local import LocalRun
     from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge

@@ -1,4 +1,4 @@
-"""`cloudrc run --seeds N`: fly N seeds on all cores; tabulate medians and confidence intervals."""
+"""`cloudrc run --seeds N`: fly seeds 1 to N on all cores; print medians with their confidence."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ METHOD = "95 % interval of the median, by order statistics"
 
 
 def interval(values: Sequence[float]) -> tuple[float, float] | None:
-    """Compute the confidence interval of the median, for any distribution.
+    """Return the 95 % confidence interval of the median of `values`, for any distribution.
 
     The k-th smallest and the k-th largest of n values enclose the median with probability
-    1 - 2 · sum_{i<k} C(n, i) / 2^n. k is the largest number for which the probability is at least
-    95 %. The result is None for fewer than 6 values, which cannot reach 95 %.
+    1 - 2 · sum_{i<k} C(n, i) / 2^n. The interval uses the largest k with a probability of at least
+    95 %. The function returns None for fewer than 6 values, because no k reaches 95 %.
 
     Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, section 7.1.
     """
@@ -43,7 +43,7 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
 
 
 def summarise(reports: Sequence[Report]) -> dict[str, Any]:
-    """Summarise reports: number of successful runs, of all runs, and statistics per number."""
+    """Return the counts of successful and of all runs, and the median and interval per number."""
     numbers = {}
     for name, unit in _units(reports).items():
         found = [r["numbers"][name]["value"] for r in reports if name in r["numbers"]]
@@ -58,7 +58,7 @@ def _units(reports: Sequence[Report]) -> dict[str, str]:
 
 
 def as_table(summary: Mapping[str, Any]) -> str:
-    """Lay out a summary as a table; the last line is the share of successful runs."""
+    """Return a summary as a table; the last line counts the successful runs."""
     rows = [("number", "median", "95 % interval", "unit")]
     for name, entry in summary["numbers"].items():
         between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
@@ -70,7 +70,7 @@ def as_table(summary: Mapping[str, Any]) -> str:
 
 
 def as_csv(reports: Sequence[Report]) -> str:
-    """Write one line per run: seed, verdict and all numbers."""
+    """Return one line of CSV per run: seed, verdict and all numbers."""
     units, text = _units(reports), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["seed", "verdict", *(f"{name} [{unit}]" for name, unit in units.items())])
@@ -81,9 +81,9 @@ def as_csv(reports: Sequence[Report]) -> str:
 
 
 def fly_seeds(options: argparse.Namespace) -> int:
-    """Fly seeds 1 to N; return the exit code, which is 0 only if all runs succeed.
+    """Fly seeds 1 to N and print one table; return 0 only if all runs succeed.
 
-    After an interrupt or the death of a worker, the table covers the finished seeds.
+    If Ctrl-C or a killed worker ends the flights early, the table has the finished seeds.
     """
     # Load the experiment here too, so that a mistake is reported once, not N times.
     name = load(options.experiment, options.set).name
@@ -121,7 +121,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
 
 def _fly_one(job: tuple[str, list[str], Path, int]) -> dict[str, Any]:
-    """Fly one seed, in a worker."""
+    """Fly one seed in a worker process; return the content of its report.json."""
     experiment, overrides, folder, seed = job
     run_folder = folder / f"seed-{seed}"
     run_folder.mkdir()

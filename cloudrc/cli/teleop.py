@@ -1,4 +1,4 @@
-"""Run `cloudrc teleop`: the process that flies missions, with its API and its stored missions."""
+"""Run `cloudrc teleop`: the process that stores and commands missions and serves the API."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import MissionStore
 
 FILES_MAX = 8_192
-"""Limit of open files; with idle connections there is still room for an emergency stop."""
+"""Limit of open files of this process: idle connections must leave room for an emergency stop."""
 LOCK_PERIOD = 0.2
-"""Pause between two attempts to open a journal that another teleop process has locked [s]."""
+"""Pause between two attempts to open the missions' file while another teleop locks it [s]."""
 PAUSE_LIMIT_NS = 500_000_000
-"""Longest time that teleop, before it ends, waits for the robot to hold [ns]."""
+"""Longest time that an ending teleop waits until the robot holds its position [ns]."""
 EPILOG = """\
 teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. It ends
 on SIGTERM, on Ctrl-C and when its parent process has ended; with --start also
@@ -68,7 +68,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def api_address(text: str) -> Address | Path:
-    """Parse [HOST:]PORT, where PORT may be 0, or unix:PATH."""
+    """Parse [HOST:]PORT or unix:PATH for argparse; PORT 0 means any free port."""
     if text.startswith("unix:") and len(text) > len("unix:"):
         return Path(text.removeprefix("unix:"))
     host, colon, port = text.rpartition(":")
@@ -108,7 +108,7 @@ def execute(options: argparse.Namespace) -> int:
 def serve_api(
     options: argparse.Namespace, experiment: ResolvedExperiment, scene: Scene
 ) -> ApiServer:
-    """Start the API; until its bridge is opened, the API answers that teleop is starting."""
+    """Start the API; until `_fly` adds the missions, the API answers that teleop is starting."""
     from cloudrc import assembly
     from cloudrc.link.state import publish
     from cloudrc.teleop.api import ApiServer, Bridge, create_app
@@ -139,14 +139,15 @@ def serve_api(
 
 
 def log_line(text: str) -> None:
-    """Write a line to the log, from any thread."""
+    """Write a line to stderr, from any thread."""
     print_line(f"cloudrc teleop: {text}", sys.stderr)
 
 
 def ending(service: MissionService, asked: Callable[[], bool]) -> Callable[[], bool]:
-    """Return a function for teleop's loop, which pauses the mission after `asked()`.
+    """Return a function that says whether teleop may end: after a request, once the robot holds.
 
-    The function returns whether teleop may end: if the robot holds, or after `PAUSE_LIMIT_NS`.
+    Once `asked()` is true, the function pauses the mission. After `PAUSE_LIMIT_NS` teleop may end
+    in any case.
     """
     until_ns: list[int] = []
 
@@ -168,7 +169,7 @@ def _fly(
     exporter: Exporter | None,
     over: Callable[[], bool],
 ) -> None:
-    """Run the service until `over()`."""
+    """Serve missions and API requests until `over()` is true."""
     from cloudrc.drivers.process import Feed
     from cloudrc.drivers.teleop import UnixPeer, serve_teleop
     from cloudrc.records import Counted, Fault
@@ -208,7 +209,10 @@ def _fly(
 def _open_store(
     path: Path | None, stop: Callable[[], bool], server: ApiServer | None
 ) -> MissionStore | None:
-    """Wait until no other teleop locks the store, and open it; return None after `stop()`."""
+    """Open the stored missions at `path`, or make a store in memory if `path` is None.
+
+    Wait while another teleop locks the file; return None if `stop()` is true before.
+    """
     from cloudrc.teleop.store import MissionStore, StoreLockedError, connect, open_store
 
     salt, reported = os.urandom(16), False

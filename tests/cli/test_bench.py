@@ -1,4 +1,4 @@
-"""The bench: the cost of the closed loop; and the cost of sealed datagrams."""
+"""The costs of the closed loop and of sealed datagrams."""
 
 import json
 import subprocess

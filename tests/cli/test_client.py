@@ -10,7 +10,7 @@ from tests.teleop.conftest import running
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answer the status that the path names, with a body that is no API's."""
+    """Answers with the HTTP status in the path, and with a body that teleop's API never sends."""
 
     def do_GET(self):
         self.send_response(int(self.path[1:]))
@@ -19,7 +19,7 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(b"[]")
 
     def log_message(self, *args):
-        """Say nothing."""
+        """Log nothing."""
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: r
 
 @pytest.fixture
 def printed(capsys):
-    """Check the output and give it: it contains the escaped text and no control characters."""
+    """Return a function that checks the output for the escaped text, and returns the output."""
 
     def check():
         out, err = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""The run that `cloudrc mission` and `cloudrc link set` find on this machine."""
+"""How `cloudrc mission` and `cloudrc link set` find a run on this machine."""
 
 import contextlib
 import json
@@ -16,7 +16,7 @@ SET = ["link", "set", "uplink.loss=0.1"]
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """A working folder without a run."""
+    """Work in a folder without a run."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     monkeypatch.chdir(folder)
@@ -28,14 +28,14 @@ def elsewhere(tmp_path, monkeypatch):
 
 @contextlib.contextmanager
 def flying(folder):
-    """A run that is flying in this folder."""
+    """Announce a run that flies in a folder; yield its API."""
     folder.mkdir(parents=True)
     with running(unix=True) as api, local.announced(folder, api.url):
         yield api
 
 
 def test_an_emergency_stop_finds_the_run(tmp_path, elsewhere, capsys):
-    """First ./runs/latest, then the only other run; with several others one has to be named."""
+    """./runs/latest comes first, then the only other run; of several others, --run names one."""
     with flying(tmp_path / "a") as a:
         assert main(["mission", "estop"]) == 0
         assert capsys.readouterr().err == f"cloudrc: using the run in {tmp_path / 'a'}\n"
@@ -105,7 +105,7 @@ def test_a_wrong_run_flag_gives_one_line(words, said, capsys):
 
 
 def with_link(folder):
-    """The folder of a run whose relay has just started."""
+    """Make the folder of a run whose relay has just started."""
     (folder / "link").mkdir(parents=True)
     return folder
 

@@ -51,7 +51,7 @@ def mission(api, monkeypatch):
 
 
 def pilot(api, *points):
-    """Move the robot from point to point, each once the mission has reached the previous one."""
+    """Move the robot to each point once the mission has reached the previous point."""
 
     def fly():
         api.until(lambda: api.get("/v1/state")["mission"] is not None)
@@ -304,7 +304,7 @@ def harmless(said):
 
 @pytest.fixture
 def forged():
-    """An API whose journal holds a name that controls terminals; the API itself refuses it."""
+    """Yield an API with a stored mission whose name contains control characters."""
     with running(unix=True) as one:
         made = one.bridge.submit(lambda service, now_ns: service.create(Order(PLAN, NAME), now_ns))
         made.result(10.0)

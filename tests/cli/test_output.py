@@ -79,7 +79,7 @@ def telemetry(stamp_ns):
 
 @pytest.fixture
 def seen(monkeypatch):
-    """Show records on a stream, with a clock that goes on by a second per look."""
+    """Return a function that shows records on a stream; each call of the clock adds 1 s."""
 
     def show(stream, *records):
         monkeypatch.setattr(progress, "monotonic", map(float, range(1000)).__next__)

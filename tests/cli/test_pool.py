@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from cloudrc.cli.main import main
 from cloudrc.cli.pool import WorkerDiedError, _hung_up, interrupt_on_signals, map_in_order
 
 KILLED = 5
-"""The piece of work that kills its process."""
+"""The piece of work at which a worker kills its own process."""
 
 
 @pytest.fixture(autouse=True)
@@ -55,6 +57,15 @@ def test_results_before_a_worker_was_killed_are_kept():
     with pytest.raises(WorkerDiedError, match=r"a worker was killed.*use fewer processes"):
         results.extend(each for each in map_in_order(_kill_at_five, range(9), 2))
     assert results == list(range(KILLED))
+
+
+def test_a_worker_killed_while_work_is_submitted_is_reported(monkeypatch):
+    def break_down(*arguments):
+        raise BrokenProcessPool
+
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", break_down)
+    with pytest.raises(WorkerDiedError, match="use fewer processes"):
+        list(map_in_order(_slow_first, range(2), 2))
 
 
 def test_ctrl_c_ends_the_workers_at_once():

@@ -50,7 +50,7 @@ def key(tmp_path):
 
 @pytest.fixture
 def taken():
-    """Yield an address with a UDP and a TCP socket."""
+    """Yield an address at which a UDP and a TCP socket already receive."""
     address = "127.0.0.1", free_ports(1)[0]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp, socket.socket() as tcp:
         udp.bind(address)
@@ -131,7 +131,7 @@ def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
 
 
 def test_the_peer_is_resolved_once_before_the_loop(monkeypatch):
-    """The control loop once asked a name server for every datagram, and waited for it."""
+    """The control loop must not wait for a name server."""
     asked = []
 
     def look_up(name, *rest):
@@ -153,7 +153,7 @@ def test_the_peer_is_resolved_once_before_the_loop(monkeypatch):
 def test_an_end_stopped_at_its_start_completes_its_recording(
     end, key, tmp_path, monkeypatch, capsys
 ):
-    """The first process of a container ignores signals without a handler."""
+    """The handlers are set first: as the first process of a container, an end needs them."""
     build = getattr(assembly, f"build_{end}")
 
     def stop_and_build(*arguments):

@@ -83,7 +83,7 @@ def test_a_failed_run_sets_the_exit_code(folder, monkeypatch):
     "how", [signal.SIGTERM, signal.SIGKILL, *nightly(signal.SIGINT, signal.SIGHUP)]
 )
 def test_a_signal_ends_a_sweep_at_once(how, folder):
-    """A terminal sends SIGINT and SIGHUP to the group; SIGTERM goes to one, SIGKILL to a worker."""
+    """SIGINT and SIGHUP go to all processes, SIGTERM to the command, SIGKILL to one worker."""
     command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
