@@ -37,7 +37,7 @@ CRUISE_SPEED = 1.0
 SETTLE_TIME = 4.0
 """Expected extra time for the beginning and the end of a leg [s]."""
 LEG_FACTOR = 3.0
-"""Limit of a leg, divided by its expected time [1]. Source: docs/reference/faults.md, "F28"."""
+"""Limit of a leg, divided by its expected time. Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
 """Mission number of a cloud that flies only one mission."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)

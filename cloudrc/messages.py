@@ -86,7 +86,7 @@ class Request(IntEnum):
     ESTOP = 2
     """Stop the rotors at once, in any state; latched until acknowledged."""
     ACKNOWLEDGE = 3
-    """Release a landing or stop whose cause the operator has seen, without arming the robot."""
+    """End the state LAND or ESTOP after the operator has seen its cause; no rotor starts."""
     PROGRESS = 4
     """Store the mission's progress on board, for a cloud that restarts. Its number is 0."""
 

@@ -76,7 +76,7 @@ class LinkChecked(NamedTuple):
 
 
 REAL_TIME_FACTOR_MIN = 0.95
-"""Lowest real-time factor of a valid run in real time [1].
+"""Lowest real-time factor of a valid run in real time.
 Source: docs/reference/control.md, "Real-time factor"."""
 
 

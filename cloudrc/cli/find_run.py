@@ -27,11 +27,14 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
 def find_local_run(
     options: argparse.Namespace, look: Callable[[Path], _Found | None], nobody: str
 ) -> _Found | None:
-    """Find the API or the link of the run of `--run`, of ./runs/latest, or of the only other run.
+    """Find the run that `--run` names, else ./runs/latest, else the only run that is flying.
 
-    `look` returns the API or the link of the run in a folder, or None if no run is flying there.
-    `nobody` is the error text if no run is flying in the folder of `--run`. The function returns
-    None if the flags name a cluster, or if no run is flying on this machine.
+    `look` takes the folder of a run and returns what the command needs: the API or the link, or
+    None if no run is flying there. If the run of `--run` is not flying, the error has the text
+    `nobody`.
+
+    Returns:
+        The result of `look`; None if no run is flying, or if the flags name a cluster.
     """
     from cloudrc.drivers.local import under_way
 

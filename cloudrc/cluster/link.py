@@ -195,7 +195,7 @@ def _needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[s
 def with_files(
     files: Mapping[str, str], profile: str | None, settings: Sequence[str]
 ) -> tuple[Edit, dict[str, str]]:
-    """Edit the profile that is one of `files`; return it, and the files that are new or changed.
+    """Edit the profile in `files`; return the edit, and the files that are new or changed.
 
     Raises:
         BadInputError: If the request is not valid, or the files are too large for a ConfigMap.

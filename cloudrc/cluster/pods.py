@@ -43,7 +43,7 @@ FATAL = {
 }
 """Reason, in Kubernetes' words, why a container will never run -> description."""
 RESTARTS_MAX = 2
-"""Largest number of restarts up to which a container may still start [1]."""
+"""Largest number of restarts up to which a container may still start."""
 TOKENS, OPERATOR = "tokens", "operator"
 """Volume with the API's tokens in the pods of cloud and missions, and key of the operator's."""
 API_PORT = 8080

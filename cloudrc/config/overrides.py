@@ -56,7 +56,9 @@ def parse_settings(texts: Iterable[str]) -> dict[KeyPath, Any]:
 
 
 def apply_overrides(document: Document, overrides: Mapping[KeyPath, Any]) -> None:
-    """Set values in a document, in order; relative paths in them start at the working folder.
+    """Set values in a document, in order.
+
+    A value that is the relative path of a file counts from the working folder.
 
     Raises:
         BadInputError: If an index is not a number or beyond the end of its list.

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 STEP = 0.1
 """Smallest change between two checks that counts as a step of the wall clock [s]."""
 DRIFT_MAX = 1e-3
-"""Largest relative drift between both clocks [1]; kernels slew by at most half of this value."""
+"""Largest relative drift between both clocks; kernels slew by at most half of this value."""
 AFTERWARDS_NS = 90_000_000_000
 """How long all records are still kept after the robot last followed the cloud [ns]. This time
 covers the landing after a loss of the link."""

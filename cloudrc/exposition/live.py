@@ -235,7 +235,7 @@ class End:
 
 
 STEP_NS, STEPS = 1_000_000_000, 10
-"""Time between two samples for the real-time factor [ns], and number of such times in it [1]."""
+"""Time between two samples for the real-time factor [ns], and number of such times in it."""
 ADMITTED = "cloud said hello"
 """`SessionOpened.cause` of a session that world opens for a newly connected cloud."""
 
@@ -244,7 +244,7 @@ class WorldEnd(End):
     """Metrics of world: metrics of every end, the robot, guard, contacts, real-time factor."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        """Set the counts and the guard's state GROUND."""
+        """Store the counts; the guard is in state GROUND at first."""
         super().__init__(table.WORLD, counts)
         self._truth: GroundTruth | None = None
         self._guard = GuardState.GROUND

@@ -66,7 +66,7 @@ def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
 
 
 WINDOW = 128
-"""Number of newer datagrams after which a missing datagram counts as lost [1]; 1.28 s at 100 Hz."""
+"""Number of newer datagrams after which a missing datagram counts as lost; 1.28 s at 100 Hz."""
 _MASK = (1 << WINDOW) - 1
 _OLDEST = 1 << (WINDOW - 1)
 
@@ -125,7 +125,7 @@ class DatagramTally:
 GAP_MAX_NS = 50_000_000
 """Largest gap between two measurements over which positions are interpolated [ns]."""
 WAITING_MAX = 256
-"""Largest number of predictions that wait for a measurement [1]; a horizon of 1 s needs 100."""
+"""Largest number of predictions that wait for a measurement; a horizon of 1 s needs 100."""
 
 
 class PredictionJudge:

@@ -125,7 +125,7 @@ CHOICES = {
     GuardState.LAND: LATCHED,
     GuardState.ESTOP: LATCHED,
 }
-"""Probability of each request, by the state of the guard that cloud knows of [1]."""
+"""Probability of each request, by the state of the guard that cloud knows of."""
 FACE_WAIT_NS = 5_000_000_000  # longest wait for the robot to come near a face of the fence [ns]
 REACHED = (0, 1, 7, MISSION_OVER)
 

@@ -34,7 +34,7 @@ CHAIN_BLOCKS = 64
 OVERTAKES = -(1 << 62)
 """Entry of a packet that skips queue and delay (`reorder`)."""
 PARETO_CUT = 1e-3
-"""Share of the Pareto distribution's tail that is cut off [1]."""
+"""Probability of the tail that is cut off the Pareto distribution."""
 
 _CACHED = 256
 _OUTPUTS_PER_COUNT = 4

@@ -37,7 +37,7 @@ SIZE_MAX = 1_200_000
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 _KNOWN = 64
-"""Number of changes that are remembered [1]."""
+"""Number of changes that are remembered."""
 
 
 class Loaded(NamedTuple):

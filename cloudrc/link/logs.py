@@ -43,13 +43,13 @@ Entry: TypeAlias = tuple[float, float | None]
 LONGEST = 5.0
 """Longest plausible median delay [s]; values with a larger median are probably in another unit."""
 UNUSABLE_MAX = 0.01
-"""Largest share of rows that may be left out [1]; above this share the log is refused."""
+"""Largest share of rows that may be left out; above this share the log is refused."""
 GAP, GAP_OF_PING, GAP_MIN = 20, 2, 1.0
-"""Shortest gap that a note reports, in median times between packets [1] and in [s]. ping sends
+"""Shortest gap that a note reports, in median times between packets and in [s]. ping sends
 regularly, and its lost packets have times, too."""
 STEPS_MAX = 3
 """Up to this number of jumps back in time, a jump is a step of the clock or a new session; more
-jumps mean that the rows are shuffled [1]."""
+jumps mean that the rows are shuffled."""
 PACKETS_MAX = 10_000_000
 """Limit of packets in a log of ping, since a number may be forged: three weeks at five a second."""
 HALVE = (

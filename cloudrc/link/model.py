@@ -23,7 +23,7 @@ HEADER_BYTES = 28
 Source: RFC 791, RFC 768.
 """
 _TABLES = 64
-"""Number of blocks of impairments that are kept [1]."""
+"""Number of blocks of impairments that are kept."""
 
 
 class LinkDirection:

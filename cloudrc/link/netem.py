@@ -47,19 +47,19 @@ PERIOD_NS = 1_000_000_000
 STEP_NS = 5_000_000
 """Shortest time between two steps of the qdisc [ns]; steps that follow sooner are skipped."""
 LIMIT = 10_000
-"""Limit of packets in a qdisc without a bottleneck [1], as in the relay."""
+"""Limit of packets in a qdisc without a bottleneck, as in the relay."""
 DELAY_MAX_MS = 274_000
 """Longest delay that tc accepts [ms]: ticks of 64 ns in 32 bits."""
 ENTRIES = 4096
-"""Number of entries of a table [1]."""
+"""Number of entries in a table of a delay distribution."""
 STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
 """Distribution -> factor that divides the table's entries, so that the tail fits in 16 bits. The
 jitter that tc gets is multiplied by the same factor."""
 _ONE = 8192
 _END_OF_TABLE = 32_767 / _ONE
-"""Largest 16-bit entry, in units of the jitter [1]."""
+"""Largest 16-bit entry, in units of the jitter."""
 _KEPT = 10_000
-"""Number of latest steps that the percentiles cover [1]."""
+"""Number of latest steps that the percentiles cover."""
 _IN_ORDER = "100gbit"
 """Rate that has no effect except that netem keeps the order of packets."""
 _ETHERNET_BYTES = 14
@@ -67,7 +67,7 @@ _ETHERNET_BYTES = 14
 _RATE_MIN = 8.0
 """Lowest rate [bit/s]: tc turns less than 1 byte/s into no limit, without a message."""
 _CHANCE_MIN = 2.0**-32
-"""Lowest probability above 0 [1]: tc turns less into 0, without a message."""
+"""Lowest probability above 0: tc turns less into 0, without a message."""
 _PACKET_BITS = 8 * 116
 """Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
 _PACKETS = 1_000

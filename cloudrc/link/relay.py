@@ -9,7 +9,7 @@ Due time of a datagram = time of arrival at the kernel + delay that the model dr
 never leaves before it is due. The relay sleeps in `select` until shortly before the next datagram
 is due, then reads the clock in a loop, since a sleeping thread wakes 15 to 50 us late.
 
-A socket is connected to its end of the tunnel, so the kernel drops datagrams from others.
+Each socket is connected to one tunnel end, so the kernel drops datagrams from other senders.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ Send: TypeAlias = Callable[[bytes], object]
 """Function that sends a datagram; it raises an OSError if the kernel refuses."""
 
 IN_FLIGHT_MAX = 10_000
-"""Limit of datagrams that a lane holds at once [1]; further datagrams are dropped and counted."""
+"""Limit of datagrams that a lane holds at once; further datagrams are dropped and counted."""
 DATAGRAM_MAX = 2_048
 """Limit of a datagram's length [bytes], so that the memory of a lane is bounded."""
 BATCH = 32
-"""Limit of datagrams that a lane takes in or releases before the next lane's turn [1]."""
+"""Limit of datagrams that a lane takes in or releases before the next lane's turn."""
 SPIN_NS = 60_000
 """How long before a due time the relay starts to read the clock in a loop [ns]."""
 STOP_PERIOD = 0.1
@@ -55,17 +55,17 @@ QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 """Percentiles of the lateness that are reported."""
 
 _BITS = 7
-"""How many significant bits of a lateness select its bucket [1]: buckets are 1.6 % wide."""
+"""How many significant bits of a lateness select its bucket: buckets are 1.6 % wide."""
 _EARLY = -1
 """Bucket of the datagrams that left before they were due."""
 _RECENT = 10
-"""Number of calls of `Lanes.recent` that its percentiles cover [1]."""
+"""Number of calls of `Lanes.recent` that its percentiles cover."""
 _FIFO_PRIORITY = 10
-"""Real-time priority [1]: above ordinary processes, below the kernel's own threads (50)."""
+"""Real-time priority: above ordinary processes, below the kernel's own threads (50)."""
 _SWITCH_INTERVAL = 0.0002
 """Longest time for which another thread of this process keeps the interpreter [s]."""
 _COLLECT_AFTER = 50_000
-"""Number of new objects that triggers a garbage collection [1]: most are datagrams in flight."""
+"""Number of new objects that triggers a garbage collection: most are datagrams in flight."""
 # Source: Linux, include/uapi/asm-generic/socket.h, prctl.h; Python has no names for them.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 

@@ -28,7 +28,7 @@ UNIX_TIME = 1e8
 the first time is subtracted."""
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _ROWS_TO_JUDGE = 10
-"""Only in traces of at least this many rows a delay of 0 may mark a loss; others are typed [1]."""
+"""Only in traces of at least this many rows a delay of 0 may mark a loss; others are typed."""
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:

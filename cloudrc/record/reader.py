@@ -40,14 +40,14 @@ except ImportError as error:
     raise missing(error) from error
 
 UNPACKED_MAX = 64
-"""Largest size of a recording in memory, as a multiple of its size in the file [1]. A file below
+"""Largest size of a recording in memory, as a multiple of its size in the file. A file below
 1 MiB counts as 1 MiB. Recordings of flights need a factor of 10, recordings of an idle robot 30."""
 MESSAGE_COST = 128
 """Memory of a message's Python objects, in addition to the message's bytes [bytes]."""
 LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
 LOSSY_SHARE_MAX = 0.999
-"""Largest value of `Recovery.share` if anything is missing [1]."""
+"""Largest value of `Recovery.share` if anything is missing."""
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
 KINDS = {
     b"": "is empty; name a recording (.mcap)",

@@ -25,7 +25,7 @@ from cloudrc.teleop.store import SHOWN, Order
 from cloudrc.teleop.wire import FAILURES, Leg, Plan
 
 PROBLEMS_MAX = 50
-"""Limit of the problems of one request that the answer describes."""
+"""Largest number of problems that the answer to a request lists."""
 
 
 def _printable(text: str) -> str:

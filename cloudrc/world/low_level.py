@@ -41,7 +41,7 @@ _TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
 
 NOSE_COSINE_MIN, YAW_SINE_MAX = 0.5, 0.3
 """Limits of the published attitude error: smallest cosine of the error about the nose, and largest
-sine of the yaw error [1]. Beyond either limit the published error uses wrong axes."""
+sine of the yaw error. Beyond either limit the published error uses wrong axes."""
 
 
 class LowLevel:

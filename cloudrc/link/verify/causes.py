@@ -15,11 +15,11 @@ from cloudrc.link.verify.judge import Row
 
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
 """Above any of these limits a shaper lacks CPU time: 99 % quantile of its release error [s], share
-of datagrams not read in time [1], share of periods in which a CPU limit stopped the shaper [1]."""
+of datagrams not read in time, share of periods in which a CPU limit stopped the shaper."""
 RAISED = ("mean", "round_trip", "deviation", "loss")
 """Quantities that rise if the shaper lacks CPU time."""
 PASSED = 0.9
-"""Below this share of the arrived datagrams at the shaper, the others take another way [1]."""
+"""Below this share of the arrived datagrams at the shaper, the others take another way."""
 
 
 class Evidence(NamedTuple):
@@ -125,7 +125,7 @@ _BY_NUMBERS = (
     ("wrong_order", "reordered", 0.0, inf, ""),
     ("wrong_distribution", "distribution", 0.0, inf, ": delays are distributed otherwise"),
 )
-"""Code, quantity, range of the measured divided by the requested value [1], and text; the surest
+"""Code, quantity, range of the measured divided by the requested value, and text; the surest
 cause comes first."""
 
 

@@ -24,12 +24,12 @@ from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mea
 Floats: TypeAlias = NDArray[np.float64]
 
 RUNS, RUN_LENGTH = 200, 1000
-"""Simulated links for a band, and datagrams of each [1]; for other numbers a band is scaled."""
+"""Simulated links for a band, and datagrams of each; for other numbers a band is scaled."""
 TAIL = 1e-3
-"""Share of honest links below a band, and share of them above it [1]."""
+"""Share of honest links below a band, and share of them above it."""
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
 """Least correlation of measured and predicted delays, and least share of datagrams whose loss or
-arrival was predicted, from which on the link counts as a relay with known random numbers [1]."""
+arrival was predicted, from which on the link counts as a relay with known random numbers."""
 STILL, SHAPE_FLOOR = 1e-4, 2e-3
 """Standard deviations of the delay [s]. Below the first, a correlation of delays means nothing;
 below the second, the machine itself changes the shape of the distribution."""
@@ -40,14 +40,14 @@ TOLERANCES = {
     "distribution": (0.05, 0.0),
     "rate": (0.0, 0.25),
 }
-"""Quantity -> tolerance in its unit, and as a share of the requested value [1]: the larger counts.
+"""Quantity -> tolerance in its unit, and as a share of the requested value: the larger counts.
 On a relay, the share of the deviation is half of that."""
 SHARE_TOLERANCE = (0.02, 0.25)
-"""Tolerance of loss, order and copies: absolute, and as a share of the requested value [1]."""
+"""Tolerance of loss, order and copies: absolute, and as a share of the requested value."""
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; that of a share is "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
-"""Fewest datagrams for a verdict [1]; widest half of a band for "ok", in tolerances [1]."""
+"""Fewest datagrams for a verdict; widest half of a band for "ok", in tolerances."""
 
 
 class Flow(NamedTuple):

@@ -41,7 +41,7 @@ PERIOD = 0.01
 CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
 """Time between two verdicts, and from a new session or profile to the first datagram [ns]."""
 KEPT, FINAL = 6000, 128
-"""Most datagrams that are judged [1]; a missing datagram counts as lost after FINAL newer ones."""
+"""Most datagrams that are judged; a missing datagram counts as lost after FINAL newer ones."""
 ENDS = 2e-3
 """Largest delay that two punctual ends and a tick of the simulation add to a round trip [s]."""
 FOLLOW_PERIOD = 0.1

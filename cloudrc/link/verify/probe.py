@@ -27,12 +27,12 @@ PROBE = 254
 FIRST_PROBE = 1.0
 """Time from the start of the link to the first probe [s]."""
 COUNT = 1500
-"""Fewest probes, unless the user gives a time [1]."""
+"""Fewest probes, unless the user gives a time."""
 LONGEST, AFTER = 120.0, 5.0
-"""Longest time to probe, and time to probe after the last change of a time line [s]."""
+"""Longest duration of the probes, and duration after the last change of the conditions [s]."""
 RATE, LINK_SHARE = 200.0, 0.4
 """Most probes per second, half as many through netem [1/s]; largest share of a limited rate that
-single probes use [1]."""
+single probes use."""
 RATE_MAX = 1e8
 """Highest rate limit that this process can measure [bit/s]."""
 TRAIN_SIZE, TRAIN_SPAN = 1400, 0.06

@@ -24,7 +24,7 @@ DELAY = (
     "these are the fast ones, so the loop delay lies below the mean of the profile."
 )
 MARGIN = 1.25
-"""Upper end of the delay axis, divided by the 99.5th percentile of the delays [1]."""
+"""Upper end of the delay axis, divided by the 99.5th percentile of the delays."""
 
 
 def draw_delay(subject: Subject) -> Figure:

@@ -20,11 +20,11 @@ from cloudrc.report.figures import marks, save, style
 from cloudrc.report.figures.style import dots, legend_above, new_figure, panel
 
 RUNS_SHOWN = 20
-"""Longest run of losses in the figure [1]; a longer run counts as one of this length."""
+"""Longest run of losses in the figure; a longer run counts as one of this length."""
 BLACKOUT = "#f7dccb"
 """Colour of blackouts, a light variant of the colour of losses."""
 DOTS = 6000
-"""Largest number of dots in one panel [1]; more dots would hide each other."""
+"""Largest number of dots in one panel; more dots would hide each other."""
 
 
 @dataclass(frozen=True, slots=True)

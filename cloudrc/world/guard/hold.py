@@ -19,13 +19,13 @@ BRAKE_TIME_CONSTANT = 0.25
 """Time constant of the exponential end of braking [s]."""
 BRAKE_LEAD, BRAKE_SHARE_MIN = 1.0, 0.2
 """When braking starts, the reference is BRAKE_LEAD [m/s] below the robot's speed, but not below
-BRAKE_SHARE_MIN [1] times that speed."""
+BRAKE_SHARE_MIN times that speed."""
 STILL_SPEED = 0.1
 """Speed below which the robot counts as at rest [m/s]."""
 LAND_SPEED = 0.5
 """Speed of the descent [m/s]. Source: docs/reference/plant.md, "Landing"."""
 STILL_SHARE = 0.2
-"""A descent has stopped when its speed is below this share of the planned speed [1]: with a low
+"""A descent has stopped when its speed is below this share of the planned speed: with a low
 speed cap every descent is slower than STILL_SPEED."""
 TOUCH_DOWN_NS = 400_000_000
 """Time without motion after which a descent has touched down [ns]."""
@@ -35,7 +35,7 @@ also at rest at its highest point, but for less time."""
 POSITION_GAIN = 0.8
 """Gain of the position hold: velocity towards the hold point per distance from that point [1/s]."""
 DAMPING_GAIN = 1.6
-"""Damping of the position hold: share of the robot's velocity that is subtracted [1]."""
+"""Damping of the position hold: share of the robot's velocity that is subtracted."""
 HOLD_SPEED_MAX = 0.5
 """Largest speed that the position hold asks for [m/s]."""
 INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1

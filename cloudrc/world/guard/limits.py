@@ -45,7 +45,7 @@ SINK_LEAD_MAX = 0.5
 """Largest difference by which the reference may sink faster than the robot [m/s]. Otherwise the
 low-level controller would turn the robot over and could not brake."""
 ROUNDING_FACTOR = 1.0 - 2.0**-45
-"""Factor on the speed cap that leaves room for rounding errors [1]."""
+"""Factor on the speed cap that leaves room for rounding errors."""
 
 
 def stopping_distance(speed: float, reaction: float) -> float:

@@ -43,7 +43,7 @@ from cloudrc.world.guard.limits import COMMAND_MAX, Limits
 from cloudrc.world.readings import Readings
 
 OVERTURNED_COSINE = 0.2
-"""Below this cosine of the tilt the robot counts as turned over, and its rotors stop [1]. Commands
+"""Below this cosine of the tilt the robot counts as turned over, and its rotors stop. Commands
 alone tilt the robot to a cosine of 0.4 at worst; only a collision tilts it further."""
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # looking up a member of an enum is slow
@@ -140,7 +140,7 @@ class Guard:
             self._enter(ESTOP, now_ns, Cause.STOPPED)
 
     def acknowledge(self, now_ns: int) -> None:
-        """Release a landing or stop that the operator has acknowledged; do not arm the robot."""
+        """End LAND or ESTOP after the operator has acknowledged the cause; start no rotor."""
         if self.latched and not self._flies:
             self._enter(GROUND, now_ns, self._take_off.condition)
         elif self.state is LAND:

@@ -572,3 +572,11 @@ def test_a_landing_that_is_acknowledged_in_the_air_holds():
     assert run(guard, 3 * SECOND + TICK, 5 * SECOND)[-1] == ZERO
     feed(guard, 5 * SECOND, 100)
     assert guard.state is HOLD
+
+
+@pytest.mark.parametrize("make", [lambda: Guard(LIMITS), armed, tracking, holding])
+def test_in_other_states_an_acknowledgement_does_nothing(make):
+    guard = make()
+    before = guard.state, guard.armed, len(guard.changes)
+    guard.acknowledge(2 * SECOND)
+    assert (guard.state, guard.armed, len(guard.changes)) == before
