@@ -113,8 +113,8 @@ class LinkContainer(Values):
             }
         },
     )
-    """The CSV files for the keys `trace` and `table` of link.profile or the experiment: file name ->
-    text of the file"""
+    """The CSV files for the keys `trace` and `table` of link.profile or the experiment: file name
+    -> text of the file"""
     resources: Resources = resources("20m", "40Mi", "1", "96Mi")
 
 
@@ -142,8 +142,8 @@ class WorldPod(Placement):
     """No longer used; values of earlier versions are accepted"""
     resources: Resources = resources("60m", "96Mi", "1", "256Mi")
     recording_size_limit: Quantity = "1Gi"
-    """Size limit of the volume for recordings [bytes]. The volume also keeps the recording from before
-    a restart; at 90 % of the limit for both together, the recording ends"""
+    """Size limit of the volume for recordings [bytes]. The volume also keeps the recording from
+    before a restart; at 90 % of the limit for both together, the recording ends"""
 
 
 class BackgroundLoad(Values):
@@ -161,8 +161,8 @@ class CloudPod(Placement):
 
     resources: Resources = resources("60m", "64Mi", "1", "192Mi")
     recording_size_limit: Quantity = "1Gi"
-    """Size limit of the volume for recordings [bytes]. The volume also keeps the recording from before
-    a restart; at 90 % of the limit for both together, the recording ends"""
+    """Size limit of the volume for recordings [bytes]. The volume also keeps the recording from
+    before a restart; at 90 % of the limit for both together, the recording ends"""
     background_load: BackgroundLoad = BackgroundLoad()
     """CPU load in the cloud pod"""
 
@@ -280,8 +280,8 @@ class Secret(Values):
     """The tunnel's pre-shared key."""
 
     existing_secret: Name = ""
-    """Name of an existing Secret. Its entry `key` holds the text of the key file. Empty: the chart makes a
-    Secret"""
+    """Name of an existing Secret. Its entry `key` holds the text of the key file. Empty: the chart
+    makes a Secret"""
 
 
 class ServiceAccount(Values):
