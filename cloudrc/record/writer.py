@@ -224,7 +224,11 @@ class _ChunkIndexes:
 
 
 def _moved(index: ChunkIndex, sign: int) -> ChunkIndex:
-    """Add to the offsets of a chunk's index, or subtract from them, the end of the chunk."""
+    """Add to the offsets of a chunk's index, or subtract from them, the end of the chunk.
+
+    The offsets are counted modulo 2^64: in a file without positions, such as /dev/null, every
+    offset is 0.
+    """
     end = sign * (index.chunk_start_offset + index.chunk_length)
-    offsets = {channel: at + end for channel, at in index.message_index_offsets.items()}
+    offsets = {name: (at + end) % 2**64 for name, at in index.message_index_offsets.items()}
     return replace(index, message_index_offsets=offsets)

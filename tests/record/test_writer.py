@@ -7,12 +7,13 @@ from collections import defaultdict
 
 import pytest
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex
 from mcap_ros2.decoder import DecoderFactory
 
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import CHUNK_NS, McapWriter
+from cloudrc.record.writer import CHUNK_NS, McapWriter, _ChunkIndexes
 from cloudrc.records import GuardChange
 from tests.record.conftest import MS, SECOND, cloud_records, world_records, write
 
@@ -124,3 +125,21 @@ def test_flying_needs_none_of_them():
         "print(len(columns.Recording.from_records([])['/pid']))"
     )
     assert run(code).split() == ["False", "0"]
+
+
+def test_the_chunks_of_a_device_are_listed_too():
+    """A process without --record writes to /dev/null, where every position is 0."""
+    index = ChunkIndex(
+        chunk_length=100,
+        chunk_start_offset=0,
+        compression="zstd",
+        compressed_size=50,
+        message_end_time=2,
+        message_index_length=30,
+        message_index_offsets={1: 0, 2: 150},
+        message_start_time=1,
+        uncompressed_size=80,
+    )
+    chunks = _ChunkIndexes()
+    chunks.append(index)
+    assert list(chunks) == [index]
