@@ -77,7 +77,7 @@ PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
 
 
 def read_counts(role: str, counts: Mapping[str, int]) -> Iterator[tuple[str, dict[Labels, float]]]:
-    """Read the metrics of a role that are counts of its process."""
+    """Turn the counts that the process of a role keeps into metrics."""
     for metric in of_role(role):
         pattern = COUNTS.get(metric.name)
         if pattern is None or (metric.name in ONE_SHAPER and pattern not in counts):
@@ -483,7 +483,7 @@ HANDLERS: Mapping[type, str] = {
     SessionOpened: "_on_session",
     TelemetrySent: "_on_telemetry",
 }
-"""Class of records -> method that handles it, in each part that has this method."""
+"""Class of a record -> name of the method that handles the record in each part that has it."""
 
 
 class LiveMetrics:

@@ -289,7 +289,7 @@ def _strange_numbers(rng: Generator) -> Lie:
 
 
 def _false_basis(rng: Generator) -> Lie:
-    """Name odometry of the future, or old odometry, as the basis of commands."""
+    """Make commands claim a wrong basis: odometry of the future, or old odometry."""
     shift_ns = int(rng.choice([1, STEP_NS, 10_000_000, 200_000_000, 2**62]))
     sign = int(rng.choice([-1, 1]))
 

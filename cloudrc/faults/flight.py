@@ -163,7 +163,7 @@ class Flight:
         return counted[-1] if counted else 0
 
     def events(self, *names: str) -> list[MissionEvent]:
-        """Return the events of missions with these names."""
+        """Return the mission events whose name is one of `names`."""
         return [event for event in self.teleop.events if event.event in names]
 
     def guard_now(self) -> tuple[GuardState, str]:

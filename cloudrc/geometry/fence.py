@@ -15,7 +15,8 @@ WALL_MARGIN = 0.2
 """Distance from the walls and the ceiling of the fence at which the guard stops the robot [m]."""
 INNER_LOW: Vector = (LOW[0] + WALL_MARGIN, LOW[1] + WALL_MARGIN, LOW[2] + FLOOR_MARGIN)
 INNER_HIGH: Vector = (HIGH[0] - WALL_MARGIN, HIGH[1] - WALL_MARGIN, HIGH[2] - WALL_MARGIN)
-"""Opposite corners of the box in which the guard lets the robot fly [m], world frame."""
+"""Opposite corners, INNER_LOW and INNER_HIGH, of the box in which the guard lets the robot fly [m],
+world frame."""
 
 
 def inside(position: Vector) -> bool:

@@ -272,7 +272,7 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """The last mission, if an earlier teleop stopped it; None after the first telemetry."""
+        """The last mission if an earlier process stopped it; None once telemetry has arrived."""
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 

@@ -81,7 +81,7 @@ class LinkMonitor:
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
 
     def follow(self, asked: Asked | None) -> None:
-        """Judge by other profiles from now on; None: by none until they are known."""
+        """Judge by other profiles from now on; judge nothing while `asked` is None (unknown)."""
         if asked != self._asked:
             self._asked, self._fresh, sent = asked, True, np.arange(float(RUN_LENGTH)) * PERIOD
             ways = () if asked is None else asked if self._uplink else asked[::-1]
@@ -127,7 +127,7 @@ class LinkMonitor:
             threading.Event().wait(FOLLOW_PERIOD)
 
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Take records; every CHECK_NS judge those since the session or the profile settled."""
+        """Store records; once per CHECK_NS judge those of the present session and profile."""
         for record in records:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch
