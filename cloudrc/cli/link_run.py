@@ -273,5 +273,7 @@ class Programs:
                 raise OSError("no answer of tc")
             text += data
         if failed:
-            return Answer(2, "", "\n".join(one for one in lines if one[:1] not in ("[", "C")))
+            return Answer(
+                2, "", "\n".join(one for one in lines if not one.startswith(("[", "Comm")))
+            )
         return Answer(0, listings[0] if lists else "", "")

@@ -1,9 +1,9 @@
 """Read the packets of measured links from logs of ping, fping and irtt, and from CSV files.
 
     ping -D -O HOST, ping --apple-time HOST, fping -D HOST
-    irtt client -i 10ms -l 203 -d 1m -o irtt.json HOST
+    irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
-A telemetry datagram has 203 bytes, a command datagram 88 bytes. irtt measures both directions if
+A telemetry datagram has 204 bytes, a command datagram 88 bytes. irtt measures both directions if
 the clocks of the two hosts agree; ping measures round trips. The columns of a CSV log name their
 units, such as `time_ms,delay_us,loss` or `timestamp_ns,rtt_ms`. The readers take half of each round
 trip if the user asks for that (`halve`).

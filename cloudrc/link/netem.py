@@ -119,7 +119,7 @@ class Iproute2:
 def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
     """Make the error for a failed call: the cause and the remedy."""
     text = " ".join((answer.error or answer.output).split())
-    unknown = "kind is unknown", "classifier not found", "No such file"
+    unknown = "kind is unknown", "classifier not found", "answers: No such file"
     if answer.code == NOT_FOUND:
         cause = f"no program {program} (package iproute2); install it, or {_INSTEAD}"
     elif "Operation not permitted" in text:
