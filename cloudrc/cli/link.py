@@ -1,6 +1,7 @@
 """Parse `cloudrc link ACTION` and run the action, which is in `cli/link_<name>.py`; `show` is here.
 
-`cli/link_verify.py` imports much, so it is imported when it runs, and its arguments are here, too.
+`cli/link_verify.py` imports much. So it is imported only when it runs, and this module declares its
+arguments.
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ def _recording(path: Path) -> Recording:
 def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     """Match sent and arrived datagrams by epoch and counter; of duplicates the first counts.
 
-    Raise a BadInputError that names `path` if the recording of both ends holds no one-way delays.
+    Raise a BadInputError that names `path` if the recording has no one-way delays.
     """
     from cloudrc.link.logs import Log
 

@@ -1,7 +1,8 @@
 """Run `cloudrc link run`: the sidecar with its clock, sockets, programs and threads.
 
-/link.json on the metrics port shows the state of the shaper. An answer takes calls of tc and ip, so
-it is cached for one second. Every `cloudrc link` imports this module, so it imports little itself.
+/link.json on the metrics port shows the state of the shaper. Each answer needs calls of tc and ip,
+so answers are cached for one second. Every `cloudrc link` imports this module, so the module itself
+imports little.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ TOOL_TIMEOUT = 5.0
 """Time limit of one call of tc or ip [s]."""
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
-"""Command after each other command; its answer of one line marks the end of the answer before."""
+"""Command that tc gets after each real command: the one line of its answer ends the real answer."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -273,5 +274,7 @@ class Programs:
                 raise OSError("no answer of tc")
             text += data
         if failed:
-            return Answer(2, "", "\n".join(one for one in lines if one[:1] not in ("[", "C")))
+            return Answer(
+                2, "", "\n".join(one for one in lines if not one.startswith(("[", "Comm")))
+            )
         return Answer(0, listings[0] if lists else "", "")

@@ -140,7 +140,7 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
 
 
 def _note(edit: Edit, number: str) -> str:
-    """Return the text of `CHANGE_FILE`: number, cause, and whether time restarts."""
+    """Return the text of `CHANGE_FILE`: number, cause, and whether the time line restarts."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 

@@ -30,7 +30,7 @@ from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 BLOCK = 256
 """Number of packets whose draws are made together."""
 CHAIN_BLOCKS = 64
-"""Number of blocks after which states restart."""
+"""Number of blocks after which bursts and correlated jitter restart."""
 OVERTAKES = -(1 << 62)
 """Entry of a packet that skips queue and delay (`reorder`)."""
 PARETO_CUT = 1e-3
@@ -50,7 +50,7 @@ Fate: TypeAlias = tuple[int, ...]
 
 
 class Purpose(IntEnum):
-    """What a column of draws decides about each packet."""
+    """Decision about a packet for which a column of random numbers is drawn."""
 
     DELAY = 0
     COPY_DELAY = 1
@@ -114,7 +114,7 @@ def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) ->
 def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> tuple[bool, ...]:
     """Run the two-state chain over a block: True for packets in the bad state, shape (256,).
 
-    `bad_start` and `bad_end` are the chances per packet that this state starts and ends [1].
+    `bad_start` and `bad_end` are the probabilities per packet that the bad state starts and ends.
     """
     if not bad_start:
         return (False,) * BLOCK

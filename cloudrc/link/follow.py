@@ -1,9 +1,9 @@
-"""Follow changes in flight: of a profile's file, of a document in the pod, of the peer's address.
+"""Follow what changes in flight: the profile and the address of the peer.
 
 A change of a release's ConfigMap is permanent, but a kubelet may need a minute to copy it to a pod.
 So `cloudrc link set` also writes the same files, as one document, into the folder of the route
-file. Whichever of ConfigMap and document arrives first takes effect. The second one has the same
-number of the change and is ignored.
+file. Whichever of ConfigMap and document arrives first takes effect. Both carry the same number of
+the change, so the later one is ignored.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ Source: docs/reference/faults.md, "F19"."""
 HANDED_FILE = "asked.json"
 """Name of the document with a change from `cloudrc link set`, in the folder of the route file."""
 SIZE_MAX = 1_200_000
-"""Size limit of that document [bytes]: the content of a ConfigMap plus the overhead of JSON."""
+"""Size limit of the document in `HANDED_FILE` [bytes]: a ConfigMap's content as JSON."""
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 _KNOWN = 64
-"""Number of changes that are remembered."""
+"""Number of changes that are remembered, to recognise a change that arrives twice."""
 
 
 class Loaded(NamedTuple):
@@ -59,7 +59,7 @@ Load = Callable[[Path], Loaded]
 
 
 class ProfileFile:
-    """A profile's file that may change; it need not exist at first.
+    """Reads the file of a profile again whenever the file changes.
 
     Kubernetes mounts a ConfigMap as a folder of links into `..data`, a link that Kubernetes
     replaces in one step; then the path leads to another file. A check is a single system call,
@@ -76,7 +76,7 @@ class ProfileFile:
         return self._read()
 
     def poll(self) -> Loaded | None:
-        """Read the file if it has changed; None if it has not, or if the new profile is refused.
+        """Read the file after a change; None without a change, or if the new profile is refused.
 
         A refusal is logged. If the file changes during the read, somebody is still writing, and
         the next call reads again.
@@ -118,12 +118,12 @@ class Handed(NamedTuple):
 
 
 def write_handed(handed: Handed) -> str:
-    """Return the text of a document."""
+    """Format a change as the text of the document."""
     return json.dumps(handed._asdict())
 
 
 def read_handed(text: str) -> Handed:
-    """Parse the text of a document.
+    """Parse the text of the document.
 
     Raises:
         ValueError: If the text is no such document, or if a file name could lead to another folder.
@@ -140,7 +140,7 @@ def read_handed(text: str) -> Handed:
 
 
 class _HandedFile(ProfileFile):
-    """The document with a change.
+    """Reads the document that `cloudrc link set` writes into a pod.
 
     A document that exists at the start is ignored, because the ConfigMap has the same change.
     """
@@ -205,7 +205,7 @@ class Profiles:
 
 
 class PeerName:
-    """The peer's name and port, whose address may change.
+    """Resolves the name of the peer, whose address may change.
 
     While an old and a new pod overlap, a headless Service returns both addresses. The address that
     appeared later belongs to the new pod and is used.

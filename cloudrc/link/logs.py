@@ -1,9 +1,9 @@
 """Read the packets of measured links from logs of ping, fping and irtt, and from CSV files.
 
     ping -D -O HOST, ping --apple-time HOST, fping -D HOST
-    irtt client -i 10ms -l 203 -d 1m -o irtt.json HOST
+    irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
-A telemetry datagram has 203 bytes, a command datagram 88 bytes. irtt measures both directions if
+A telemetry datagram has 204 bytes, a command datagram 88 bytes. irtt measures both directions if
 the clocks of the two hosts agree; ping measures round trips. The columns of a CSV log name their
 units, such as `time_ms,delay_us,loss` or `timestamp_ns,rtt_ms`. The readers take half of each round
 trip if the user asks for that (`halve`).
@@ -39,14 +39,14 @@ from cloudrc.link.traces import Row, decimals_of, looks_lost, read_rows
 Direction: TypeAlias = Literal["uplink", "downlink"]
 Floats: TypeAlias = NDArray[np.float64]
 Entry: TypeAlias = tuple[float, float | None]
-"""Time of sending [s] and delay [s], None if the packet was lost."""
+"""Time of sending [s] and delay [s]; the delay is None if the packet was lost."""
 LONGEST = 5.0
 """Longest plausible median delay [s]; values with a larger median are probably in another unit."""
 UNUSABLE_MAX = 0.01
 """Largest share of rows that may be left out; above this share the log is refused."""
 GAP, GAP_OF_PING, GAP_MIN = 20, 2, 1.0
-"""Shortest gap that a note reports, in median times between packets and in [s]. ping sends
-regularly, and its lost packets have times, too."""
+"""A note reports a gap above GAP (for ping GAP_OF_PING) median times between packets, if the gap is
+also above GAP_MIN [s]. The limit for ping is lower, because ping sends regularly."""
 STEPS_MAX = 3
 """Up to this number of jumps back in time, a jump is a step of the clock or a new session; more
 jumps mean that the rows are shuffled."""
@@ -175,7 +175,7 @@ def trace_of(packets: Packets) -> Trace:
     """Make a trace that reproduces the delays and losses for a stream of the same rate.
 
     Each row begins halfway between its packet and the packet before. So a replayed packet may be
-    late or early by half a period and still meets its own row. Time begins at the first packet.
+    late or early by half a period and still gets its own row. Time begins at the first packet.
     """
     sent = packets.sent
     halfway = [(before + after) / 2 - sent[0] for before, after in pairwise(sent)]
@@ -221,7 +221,7 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
     direction a packet was lost, the packet counts as lost in both directions. Times of sending are
     on the client's monotonic clock, so steps of its wall clock do not matter.
 
-    `direction` may be None with `halve` alone. `name` is that of the file, for messages.
+    `direction` may be None only with `halve`. `name` is the name of the file, for messages.
 
     Raises:
         BadInputError: If the file is not such an output, if it contradicts its own counts, or if
@@ -267,7 +267,7 @@ def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log
 
 
 def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
-    """Reject a log without one-way delays, or whose two clocks differ, or one of which steps."""
+    """Reject a log that has no one-way delays, whose clocks differ, or in which a clock steps."""
     if any(not {"send", "receive"} <= trip["delay"].keys() for trip in arrived):
         raise BadInputError(f"{log.name} (irtt's server sent no stamps): has round trips; {HALVE}")
     both = [int(trip["delay"][key]) for trip in arrived for key in ("send", "receive")]
@@ -344,7 +344,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     is 0, all other delays are far from 0, and there is no column `loss`.
 
     `trust_units` accepts values that seem to be in another unit. Without `halve`, round trips are
-    rejected. `name` is that of the file, for messages.
+    rejected. `name` is the name of the file, for messages.
 
     Raises:
         BadInputError: If the log cannot be used; the text names line, value and remedy.
@@ -526,7 +526,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
 
 
 class _Ping:
-    """Content of the lines of a log. A number is a packet's sequence number.
+    """Collects the packets of a log of ping; a number is the sequence number of a packet.
 
     Attributes:
         replies: Number -> time of sending and round trip [s].

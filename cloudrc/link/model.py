@@ -23,7 +23,7 @@ HEADER_BYTES = 28
 Source: RFC 791, RFC 768.
 """
 _TABLES = 64
-"""Number of blocks of impairments that are kept."""
+"""Number of blocks of impairments that stay in memory."""
 
 
 class LinkDirection:
@@ -57,8 +57,8 @@ class LinkDirection:
         """Replace the conditions from the next packet on.
 
         Seed, counts and the bottleneck's queue stay. The random draws are the same as if the link
-        had used this profile from the start. The new time line begins at the next packet
-        (`restart`), or began when the present one did.
+        had used this profile from the start. With `restart`, the new time line begins at the next
+        packet; otherwise the origin of the old time line stays.
         """
         if restart:
             self._origin_ns = None
@@ -122,8 +122,8 @@ class LinkDirection:
     def counts(self) -> dict[str, int]:
         """Return the number of packets by outcome so far.
 
-        At least one copy arrives (`passed`) or two (`duplicated`); no copy arrives, by cause
-        (`lost`, `blackout`, `queue`); the packet is damaged (`corrupted`).
+        The outcomes: `passed` (at least one copy arrives); `duplicated` (two copies arrive);
+        `lost`, `blackout`, `queue` (no copy arrives, by cause); `corrupted` (a bit is flipped).
         """
         return dict(self._counts)
 

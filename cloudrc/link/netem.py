@@ -45,7 +45,8 @@ ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
 PERIOD_NS = 1_000_000_000
 """Time between two checks of the qdiscs [ns]."""
 STEP_NS = 5_000_000
-"""Shortest time between two steps of the qdisc [ns]; steps that follow sooner are skipped."""
+"""Shortest time between two changes of the qdisc along a time line [ns]. If the changes of a time
+line follow each other sooner, some are skipped."""
 LIMIT = 10_000
 """Limit of packets in a qdisc without a bottleneck, as in the relay."""
 DELAY_MAX_MS = 274_000
@@ -59,7 +60,7 @@ _ONE = 8192
 _END_OF_TABLE = 32_767 / _ONE
 """Largest 16-bit entry, in units of the jitter."""
 _KEPT = 10_000
-"""Number of latest steps that the percentiles cover."""
+"""Number of the most recent changes whose lateness counts in the percentiles."""
 _IN_ORDER = "100gbit"
 """Rate that has no effect except that netem keeps the order of packets."""
 _ETHERNET_BYTES = 14
@@ -71,7 +72,7 @@ _CHANCE_MIN = 2.0**-32
 _PACKET_BITS = 8 * 116
 """Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
 _PACKETS = 1_000
-"""Assumed packet rate without a bottleneck [1/s], higher than that of a tunnel or a probe."""
+"""Assumed packet rate without a bottleneck [1/s], higher than the rate of tunnel or probes."""
 # The kernel's own default for three bands: nothing falls into the fourth by its type of service.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
 _MODULES = ("sch_netem", "sch_prio", "cls_u32")
@@ -117,9 +118,9 @@ class Iproute2:
 
 
 def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
-    """Make the error for a failed call: the cause and the remedy."""
+    """Turn the failed call of a program into an error with cause and remedy."""
     text = " ".join((answer.error or answer.output).split())
-    unknown = "kind is unknown", "classifier not found", "No such file"
+    unknown = "kind is unknown", "classifier not found", "answers: No such file"
     if answer.code == NOT_FOUND:
         cause = f"no program {program} (package iproute2); install it, or {_INSTEAD}"
     elif "Operation not permitted" in text:
@@ -157,10 +158,11 @@ _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
 
 
 def table(distribution: str) -> list[int]:
-    """Make the table of "uniform", "normal" or "pareto": quantiles at the centres of equal shares.
+    """Make netem's table for the distribution "uniform", "normal" or "pareto".
 
     Returns:
-        Quantile · 8192 / STRETCH in units of the jitter, rounded, rising, shape (4096,).
+        Quantiles at the probabilities (n + 0.5) / 4096, in units of the jitter, times
+        8192 / STRETCH, rounded, rising, shape (4096,).
     """
     values = _QUANTILES[distribution]((np.arange(ENTRIES) + 0.5) / ENTRIES)
     if distribution != "uniform":  # mean 0, standard deviation 1
@@ -177,7 +179,7 @@ def stretch(profile: DirectionProfile) -> int:
 
 
 def distribution_name(profile: DirectionProfile) -> str:
-    """Return tc's name of a profile's distribution: a name in `STRETCH`, or one for its table."""
+    """Return the name by which tc finds the table of a profile's distribution."""
     if profile.distribution != "table":
         return profile.distribution
     # tc makes a file name of it, so only letters and digits; another table is another file.
@@ -185,7 +187,7 @@ def distribution_name(profile: DirectionProfile) -> str:
 
 
 def write_tables(folder: Path) -> None:
-    """Write all tables into a folder; tc finds them if TC_LIB_DIR names this folder."""
+    """Write the tables for `STRETCH` to a folder; tc reads them if TC_LIB_DIR names the folder."""
     for distribution in STRETCH:
         _write(folder, distribution, table(distribution))
 
@@ -327,8 +329,9 @@ def _is_ours(root: dict[str, Any]) -> bool:
 def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
     """Read netem's counts from the objects of `tc -s -j qdisc show`; empty without `Netem`'s qdisc.
 
-    Datagrams are sent on (`forwarded`, copies included), dropped at random or by a full queue
-    (`lost`), or queued now (`held`).
+    Returns:
+        Numbers of datagrams: `forwarded` (copies included), `lost` (dropped at random or by a full
+        queue), and `held` (queued now).
     """
     leaf = leaf_of(qdiscs)
     if leaf is None:
@@ -337,11 +340,11 @@ def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
 
 
 class Steps:
-    """Counts the steps of a qdisc along a time line.
+    """Counts the changes that a time line makes to a qdisc, and their lateness.
 
     Attributes:
-        applied: Number of steps that were taken.
-        passed_over: Number of steps that were skipped, because the next one was due.
+        applied: Number of changes made.
+        passed_over: Number of changes that were skipped, because the next change was due.
     """
 
     def __init__(self) -> None:
@@ -349,23 +352,23 @@ class Steps:
         self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
 
     def note(self, lateness_ns: int, passed_over: int) -> None:
-        """Count a step, and the steps that were skipped just before it.
+        """Count one change, and the changes that were skipped just before.
 
-        The lateness [ns] is the time from when the step was due until tc reports it in force.
+        The lateness [ns] is the time from the due instant until tc reports the change in force.
         """
         self.applied += 1
         self.passed_over += passed_over
         self._lateness_ns.append(lateness_ns)
 
     def counts(self) -> dict[str, int]:
-        """Return the median and the 99th percentile of the lateness [ns]; empty before a step."""
+        """Return the median and the 99th percentile of the lateness [ns]; {} before a change."""
         if not self._lateness_ns:
             return {}
         found = np.quantile(self._lateness_ns, (0.5, 0.99), method="inverted_cdf").tolist()
         return {"step_lateness_p50_ns": found[0], "step_lateness_p99_ns": found[1]}
 
     def in_words(self) -> str:
-        """Describe how late the steps of the time line were; needs at least one step."""
+        """Describe how late the changes of the time line were; needs at least one change."""
         median_ns, worst_ns = self.counts().values()
         return (
             f"{self.applied} steps of the time line, late by {median_ns * 1e-6:.2f} ms in the "
@@ -375,10 +378,10 @@ class Steps:
 
 
 class Netem:
-    """One direction of the link in the kernel.
+    """Shapes one direction of the link in the kernel.
 
     Attributes:
-        steps: Counts and lateness of the steps along the time line so far.
+        steps: Counts and lateness of the changes that the time line has made so far.
     """
 
     name = "netem"
@@ -461,7 +464,7 @@ class Netem:
             raise
 
     def step(self, timeout: float) -> None:
-        """Apply the steps of the time line when they are due, for `timeout` [s]."""
+        """Make the changes of the time line that fall due within the next `timeout` [s]."""
         until_ns = self._clock() + round(timeout * 1e9)
         if self._clock() - self._looked_ns >= PERIOD_NS:
             # The limit is as asked again once what was under way at a change has left.
@@ -477,7 +480,7 @@ class Netem:
     def counts(self) -> dict[str, int]:
         """Return `counters`, the counts of `steps`, and `restored`.
 
-        `restored` is how often another program has removed or changed the qdiscs. Its name comes
+        `restored` is how often another program has removed or changed the qdiscs. The name comes
         from an older metric; nothing is restored.
         """
         return counters(self._look()) | self.steps.counts() | {"restored": self._damages}
@@ -487,13 +490,13 @@ class Netem:
         return {}
 
     def close(self) -> None:
-        """Remove the qdiscs if they are from `Netem`; queued datagrams are lost."""
+        """Remove the qdiscs that `Netem` has set; queued datagrams are lost."""
         if self._device and _is_ours(_root_of(self._qdiscs())):
             self._iproute2.tc("qdisc", "del", "dev", self._device, "root")
         self._device, self._applied = "", []
 
     def _look(self) -> list[dict[str, Any]]:
-        """Read the qdiscs; log and count changes by another program since the last own change."""
+        """Read the qdiscs; log and count what another program has changed."""
         self._looked_ns, qdiscs = self._clock(), self._qdiscs()
         leaf = leaf_of(qdiscs)
         found = leaf and leaf.get("options")
@@ -525,7 +528,7 @@ class Netem:
         self._apply("add" if leaf_of(qdiscs) is None else "change")
 
     def _step(self) -> None:
-        """Apply the present step of the time line; tolerate damage by another program."""
+        """Apply the present conditions; tolerate that another program has removed the qdisc."""
         try:
             self._apply("change")
         except CloudrcError:
@@ -534,7 +537,7 @@ class Netem:
                 raise
 
     def _apply(self, verb: str) -> None:
-        """Bring the present conditions into force, unless they already are."""
+        """Put the present conditions of the time line into force, if they are not in force yet."""
         elapsed_ns, starts_ns = self._clock() - self._origin_ns, self._timeline.pass_ns
         before, self._piece = self._piece, max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
         wanted = options(self._profile, self._timeline.pieces[self._piece], self._room)
@@ -550,7 +553,7 @@ class Netem:
                 self._log(self.steps.in_words())
 
     def _next_ns(self) -> float:
-        """Return when the next step may take effect [ns]; infinite after the last step."""
+        """Return when the next change may be made [ns] on `clock`; infinite after the last one."""
         following = self._piece + 1
         if following >= len(self._timeline.pass_ns):
             return inf

@@ -176,7 +176,7 @@ class Timeline:
 
     @property
     def last_ns(self) -> float:
-        """When the conditions change for the last time [ns]; infinite for a looping time line."""
+        """Time of the last change since the link came up [ns]; infinite for a looping time line."""
         return self.pass_ns[-1] if self.period_ns is None else inf
 
     def only(self) -> Conditions | None:

@@ -38,7 +38,7 @@ Send: TypeAlias = Callable[[bytes], object]
 """Function that sends a datagram; it raises an OSError if the kernel refuses."""
 
 IN_FLIGHT_MAX = 10_000
-"""Limit of datagrams that a lane holds at once; further datagrams are dropped and counted."""
+"""Limit of datagrams that one direction holds at once; more datagrams are dropped and counted."""
 DATAGRAM_MAX = 2_048
 """Limit of a datagram's length [bytes], so that the memory of a lane is bounded."""
 BATCH = 32
@@ -52,7 +52,7 @@ ANCILLARY_SIZE = 64
 AGE_MAX_NS = 50_000_000
 """Limit of a datagram's age when it is read [ns]; an older datagram counts as this old."""
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-"""Percentiles of the lateness that are reported."""
+"""Name -> probability of each percentile of the lateness that is reported."""
 
 _BITS = 7
 """How many significant bits of a lateness select its bucket: buckets are 1.6 % wide."""
@@ -119,7 +119,7 @@ class Stamps:
     def wall_ns(self, ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
         """Return when a datagram arrived by the wall clock [ns]; None without a stamp.
 
-        `ancillary` are the ancillary data that `recvmsg` returns; they also update `dropped`.
+        `ancillary` are the ancillary data that `recvmsg` returns; the call also updates `dropped`.
         """
         wall_ns = None
         for _, kind, data in ancillary:
@@ -141,11 +141,11 @@ class Stamps:
 
 
 class Lane:
-    """Takes datagrams in, asks the model, and sends them when they are due.
+    """One direction of the relay: takes datagrams in, asks the model, sends them when they are due.
 
     Attributes:
         source: Bound UDP socket at which the datagrams arrive; the caller closes it.
-        direction: Model of the link.
+        direction: Model of this direction of the link.
         origin_ns: Start of the model's time [ns], monotonic clock; None before the first datagram,
             which sets it.
         errors: How late datagrams have left.
@@ -257,10 +257,10 @@ class Lane:
 
 
 class Lanes:
-    """Lanes that share one thread and one wait.
+    """Runs several lanes in one thread.
 
-    The models' time starts at `origin_ns` [ns], monotonic clock. If it is None, their time starts
-    at the first datagram on any lane, as in virtual time.
+    The time of the models starts at `origin_ns` [ns], monotonic clock. If `origin_ns` is None, the
+    time starts at the first datagram on any lane, as in virtual time.
     """
 
     def __init__(self, lanes: Sequence[Lane], origin_ns: int | None) -> None:
@@ -317,9 +317,9 @@ class Lanes:
         return dict(outcomes)
 
     def recent(self) -> dict[str, int]:
-        """Return the percentiles [ns] since the tenth call before, and `released_early` in total.
+        """Return the total `released_early`, and the recent percentiles of the lateness [ns].
 
-        Call this method once a second: then the percentiles cover ten seconds.
+        Call this method once a second: the percentiles cover the time since the tenth call before.
         """
         errors = self.errors()
         recent = ReleaseErrors(errors - self._past[0]).in_ns()
@@ -349,9 +349,9 @@ class Relay(Lanes):
         world_peer: Address,
         cloud_peer: Address,
     ) -> None:
-        """Connect the bound UDP sockets of both sides to their ends; the caller closes them.
+        """Connect the bound UDP sockets of both sides to their ends; the caller closes the sockets.
 
-        The origin of both models is 0. An end sends from the address at which it receives.
+        The origin of both models is 0. Each end sends from the address at which it receives.
 
         Raises:
             OSError: If an end cannot be reached from its socket's address.
@@ -380,7 +380,7 @@ class Relay(Lanes):
 
 
 class RelayShaper(Lanes):
-    """One direction of the link in userspace, with the same methods as `Netem`."""
+    """Shapes one direction of the link in userspace, with the same methods as `Netem`."""
 
     name = "relay"
 

@@ -1,7 +1,7 @@
-"""Run the `link` container of a pod: choose a shaper, publish the route, follow changes.
+"""Run the `link` container of a pod: choose a shaper, follow changes of profile and peer.
 
-Other threads set the attributes `peer` and `profile` of the `Sidecar`; only the thread in `run`
-uses the shaper.
+The route file holds the address to which this pod's tunnel end has to send. Other threads set the
+attributes `peer` and `profile` of the `Sidecar`; only the thread in `run` uses the shaper.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from cloudrc.records import Counted
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: "relay" and "netem" are strict, "auto" uses netem if possible."""
 COUNT_PERIOD_NS = 1_000_000_000
-"""Time between two updates of the metrics, and of the file with `RELEASED_SUFFIX` [ns]."""
+"""Time between two updates of the metrics, and of the file with the lateness of datagrams [ns]."""
 STEP = 0.05
 """Longest time until the thread in `run` sees a new peer or profile [s]."""
 
@@ -43,7 +43,7 @@ STEP = 0.05
 Shaper: TypeAlias = RelayShaper | Netem
 """Shapes the datagrams from this pod's tunnel end to the other pod's."""
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
-"""Function that makes a shaper from conditions and the start of their time line [ns]."""
+"""Function that makes a shaper from a profile and the origin of its time line [ns], monotonic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Near:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the process of a link reports about the direction that it shapes.
+    """Report of a `link` container: the shaper and the conditions in force.
 
     Attributes:
         shaper: "relay" or "netem".
@@ -123,16 +123,16 @@ class Metrics(Protocol):
     """Exports the metrics of a sidecar."""
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the shaper of a direction from now on."""
+        """Export which shaper a direction uses from now on."""
 
     def ready(self, ready: bool) -> None:
-        """Set whether the route is published."""
+        """Export whether the route file exists."""
 
     def asked(self, direction: str, delay: float) -> None:
-        """Set the mean delay [s] that the profile in force requests."""
+        """Export the mean one-way delay [s] that the profile in force requests."""
 
     def see(self, records: Iterable[Counted]) -> None:
-        """Set the number of datagrams so far by outcome; called once a second."""
+        """Export the number of datagrams so far by outcome; called once a second."""
 
 
 class Sidecar:
@@ -153,9 +153,9 @@ class Sidecar:
         route: Path,
         metrics: Metrics | None = None,
     ) -> None:
-        """Set up; `route` is the file for the address to which this pod's tunnel end has to send.
+        """Set up; `route` is the path of the route file, and the state file is in the same folder.
 
-        The state file is in the same folder. `direction` is "uplink" or "downlink".
+        `direction` is "uplink" or "downlink".
         """
         self.peer: Address | None = None
         self.profile = profile
@@ -270,7 +270,7 @@ class Sidecar:
         return True
 
     def _change_of(self, profile: Loaded) -> Change:
-        """Return the change of a profile; an unknown change if the number is the last one's."""
+        """Return the change that led to a profile; an unknown change if the number is not new."""
         return profile.change if profile.change.number != self._number else Change()
 
     def _tell(self, shaper: Shaper, profile: Loaded) -> None:

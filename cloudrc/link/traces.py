@@ -28,7 +28,8 @@ UNIX_TIME = 1e8
 the first time is subtracted."""
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _ROWS_TO_JUDGE = 10
-"""Only in traces of at least this many rows a delay of 0 may mark a loss; others are typed."""
+"""Only in traces of at least this many rows a delay of 0 may mark a loss; shorter traces are
+probably typed by hand."""
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
@@ -156,7 +157,7 @@ class Row(NamedTuple):
         return _parse(self.text(column).replace(self.decimal, "."))
 
     def no_number(self, column: str, wanted: str = "a number") -> BadInputError:
-        """Make the error for a cell that should have what is wanted."""
+        """Make the error for a cell that is not as `wanted`."""
         text = self.text(column)
         shown = repr(text[:40]) if text else "nothing"
         return BadInputError(f"{self.where}: {column} is {shown}; give {wanted}")
@@ -165,8 +166,8 @@ class Row(NamedTuple):
 def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]]:
     """Read a CSV file with a header, separated by commas, or by semicolons or tabs.
 
-    Blank lines and comments are skipped. A file with numbers alone is refused, and a row with more
-    cells than the header.
+    Blank lines and comments are skipped. A file without a header is refused, and so is a row with
+    more cells than the header.
 
     Returns:
         Names of the columns in lower case ("RTT (ms)" becomes rtt_ms), and the rows.

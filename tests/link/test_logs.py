@@ -151,8 +151,8 @@ def test_packets_are_put_in_the_order_of_sending():
     packets = log.packets()
     assert (packets.sent, packets.delays) == ((1.0, 2.0), (None, 0.1))
     assert (packets.lost, packets.duration) == (1, 1.0)
-    shuffled = [(float(n * 7 % 50), 0.1) for n in range(50)]
-    assert Log("x", shuffled).packets().notes == ("42 out of order, sorted",)
+    shuffled = [(float(n % 30 + 30 * (4 - n // 30)), 0.1) for n in range(150)]
+    assert Log("x", shuffled).packets().notes == ("120 out of order, sorted",)
     with pytest.raises(BadInputError, match="no packet arrived"):
         Log("x", [(0.0, None)]).packets()
 
@@ -193,15 +193,15 @@ def irtt(trips, direction=None, **stats):
     return read_irtt(text, "x", direction, halve=direction is None)
 
 
-TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(4)]
+TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(4, send=35)]
 
 
 @pytest.mark.parametrize(
     ("direction", "sent", "delays"),
     [
-        ("uplink", (0.0, 0.010, 0.030, 0.040), (0.030, None, None, 0.030)),
-        ("downlink", (0.0, 0.020, 0.030, 0.040), (0.020, None, None, 0.020)),
-        (None, (0.0, 0.010, 0.020, 0.030, 0.040), (0.025, None, None, None, 0.025)),
+        ("uplink", (0.0, 0.010, 0.030, 0.040), (0.030, None, None, 0.035)),
+        ("downlink", (0.0, 0.0225, 0.0325, 0.045), (0.020, None, None, 0.020)),
+        (None, (0.0, 0.010, 0.020, 0.030, 0.040), (0.025, None, None, None, 0.0275)),
     ],
 )
 def test_irtt_knows_both_ways(direction, sent, delays):
@@ -212,8 +212,17 @@ def test_irtt_knows_both_ways(direction, sent, delays):
     assert packets.notes == ("1 duplicates left out",)
 
 
+def test_irtt_without_a_monotonic_clock_is_read():
+    trips = [trip(0), trip(1)]
+    for one in trips:
+        del one["timestamps"]["client"]["send"]["monotonic"]
+    assert irtt(trips, "uplink").sent == pytest.approx((0.0, 0.010))
+
+
 STEPPED = [trip(0), trip(1), trip(2)]
 STEPPED[2]["timestamps"]["server"]["receive"]["monotonic"] -= 30_000_000
+CLIENT_STEPPED = [trip(0), trip(1)]
+CLIENT_STEPPED[1]["timestamps"]["client"]["send"]["wall"] += 9_000_000
 NO_STAMPS = [trip(0)]
 del NO_STAMPS[0]["delay"]["send"]
 
@@ -225,6 +234,7 @@ del NO_STAMPS[0]["delay"]["send"]
         ([trip(0, send=-5, receive=60)], {}, "arrived 5 ms before it was sent: the two clocks dif"),
         ([trip(0, send=60, receive=-5)], {}, "arrived 5 ms before it was sent: the two clocks dif"),
         (STEPPED, {}, "the clock of irtt's server made a step of 30 ms"),
+        (CLIENT_STEPPED, {}, "the clock of irtt's client made a step of 9 ms"),
         (NO_STAMPS, {}, r"server sent no stamps.*--halve-rtt"),
         (
             TRIPS,
@@ -343,7 +353,9 @@ STAMPED = "[1700000000.5] "
     ],
 )
 def test_other_pings_and_languages_are_read(lines, delays):
-    found = [delay and delay * 1e3 for delay in ping(*lines).delays]
+    packets = ping(*lines)
+    assert packets.duration == pytest.approx(len(delays) - 1)
+    found = [delay and delay * 1e3 for delay in packets.delays]
     assert found == pytest.approx(list(delays))
 
 
@@ -396,9 +408,11 @@ def test_a_step_of_the_clock_or_a_pause_is_named():
     packets = ping(*(reply(n, n + 10.0 * (n > 5)) for n in range(1, 12)))
     assert packets.notes[0].startswith("nothing sent for 11 s after packet 5: a pause, ")
     dated = [
-        f"2024-01-{day} 10:00:00.5 {reply(number, 0.0)[11:]}"
+        f"2024-01-{day} 1{number}:00:00.5 {reply(number, 0.0)[11:]}"
         for number, day in enumerate((10, 11, 12, 13, 18))
     ]
-    assert ping(*dated).notes[0].startswith("nothing sent for 4.32e+05 s after packet 4: a pause, ")
+    assert (
+        ping(*dated).notes[0].startswith("nothing sent for 4.356e+05 s after packet 4: a pause, ")
+    )
     back = ping(*FIVE, reply(6, 0.3))
     assert back.notes == ("1 out of order, sorted",)

@@ -263,6 +263,10 @@ def test_tables_are_the_models_distributions(distribution, tmp_path):
         ),
         (Answer(1, "", 'Illegal "latency"\n'), "'tc qdisc add netem' failed: Illegal \"latency\""),
         (Answer(3, "", ""), "exit code 3"),
+        (
+            Answer(1, "", "No distribution data for t (No such file or directory)"),
+            "failed: No dist",
+        ),
     ],
 )
 def test_an_error_of_tc_becomes_one_sentence(answer, words):
@@ -369,6 +373,7 @@ def test_a_kernel_that_lacks_a_module_is_left_as_it_was(lacks):
     with pytest.raises(MissingPrerequisiteError, match="this kernel lacks sch_netem, sch_prio or "):
         netem(kernel, PLAIN).follow_peer(PEER)
     assert kernel.root["kind"] == "noqueue"
+    assert "'tc qdisc change' failed" in str(explain("tc", ("qdisc", "change"), UNKNOWN))
 
 
 def take_the_delay_out(kernel):
