@@ -114,7 +114,8 @@ def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) ->
 def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> tuple[bool, ...]:
     """Run the two-state chain over a block: True for packets in the bad state, shape (256,).
 
-    `bad_start` and `bad_end` are the probabilities per packet that the bad state starts and ends.
+    `bad_start` and `bad_end` are the probabilities per packet, in [0, 1], that the bad state
+    starts and ends.
     """
     if not bad_start:
         return (False,) * BLOCK
