@@ -274,7 +274,6 @@ class Programs:
                 raise OSError("no answer of tc")
             text += data
         if failed:
-            return Answer(
-                2, "", "\n".join(one for one in lines if not one.startswith(("[", "Comm")))
-            )
+            said = [one for one in lines if not one.startswith(("[", "Command failed"))]
+            return Answer(2, "", "\n".join(said))
         return Answer(0, listings[0] if lists else "", "")

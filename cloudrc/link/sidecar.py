@@ -39,7 +39,6 @@ COUNT_PERIOD_NS = 1_000_000_000
 STEP = 0.05
 """Longest time until the thread in `run` sees a new peer or profile [s]."""
 
-
 Shaper: TypeAlias = RelayShaper | Netem
 """Shapes the datagrams from this pod's tunnel end to the other pod's."""
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]

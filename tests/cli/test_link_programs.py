@@ -15,7 +15,7 @@ def answer(words):
     with log.open("a") as file:
         file.write(" ".join(words) + chr(10))
     if "lacks" in words:
-        print("Error: Specified qdisc kind is unknown.", file=sys.stderr, flush=True)
+        print("Cannot find device eth0", file=sys.stderr, flush=True)
         return 2
     if "show" in words:
         print('[{{"kind":"netem"}}]' if "eth0" in words else "[]", flush=True)
@@ -47,7 +47,7 @@ def test_changes_and_listings_go_through_one_process(programs, tmp_path):
         assert programs(SHOW) == (0, '[{"kind":"netem"}]', "")
         code, _, error = programs((*CHANGE, "lacks"))
         assert code
-        assert "qdisc kind is unknown" in error
+        assert error == "Cannot find device eth0"
         assert programs((*SHOW, "lacks")).code
     lines = [line for line in (tmp_path / "log").read_text().splitlines() if line[-2:] != "lo"]
     assert lines[:2] == ["qdisc change dev eth0 netem delay 1us", "qdisc show dev eth0"]

@@ -39,7 +39,7 @@ def test_a_row_of_a_trace_begins_halfway_between_two_packets():
             "timestamp_ns,delay_ns\n1700000000000000000,45000000\n1700000000500000000,6e7",
             (0.045, 0.06),
         ),
-        ("\ufeffTime (ms);Delay [µs]\n0;45000,5\n500;6e4".lstrip("\ufeff"), (0.0450005, 0.060)),
+        ("Time (ms);Delay [µs]\n0;45000,5\n500;6e4", (0.0450005, 0.060)),
         (
             'timestamp\t"delay_ms"\n2024-01-20 10:00:00.000\t45\n2024-01-20T10:00:00.500\t60',
             (0.045, 0.06),

@@ -5,14 +5,12 @@ import random
 from dataclasses import replace
 from importlib.resources import files
 from math import asin, erf, isnan, pi, sqrt
-from typing import Literal
 
 import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from cloudrc.config.schema import Direction, Profile
 from cloudrc.link.draws import (
@@ -32,8 +30,6 @@ MS, SECOND = 1_000_000, 1_000_000_000
 PERIOD_NS, SIZE = 10 * MS, 172
 COUNT = 20_000
 KEY = stream_key(1, True, 1, 3)
-Array = NDArray[np.float64]
-Shape = Literal["uniform", "normal", "pareto"]
 BURSTS = GilbertElliott(0.02, 0.2)
 """Loss 1/11, in bursts of 5 packets."""
 LIVELY = DirectionProfile(

@@ -14,11 +14,9 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from cloudrc.assembly import link_profile
 from cloudrc.cli.link_run import Programs
@@ -39,8 +37,6 @@ MINUTES = [
     and (way == "uplink" or load_profile(name).downlink != load_profile(name).uplink)
 ]
 """Every direction that ships, once: most profiles have the same both ways."""
-Distribution = Literal["uniform", "normal", "pareto"]
-Floats = NDArray[np.float64]
 pytestmark = pytest.mark.netem
 
 
@@ -495,8 +491,7 @@ class Pod:
         self.process.wait()
 
     def told(self):
-        found = json.loads(self.state.read_text())
-        return found
+        return json.loads(self.state.read_text())
 
     def end(self):
         self.process.send_signal(signal.SIGTERM)

@@ -318,7 +318,7 @@ def test_a_thread_gets_priority_if_permitted_and_exact_sleeps(monkeypatch):
     assert ask_for_fifo() == "this system has no SCHED_FIFO"
 
 
-LIVELY: dict[str, object] = {
+LIVELY = {
     "profile": "ideal",
     "uplink": {"delay_ms": 20, "jitter_ms": 15, "duplicate": 0.2, "loss": 0.2, "reorder": 0.1},
 }

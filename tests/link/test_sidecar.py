@@ -4,7 +4,6 @@ import json
 from datetime import UTC, datetime, timedelta
 from errno import ENOSPC
 from itertools import pairwise
-from typing import Any
 
 import pytest
 
@@ -113,8 +112,7 @@ class Bench:
         self.sidecar.profile = Loaded(DirectionProfile(delay), values, change)
 
     def told(self):
-        found = json.loads(self.state.read_text())
-        return found
+        return json.loads(self.state.read_text())
 
 
 def test_relay_touches_no_netem_and_leaves_no_route(tmp_path):
@@ -258,8 +256,8 @@ def test_a_full_disk_ends_nothing_and_delays_the_state(tmp_path, monkeypatch):
 RICH = DirectionProfile(
     0.04, 0.01, "table", loss=GilbertElliott(0.01, 0.2), duplicate=0.02, rate=2e6, table=(-1.0, 1.0)
 )
-OURS: dict[str, Any] = {"kind": "netem", "handle": "7401:", "dev": "eth0", "options": {}}
-THEIRS: dict[str, Any] = {"kind": "netem", "handle": "8001:", "dev": "eth1", "options": {}}
+OURS = {"kind": "netem", "handle": "7401:", "dev": "eth0", "options": {}}
+THEIRS = {"kind": "netem", "handle": "8001:", "dev": "eth1", "options": {}}
 
 
 def test_a_status_is_written_and_read_again():
