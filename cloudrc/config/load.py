@@ -173,14 +173,6 @@ def check_profile(document: Document, name: str) -> Profile:
     return _validate(document, Profile, name, _resolve_traces(document, ()))
 
 
-def load_mission(name: str | Path, folder: Path | None = None) -> Mission:
-    """Load a mission by name or path (relative to `folder`); raises BadInputError.
-
-    `config.mission_check.check_mission` checks a mission against a scene.
-    """
-    return _validate(shipped.read("mission", str(name), folder or Path()), Mission, str(name))
-
-
 def dump(experiment: ResolvedExperiment) -> str:
     """Write an experiment as YAML that loads as an equal experiment without other files.
 

@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 import cloudrc
-from cloudrc.config.load import load_mission
+from cloudrc.config.load import load_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.geometry.scene import load_scene
 from tests.chart.conftest import CHART, of_kind, pod_specs, render
@@ -14,6 +14,10 @@ EXAMPLES = {
     for name in ("mission-job", "mission-paper")
 }
 ENABLED = {"mission": {"enabled": True}}
+
+
+def load(mission):
+    return load_experiment("hover", [f"mission={mission}"]).mission
 
 
 def jobs(values=None, **where):
@@ -67,8 +71,8 @@ def test_the_plan_defaults_to_the_experiments_mission(values, name, tmp_path):
     config = job["spec"]["template"]["spec"]["volumes"][0]["configMap"]["name"]
     (data,) = (t["data"] for t in objects if t["metadata"]["name"] == config and "data" in t)
     (tmp_path / "mission.yaml").write_text(data["mission.yaml"])
-    mission = load_mission(tmp_path / "mission.yaml")
-    assert mission == load_mission(name) if name else mission.start == "here"
+    mission = load(tmp_path / "mission.yaml")
+    assert mission == load(name) if name else mission.start == "here"
 
 
 def test_only_another_mission_makes_another_job():
@@ -93,10 +97,10 @@ def test_an_example_fits_the_release_of_the_readme(name, tmp_path):
     selected = release["cloudrc-mission"]["spec"]["podSelector"]["matchLabels"]
     assert selected.items() <= pod["metadata"]["labels"].items()
     (tmp_path / "mission.yaml").write_text(config["data"]["mission.yaml"])
-    mission = load_mission(tmp_path / "mission.yaml")
+    mission = load(tmp_path / "mission.yaml")
     assert check_mission(mission, load_scene("pipes")) == []
     if name == "mission-paper":
-        assert mission.waypoints == load_mission("pipes").waypoints
+        assert mission.waypoints == load("pipes").waypoints
 
 
 def test_the_chart_makes_the_job_of_the_examples():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import yaml
 
@@ -22,8 +20,6 @@ from tests.cluster.conftest import (
     start_pod,
     terminated,
 )
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_flags_override_the_kubeconfig(api):

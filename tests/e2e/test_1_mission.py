@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import pytest
 
@@ -32,7 +30,6 @@ MISSION = "paper-mission"
 LIMIT_TIME = 360.0
 """Time limit from `kind create cluster` to the completed Job [s]."""
 PORTS = {"world": (9100, 9102), "cloud": (8080, 9100, 9101, 9102)}
-Ask = Callable[[str], list[dict[str, Any]]]
 
 
 @dataclass

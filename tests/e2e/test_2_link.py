@@ -68,7 +68,6 @@ LINK_TEST = f"{NAME}-test-link"
 """Pod of `helm test` that verifies the link; Helm keeps the pod after a failure."""
 ASIDE = (0.5, 0.5, 0.8)
 """Point to which the operator sends the robot while the mission is held [m]."""
-Times = tuple[float, dict[str, float]]
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.pods import fetch_recording
-from cloudrc.config.load import load_mission
+from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from tests.drivers.conftest import ages_at_hold
@@ -33,7 +33,7 @@ from tests.e2e.conftest import (
     value,
 )
 
-PIPES = [waypoint.model_dump(mode="json") for waypoint in load_mission("pipes").waypoints]
+PIPES = load_experiment("paper").mission.model_dump(mode="json")["waypoints"]
 LINGER = 12
 """Time for which an old pod runs beside the new one [s]."""
 ENDS_IN = 2.0

@@ -19,14 +19,11 @@ from cloudrc.records import (
     Lateness,
     LinkChecked,
     MissionEvent,
-    Record,
     SessionOpened,
     TelemetrySent,
 )
 from tests.exposition.conftest import MS, period
 from tests.flights.conftest import records
-
-Flight = tuple[list[Record], list[Record]]
 
 
 def value(live, name, *label_values):

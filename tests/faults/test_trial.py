@@ -23,7 +23,6 @@ from cloudrc.world.guard.limits import Limits as GuardLimits
 from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
 
-Patch = pytest.MonkeyPatch
 MS = 1_000_000
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
 SHORT = [path for path in REGRESSIONS if load(path).duration < 45.0]

@@ -18,7 +18,7 @@ LAST = 27.0
 """Uncapped the board is touched 1 s later; at 1.5 m/s 4.9 s later, 2.2 s after pipe 3's mouth."""
 ANYWHERE = np.linspace(1.5, LAST, COUNT).round(3).tolist()
 """Evenly from the first waypoint on [s], before, in and between the pipes: half are in one."""
-SLOW, UNCAPPED = ("cloud.controller.speed_max=1.5",), ()
+SLOW = ("cloud.controller.speed_max=1.5",)
 LONG = ("guard.hold_max_s=100", "criteria.time_limit_s=200")
 PATIENCE = (*LONG, *(f"mission.waypoints.{k}.time_limit_s=200" for k in range(7)))
 BOTH = ("uplink", "downlink")

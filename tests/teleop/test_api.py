@@ -13,7 +13,7 @@ import pytest
 
 from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.cli.teleop import api_address, serve_api
-from cloudrc.config.load import load_experiment, load_mission
+from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.geometry.scene import load_scene
@@ -82,7 +82,7 @@ def test_the_operator_steers_and_a_conflict_names_its_mission(api):
 
 
 def test_only_a_mission_to_the_board_must_touch_it(api):
-    pipes = [point.position_m for point in load_mission("pipes").waypoints]
+    pipes = [point.position_m for point in load_experiment("paper").mission.waypoints]
     for points, contact in (([(0.5, 0.0, 1.0)], False), (pipes, True)):
         _, view = api.post("/v1/missions", {"waypoints": [{"position_m": p} for p in points]})
         assert api.flight.teleop.book.find(view["id"]).order.contact is contact

@@ -171,10 +171,6 @@ def test_a_draw_of_the_model_is_predicted_exactly():
     assert not plan.expected(replace(plan, flow=plan.flow._replace(seed=2)).draw(plan.sent)).known
 
 
-def causes_of(rows, known):
-    return [cause.code for cause in find_causes({"uplink": Findings(rows, known)})]
-
-
 STARVED = Evidence("relay", starved="500 datagrams not read in time")
 
 
