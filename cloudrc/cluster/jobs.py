@@ -8,9 +8,9 @@ the exit code of the mission's verdict. The objects are those of the chart's
 from __future__ import annotations
 
 import json
+import re
 import secrets
 import time
-import urllib.request
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,13 +21,11 @@ import yaml
 
 from cloudrc.cluster.client import ClusterError, Release, chart_folder, retry
 from cloudrc.cluster.pods import (
-    NO_PROXY,
-    api_url,
     container_statuses,
+    fetch_metrics,
     find_deployment,
     list_pods,
     one_line,
-    operator_token,
     pod_failure,
     pod_log,
     tokens_secret,
@@ -59,8 +57,8 @@ LOOK_PERIOD = 0.5
 """Time between two requests for the state of a Job [s]."""
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives its pod 30 s."""
-API_LIMIT = 10.0
-"""Time limit for the release's API to answer [s]."""
+FLYING = re.compile(r"^cloudrc_mission_state [123]\b", re.MULTILINE)
+"""Line of teleop's metrics while a mission is starting, flying or held."""
 ENDED = ("complete", "failed")
 """States of a Job that has ended."""
 
@@ -179,24 +177,19 @@ def follow_limit(limit: float, queue: bool) -> float:
 
 
 def find_flight(release: Release) -> tuple[str, str] | None:
-    """Find a Job that has not ended, or else the API's current mission.
+    """Find a Job that has not ended, or else a mission that teleop's metrics show.
 
     Returns:
-        The flight in words, and the command that ends it. None if nothing flies, or if the API
+        The flight in words, and the command that ends it. None if nothing flies, or if the pod
         does not answer: a broken release must not prevent its own repair.
     """
     for job in release.find("jobs", COMPONENT):
         if (status := _status(job, None)).state not in ENDED:
             kubectl = f"kubectl {' '.join(release.flags)}"
             return f"Job '{status.name}'", f"{kubectl} delete job {status.name}"
-    with suppress(CloudrcError, OSError, ValueError), api_url(release) as url:
-        headers = {"Authorization": f"Bearer {operator_token(release)}"}
-        request = urllib.request.Request(f"{url}/v1/state", headers=headers)
-        with NO_PROXY.open(request, timeout=API_LIMIT) as answer:
-            mission = json.load(answer)["mission"]
-        if mission is not None:
-            cancel = f"cloudrc mission cancel {mission['id']} {' '.join(release.cloudrc_flags)}"
-            return f"mission {mission['id']}", cancel
+    with suppress(CloudrcError):
+        if FLYING.search(fetch_metrics(release, "cloud")["teleop"]):
+            return "a mission", f"cloudrc mission cancel {' '.join(release.cloudrc_flags)}"
     return None
 
 
