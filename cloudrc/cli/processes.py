@@ -397,13 +397,13 @@ def _run_relay(options: argparse.Namespace) -> int:
     if exporter is not None:
         should_stop = _counting(stop, relay, exporter)
         for way, loaded in read_profiles(experiment).items():
-            exporter.link.shaped("relay", way, "relay")
-            exporter.link.asked(way, summary(loaded.direction)["delay"] or 0.0)
+            exporter.shaped("relay", way, "relay")
+            exporter.asked(way, summary(loaded.direction)["delay"] or 0.0)
         exporter.runs(fingerprint(experiment))
         exporter.ready(True)
     feed = Feed.on_stdout(watched=options.feed)
     if options.link:
-        asked = exporter.link.asked if exporter else lambda way, delay: None
+        asked = exporter.asked if exporter else lambda way, delay: None
         control = RelayControl(options.link, links, read_profiles(experiment), asked, relay)
         threading.Thread(target=control.follow, name="link control", daemon=True).start()
         should_stop = control.stop_after(should_stop)

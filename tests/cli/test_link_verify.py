@@ -66,7 +66,7 @@ def release(monkeypatch):
         pods = {"world": (at_world, at_up), "cloud": (at_cloud, at_down)}
         made = Release({"world": world, "cloud": cloud}, {"uplink": up, "downlink": down}, pods)
         for way, exporter in made.links.items():
-            exporter.link.shaped("relay", way, "auto")
+            exporter.shaped("relay", way, "auto")
             made.shapes(way, Told("relay", "", APPLIED, Near("eth0", {})))
 
         def count(seconds):

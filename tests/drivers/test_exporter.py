@@ -77,10 +77,10 @@ def exporter(role, flight, *, missions=True):
     if role in ENDS:
         made.recording(lambda: 0.3)
     if role == "link":
-        made.link.shaped("netem", "uplink", "auto")  # "relay" takes its place
+        made.shaped("netem", "uplink", "auto")  # "relay" takes its place
         for way in DIRECTIONS:
-            made.link.shaped("relay", way, "auto")
-        made.link.asked("uplink", 0.045)
+            made.shaped("relay", way, "auto")
+        made.asked("uplink", 0.045)
     return made
 
 
