@@ -22,6 +22,8 @@ KeyPath = tuple[str, ...]
 
 SIZE_MAX = 8 << 20
 """Largest file that is read [bytes]: more than any mission needs."""
+VALUES_MAX = 300_000
+"""Largest number of values in a document: aliases inside aliases multiply the values."""
 SET_LABEL = "--set"
 """Label of a value that was set on the command line."""
 
@@ -122,6 +124,8 @@ def write_yaml(value: Any) -> str:
 def _construct(loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int]) -> Any:
     """Convert a node to plain values, and note the lines of all values in it."""
     lines.setdefault(path, node.start_mark.line + 1)
+    if len(lines) > VALUES_MAX:
+        raise _refuse(node, f"more than {VALUES_MAX} values")
     if isinstance(node, yaml.SequenceNode):
         items = enumerate(node.value)
         return [_construct(loader, item, (*path, str(n)), lines) for n, item in items]

@@ -5,6 +5,7 @@ import os
 import signal
 import stat
 from contextlib import suppress
+from itertools import pairwise
 from math import nan
 from pathlib import Path
 
@@ -99,6 +100,14 @@ def test_no_file_is_read_beyond_its_size_limit(tmp_path, module, read):
         file.truncate(module.SIZE_MAX + 1)
     with pytest.raises(BadInputError, match=f": longer than {module.SIZE_MAX} bytes; "):
         read(path)
+
+
+def test_aliases_in_aliases_do_not_multiply_values_without_end(tmp_path):
+    names = "abcdefghij"
+    lines = [f"{y}: &{y} [{', '.join(f'*{x}' for _ in names)}]" for x, y in pairwise(names)]
+    (tmp_path / "config.yaml").write_text("\n".join(["a: &a [1]", *lines]))
+    with pytest.raises(BadInputError, match="more than 300000 values"):
+        read_experiment(tmp_path / "config.yaml")
 
 
 @pytest.fixture
