@@ -70,7 +70,7 @@ COUNTS_WAIT = 1.3
 """Time until the processes have counted the last probe [s]; they do so once a second."""
 POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0
 """Pause between two polls, and longest wait for a page [s]."""
-PORTS = END_PORT, LINK_PORT = METRICS["world"]["world"], METRICS["world"]["link"]
+PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
 LOOPBACK, DEVICE = "127.0.0.1", "tunnel"
 HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}
 """Direction -> address of its sending end, in that end's namespace."""
