@@ -275,7 +275,9 @@ def _ended(name: str, code: int, log: str) -> CloudrcError:
     last = (log.strip().splitlines() or ["it left no message"])[-1]
     text = f"the {name} is not shaped: {_advise(last.removeprefix('cloudrc: error: '))}"
     known = {one.exit_code: one for one in (BadInputError, MissingPrerequisiteError, TimedOutError)}
-    return known.get(code, InvalidRunError)(text + f" (exit code {code})" * (code not in known))
+    if code in known:
+        return known[code](text)
+    return InvalidRunError(f"{text} (exit code {code})")
 
 
 @contextlib.contextmanager
