@@ -25,12 +25,12 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def find_local_run(
-    options: argparse.Namespace, look: Callable[[Path], _Found | None], nobody: str
+    options: argparse.Namespace, look: Callable[[Path, str], _Found | None], nobody: str
 ) -> _Found | None:
     """Find the run that `--run` names, else ./runs/latest, else the only run that is flying.
 
-    `look` takes the folder of a run and returns what the command needs: the API or the link, or
-    None if no run is flying there. If the run of `--run` is not flying, the error has the text
+    `look` takes the folder of a flying run and the URL of its API ("" without), and returns what
+    the command needs, or None. If the run of `--run` is not flying, the error has the text
     `nobody`.
 
     Returns:
@@ -39,17 +39,25 @@ def find_local_run(
     from cloudrc.drivers.local import under_way
 
     in_cluster = options.context or options.namespace or options.release
+    if options.run is None and (in_cluster or Path(sys.argv[0]).name == KUBECTL_PLUGIN):
+        return None
+    if in_cluster:
+        raise BadInputError("--run names a run here, the other flags a cluster; give one")
+    # The URL comes from this user's flight files, never from the run's folder: a run's folder may
+    # come from somebody else and name a foreign server.
+    flights = under_way()
+
+    def find(run: Path) -> _Found | None:
+        real = Path(os.path.realpath(run))
+        return look(run, flights[real]) if real in flights else None
+
     if options.run is not None:
-        if in_cluster:
-            raise BadInputError("--run names a run here, the other flags a cluster; give one")
-        if (found := look(options.run)) is None:
+        if (found := find(options.run)) is None:
             raise BadInputError(f"--run {options.run}: {nobody}")
         return found
-    if in_cluster or Path(sys.argv[0]).name == KUBECTL_PLUGIN:
-        return None
-    if (found := look(RUNS / "latest")) is not None:
+    if (found := find(RUNS / "latest")) is not None:
         return found
-    others = {run: found for run in under_way() if (found := look(run)) is not None}
+    others = {run: found for run in flights if (found := find(run)) is not None}
     if len(others) > 1:
         names = " or ".join(f"--run {run}" for run in others)
         raise BadInputError(f"{len(others)} runs are flying here; choose one: {names}")
@@ -71,29 +79,3 @@ def no_run_error(
     return MissingPrerequisiteError(
         f"no run flies here (start one: cloudrc run; or name one: {flags}), and {error}"
     )
-
-
-def link_folder_of(run: Path) -> Path | None:
-    """Return the folder that controls the relay of a run; None if the run is not flying.
-
-    The folder alone does not prove a flight, because it stays after a run was killed.
-    """
-    from cloudrc.drivers.local import LINK_FOLDER, under_way
-
-    folder = run / LINK_FOLDER
-    return folder if folder.is_dir() and _real(run) in under_way() else None
-
-
-def api_url_of(run: Path) -> str | None:
-    """Return the URL of the API of this user's run in a folder; None if the run is not flying.
-
-    The URL comes from this user's flight files, never from the run's folder: a run's folder may
-    come from somebody else and name a foreign server.
-    """
-    from cloudrc.drivers.local import under_way
-
-    return under_way().get(_real(run)) or None
-
-
-def _real(run: Path) -> Path:
-    return Path(os.path.realpath(run))

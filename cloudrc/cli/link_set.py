@@ -13,7 +13,7 @@ from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
-from cloudrc.cli.find_run import find_local_run, link_folder_of, no_run_error, run_argument
+from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
 from cloudrc.cli.output import format_document, output_argument, print_line, table
 from cloudrc.cluster.client import DEFAULT_RELEASE, ClusterError, Release
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
@@ -57,7 +57,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Change the link and print its new state."""
     began, number = monotonic(), secrets.token_hex(4)
-    folder = find_local_run(options, link_folder_of, "no run flies there")
+    from cloudrc.drivers.local import LINK_FOLDER
+
+    def link_folder(run: Path, api: str) -> Path | None:
+        folder = run / LINK_FOLDER
+        return folder if folder.is_dir() else None
+
+    folder = find_local_run(options, link_folder, "no run flies there")
     if folder is not None:
         edit, states = _set_here(options, folder, number)
         took = monotonic() - began

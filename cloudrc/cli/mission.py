@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from cloudrc.cli import client
 from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
-from cloudrc.cli.find_run import api_url_of, find_local_run, no_run_error, run_argument
+from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
 from cloudrc.cli.output import escape, format_document, output_argument, print_line, table
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.drivers.machine import Deadline
@@ -134,7 +134,7 @@ def execute(options: argparse.Namespace) -> int:
         return _fly(options)
     if options.api:
         return API_VERBS[verb](options, Api(options.api, token_reader(token_file(options))))
-    if (url := find_local_run(options, api_url_of, NO_API)) is not None:
+    if (url := find_local_run(options, lambda run, api: api or None, NO_API)) is not None:
         return API_VERBS[verb](options, Api(url))  # a local run asks for no token, so send none
     if verb == "run":
         return _run_job(options)

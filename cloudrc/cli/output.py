@@ -10,13 +10,8 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, TextIO
+from typing import TextIO
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-UNLIMITED = 10_000
-"""Width of output that is not for a terminal [columns]."""
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
 
@@ -66,27 +61,12 @@ def paint(text: str, colour: str) -> str:
     return f"\x1b[{_CODES[colour]}m{text}\x1b[0m"
 
 
-def console(stream: TextIO) -> Console:
-    """Make a rich console that writes to a stream, in plain text if the stream is no terminal."""
-    from rich.console import Console
-
-    live = is_live(stream)
-    return Console(
-        file=stream,
-        force_terminal=live,
-        color_system="standard" if live else None,
-        width=None if live else UNLIMITED,
-        highlight=False,
-        markup=False,
-        emoji=False,
-    )
-
-
 def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     """Align rows of equal length in columns; return one line per row.
 
     The cells are escaped. The columns whose index is in `right` are aligned right.
     """
+    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -96,7 +76,7 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     for row in rows:
         grid.add_row(*(Text(escape(cell)) for cell in row))
     drawn = io.StringIO()
-    console(drawn).print(grid)
+    Console(file=drawn, width=10_000).print(grid)  # no line is wrapped
     return "\n".join(line.rstrip() for line in drawn.getvalue().splitlines())
 
 

@@ -7,10 +7,11 @@ from collections.abc import Iterable
 from time import monotonic
 from typing import TextIO
 
+from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from cloudrc.cli.output import console, escape, is_live, print_or_drop
+from cloudrc.cli.output import escape, is_live, print_or_drop
 from cloudrc.drivers.process import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (
@@ -39,7 +40,7 @@ class FlightView:
         self._guard, self._ended = GuardState.GROUND, False
         self._status: Live | None = None
         if is_live(stream):
-            terminal = console(stream)
+            terminal = Console(file=stream)
             self._status = Live(console=terminal, transient=True, get_renderable=self.line)
 
     def see(self, records: Iterable[Record]) -> None:
