@@ -114,9 +114,11 @@ class Api:
             "http": http.client.HTTPConnection,
             "https": http.client.HTTPSConnection,
         }
-        if not parts.hostname or parts.port == 0 or parts.username:
+        if not parts.hostname or parts.port == 0 or parts.username or parts.path or parts.query:
             raise ValueError(self.url)
-        return kinds[parts.scheme](parts.hostname, parts.port, timeout=limit)
+        kind = kinds[parts.scheme]
+        # Without a port, http.client would read one from an IPv6 address.
+        return kind(parts.hostname, parts.port or kind.default_port, timeout=limit)
 
 
 class _UnixConnection(http.client.HTTPConnection):

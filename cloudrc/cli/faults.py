@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
-from cloudrc.cli.parser import COUNT_MAX, input_file, read_count
+from cloudrc.cli.parser import input_file, read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
 
@@ -31,8 +31,8 @@ examples:
 
 exit codes: 0 all checks passed, 1 a check failed, 2 bad input,
   6 a worker was killed, 130 interrupted"""
-SEED_MAX = 2**53 - 1 - COUNT_MAX
-"""Largest seed that is accepted; a search that counts up from this seed stays below 2^53."""
+SEED_MAX = 2**52
+"""Largest first seed. A search counts on from it, and a seed is below 2^53."""
 MINUTES_MAX = 10_000.0
 """Longest search [min]: a week."""
 ACTIONS = {
@@ -71,12 +71,6 @@ def _name_or_file(text: str) -> str | Path:
     return input_file(text) if is_path else text
 
 
-def _seed(text: str) -> int:
-    if not text.isdecimal() or int(text) > SEED_MAX:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0 to {SEED_MAX}")
-    return int(text)
-
-
 def _minutes(text: str) -> float:
     try:
         minutes = float(text)
@@ -99,10 +93,10 @@ def _folder(text: str) -> Path:
 JOBS = (read_count, 1, "J", "number of parallel processes, at most one per core (default: 1)")
 STORED = f"folder for failing schedules, after reduction (default: ./{STORE})"
 OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
-    "run": {"--seed": (_seed, 1, "N", "seed (default: 1)"), "--jobs": JOBS},
+    "run": {"--seed": (whole_number(0, SEED_MAX), 1, "N", "seed (default: 1)"), "--jobs": JOBS},
     "search": {
         "--minutes": (_minutes, 1.0, "M", "duration (default: 1)"),
-        "--first": (_seed, 1, "SEED", "first seed (default: 1)"),
+        "--first": (whole_number(0, SEED_MAX), 1, "SEED", "first seed (default: 1)"),
         "--jobs": JOBS,
         "--store": (_folder, STORE, "DIR", STORED),
     },

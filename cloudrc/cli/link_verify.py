@@ -413,7 +413,7 @@ def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
     for row in rows:
         if row.verdict == "told":
             loops = row.name == "time_line" and row.measured == 1.0
-            yield f"{way}: {LOOPS if loops else TOLD[row.name]}"
+            yield f"{way}: {LOOPS if loops else TOLD.get(row.name, NOT_JUDGED)}"
 
 
 def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[str, str]) -> Report:

@@ -6,7 +6,7 @@ import argparse
 import difflib
 import importlib
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -79,11 +79,18 @@ def describe_unknown(given: str, names: Iterable[str]) -> str:
     return f"no '{given}'; choose one of {', '.join(known)}"
 
 
-def read_count(text: str) -> int:
-    """Read a whole number from 1 to `COUNT_MAX`, as a type for argparse."""
-    if not text.isdecimal() or not 1 <= int(text) <= COUNT_MAX:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1 to {COUNT_MAX}")
-    return int(text)
+def whole_number(low: int, high: int) -> Callable[[str], int]:
+    """Return a function that reads a whole number in a range, as a type for argparse."""
+
+    def read(text: str) -> int:
+        if not text.isdecimal() or not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from {low} to {high}")
+        return int(text)
+
+    return read
+
+
+read_count = whole_number(1, COUNT_MAX)
 
 
 def input_file(text: str) -> Path:

@@ -21,7 +21,7 @@ from cloudrc.cli.output import (
     print_line,
     print_or_drop,
 )
-from cloudrc.cli.parser import read_count
+from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cli.report import summary
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
@@ -69,7 +69,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("experiment", nargs="?", default="paper", metavar="EXPERIMENT", help=about)
     add("--mode", choices=MODES, help="where to fly (default: local; with --seeds: virtual)")
     about = "random seed of this run (default: the experiment's)"
-    many.add_argument("--seed", type=_seed, metavar="S", help=about)
+    many.add_argument("--seed", type=whole_number(0, 2**53 - 1), metavar="S", help=about)
     about = "fly seeds 1 to N on all cores and print a table"
     many.add_argument("--seeds", type=read_count, metavar="N", help=about)
     about = "change one key of the experiment; repeatable"
@@ -78,12 +78,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     output_argument(parser, "json, yaml: print only the report")
     release_arguments(parser)
     timeout_argument(parser)
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number >= 0")
-    return int(text)
 
 
 def execute(options: argparse.Namespace) -> int:
