@@ -209,13 +209,15 @@ def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
     """Return a function that flies in the cluster that the flags name."""
+    from cloudrc.cli.client import Api
     from cloudrc.cluster.client import program
-    from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files
+    from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files, refuse_second_flight
 
     refuse_local_files(experiment)
     release = release_from_flags(options)
     for name in ("helm", "kubectl"):
         program(name)
+    refuse_second_flight(release, lambda url, token: Api(url, lambda: token).get("/v1/state"))
 
     def tell(text: str) -> None:
         print_line(f"  {text}", stream)

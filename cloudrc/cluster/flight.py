@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, retry, run
-from cloudrc.cluster.jobs import delete_job, find_flight, follow, follow_limit, run_job
+from cloudrc.cluster.jobs import Ask, delete_job, find_flight, follow, follow_limit, run_job
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
@@ -135,6 +135,15 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
     return f"container {' and '.join(waiting)} is not ready yet", False
 
 
+def refuse_second_flight(release: Release, ask: Ask) -> None:
+    """Raise an error if a mission is under way; an installation would replace both pods."""
+    if found := find_flight(release, ask):
+        raise ClusterError(
+            f"{found[0]} is under way on release '{release.name}' {release.where}; wait for it, "
+            f"end it: {found[1]}, or fly on a release of your own: --release NAME"
+        )
+
+
 def fly_in_cluster(
     experiment: ResolvedExperiment, folder: Path, release: Release, timeout: float, tell: Tell
 ) -> dict[str, Any]:
@@ -150,11 +159,6 @@ def fly_in_cluster(
     """
     from cloudrc.config.load import dump
 
-    if found := find_flight(release):  # an install would replace both pods
-        raise ClusterError(
-            f"{found[0]} is under way on release '{release.name}' {release.where}; wait for it, "
-            f"end it: {found[1]}, or fly on a release of your own: --release NAME"
-        )
     began = time.monotonic()
     install(release, chart_values(experiment, current_values(release)), timeout, tell)
     took = time.monotonic() - began

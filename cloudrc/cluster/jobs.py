@@ -8,24 +8,24 @@ the exit code of the mission's verdict. The objects are those of the chart's
 from __future__ import annotations
 
 import json
-import re
 import secrets
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from math import ceil
-from typing import Any
+from typing import Any, TypeAlias
 
 import yaml
 
 from cloudrc.cluster.client import ClusterError, Release, chart_folder, retry
 from cloudrc.cluster.pods import (
+    api_url,
     container_statuses,
-    fetch_metrics,
     find_deployment,
     list_pods,
     one_line,
+    operator_token,
     pod_failure,
     pod_log,
     tokens_secret,
@@ -57,8 +57,8 @@ LOOK_PERIOD = 0.5
 """Time between two requests for the state of a Job [s]."""
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives its pod 30 s."""
-FLYING = re.compile(r"^cloudrc_mission_state [123]\b", re.MULTILINE)
-"""Line of teleop's metrics while a mission is starting, flying or held."""
+Ask: TypeAlias = Callable[[str, str], Any]
+"""Function that asks an API, by its URL and a token, for the state of robot and missions."""
 ENDED = ("complete", "failed")
 """States of a Job that has ended."""
 
@@ -176,20 +176,21 @@ def follow_limit(limit: float, queue: bool) -> float:
     return deadline_of(limit, queue) + END_ALLOWANCE
 
 
-def find_flight(release: Release) -> tuple[str, str] | None:
-    """Find a Job that has not ended, or else a mission that teleop's metrics show.
+def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
+    """Find a Job that has not ended, or else a mission that the API shows.
 
     Returns:
-        The flight in words, and the command that ends it. None if nothing flies, or if the pod
+        The flight in words, and the command that ends it. None if nothing flies, or if the API
         does not answer: a broken release must not prevent its own repair.
     """
     for job in release.find("jobs", COMPONENT):
         if (status := _status(job, None)).state not in ENDED:
             kubectl = f"kubectl {' '.join(release.flags)}"
             return f"Job '{status.name}'", f"{kubectl} delete job {status.name}"
-    with suppress(CloudrcError):
-        if FLYING.search(fetch_metrics(release, "cloud")["teleop"]):
-            return "a mission", f"cloudrc mission cancel {' '.join(release.cloudrc_flags)}"
+    with suppress(CloudrcError), api_url(release) as url:
+        if (mission := ask(url, operator_token(release))["mission"]) is not None:
+            cancel = f"cloudrc mission cancel {mission['id']} {' '.join(release.cloudrc_flags)}"
+            return f"mission {mission['id']}", cancel
     return None
 
 

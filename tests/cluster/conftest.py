@@ -114,7 +114,7 @@ class FakeTeleop:
     """The API and the metrics of a cloud pod, with a record of its requests."""
 
     def __init__(self):
-        self.metrics = 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
+        self.mission: dict[str, str] | None = None
         self.posted: list[str] = []
         self.tokens: set[str | None] = set()
         self.server = serve(self._answer)
@@ -122,10 +122,10 @@ class FakeTeleop:
 
     def _answer(self, request, body):
         if request.path == "/metrics":
-            return 200, self.metrics
+            return 200, 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
         self.tokens.add(request.headers["Authorization"])
         if request.command == "GET":
-            return 200, {"missions": []}
+            return 200, {"missions": [], "mission": self.mission}
         self.posted.append(request.path)
         return 200, {}
 

@@ -197,11 +197,11 @@ def test_an_interrupted_flight_cancels_its_mission_and_is_reported(
 
 
 def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, capsys):
-    teleop.metrics += "cloudrc_mission_state 3.0\n"
+    teleop.mission = {"id": "m7"}
     assert main([*LINE, "--out", "out"]) == 5
     said = capsys.readouterr().err
-    assert "a mission is under way on release 'cloudrc'" in said
-    assert "end it: cloudrc mission cancel --namespace=demo --release=cloudrc, or" in said
+    assert "mission m7 is under way on release 'cloudrc'" in said
+    assert "end it: cloudrc mission cancel m7 --namespace=demo --release=cloudrc, or" in said
     run_job(connect(), {}, name="first")
     assert main([*LINE, "--out", "out"]) == 5
     said = capsys.readouterr().err
