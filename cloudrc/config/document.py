@@ -84,7 +84,7 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
         mark = error.problem_mark or error.context_mark
         place = f"{name}:{mark.line + 1}" if mark else name
         raise BadInputError(f"{place}: {error.problem}; fix the YAML there") from error
-    except (yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())
         raise BadInputError(f"{name}: not readable as YAML: {reason}") from error
     except RecursionError:
@@ -95,12 +95,15 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
 def parse_value(text: str, name: str) -> Any:
     """Parse a value of the command line; `name` stands for it in messages.
 
-    In a scalar without quotes, ` #` starts no comment and `: ` starts no mapping.
+    In a scalar without quotes, ` #` starts no comment and `: ` starts no mapping. Several lines are
+    a YAML document.
 
     Raises:
         BadInputError: If brackets or quotes hold no YAML, or if text follows them.
     """
     stripped = text.strip()
+    if "\n" in stripped:
+        return parse_yaml(text, name)[0]
     quoted = len(stripped) > 1 and stripped[0] in "'\"" and stripped[0] == stripped[-1]
     if quoted or stripped.startswith(("[", "{")):
         # A comment would swallow the outer bracket; what follows the value adds an element.

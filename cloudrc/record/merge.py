@@ -25,7 +25,7 @@ from cloudrc.record.columns import Recording, Table
 from cloudrc.record.reader import Contents, read_contents
 from cloudrc.record.ros import shifted
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import CHANGED, MISSING
+from cloudrc.record.writer import MISSING
 from cloudrc.records import UNDER_WAY
 
 BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
@@ -57,16 +57,14 @@ SAME_CLOCK = ClockOffset(0, 0, "same clock")
 def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
     """Estimate the offset that puts cloud's stamps on world's clock.
 
-    It is 0 if both files name the same clock; else the centre of the interval that the packets
-    allow; without packets in both directions, the difference of the first stamps.
+    It is the centre of the interval that the packets allow; without packets in both directions, the
+    difference of the first stamps.
 
     Source: the clock filter of RFC 5905 (NTP), section 10: it uses the sample with the smallest
         round trip, and half of this round trip bounds the error.
     Deviation: each direction uses its own fastest packet. Clock drift is not modelled (50 ppm are
         3 ms per minute).
     """
-    if _share_clock(world, cloud):
-        return SAME_CLOCK
     uplink = _smallest_difference(world["/telemetry"], cloud["/uplink_delay"])
     downlink = _smallest_difference(cloud["/delay_estimate"], world["/downlink_delay"])
     if uplink is None or downlink is None:
@@ -76,7 +74,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
     return ClockOffset((downlink - uplink) // 2, uncertainty_ns, "packets")
 
 
-def _share_clock(world: Recording | Contents, cloud: Recording | Contents) -> bool:
+def _share_clock(world: Contents, cloud: Contents) -> bool:
     clock_id = world.metadata.get("clock_id")
     return bool(clock_id) and clock_id == cloud.metadata.get("clock_id")
 
@@ -138,6 +136,7 @@ def merge(world: Path, cloud: Path) -> Contents:
     notes = [f"{end}: {contents.note}" for end, contents in read.items() if contents.note]
     mission = next(iter(read.values())) if failures else _join(read["world"], read["cloud"])
     _set_note(mission, [*notes, *map(str, failures)])
+    mission.lacking = "; ".join(f"{end}: {one.lacking}" for end, one in read.items() if one.lacking)
     return mission
 
 
@@ -160,12 +159,10 @@ def _join(world: Contents, cloud: Contents) -> Contents:
         for (topic, from_ns, data), to_ns in zip(cloud.messages, moved_ns.tolist(), strict=True)
     ]
     in_order = heapq.merge(world.messages, moved, key=itemgetter(1))
-    metadata = {**cloud.metadata, **world.metadata, **offset.metadata()}
     return Contents(
         messages=[(topic, max(ns, 0), data) for topic, ns, data in in_order],  # MCAP's least time
-        metadata=metadata,
+        metadata={**cloud.metadata, **world.metadata, **offset.metadata()},
         attachments={**cloud.attachments, **world.attachments},
-        lacking=metadata.get(CHANGED, ""),
     )
 
 

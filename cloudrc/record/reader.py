@@ -304,10 +304,10 @@ def _read(path: Path) -> tuple[Contents, Records, int]:
 
 def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
     """Check whether cloudrc records a channel's topic, and in the same layout."""
-    ros_type = TOPICS[channel.topic].ros_type if channel.topic in TOPICS else ""
-    if schema is None or schema.name != ros_type:
+    topic = TOPICS.get(channel.topic)
+    if schema is None or topic is None or schema.name != topic.ros_type:
         return False
-    return is_known(ros_type, schema.data.decode("utf-8", "replace"))
+    return is_known(topic.ros_type, schema.data.decode("utf-8", "replace"))
 
 
 def _note(contents: Contents, records: Records, ours: dict[int, bool], total: int) -> None:

@@ -68,6 +68,7 @@ def test_at_most_fifty_problems_are_listed(mine):
         ("seed: !!python/name:os.system x", "mine.yaml:1"),
         ("{<<: {seed: 1}}", "mine.yaml:1: <<: unknown key; known here: name"),
         ("{[a]: 1}", "mine.yaml:1: a key must be text"),
+        ("seed: !!bool foo", "mine.yaml: not readable as YAML"),
         ("seed: 1\nname: !!binary eA==", "mine.yaml:2: could not determine a constructor for"),
         ("a: " + "[" * 600 + "]" * 600, "mine.yaml:1: nested too deep"),
         ("[" * 100_000, "nest"),  # libyaml's own limit and message

@@ -126,6 +126,7 @@ def test_a_value_is_the_whole_rest_of_its_argument(text):
 def test_a_value_may_be_a_number_a_list_or_quoted():
     values = {"1e-3": 0.001, "true": True, "": None, "[1, 'a #']": [1, "a #"], '"5"': "5"}
     assert {text: parse_value(text, "x") for text in values} == values
+    assert parse_value("a: 1\nb: 2", "x") == {"a": 1, "b": 2}
 
 
 def test_the_order_of_settings_does_not_matter():

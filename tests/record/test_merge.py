@@ -164,3 +164,12 @@ def test_time_never_runs_backwards(steps, data):
     assert (converted <= machine_ns).all()
     if not any(steps):
         assert converted.tolist() == machine_ns.tolist()
+
+
+def test_what_either_file_lacks_is_kept(tmp_path):
+    paths = tmp_path / "world.mcap", tmp_path / "cloud.mcap"
+    for path, records in zip(paths, (world_records(3), cloud_records(3)), strict=True):
+        with McapWriter(path, clock=path.stem) as writer:
+            writer.write(records)
+            writer.note({"changed": f"filtered by {path.stem}"})
+    assert merge(*paths).lacking == "world: filtered by world; cloud: filtered by cloud"

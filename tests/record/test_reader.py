@@ -203,22 +203,24 @@ def write_foreign(path, topic, ros_type, text, data, channels=1, **options):
         writer.finish()
 
 
-ARRIVAL = definition("cloudrc_msgs/msg/Arrival")
+OURS = "cloudrc_msgs/msg/Arrival"
+ARRIVAL = definition(OURS)
 
 
 @pytest.mark.parametrize(
     ("topic", "name", "text", "channels", "said"),
     [
-        ("/uplink_delay", "Arrival", ARRIVAL.replace("bool used", "int8 used"), 1, "layout"),
-        ("/uplink_delay", "Pid", definition("cloudrc_msgs/msg/Pid"), 1, "layout"),
-        ("/uplink_delay", "Arrival", ARRIVAL, 2, "two robots or two recordings are in one file"),
-        ("/uplink_delay", "Arrival", ARRIVAL, 1, "1 messages are not readable"),
-        ("/camera", "Arrival", ARRIVAL, 1, ""),
+        ("/uplink_delay", OURS, ARRIVAL.replace("bool used", "int8 used"), 1, "layout"),
+        ("/uplink_delay", "cloudrc_msgs/msg/Pid", definition("cloudrc_msgs/msg/Pid"), 1, "layout"),
+        ("/uplink_delay", OURS, ARRIVAL, 2, "two robots or two recordings are in one file"),
+        ("/uplink_delay", OURS, ARRIVAL, 1, "1 messages are not readable"),
+        ("/camera", OURS, ARRIVAL, 1, ""),
+        ("/camera", "", "", 1, ""),
     ],
 )
 def test_foreign_topics_are_told_apart(path, topic, name, text, channels, said):
     data = [b"\0\1\0\0\7"]
-    write_foreign(path, topic, f"cloudrc_msgs/msg/{name}", text, data, channels)
+    write_foreign(path, topic, name, text, data, channels)
     recording = Recording.read(path)
     assert said in recording.lacking
     assert bool(said) == bool(recording.note)

@@ -185,7 +185,7 @@ FLIGHT = """
 import sys, time
 from pathlib import Path
 from cloudrc.drivers.recording import RecordingThread
-from cloudrc.record.recorder import TROUBLE, Recorder
+from cloudrc.record.recorder import Recorder
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
 
