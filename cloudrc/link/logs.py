@@ -308,10 +308,11 @@ def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     if what == "downlink":
         usual = round(median([int(t["delay"]["send"]) for t in trips if _arrived(t)] or [0]))
     entries: list[tuple[int, float | None]] = []
-    for trip in trips:
+    stamps = [trip["timestamps"]["client"]["send"] for trip in trips]
+    clock = "monotonic" if all("monotonic" in stamp for stamp in stamps) else "wall"
+    for trip, stamp in zip(trips, stamps, strict=True):
         if str(trip["lost"]).lower() != other:
-            stamps, delays = trip["timestamps"]["client"]["send"], trip["delay"]
-            sent, arrived = int(stamps.get("monotonic", stamps.get("wall"))), _arrived(trip)
+            delays, sent, arrived = trip.get("delay", {}), int(stamp[clock]), _arrived(trip)
             if what == "downlink":
                 sent += int(delays["send"]) if arrived else usual
             entries.append((sent, int(delays[key]) * part * 1e-9 if arrived else None))

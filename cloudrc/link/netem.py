@@ -75,7 +75,6 @@ _PACKETS = 1_000
 """Assumed packet rate without a bottleneck [1/s], higher than the rate of tunnel or probes."""
 # The kernel's own default for three bands: nothing falls into the fourth by its type of service.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
-_MODULES = ("sch_netem", "sch_prio", "cls_u32")
 _INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
 
 
@@ -130,9 +129,9 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
         )
     elif "add" in words and any(sign in text for sign in unknown):
         cause = (
-            f"this kernel lacks {', '.join(_MODULES[:-1])} or {_MODULES[-1]}; {_INSTEAD}, or use "
-            f"nodes whose kernel has them ('modprobe -a {' '.join(_MODULES)}' there) and a "
-            "namespace for privileged pods"
+            f"this kernel lacks sch_netem, sch_prio or cls_u32; {_INSTEAD}, or use nodes whose "
+            "kernel has them ('modprobe -a sch_netem sch_prio cls_u32' there) and a namespace for "
+            "privileged pods"
         )
     else:
         reason = text or f"exit code {answer.code}"
