@@ -238,13 +238,19 @@ UNDER_WAY = ("started", "reached", "held", "resumed", "goto", "paused")
 that flies the mission ends, and the next process continues the mission."""
 
 
+FAILURES = (
+    *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
+    *("taken_over", "end_lost"),
+)
+"""Events that end a mission as failed."""
+
+
 class MissionEvent(NamedTuple):
     """Cloud: an event of the mission. Topic /mission.
 
     Attributes:
-        event: One of `UNDER_WAY`, or the outcome of the mission: "done", "cancelled", "timed_out",
-            "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped", "taken_over",
-            "end_lost".
+        event: One of `UNDER_WAY`, or the outcome of the mission: "done", "cancelled", or one of
+            `FAILURES`.
         waypoint: Index of the waypoint of the event; -1 if none.
         text: The event in words.
     """

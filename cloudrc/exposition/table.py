@@ -13,6 +13,8 @@ from textwrap import dedent
 from types import MappingProxyType
 from typing import NamedTuple
 
+from cloudrc.records import FAILURES
+
 WORLD, CLOUD, TELEOP, LINK = "world", "cloud", "teleop", "link"
 ROLES = (WORLD, CLOUD, TELEOP, LINK)
 ENDS = (WORLD, CLOUD)
@@ -37,10 +39,7 @@ GUARD_STATES = ("ground", "track", "hold", "land", "estop")
 """States of the guard, in the order of `cloudrc.messages.GuardState`."""
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
 """States of a mission; the index of a state is the value of `cloudrc_mission_state`."""
-MISSION_OUTCOMES = (
-    *("done", "cancelled", "timed_out", "leg_timed_out", "world_restarted", "guard_stopped"),
-    *("emergency_stopped", "taken_over", "end_lost", "other"),
-)
+MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
 API_REFUSALS = ("token", "role", "busy")
 """Reasons for which the API rejects a request: no valid token; a reader's token for a request of an
 operator; too many requests at the same time."""

@@ -88,7 +88,7 @@ class Tokens:
         """
         versions = [version(path) for path in self._paths]
         if versions != self._versions:
-            self._known = {}
+            self._known, self._versions = {}, []
             with suppress(BadInputError):
                 self._known, self._versions = self._read(), versions
         return self._known.get(hashlib.sha256(token.encode()).digest())

@@ -21,8 +21,9 @@ from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeL
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
+from cloudrc.records import FAILURES
 from cloudrc.teleop.store import SHOWN, Order
-from cloudrc.teleop.wire import FAILURES, Leg, Plan
+from cloudrc.teleop.wire import Leg, Plan
 
 PROBLEMS_MAX = 50
 """Largest number of problems that the answer to a request lists."""

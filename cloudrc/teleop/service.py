@@ -59,9 +59,8 @@ IN_MISSION = {
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
     """Describe what the robot does next, or what the operator has to do.
 
-    `age` is the age of the telemetry [s], `cloud_age` the age of the last message from
-    cloud [s].
-    `mission` is the state of the mission under way, or None.
+    `age` is that of the telemetry [s], `cloud_age` that of cloud's last message [s]; `mission` is
+    the state of the mission under way, or None.
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD

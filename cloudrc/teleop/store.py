@@ -27,6 +27,8 @@ from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, as the API shows it."""
+MAGIC = b"SQLite format 3\0"
+"""First bytes of a database. Source: sqlite.org, fileformat2.html, section 1.3."""
 SHOWN = 100
 """Number of the newest events that the store keeps for each mission."""
 
@@ -161,7 +163,9 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
         if code == sqlite3.SQLITE_BUSY:
             text = f"{path}: another teleop has this journal open; waiting until it ends"
             raise StoreLockedError(text) from None
-        if code == sqlite3.SQLITE_NOTADB:
+        with path.open("rb") as file:
+            is_sqlite = file.read(len(MAGIC)) == MAGIC
+        if code == sqlite3.SQLITE_NOTADB and not is_sqlite:  # else its head is damaged
             text = "is no journal; move it away, or name another file"
             raise BadInputError(f"--journal {path}: {text}") from None
         if isinstance(error, sqlite3.OperationalError):  # the disk fails; the content is intact

@@ -22,7 +22,7 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
-from cloudrc.records import MissionEvent
+from cloudrc.records import FAILURES, MissionEvent
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +79,6 @@ QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
 """States of a mission that has not ended; STARTING ends when telemetry shows the start."""
 ENDED = "done", "failed", "cancelled"
 """States of a mission that has ended."""
-FAILURES = (
-    *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
-    *("taken_over", "end_lost"),
-)
-"""Events that end a mission as failed."""
 STATES = {
     **{state: state for state in (QUEUED, STARTING, HELD, "done", "cancelled")},
     **dict.fromkeys(("started", "resumed"), FLYING),

@@ -106,6 +106,10 @@ def test_a_changed_token_file_counts_at_once(monkeypatch):
             api.token_file.write_text(OPERATOR)
             assert role(OPERATOR) == 401
         api.until(lambda: role(OPERATOR) == 200)
+        away = api.token_file.rename(api.token_file.with_name("away"))
+        assert role(OPERATOR) == 401
+        away.rename(api.token_file)
+        assert role(OPERATOR) == 200, "the same file is back"
 
 
 # The gate

@@ -96,6 +96,7 @@ def execute(path, statement):
 @pytest.mark.parametrize(
     "damage",
     [
+        lambda path: overwrite(path, 16, b"\xff\xff"),  # in the head: the size of a page
         lambda path: overwrite(path, 4096, os.urandom(9000)),
         lambda path: overwrite(path, path.stat().st_size - 4096, bytes(4096)),
         lambda path: execute(path, "UPDATE mission SET status = '{'"),
