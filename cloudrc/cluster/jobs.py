@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from math import ceil
 from typing import Any, TypeAlias
 
@@ -197,8 +198,8 @@ def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
 def delete_job(release: Release, name: str) -> None:
     """Delete a Job with its pod and ConfigMap; the pod cancels its mission before it ends."""
     release.request("delete", "jobs", name=name, propagation_policy="Foreground")
-    until = time.monotonic() + DELETE_LIMIT
-    while any(job.metadata.name == name for job in release.find("jobs", COMPONENT)):
+    until, jobs = time.monotonic() + DELETE_LIMIT, partial(release.find, "jobs", COMPONENT)
+    while any(job.metadata.name == name for job in retry(jobs, lambda text: None)):
         if time.monotonic() > until:
             raise TimedOutError(
                 f"Job '{name}' has not ended {DELETE_LIMIT:g} s after its deletion; "

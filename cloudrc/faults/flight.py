@@ -62,8 +62,8 @@ class Flight:
         seed: int = 1,
         cloud_clock: Clock | None = None,  # None if the two ends share a clock
         link: Shape = replace,  # changes both directions of the link; by default nothing
-        uplink: Shape = replace,  # changes the link from world to cloud, too
-        downlink: Shape = replace,  # changes the link from cloud to world, too
+        uplink: Shape | None = None,  # changes the direction from world to cloud instead
+        downlink: Shape | None = None,  # changes the direction from cloud to world instead
         honest: bool = True,  # whether a contact is a breach
         keep: bool = True,  # whether all records are kept and hashed
         start: bool = True,  # whether the experiment's mission is ordered at once
@@ -93,8 +93,8 @@ class Flight:
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock, "cloud")
         self.teleop.run_on(self.cloud)
-        self.uplink = self._make_link(link, uplink, up=True)
-        self.downlink = self._make_link(link, downlink, up=False)
+        self.uplink = self._make_link(uplink or link, up=True)
+        self.downlink = self._make_link(downlink or link, up=False)
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
 
     @property
@@ -203,11 +203,9 @@ class Flight:
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
 
-    def _make_link(self, *shapes: Shape, up: bool) -> LinkDirection:
+    def _make_link(self, shape: Shape, *, up: bool) -> LinkDirection:
         profile = assembly.link_profile(self.experiment.uplink if up else self.experiment.downlink)
-        for shape in shapes:
-            profile = shape(profile)
-        return LinkDirection(profile, self.experiment.seed, uplink=up)
+        return LinkDirection(shape(profile), self.experiment.seed, uplink=up)
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:
         """Begin a new process of an end, with its own nonce and the keys of its file."""

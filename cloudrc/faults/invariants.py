@@ -363,7 +363,8 @@ class RobotInvariants:
         self._armed = self._armed and state not in LATCHED
         self._ramp_until_ns = -1
         if state is TRACK:
-            self._tracked_ns = self._check_settled("TRACK", self._tracked_ns, now_ns)
+            self._check_settled("TRACK", self._tracked_ns, now_ns)
+            self._tracked_ns = now_ns
             if was is HOLD and not self._is_reset:
                 self._ramp_until_ns = now_ns + self._ramp_ns
                 fresh_ns = self._fresh_ns
@@ -396,11 +397,10 @@ class RobotInvariants:
             self._note(now_ns, "hold", f"{state.name} for {alone_ns * 1e-9:.3f} s of a mission")
             self._alone_ns = now_ns
 
-    def _check_settled(self, name: str, last_ns: int, now_ns: int) -> int:
-        """Check that enough time has passed since the last TRACK or HOLD; return `now_ns` [ns]."""
+    def _check_settled(self, name: str, last_ns: int, now_ns: int) -> None:
+        """Check that enough time has passed since the last TRACK or HOLD."""
         if now_ns - last_ns < SETTLE_NS:
             self._note(now_ns, "hold", f"{name} again after {(now_ns - last_ns) * 1e-9:.3f} s")
-        return now_ns
 
     def _wait_ns(self, state: GuardState) -> float:
         """Return how long a robot in a mission waits for its cloud [ns]."""

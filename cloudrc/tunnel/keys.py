@@ -1,7 +1,7 @@
 """Pre-shared keys, and the text of a key file.
 
-The text form of a `Key` hides the secret, and a `Key` cannot be pickled. The tunnel uses keys that
-HKDF-SHA256 (RFC 5869) derives from the pre-shared key, each bound to the wire version and one use.
+The text form of a `Key` hides the secret. The tunnel uses keys that HKDF-SHA256 (RFC 5869) derives
+from the pre-shared key, each bound to the wire version and one use.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 from dataclasses import dataclass, field
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
@@ -63,9 +63,6 @@ class Key:
 
     def __repr__(self) -> str:
         return f"<key {self.name}>"
-
-    def __reduce__(self) -> NoReturn:
-        raise TypeError("a key is not pickled")
 
 
 class KeySet(NamedTuple):
