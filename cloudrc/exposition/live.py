@@ -97,7 +97,7 @@ class LinkVerdict:
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 
-    def see(self, record: LinkChecked) -> None:
+    def _on_check(self, record: LinkChecked) -> None:
         """Store the verdict on one quantity, and drop the quantities of an older check."""
         newest = [one for one in self._newest if one.stamp_ns == record.stamp_ns]
         self._newest = (*newest, record)  # a new tuple: another thread may be reading the old one
@@ -182,9 +182,6 @@ class End:
         if used:
             self._newest_ns, self._newest_delay = stamp_ns, delay
 
-    def _on_check(self, record: LinkChecked) -> None:
-        self.check.see(record)
-
     def _on_fault(self, record: Fault) -> None:
         self._clock_steps += record.code == CLOCK_SET
 
@@ -218,7 +215,6 @@ class End:
         datagrams[self._outgoing, "sent"] = counts.get("sent", 0)
         readings: Readings = {
             **self._histograms,
-            **self.check.read(),
             "cloudrc_session_epoch": unlabelled(self._epoch),
             "cloudrc_sessions_opened_total": unlabelled(self._sessions),
             "cloudrc_datagrams_total": datagrams,
@@ -509,7 +505,8 @@ class LiveMetrics:
         self.link = Link(self._counts) if role == table.LINK else None
         has_mission = missions and role in table.MISSION
         mission = Mission(always=role == table.TELEOP) if has_mission else None
-        self._parts = [part for part in (self.end, self.link, mission) if part is not None]
+        parts = self.end, self.end and self.end.check, self.link, mission
+        self._parts = [part for part in parts if part is not None]
         self._handlers: dict[type, Callable[[Any], None]] = {
             kind: getattr(part, name)
             for part in (self, *self._parts)

@@ -45,6 +45,7 @@ _PARETO_MEAN = 1.5 * (1.0 - PARETO_CUT ** (2 / 3)) / (1.0 - PARETO_CUT)
 _PARETO_SQUARE = 3.0 * (1.0 - PARETO_CUT ** (1 / 3)) / (1.0 - PARETO_CUT)
 _PARETO_DEVIATION = sqrt(_PARETO_SQUARE - _PARETO_MEAN**2)
 
+Floats: TypeAlias = NDArray[np.float64]
 StreamKey: TypeAlias = tuple[int, int]
 Fate: TypeAlias = tuple[int, ...]
 
@@ -70,7 +71,7 @@ def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
 
 
 @lru_cache(maxsize=_CACHED)
-def uniforms(key: StreamKey, purpose: Purpose, block: int) -> NDArray[np.float64]:
+def uniforms(key: StreamKey, purpose: Purpose, block: int) -> Floats:
     """Draw independent uniform variates for the packets of a block: in (0, 1), shape (256,).
 
     Source: J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011:

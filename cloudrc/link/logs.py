@@ -30,14 +30,13 @@ from statistics import fmean, median
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
+from cloudrc.link.draws import Floats
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import Row, decimals_of, looks_lost, read_rows
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
-Floats: TypeAlias = NDArray[np.float64]
 Entry: TypeAlias = tuple[float, float | None]
 """Time of sending [s] and delay [s]; the delay is None if the packet was lost."""
 LONGEST = 5.0

@@ -31,10 +31,9 @@ from statistics import NormalDist
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
-from cloudrc.link.draws import PARETO_CUT
+from cloudrc.link.draws import PARETO_CUT, Floats
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
 from cloudrc.link.relay import Address
 
@@ -86,7 +85,6 @@ class Answer(NamedTuple):
     error: str
 
 
-Floats: TypeAlias = NDArray[np.float64]
 Run: TypeAlias = Callable[[Sequence[str]], Answer]
 """Function that runs a program to its end."""
 

@@ -28,7 +28,7 @@ from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, as the API shows it."""
 MAGIC = b"SQLite format 3\0"
-"""First bytes of a database. Source: sqlite.org, fileformat2.html, section 1.3."""
+"""First bytes of a database file of SQLite."""
 SHOWN = 100
 """Number of the newest events that the store keeps for each mission."""
 

@@ -13,15 +13,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isnan, nan, sqrt
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cloudrc.link.draws import Floats
 from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
-
-Floats: TypeAlias = NDArray[np.float64]
 
 RUNS, RUN_LENGTH = 200, 1000
 """Simulated links for a band, and datagrams of each; for other numbers a band is scaled."""
