@@ -19,6 +19,7 @@ from cloudrc.link.verify.judge import Flow
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from cloudrc.records import Arrival, Fault, LinkChecked
+from cloudrc.tunnel.codec import SIZES, Kind
 
 _WORDS, _ONE = 1 << 32, 8192
 _HEADERS = 28
@@ -105,7 +106,7 @@ def asked(name, way):
     return link_profile(getattr(load_profile(name), way))
 
 
-SEED, KINDS, SIZES = 1, {True: 3, False: 4}, {True: 203, False: 88}
+SEED, KINDS = 1, {True: Kind.TELEMETRY, False: Kind.COMMAND}
 PERIOD_NS = 10_000_000
 OVERHEAD = 8e-5
 """Delay that a good relay and the network stack add [s]."""
@@ -114,7 +115,9 @@ OVERHEAD = 8e-5
 def rows_of(profile, real, *, stall=0.0, seconds=None):
     """Probe a link; a relay without CPU delays 30 % of the probes by up to `stall` [s]."""
     netem = isinstance(real, VirtualNetem)
-    plan = plan_probes(profile, Flow(SEED, True, PROBE, 203), seconds, drawn=netem)
+    plan = plan_probes(
+        profile, Flow(SEED, True, PROBE, SIZES[Kind.TELEMETRY]), seconds, drawn=netem
+    )
     stream = meet(plan, real)
     rng = np.random.default_rng(SEED)
     late = stall * rng.random(len(stream.sent)) * (rng.random(len(stream.sent)) < 0.3)
@@ -146,7 +149,7 @@ def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False, n
     """
     model = LinkDirection(profile, seed, uplink=uplink)
     link = VirtualNetem(profile, seed) if netem else model
-    kind, size, found = KINDS[uplink], SIZES[uplink], []
+    kind, size, found = KINDS[uplink], SIZES[KINDS[uplink]], []
     for n in range(round(seconds * 100)):
         sent_ns = n * PERIOD_NS
         fate = link.send(1, kind, n, size, sent_ns)
@@ -161,7 +164,7 @@ def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False, n
 
 def hearing(up, down, *, uplink=False):
     """Return the monitor of the end that receives a direction."""
-    flow = Flow(SEED, uplink, KINDS[uplink], SIZES[uplink])
+    flow = Flow(SEED, uplink, KINDS[uplink], SIZES[KINDS[uplink]])
     monitor = LinkMonitor(uplink=uplink, flow=flow)
     monitor.follow((up, down))
     return monitor

@@ -13,6 +13,7 @@ from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
 from cloudrc.link.verify.judge import Flow, look_twice, netem_makes, verdict_of
 from cloudrc.link.verify.probe import PROBE, plan_probes
+from cloudrc.tunnel.codec import SIZES, Kind
 from tests.link.verify.conftest import (
     VirtualNetem,
     asked,
@@ -152,7 +153,7 @@ def test_a_wrong_netem_is_off(values, quantity):
 )
 def test_the_model_does_what_the_kernel_does(profile):
     check(profile)
-    plan = plan_probes(profile, Flow(1, True, PROBE, 203), 300.0)
+    plan = plan_probes(profile, Flow(1, True, PROBE, SIZES[Kind.TELEMETRY]), 300.0)
     made = replace(plan, profile=netem_makes(profile))
     ours, theirs = (
         plan.quantities(one, np.zeros(0))
@@ -164,7 +165,7 @@ def test_the_model_does_what_the_kernel_does(profile):
 
 def test_a_draw_of_the_model_is_predicted_exactly():
     profile = replace(asked("lossy", "uplink"), duplicate=0.1, corrupt=0.1)
-    plan = plan_probes(profile, Flow(1, True, PROBE, 203))
+    plan = plan_probes(profile, Flow(1, True, PROBE, SIZES[Kind.TELEMETRY]))
     first, again = plan.draw(plan.sent), plan.draw(plan.sent[500:], 1, 500)
     assert np.array_equal(first.delays[500:], again.delays, equal_nan=True)
     assert plan.expected(first).known
