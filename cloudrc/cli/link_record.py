@@ -198,10 +198,9 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 
 
 def _halves(recording: Recording, path: Path) -> Packets:
-    """Estimate each packet's delay as half of a round trip, at the time of sending the command.
+    """Estimate the delay as half of each measured round trip, at the time when it began.
 
-    Losses are not visible. Telemetry repeats an echo until the next command arrives; the repeats
-    do not count.
+    Losses are not visible.
     """
     from cloudrc.link.logs import Log
 
@@ -212,10 +211,10 @@ def _halves(recording: Recording, path: Path) -> Packets:
         if isnan(rtt):
             continue
         if (rtt, loop) == previous:
-            log.counts["repeated echoes left out"] += 1
+            log.counts["periods without a new round trip left out"] += 1
             continue
         previous = rtt, loop
-        log.entries.append((stamp_ns * 1e-9 - loop, rtt / 2))
+        log.entries.append((stamp_ns * 1e-9 - rtt, rtt / 2))
     if not log.entries:
         raise log.error("holds no round trip; give the folder of a run that flew")
     return log.packets()

@@ -23,7 +23,7 @@ from cloudrc.cloud.operator import (
 from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, SessionOpened
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import REPEATED, USED
+from cloudrc.tunnel.channel import LATE, REPEATED, USED
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
@@ -257,6 +257,8 @@ class CloudEndpoint(TunnelEnd):
             delay = (now_ns - telemetry.stamp_ns - telemetry.slip_ns) * 1e-9
         if outcome != REPEATED or not self._channel.is_flooded:
             self._records.append(_new(Arrival, (now_ns, True, epoch, counter, delay, used)))
+        if outcome == LATE:
+            self._loop.observe_late(telemetry, now_ns)
         if used:
             self.guard = telemetry.guard
             self._alarm.see(telemetry.guard, telemetry.mission)

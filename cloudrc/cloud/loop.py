@@ -15,7 +15,7 @@ so it needs no clock synchronisation.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from math import isfinite, nan
 
@@ -31,6 +31,11 @@ HORIZON_MAX = 1.0
 FREEZE_NS = 400_000_000
 """Time without a new echo, in addition to the horizon, after which the loop freezes [ns].
 Source: docs/reference/plant.md, "Frozen reference"."""
+FRESH_ECHO_NS = 50_000_000
+"""Longest hold of an echo that is a delay sample [ns]: five command periods. While the downlink is
+silent, the hold grows, and the delay of the link does not."""
+ECHOES = 32
+"""Number of echoes that cloud remembers, so that each command counts once."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 INSTEAD = {
     "estimator": "cloud uses the last good horizon",
@@ -54,22 +59,38 @@ class DelayMeter:
         """Use `estimator`, and count clamped horizons in `counts`."""
         self._estimator, self._counts = estimator, counts
         self._stamp_ns, self.newest_echo_ns = 0, NEVER_NS
+        self._echoes: deque[int] = deque(maxlen=ECHOES)
         self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process new telemetry at its arrival `now_ns` [ns].
+        """Process the telemetry to be used, at its arrival `now_ns` [ns].
 
-        A repeated echo is no sample. While the downlink is silent, world repeats the echo of the
-        same command; the growing age of that command would corrupt the estimate.
+        Each telemetry with a fresh echo is one sample of eq. (1), even if the echo is repeated.
+        Samples of new echoes alone would have the shortest holds, and the mean would be too small.
+        Source: docs/reference/control.md, "The delay sample".
         """
         self._stamp_ns = telemetry.stamp_ns
         echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
-        if echo_ns <= self.newest_echo_ns:
+        self.observe_echo(telemetry)
+        if echo_ns == NEVER_NS or hold_ns > FRESH_ECHO_NS:
             return
-        self.newest_echo_ns, loop_ns = echo_ns, now_ns - echo_ns
+        loop_ns = now_ns - echo_ns
         self.loop_delay, self.rtt = loop_ns * 1e-9, (loop_ns - hold_ns) * 1e-9
-        applied_minus_stamp = (telemetry.stamp_ns - hold_ns - echo_ns) * 1e-9
-        self._estimator.update(DelaySample(self.loop_delay, self.rtt, applied_minus_stamp))
+        self._estimator.update(DelaySample(self.loop_delay, self.rtt))
+
+    def observe_echo(self, telemetry: Telemetry) -> None:
+        """Process the echo of telemetry, which may be late: it shows when a command was applied.
+
+        Late telemetry often has the only echo of a command that another one soon replaced. Without
+        these commands, which are the slow ones, the average delay would be too small.
+        """
+        echo_ns = telemetry.echo_stamp_ns
+        if echo_ns == NEVER_NS or echo_ns in self._echoes:
+            return
+        self._echoes.append(echo_ns)
+        self.newest_echo_ns = max(self.newest_echo_ns, echo_ns)
+        applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
+        self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
 
     def horizon(self, now_ns: int) -> float:
         """Return the horizon for a command that leaves at `now_ns` [ns], in [0, 1] s.
@@ -166,6 +187,13 @@ class ControlLoop:
             self._predictor.observe(telemetry.odometry)
         except BaseException as error:
             self._note("predictor", error, now_ns)
+
+    def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
+        """Process telemetry that is older than the newest: only its echo counts."""
+        try:
+            self._delays.observe_echo(telemetry)
+        except BaseException as error:
+            self._note("estimator", error, now_ns)
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int

@@ -8,10 +8,10 @@ from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentil
 
 
 def round_trips(flight: Flight) -> Columns:
-    """Select the control periods with a new echo: world reports the newest command it applied.
+    """Select the control periods with a new round trip, measured by telemetry with a fresh echo.
 
-    A period without a new echo repeats the previous values. Counting such periods would give too
-    much weight to a silent link, during which the last echo repeats for seconds.
+    Other periods repeat the values of an earlier period. Counting such periods would give too much
+    weight to a silent link, during which the last value repeats for seconds.
     """
     control = flight.control
     pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)
@@ -44,8 +44,10 @@ def _estimate_error(flight: Flight) -> float | None:
 
 
 def _delay_error(flight: Flight) -> float | None:
+    """Compare the horizon with the true delay; before the first echo there is no estimate."""
     applied = flight.applied
-    return rms(applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9)
+    errors = applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9
+    return rms(errors[np.isfinite(applied["rtt"])])
 
 
 def wakes(flight: Flight, end: str) -> Columns:
@@ -90,7 +92,7 @@ add_metrics(
     ("estimate_error_rms", "m", "RMS distance from the predicted to the true position at the "
      "instant of the prediction.", _estimate_error),
     ("delay_estimate_error_rms", "s", "RMS difference between the horizon and the true delay from "
-     "odometry to applied command.", _delay_error),
+     "odometry to applied command, from the first echo on.", _delay_error),
     ("tracking_rms_measured", "m", "RMS distance between the setpoint and the measured position "
      "that cloud used.",
      lambda flight: rms(flight.control["setpoint"] - flight.control["measured"])),

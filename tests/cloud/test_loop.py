@@ -1,6 +1,7 @@
 """The control loop: delays, when it freezes, and that it goes on whatever a plug-in does."""
 
 from collections import Counter
+from functools import partial
 from math import inf, nan
 from types import SimpleNamespace
 
@@ -33,12 +34,29 @@ def test_a_command_names_its_basis_and_its_delays():
     assert control.rtt == pytest.approx(0.083)
 
 
-def test_a_repeated_echo_is_no_sample():
-    """While the downlink is silent, world echoes the same command with a growing age."""
-    a_loop = loop(heard_ms=1090, echo_ms=1000)
-    for k in range(1, 2000):
-        a_loop.observe(telemetry(100 + 10 * k, echo_ms=1000, hold_ms=10 * k), (1090 + 10 * k) * MS)
-    assert command(a_loop, 21_090)[1].horizon == pytest.approx(0.090)
+@pytest.mark.parametrize(("hold_ms", "horizon_ms"), [(0, 90), (50, 140), (51, 90)])
+def test_each_telemetry_is_a_sample_while_its_echo_is_fresh(hold_ms, horizon_ms):
+    """While the downlink is silent, world echoes the same command with a growing hold."""
+    a_loop = loop(estimator=partial(RunningMean, 1), heard_ms=1090, echo_ms=1000)
+    a_loop.observe(telemetry(100 + hold_ms, 1000, hold_ms), (1090 + hold_ms) * MS)
+    assert command(a_loop, 1150)[1].horizon == pytest.approx(horizon_ms * 1e-3)
+
+
+def test_each_applied_command_counts_once_also_in_late_telemetry():
+    applied = []
+
+    class Listening(Estimator):
+        def add_applied(self, applied_minus_stamp):
+            applied.append(round(applied_minus_stamp * 1e3))
+
+        def horizon(self, age):
+            return 0.0
+
+    a_loop = loop(estimator=Listening, heard_ms=1090, echo_ms=1000)  # world's clock is behind
+    a_loop.observe(telemetry(120, echo_ms=1020, hold_ms=2), 1110 * MS)
+    a_loop.observe_late(telemetry(110, echo_ms=1005, hold_ms=1), 1115 * MS)
+    a_loop.observe(telemetry(130, echo_ms=1020, hold_ms=12), 1120 * MS)
+    assert applied == [-900, -902, -896]
 
 
 def test_split_counts_how_long_cloud_has_held_the_odometry():

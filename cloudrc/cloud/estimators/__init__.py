@@ -11,27 +11,31 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """The delays that one newly echoed command shows.
+    """The delays that one telemetry with a fresh echo shows.
 
     Attributes:
         loop_delay: Arrival of the echo minus the command's stamp [s]. The difference includes the
             hold time: how long world had the command before it sent the echo.
         rtt: `loop_delay` minus the hold time [s].
-        applied_minus_stamp: Instant of application on world's clock minus the command's stamp on
-            cloud's clock [s]: the downlink delay plus the unknown offset world - cloud.
     """
 
     loop_delay: float
     rtt: float
-    applied_minus_stamp: float
 
 
 class Estimator:
     """Estimates the horizon: the time from the measurement to the application of the command."""
 
     def update(self, sample: DelaySample) -> None:
-        """Add one sample; called once per newly echoed command, never for a repeated echo."""
-        raise NotImplementedError
+        """Add the delays of telemetry that cloud uses; most echoes come more than once."""
+
+    def add_applied(self, applied_minus_stamp: float) -> None:
+        """Add a command that world has applied; called once for each command that an echo shows.
+
+        Args:
+            applied_minus_stamp: Instant of application on world's clock minus the command's stamp
+                on cloud's clock [s]: the downlink delay plus the unknown offset world - cloud.
+        """
 
     def horizon(self, age: float) -> float:
         """Return the horizon for a command that leaves now [s]; 0 before the first sample.

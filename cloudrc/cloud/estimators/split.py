@@ -14,7 +14,7 @@ and the sum is the time from the measurement to the application of the command.
 from __future__ import annotations
 
 from cloudrc.cloud import parameters
-from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.estimators import Estimator
 
 
 class Split(Estimator):
@@ -25,13 +25,13 @@ class Split(Estimator):
         self._gain = gain
         self._applied_minus_stamp: float | None = None
 
-    def update(self, sample: DelaySample) -> None:
+    def add_applied(self, applied_minus_stamp: float) -> None:
         """Add one `applied_minus_stamp` [s] to the average of the downlink."""
         if self._applied_minus_stamp is None:
-            self._applied_minus_stamp = sample.applied_minus_stamp
+            self._applied_minus_stamp = applied_minus_stamp
         else:
             self._applied_minus_stamp += self._gain * (
-                sample.applied_minus_stamp - self._applied_minus_stamp
+                applied_minus_stamp - self._applied_minus_stamp
             )
 
     def horizon(self, age: float) -> float:
