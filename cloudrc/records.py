@@ -95,12 +95,16 @@ class GroundTruth(NamedTuple):
     Attributes:
         odometry: True pose and twist.
         tip_force: Force on the touch sensor [N].
+        tip_force_peak: Largest force since the previous record, of every physics step [N].
+        tip_impulse: Integral of the force over time since the previous record [N s].
         reference: Velocity that the guard lets the low-level controller follow [m/s], shape (3,).
     """
 
     stamp_ns: int
     odometry: Odometry
     tip_force: float
+    tip_force_peak: float
+    tip_impulse: float
     reference: Vector
 
 

@@ -11,6 +11,8 @@ from cloudrc.metrics.flight import Array, Flight, add_metrics, mean
 
 BOARD = "board"
 """Name of the scene's body that the arm must touch."""
+IMPACT_NS = 100_000_000
+"""Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
 PRESSING_NS = 2_000_000_000
 """Length of the last part of the mission, over which the steady contact force is averaged [ns]."""
 RESTING_NS = 5_000_000_000
@@ -61,8 +63,20 @@ def _tip_speed(flight: Flight) -> float | None:
 
 def _peak_force(flight: Flight) -> float | None:
     """Find the largest force [N], which depends on the simulator's contact parameters."""
-    force = flight.during("/contact_force")["tip_force"]
+    force = flight.during("/contact_force")["tip_force_peak"]
     return None if first_touch(flight) is None or not len(force) else float(force.max())
+
+
+def _impulse(flight: Flight) -> float | None:
+    """Integrate the force of the impact [N s]; the simulator's contact parameters do not change it.
+
+    Source: docs/reference/plant.md, "Contact".
+    """
+    touch, force = first_touch(flight), flight.during("/contact_force")
+    if touch is None:
+        return None
+    since_ns = force["stamp_ns"] - touch["stamp_ns"]
+    return float(force["tip_impulse"][(since_ns >= 0) & (since_ns < IMPACT_NS)].sum())
 
 
 def _steady_force(flight: Flight) -> float | None:
@@ -133,8 +147,9 @@ add_metrics(
      "board.", _contact_time),
     ("tip_speed", "m/s", "Speed of the arm's tip just before it first touches the board.",
      _tip_speed),
-    ("peak_contact_force", "N", "Largest force on the arm's tip, as sampled at 100 Hz.",
-     _peak_force),
+    ("peak_contact_force", "N", "Largest force on the arm's tip in any physics step.", _peak_force),
+    ("contact_impulse", "N s", "Force on the arm's tip times time, over the first 0.1 s of the "
+     "first touch.", _impulse),
     ("steady_contact_force", "N", "Mean force on the arm's tip over the last 2 s of the mission.",
      _steady_force),
     ("pipe_contacts", "1", "Number of contacts with a pipe.", _pipe_contacts),

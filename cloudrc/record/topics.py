@@ -116,7 +116,9 @@ _TABLE = (
         stamp_path="odometry.stamp_ns", part="odometry."),
     Topic("/contact_force", "cloudrc_msgs/msg/ContactForce", rec.GroundTruth, "world",
         "Force on the touch sensor, world's clock", (
-        Field("tip_force", "float", "N", "on the arm's tip"),)),
+        Field("tip_force", "float", "N", "on the arm's tip"),
+        Field("tip_force_peak", "float", "N", "largest of all physics steps since the row before"),
+        Field("tip_impulse", "float", "N s", "force times time since the row before"))),
     Topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
         "Velocity that the guard lets the low-level controller follow, world's clock", (
         Field("reference", "vector", "m/s", "after the guard's caps, world frame"),)),

@@ -278,7 +278,8 @@ class WorldEndpoint(TunnelEnd):
         tip_force = simulator.tip_force()
         position, orientation, velocity, rate, _ = simulator.readings
         truth = _new(Odometry, (now_ns, position, orientation, velocity, rate))
-        records.append(_new(GroundTruth, (now_ns, truth, tip_force, guard.reference)))
+        forces = (tip_force, *simulator.take_tip_force())
+        records.append(_new(GroundTruth, (now_ns, truth, *forces, guard.reference)))
         if guard.changes:
             records += guard.take_changes()
         if simulator.touches:

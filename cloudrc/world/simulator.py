@@ -40,6 +40,8 @@ class Simulator:
         dt: Duration of a step [s].
         steps: Number of steps since the last reset.
         readings: State of the base after the last step.
+        tip_force_peak: Largest force on the arm's tip since the last call of `take_tip_force` [N].
+        tip_impulse: Integral of that force over time since the last call [N s].
         touches: Contacts that began since the last call of `take_contacts`, without stamps.
         tape: None, or a list to which every step since the last reset appends its controls, for
             `replay`.
@@ -75,6 +77,7 @@ class Simulator:
         mujoco.mj_forward(self.model, self._data)
         self._rotors.speeds = STOPPED
         self.steps = self._contacts = 0
+        self.tip_force_peak = self.tip_impulse = 0.0
         if self.tape is not None:
             self.tape.clear()
         self.touches: list[Contact] = []
@@ -101,6 +104,10 @@ class Simulator:
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
         contacts = data.ncon
         if contacts or self._contacts:
+            force = self._sensors[self._tip_sensor]
+            self.tip_impulse += force * self.dt
+            if force > self.tip_force_peak:
+                self.tip_force_peak = force
             # Look at once if their number has changed, else only every few steps.
             if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
                 self._note_contacts(before)
@@ -119,6 +126,12 @@ class Simulator:
     def tip_force(self) -> float:
         """Return the normal force on the arm's tip at the beginning of the last step [N]."""
         return self._sensors[self._tip_sensor]
+
+    def take_tip_force(self) -> tuple[float, float]:
+        """Return `tip_force_peak` [N] and `tip_impulse` [N s], and set both to 0."""
+        found = self.tip_force_peak, self.tip_impulse
+        self.tip_force_peak = self.tip_impulse = 0.0
+        return found
 
     def take_contacts(self) -> list[Contact]:
         """Return the contacts that began since the last call, oldest first, without stamps."""

@@ -182,6 +182,19 @@ def test_the_tip_touches_the_board_once_and_feels_it(at_the_board):
     assert touch.tip_velocity[0] == pytest.approx(touch.velocity[0], abs=0.03)
 
 
+def test_the_peak_force_is_that_of_every_step_and_the_impulse_stops_the_tip(at_the_board):
+    simulator, low_level = at_the_board
+    peaks, every = [], []
+    for _ in range(100):
+        for _ in range(5):
+            fly(simulator, low_level, (0.2, 0.0, 0.0), simulator.dt)
+            every.append(simulator.tip_force())
+        peaks.append(simulator.take_tip_force())
+    assert max(peak for peak, _ in peaks) == max(every) > 10.0
+    assert sum(impulse for _, impulse in peaks) == pytest.approx(sum(every) * simulator.dt)
+    assert simulator.take_tip_force() == (0.0, 0.0)
+
+
 def test_the_steady_force_is_what_statics_says(at_the_board):
     # Wanted: 4 * .2 N + .1 N from the integral, a tilt of .9 / 10.3 = .0874. The arm's weight adds
     # .0196, the force itself takes .17 F (its lever is .17 m, k_R = 1): F = 10.4 (.107 - .17 F).
