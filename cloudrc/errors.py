@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import traceback
+from pathlib import Path
+
 TEXT_MAX = 2000
 """Longest part of a foreign text that is shown [characters]."""
 
@@ -57,3 +60,11 @@ def describe_error(error: BaseException) -> str:
         raise
     except BaseException:  # the exception's __str__ is foreign code, too
         return to_one_line(name)
+
+
+def locate_error(error: BaseException) -> str:
+    """Return where an exception was raised, as "FILE:LINE in FUNCTION" without folders."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames:
+        return ""
+    return f"{Path(frames[-1].filename).name}:{frames[-1].lineno} in {frames[-1].name}"

@@ -272,11 +272,13 @@ class Fault(NamedTuple):
         code: One word, such as "predictor_failed", "recorder", "link_check", or "late" (cloud
             missed periods, or world is slower than real time).
         text: What is wrong, where, and what to do.
+        traceback: The traceback of a plug-in's first failure; "" for another fault.
     """
 
     stamp_ns: int
     code: str
     text: str
+    traceback: str = ""
 
 
 class Counted(NamedTuple):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import escape, format_document, output_argument, paint, table
+from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
 from cloudrc.errors import BadInputError
 
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
@@ -62,6 +63,7 @@ def execute(options: argparse.Namespace) -> int:
     unmeasured = metrics.not_measured(experiment.report.metrics, options.metric)
     run = replace(run, notes=(*run.notes, *unmeasured))
     document = write_report(options.run, recording, experiment, run, own=options.metric)
+    print_traceback(options, document)
     for_people = options.output == "table"
     print(
         summary(document, options.run) if for_people else format_document(document, options.output)
@@ -90,3 +92,10 @@ def summary(report: Mapping[str, Any], folder: Path) -> str:
         count = numbers["fault_count"].value
         lines.append(paint(f"  faults noted in flight: {count:.0f}, see the report", "yellow"))
     return "\n".join([*lines, "", escape(str(folder / "report.html"))])
+
+
+def print_traceback(options: argparse.Namespace, report: Mapping[str, Any]) -> None:
+    """With --debug, print the traceback of the first failure of a plug-in to stderr."""
+    if getattr(options, "debug", False) and "traceback" in report:
+        for line in report["traceback"].splitlines():
+            print_line(line, sys.stderr)

@@ -23,7 +23,7 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals
-from cloudrc.cli.report import summary
+from cloudrc.cli.report import print_traceback, summary
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
@@ -138,6 +138,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     finally:
         if in_cluster and options.out is None and folder.exists():
             point_latest_to(folder)
+    print_traceback(options, report)
     print_or_drop(
         format_document(report, options.output) if for_programs else summary(report, folder)
     )

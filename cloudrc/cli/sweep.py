@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 
 from cloudrc.cli.output import escape, format_document, format_number, print_or_drop, table
 from cloudrc.cli.pool import map_in_order, take_each
+from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import fly, load, new_folder
 from cloudrc.metrics.verdict import EXIT_CODES
 
@@ -98,6 +99,8 @@ def fly_seeds(options: argparse.Namespace) -> int:
         line = f"{count:>7}  seed {report['seed']}  {report['verdict']}{failure}"
         if for_people or sys.stderr.isatty():
             print_or_drop(escape(line), sys.stdout if for_people else sys.stderr)
+        if not any("traceback" in earlier for earlier in reports[:-1]):
+            print_traceback(options, report)
         if report["verdict"] == "interrupted":  # with one core, this process flies
             raise KeyboardInterrupt
 

@@ -15,14 +15,16 @@ so it needs no clock synchronisation.
 
 from __future__ import annotations
 
+import traceback
 from collections import Counter, deque
 from collections.abc import Callable
 from math import isfinite, nan
+from typing import NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.errors import describe_error
+from cloudrc.errors import describe_error, locate_error
 from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
 from cloudrc.records import Control, Fault
 
@@ -43,6 +45,14 @@ INSTEAD = {
     "controller": "cloud commands zero velocity",
 }
 """Kind of plug-in -> what cloud does when the plug-in fails."""
+TRACEBACK_MAX = 4000
+"""Longest recorded traceback [characters]; of a longer one the end is kept."""
+
+
+class InvalidResultError(ValueError):
+    """A plug-in returned a value that is not a number, or not finite."""
+
+
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
@@ -96,13 +106,13 @@ class DelayMeter:
         """Return the horizon for a command that leaves at `now_ns` [ns], in [0, 1] s.
 
         Raises:
-            ValueError: If the estimator's horizon is not finite.
+            InvalidResultError: If the estimator's horizon is not finite.
         """
         horizon = float(self._estimator.horizon((now_ns - self._stamp_ns) * 1e-9))
         if 0.0 <= horizon <= HORIZON_MAX:
             return horizon
         if not isfinite(horizon):
-            raise ValueError(f"its horizon is {horizon}")
+            raise InvalidResultError(f"its horizon is {horizon}")
         self._counts["horizon_clamped"] += 1
         return min(max(horizon, 0.0), HORIZON_MAX)
 
@@ -252,7 +262,7 @@ class ControlLoop:
             w, x, y, z = estimate.orientation_wxyz
             orientation = (float(w), float(x), float(y), float(z))
             if not isfinite(sum(position) + sum(velocity) + sum(orientation)):
-                raise ValueError(f"it returned {estimate}")
+                _refuse(position=position, velocity=velocity, orientation=orientation)
             stamp_ns, rate = estimate.stamp_ns, estimate.angular_velocity_body
             return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
         except BaseException as error:
@@ -266,7 +276,7 @@ class ControlLoop:
             output = self._controller.update(estimate, setpoint, dt)
             velocity, yaw_rate = _triple(output.velocity), float(output.yaw_rate)
             if not isfinite(sum(velocity) + yaw_rate):
-                raise ValueError(f"it returned {output}")
+                _refuse(velocity=velocity, yaw_rate=(yaw_rate,))
             proportional, integral = _triple(output.proportional), _triple(output.integral)
             derivative = _triple(output.derivative)
             terms = (velocity, yaw_rate, proportional, integral, derivative)
@@ -294,9 +304,21 @@ class ControlLoop:
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:
-            what = f"the {kind} failed ({describe_error(error)}); {instead or INSTEAD[kind]}"
-            fault = Fault(now_ns, code, f"{what}; fix cloud.{kind} or choose another")
+            where = "" if isinstance(error, InvalidResultError) else f", {locate_error(error)}"
+            what = f"the {kind} failed ({describe_error(error)}{where})"
+            text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
+            frames = "".join(traceback.format_tb(error.__traceback__))[-TRACEBACK_MAX:]
+            trace = frames.encode(errors="replace").decode() + describe_error(error)
+            fault = Fault(now_ns, code, text, trace)
             (self._undated if now_ns == NEVER_NS else self.faults).append(fault)
+
+
+def _refuse(**values: tuple[float, ...]) -> NoReturn:
+    """Raise an InvalidResultError that names the first value that is not finite."""
+    wrong = (each for each in values.items() if not isfinite(sum(each[1])))
+    name, value = next(wrong, next(iter(values.items())))
+    shown = ", ".join(f"{number:.4g}" for number in value)
+    raise InvalidResultError(f"its {name} is ({shown})")
 
 
 def _triple(numbers: Vector) -> Vector:

@@ -32,6 +32,8 @@ age of a command. With a larger loss, a slow machine instead of the network coul
 guard does."""
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 """Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
+PLUGIN_FAILURES_MAX = 0.01
+"""Largest share of periods in which a plug-in may fail in a valid flight, in [0, 1]."""
 ADVICE = "close other programs or give the run more cores"
 
 Outcome = Literal["success", "failure", "invalid", "interrupted"]
@@ -164,9 +166,17 @@ def flight_evidence(
         end=UNKNOWN if end_ns is None else _moment(flight, end_ns),
         time_limit=criteria.time_limit_s,
         touch=touch,
-        violations=(*_pipes(flight), *_interventions(flight), *_restarts(flight)),
+        violations=tuple(_violations(flight)),
         slow=_not_real_time(numbers) if real_time else "",
     )
+
+
+def _violations(flight: Flight) -> Iterator[Failure]:
+    """Yield all events in the recording that must not happen."""
+    yield from _pipes(flight)
+    yield from _interventions(flight)
+    yield from _restarts(flight)
+    yield from _plugins(flight)
 
 
 def _ending(flight: Flight, interrupted: bool) -> Ending:
@@ -218,6 +228,21 @@ def _restarts(flight: Flight) -> Iterator[Failure]:
         if end == "world" and stamp_ns > (flight.start_ns or 0):
             text = f"world opened a new session in flight: {cause}"
             yield Failure("world_restarted", text, *_moment(flight, int(stamp_ns)))
+
+
+def _plugins(flight: Flight) -> Iterator[Failure]:
+    """Yield the plug-ins that failed so often that the numbers are those of other plug-ins."""
+    periods, faults = len(flight.recording["/delay_estimate"]), flight.recording["/fault"]
+    for kind in ("estimator", "predictor", "controller"):
+        share = (flight.last_total(f"{kind}_failed") or 0.0) / max(periods, 1)
+        if share > PLUGIN_FAILURES_MAX:
+            first = faults["text"][faults["code"] == f"{kind}_failed"]
+            why = f": {first[0]}" if len(first) else ""
+            limit = f"{PLUGIN_FAILURES_MAX:.0%}"
+            text = (
+                f"cloud.{kind} failed in {min(share, 1.0):.0%} of its periods, above {limit}{why}"
+            )
+            yield Failure("plugin_failed", text)
 
 
 def _not_real_time(numbers: Mapping[str, Number]) -> str:

@@ -179,7 +179,8 @@ _TABLE = (
     Topic("/fault", "cloudrc_msgs/msg/Fault", rec.Fault, "either",
         "A fault that did not stop the flight, clock of its end", (
         Field("code", "string", "", _CODES),
-        Field("text", "string", "", "what, where, what to do"))),
+        Field("text", "string", "", "what, where, what to do"),
+        Field("traceback", "string", "", "of a plug-in's first failure, else empty"))),
     Topic("/count", "cloudrc_msgs/msg/Counted", rec.Counted, "either",
         "A counter, clock of its end", (
         _END,

@@ -70,6 +70,7 @@ class Assessment:
                 "numbers": values,
                 "clock_offset": clock_offset_document(recording.metadata),
                 "complete": recording.complete,
+                "traceback": next(filter(None, recording["/fault"]["traceback"]), None),
                 "notes": list(self.notes),
             }
         )

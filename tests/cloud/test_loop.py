@@ -1,5 +1,6 @@
 """The control loop: delays, when it freezes, and that it goes on whatever a plug-in does."""
 
+import re
 from collections import Counter
 from functools import partial
 from math import inf, nan
@@ -169,7 +170,22 @@ def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     assert fault.code == f"{kind}_failed"
     assert "\n" not in fault.text
     assert len(fault.text.encode()) < 2200
+    assert len(fault.traceback.encode()) < 6200
     assert fault.text.endswith(f"fix cloud.{kind} or choose another")
+
+
+def test_a_failure_names_file_and_line_and_keeps_its_traceback():
+    a_loop = loop(controller=raises(ZeroDivisionError("no"))(), heard_ms=1090)
+    command(a_loop, 1094)
+    (fault,) = a_loop.take_faults()
+    assert re.search(r"\(ZeroDivisionError: no, test_loop.py:\d+ in update\)", fault.text)
+    assert "raise error\nZeroDivisionError: no" in fault.traceback
+
+
+def test_a_value_that_is_not_finite_is_named_shortly():
+    a_loop = loop(predictor=NOT_FINITE(), heard_ms=1090)
+    command(a_loop, 1094)
+    assert "failed (InvalidResultError: its position is (inf, 0, 0));" in a_loop.faults[0].text
 
 
 VECTORS = ("velocity", "proportional", "integral", "derivative")
