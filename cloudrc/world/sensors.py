@@ -11,12 +11,12 @@ from cloudrc.messages import Odometry, Vector
 
 
 class Sensors:
-    """White Gaussian noise, independent per axis and sample, on position and velocity."""
+    """Add white Gaussian noise, independent per axis and sample, to position and velocity."""
 
     def __init__(
         self, position_noise: float, velocity_noise: float, rng: np.random.Generator
     ) -> None:
-        """Set the deviations per axis, `position_noise` [m] and `velocity_noise` [m/s]; 0: none."""
+        """Set the standard deviations of the noise per axis [m], [m/s]; 0 means no noise."""
         self._position_noise, self._velocity_noise = position_noise, velocity_noise
         self._rng = rng
         self._exact = position_noise == velocity_noise == 0.0

@@ -1,7 +1,7 @@
-"""The physics: it turns commanded rotor speeds into readings and contacts.
+"""Simulate the physics: turn commanded rotor speeds into readings and contacts.
 
-`struct` accesses MuJoCo's arrays through memory views: writing four elements takes a quarter of the
-time of a numpy slice assignment.
+The module writes to MuJoCo's arrays with `struct` through memory views. Four elements take a
+quarter of the time of a numpy slice assignment.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
 TOUCH_GAP = 0.1
 """Shortest time without contact before a contact counts as a new contact [s]."""
 CONTACT_CHECK_STEPS = 5
-"""Number of steps between two checks of the contacts, as long as their number is constant. A check
-takes as long as a step."""
+"""Number of steps between two checks of the contacts while the number of contacts is constant. A
+check takes as long as a step."""
 
 _mj_step = mujoco.mj_step
 _pack_ctrl = Struct("4d").pack_into
@@ -40,15 +40,15 @@ class Simulator:
         dt: Duration of a step [s].
         steps: Number of steps since the last reset.
         readings: State of the base after the last step.
-        touches: Contacts that began since the last call of `take_contacts`, without stamps.
-        tape: None, or a list to which every step since the last reset appends its controls, for
-            `replay`.
+        touches: Contacts that began since the last call of `take_contacts`, with stamp 0.
+        tape: List to which every step appends its controls, for `replay`; None for no list. A reset
+            empties the list.
     """
 
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
-        Raise a BadInputError if a file is missing or does not suit the loop.
+        Raise a BadInputError if a file is missing or does not fit the onboard controller.
         """
         self.model = model = compile_model(robot, scene)
         self.dt: float = model.opt.timestep
@@ -85,8 +85,8 @@ class Simulator:
     def step(self, rotor_speeds: RotorSpeeds) -> None:
         """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
 
-        Thrust and drag use the rotor speeds at the end of the step, and the drag uses the velocity
-        at the beginning of the step.
+        Thrust and drag use the rotor speeds at the end of the step. The drag uses the velocity at
+        the beginning of the step.
         """
         before, data = self.readings, self._data
         controls = self._rotors.step(rotor_speeds, before)
@@ -108,7 +108,7 @@ class Simulator:
 
     @property
     def touch_age(self) -> float:
-        """Time since the robot last touched something [s]; at the reset it touches the floor."""
+        """Time since the robot last touched something [s]; a reset puts the robot on the floor."""
         return (self.steps - max(self._last_touch.values())) * self.dt
 
     @property
@@ -121,12 +121,12 @@ class Simulator:
         return self._sensors[self._tip_sensor]
 
     def take_contacts(self) -> list[Contact]:
-        """Return the contacts that began since the last call, oldest first, without stamps."""
+        """Return the contacts that began since the last call, oldest first, with stamp 0."""
         touches, self.touches = self.touches, []
         return touches
 
     def state(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return the state of the physics, `mjSTATE_FULLPHYSICS`, for `replay`, shape (n,).
+        """Return the state of the physics for `replay`: `mjSTATE_FULLPHYSICS`, shape (n,).
 
         The second array has the accelerations from which the contact solver starts, shape (nv,).
         """
@@ -136,7 +136,7 @@ class Simulator:
         return physics, self._data.qacc_warmstart.copy()
 
     def _note_contacts(self, before: Readings) -> None:
-        """Note the new contacts, which MuJoCo found in the state `before` the step."""
+        """Note the new contacts; MuJoCo found all contacts in the state `before` the step."""
         contact = self._data.contact
         tip = self._data.site_xpos[self._tip].tolist()
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
@@ -167,10 +167,10 @@ def _velocity_at(readings: Readings, offset: Vector) -> Vector:
 def replay(
     model: Any, physics: npt.ArrayLike, warmstart: npt.ArrayLike, tape: npt.ArrayLike
 ) -> npt.NDArray[np.float64]:
-    """Replay a `Simulator.tape` without a reset at the speed of raw `mj_step`, for the benchmark.
+    """Repeat the steps of a `Simulator.tape` at the speed of raw `mj_step`, for the benchmark.
 
-    The replay starts from `Simulator.state()`. Return the state of the physics at the end, which is
-    equal to that of the flight, bit by bit.
+    `physics` and `warmstart` are the result of `Simulator.state()` at the beginning of the tape.
+    Return the state of the physics at the end, which equals that of the simulator bit by bit.
     """
     from mujoco import rollout
 
