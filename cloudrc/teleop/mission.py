@@ -1,4 +1,4 @@
-"""Fly missions: turn the operator's verbs and telemetry into setpoints, requests and events.
+"""Fly missions: turn the operator's commands and telemetry into setpoints, requests and events.
 
               start                    start seen             every waypoint reached
         IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
@@ -6,9 +6,10 @@
                                                      v |
                                                      HELD
 
-Cancel leads from STARTING, FLYING and HELD to CANCELLED. A time limit, a restart of world, a guard
-in LAND or an emergency stop lead to FAILED. At the end of a mission teleop asks the robot to hold,
-and makes the robot's position the setpoint, because an armed robot flies to the last setpoint.
+The command cancel leads from STARTING, FLYING and HELD to CANCELLED. A time limit, a restart of
+world, a guard in LAND or an emergency stop leads to FAILED. At the end of a mission teleop asks the
+robot to hold. It also makes the robot's position the setpoint, because a robot that misses the
+request still flies to the last setpoint.
 """
 
 from __future__ import annotations
@@ -39,25 +40,25 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
 
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
-"""Lowest z at which teleop holds the robot [m], world frame; the floor is at 0. At a lower z the
+"""Lowest z at which teleop holds the robot [m], world frame. The floor is at z = 0; lower, the
 robot would scrape along the floor.
 Source: docs/safety.md, "The guard"."""
 NO_WAYPOINT = -1
-"""Waypoint index of a setpoint or event without a waypoint."""
+"""Waypoint index in a setpoint or event that belongs to no waypoint."""
 UNDER_WAY = FLYING, STARTING, HELD
-"""States of a mission that has begun and not ended."""
+"""States of a mission that has begun and has not ended."""
 GAP_MAX_NS = 500_000_000
-"""Of a longer gap between two telemetry messages, only this much is time of flight [ns]."""
+"""Largest part of a gap between two telemetry messages that counts as time of flight [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
-"""Time without telemetry after which the dwell time starts again [ns]."""
+"""Time without telemetry after which the dwell time at a waypoint starts again [ns]."""
 # Looking up an enum's member is slow, and these are used in every period.
 GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
 
 
 class LegWatch:
-    """Measure the flight time of one leg, and detect when the robot has reached the waypoint.
+    """Measure the time of flight to a waypoint, and detect when the robot has reached the waypoint.
 
-    Only time in which the robot follows cloud's commands counts.
+    Only time in which the robot follows cloud's commands counts as time of flight.
     """
 
     def __init__(self) -> None:
@@ -65,16 +66,16 @@ class LegWatch:
         self.pause()
 
     def pause(self) -> None:
-        """Interrupt the leg: keep the time of flight, but restart the dwell time."""
+        """Interrupt the flight to the waypoint: keep the time of flight, restart the dwell time."""
         self._seen_ns = self._near_since_ns = NEVER_NS
 
     @property
     def flown(self) -> float:
-        """Time of flight of this leg [s]."""
+        """Time of flight to the waypoint so far [s]."""
         return self._flown_ns * 1e-9
 
     def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
-        """Return whether the robot, seen at `now_ns` [ns], has stayed for the dwell time."""
+        """Tell whether the robot, observed at `now_ns` [ns], has stayed for the dwell time."""
         before_ns, self._seen_ns = self._seen_ns, now_ns
         if seen.guard is HOLD:
             self._near_since_ns = NEVER_NS
@@ -95,9 +96,10 @@ class LegWatch:
 class Teleop:
     """State machine that flies missions one after the other.
 
-    Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, and another method for each
-    command of the operator. After each of these calls, call `take_outputs`. A setpoint is valid
-    until the next setpoint or the next session. All times `now_ns` are of the caller's clock [ns].
+    Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, and one of the other methods
+    for each command of the operator. After each call, send the messages of `take_outputs`. A
+    setpoint is valid until the next setpoint or the next session. All times `now_ns` are on the
+    caller's clock [ns].
 
     Attributes:
         state: State of the mission; "idle" before the first mission.
@@ -105,12 +107,15 @@ class Teleop:
         outcome: Last event of the mission; None before the first mission and during a mission.
         seen: The newest telemetry; None before the first telemetry.
         requests: Sender of the requests to the robot.
-        stopping: Whether an emergency stop is on its way: telemetry does not show ESTOP yet.
+        stopping: Whether an emergency stop was requested, and telemetry does not show ESTOP yet.
         outputs: Messages since the last `take_outputs`.
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission; `ended` returns whether the mission with this number is over."""
+        """Begin without a mission.
+
+        `ended` returns whether the mission with a given number has ended.
+        """
         self.state, self.leg = "idle", 0
         self.outcome: MissionEvent | None = None
         self.outputs: list[Output] = []
@@ -172,7 +177,7 @@ class Teleop:
         self._select(Setpoint(leg.position, leg.yaw, NO_WAYPOINT))
 
     def hold(self, now_ns: int) -> None:
-        """Hold the robot at its position; raise BadInputError unless it flies a mission."""
+        """Hold the robot at its position; raise BadInputError unless a mission flies."""
         self._check("hold", FLYING)
         self._hold(now_ns)
 
@@ -190,8 +195,8 @@ class Teleop:
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once in any state, and drop all earlier requests to the robot.
 
-        Teleop sends `ALARM` to cloud now, and repeats `ALARM` until telemetry shows ESTOP. Cloud
-        repeats the stop until the robot has acted on it, even if the robot was stopped before.
+        Teleop sends `ALARM` to cloud until telemetry shows ESTOP. Cloud repeats the stop to the
+        robot until the robot has carried out this stop.
         """
         if self.state in UNDER_WAY:
             self._end("emergency_stopped", "emergency stop", now_ns, where=True)
@@ -253,7 +258,7 @@ class Teleop:
             raise BadInputError(f"{verb}: the mission is {self.state}; it must be {needed}")
 
     def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
-        """Find a failure in telemetry that ends the mission; return its code and its text."""
+        """Find in telemetry a reason why the mission fails; return the event's code and text."""
         if self._world not in ("", seen.world):
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
@@ -267,7 +272,7 @@ class Teleop:
         return None
 
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
-        """Find an exceeded time limit; return its code and its text."""
+        """Find a time limit that has passed; return the event's code and text."""
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
         if self.elapsed(now_ns) >= limit and self.state == STARTING:
             return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
@@ -280,8 +285,8 @@ class Teleop:
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
         """Keep the robot from flying a mission that this teleop does not fly.
 
-        The setpoint becomes the robot's position. If the robot stands on the ground, or if its
-        mission has ended, teleop also asks the robot to end the mission.
+        The robot's position becomes the setpoint. If the robot stands on the ground, or if the
+        foreign mission has ended, teleop also asks the robot to end that mission.
         """
         mission_id = seen.mission_id
         over = self._is_ended(mission_id) or (seen.guard is GROUND and mission_id != 0)
@@ -290,13 +295,13 @@ class Teleop:
         self._select_here()
 
     def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
-        """Store a new mission: its plan, its number, and the start of its time [ns]."""
+        """Store plan and number of a new mission, and when it began [ns]."""
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
         self._continued = self._was_held = False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
-        """Begin the mission after telemetry shows its start; measure its time from now on."""
+        """Begin the mission once telemetry shows its start; its time begins now."""
         self._world, self._expected = seen.world, (self._mission_id,)
         self._watch = LegWatch()
         if not self._continued:
@@ -331,13 +336,13 @@ class Teleop:
         self._report("held", self.leg, f"held {self.where}", now_ns)
 
     def _end(self, code: str, text: str, now_ns: int, *, where: bool = False) -> None:
-        """End the mission, and ask the robot to hold; `where` adds the waypoint to the text."""
+        """End the mission, and ask the robot to hold; with `where`, the text names the waypoint."""
         text = f"{text} {self.where}" if where else text
         waypoint = min(self.leg, len(self._plan.legs) - 1)
         if code != "done" and self._mission_id:
             self.requests.report(self._mission_id, MISSION_OVER)
         on_ground = self.seen is not None and self.seen.guard is GROUND
-        if code != "taken_over" or on_ground:  # on the ground it would scrape along the floor
+        if code != "taken_over" or on_ground:  # commands would drag a robot along the ground
             self.requests.ask(Request.END)
         else:
             self.requests.forget()  # another teleop's mission must not be ended
@@ -346,7 +351,7 @@ class Teleop:
 
     @property
     def _onboard(self) -> int:
-        """Number of waypoints of the mission that the robot has stored as reached."""
+        """Number of waypoints of this mission that the robot has stored as reached."""
         seen = self.seen
         return seen.reached if seen and seen.mission_id == self._mission_id != 0 else 0
 
@@ -357,13 +362,13 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether the robot may still fly an earlier mission when this mission begins."""
+        """Whether the robot may still fly an earlier mission, before this mission begins."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self) -> None:
-        """Select the first waypoint already before telemetry shows the start of the mission.
+        """Select the first waypoint before telemetry shows the start, to save a round trip.
 
-        Select nothing while the robot may move, because the robot would fly there at once.
+        While the robot may move, select nothing, because the robot would fly there at once.
         """
         if not self._is_pending or self.seen is None or self._may_move:
             return
@@ -373,9 +378,9 @@ class Teleop:
             self._select_leg(leg)
 
     def _repeat_setpoint(self) -> None:
-        """Send the setpoint again in a new session, because cloud keeps none from the old session.
+        """Send the setpoint again in a new session, because cloud has forgotten it.
 
-        If the mission has not started and the robot may move, select the robot's position.
+        If the mission has not started and the robot may move, the setpoint is the robot's position.
         """
         if self.state == STARTING and self._may_move:
             self._is_pending = True
@@ -408,7 +413,7 @@ class Teleop:
 
     @property
     def where(self) -> str:
-        """Current waypoint in words, for events."""
+        """The way to the current waypoint in words, for events."""
         return f"on the way to {self._leg_name}"
 
     @property

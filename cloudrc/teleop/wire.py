@@ -1,6 +1,6 @@
-"""Define teleop's plans and messages; encode messages between the processes of cloud and teleop.
+"""Define teleop's plans and messages, and encode the messages between cloud and teleop.
 
-Each datagram is a JSON list: the name of the message's type and its fields in order.
+Each datagram is a JSON list: the name of the message's type, then its fields in order.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from cloudrc.records import FAILURES, MissionEvent
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One waypoint and the conditions for reaching it.
+    """A waypoint, and the conditions under which it counts as reached.
 
-    If `tolerance` is infinite, the leg ends after the time `dwell`, wherever the robot is. Missions
-    of random steps use such legs.
+    If `tolerance` is infinite, the waypoint is reached after the time `dwell`, wherever the robot
+    is. Missions of random steps use this.
     """
 
     position: Vector  # [m], world frame, shape (3,)
@@ -42,7 +42,7 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Waypoints of a mission, with start and time limit."""
+    """Waypoints of a mission, with the place of the start and the time limit."""
 
     legs: tuple[Leg, ...]  # in order; at least one
     start: Start = Start.SPAWN  # the spawn (world is reset), or the robot's position
@@ -54,7 +54,7 @@ NO_PLAN = Plan((Leg(ZERO),))
 
 
 class RobotStatus(NamedTuple):
-    """The robot's status from the newest telemetry, sent from cloud to teleop.
+    """The robot's status from the newest telemetry, which cloud sends to teleop.
 
     Numbers that are not known yet are NaN.
     """
@@ -84,14 +84,15 @@ STATES = {
     **dict.fromkeys(("started", "resumed"), FLYING),
     **dict.fromkeys(FAILURES, "failed"),
 }
-"""State of a mission after an event; other events do not change the state."""
+"""Event -> state of the mission after the event; all other events leave the state as it is."""
 
 
 Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 """Messages from teleop to cloud."""
 Message: TypeAlias = RobotStatus | Output
 ALARM = OperatorRequest(0, Request.ESTOP)
-"""Emergency stop. It can bypass teleop's state machine, and cloud gives the stop a number."""
+"""Emergency stop without a number, which cloud adds. It may be sent without the state machine
+`Teleop`."""
 _KINDS: dict[str, TypeAdapter[Message]] = {
     kind.__name__: TypeAdapter(kind)
     for kind in (RobotStatus, Setpoint, OperatorRequest, MissionEvent)
