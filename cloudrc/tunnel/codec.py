@@ -1,12 +1,11 @@
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
 A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body with a fixed
-length for each kind, and a 16-byte authentication tag. This module makes header and body; `session`
-adds and verifies the tag. Only DecodeError is raised.
+length for each kind, and a 16-byte authentication tag, which `session` adds and verifies. The
+functions raise no exception except DecodeError.
 
-The header is authenticated but not encrypted, because the link reads it. The last 12 bytes of the
-header are the nonce of the cipher. They are unique: no two datagrams of one direction and epoch
-have the same kind and counter.
+The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
+nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
 
 Deviation: the paper's tunnel sends pickled ROS messages, which have 1 kB and can execute code.
 """
@@ -86,8 +85,8 @@ class Hello(NamedTuple):
 class Accept(NamedTuple):
     """World's answer that opens a session.
 
-    `nonce` is that of the answered hello. `world_nonce` identifies world's process, `clock`
-    identifies world's monotonic clock, each by 16 random bytes.
+    `nonce` is that of the answered hello. `world_nonce` and `clock` identify world's process and
+    monotonic clock by 16 random bytes each.
     """
 
     nonce: bytes

@@ -7,17 +7,15 @@
                                         <--    ACCEPT (nonce, world's nonce, clock), a new epoch
                                             or BUSY (nonce)
 
-These datagrams are called greetings. A pre-shared key authenticates each greeting by a tag; world
-answers with the key of the hello. No answer is longer than its hello. The cookie is a MAC over a
-time slot: world stores nothing for a hello without a cookie, and a captured hello is useless after
-two slots. World answers a hello with a cookie once per counter. World sends at most ten challenges
-per second. A challenge names no receiver, so the true cloud can also use a challenge that a forger
-has caused.
+A pre-shared key authenticates each of these datagrams by a tag; world answers with the key of the
+hello. No answer is longer than its hello. The cookie is a MAC over a time slot: world stores
+nothing for a hello without a cookie, and a captured hello is useless after two slots. World answers
+a hello with a cookie once per counter. World sends at most ten challenges per second. A challenge
+names no receiver, so the true cloud can also use a challenge to a forger.
 
-A cloud keeps its session while world receives at least one new sealed datagram from this cloud per
-`command_age_max`. Otherwise another cloud can get a session, which has the next epoch (session
-number). Epochs rise even if world restarts, because each hello contains the newest epoch that its
-cloud knows.
+A cloud keeps its session while world receives at least one new encrypted datagram from this cloud
+per `command_age_max`. Otherwise another cloud can get a session. Each session has a higher number,
+the epoch, even after a restart of world: each hello contains the newest epoch that its cloud knows.
 
 Deviation: WireGuard also derives session keys by Diffie-Hellman. In this tunnel the pre-shared key
 is enough: one owner has both ends, and anybody with the key can command the robot anyway.
@@ -43,10 +41,9 @@ CHALLENGE_NS = 100_000_000
 COOKIE_NS = 2_000_000_000
 """Length of the time slot of a cookie [ns]. A cookie is valid in its slot and in the next slot."""
 GRACE_NS = 1_000_000_000
-"""Shortest time for which a cloud keeps a new session before world has received a sealed datagram
-from this cloud [ns]."""
+"""Time for which a cloud keeps a new session without having sent an encrypted datagram [ns]."""
 REPEATS_MAX = 3
-"""How often world repeats its ACCEPT to a cloud that sends hellos but no sealed datagrams."""
+"""How often world repeats its ACCEPT to a cloud that sends hellos but no encrypted datagrams."""
 CLOUDS_MAX = 64
 """Number of cloud processes of which world remembers the newest hello's counter."""
 NO_COOKIE = bytes(codec.COOKIE_SIZE)
@@ -65,11 +62,7 @@ def is_newer(epoch: int, than: int) -> bool:
 
 
 class HelloAnswer(NamedTuple):
-    """World's answer to a hello.
-
-    `outcome` names the counter of this outcome, `datagrams` are to be sent to cloud, and `opened`
-    tells whether the hello has opened a session.
-    """
+    """World's answer to a hello: name of the counter, datagrams, whether a session was opened."""
 
     outcome: str
     datagrams: list[bytes]
@@ -86,8 +79,7 @@ class ServerHandshake:
             session: Keys and counters of world's session; this class begins each epoch.
             nonce: 16 bytes that identify this process, new at every start.
             clock: 16 bytes that identify the monotonic clock of this machine.
-            age_max_ns: Time without a datagram from the cloud with the session after which another
-                cloud can get a session [ns].
+            age_max_ns: Silence of a cloud after which another cloud can get a session [ns].
         """
         self._session = session
         self._nonce, self._clock, self._epoch = nonce, clock, NO_EPOCH
@@ -157,9 +149,9 @@ class ServerHandshake:
     def _keeps_epoch(self, now_ns: int) -> bool:
         """Decide whether the cloud with the session keeps its epoch, or gets the next epoch.
 
-        The cloud gets the next epoch if the epoch has ended, or if the hello has a newer key than
-        the epoch. It also gets the next epoch after more than REPEATS_MAX hellos in a row while
-        world receives no sealed datagram from it, or while hello and epoch have different keys.
+        The cloud gets the next epoch if the epoch has ended, or if the hello has a newer key. It
+        also gets the next epoch after more than REPEATS_MAX hellos if world has received no
+        encrypted datagram since the first of them, or if hello and epoch have different keys.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -229,10 +221,10 @@ class ClientHandshake:
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
-        While cloud has a session, it ignores an ACCEPT of another world process, which may be a
-        late datagram of an ended process; `asks` tells whether cloud asks for a session. If cloud
-        has joined an ended process by mistake, the running process counts as ended. When the
-        running process answers again, cloud asks under a new nonce.
+        Cloud accepts another world process only while cloud asks for a session (`asks`), because
+        the ACCEPT may be a late datagram of an ended process. If cloud has joined an ended process
+        anyway, the running process counts as ended; when it answers again, cloud asks under a new
+        nonce.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):

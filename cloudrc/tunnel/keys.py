@@ -50,7 +50,7 @@ class Key:
         return HKDF(SHA256(), KEY_SIZE, salt, _LABEL + use).derive(self._secret)
 
     def tag(self, data: bytes) -> bytes:
-        """Compute the authentication tag of a greeting: HMAC-SHA256, cut to 16 bytes."""
+        """Compute the authentication tag of a handshake datagram: HMAC-SHA256, cut to 16 bytes."""
         return hmac.digest(self._tag_key, data, hashlib.sha256)[:TAG_SIZE]
 
     def verifies(self, data: bytes, tag: bytes) -> bool:
@@ -73,7 +73,7 @@ class KeySet(NamedTuple):
 
     @property
     def accepted(self) -> tuple[Key, ...]:
-        """The keys with which an end accepts greetings; the first is the current key."""
+        """The keys that an end accepts in a handshake; the first is the current key."""
         return (self.current,) if self.previous is None else (self.current, self.previous)
 
 

@@ -4,9 +4,9 @@ Each direction of a session has one key. HKDF derives this key from a pre-shared
 both ends, and the epoch (session number). One key is enough for a session: 2^32 datagrams take over
 a year. A datagram changes no state before its tag is verified.
 
-Counters restart with every session. Greetings belong to no session, so their counters continue: the
-link decides the loss of a datagram by its epoch and counter, and would lose a greeting with a
-repeated counter each time.
+Counters restart with every session. The handshake comes before the session, so its counters
+continue: the link decides the loss of a datagram by epoch and counter, and would lose a handshake
+datagram with a repeated counter each time.
 
 Two ends in one process need no keys: their datagrams reach no network, and encryption would take a
 twentieth of the flight's time. Drivers with a socket refuse a session without keys
@@ -33,7 +33,7 @@ from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 NO_EPOCH = 0
 """Epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram."""
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}
-"""Kinds of datagram that belong to no session: all greetings except ACCEPT."""
+"""Kinds of handshake datagrams that belong to no session: all except ACCEPT."""
 _PUBLIC_KEY = b"nothing is secret in one process"
 _NO_TAG = bytes(TAG_SIZE)
 
@@ -98,7 +98,7 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def greet(self, kind: int, body: bytes, key: Key | None = None) -> bytes:
-        """Make a greeting with the tag of a pre-shared key, by default the key of the session."""
+        """Make a handshake datagram with the tag of a pre-shared key, by default the session's."""
         counter = self._counters[kind]
         self._counters[kind] = counter + 1
         epoch = NO_EPOCH if kind in TIMELESS else self.epoch

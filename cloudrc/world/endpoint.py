@@ -1,12 +1,11 @@
 """World's end of the tunnel: receive commands, fly the robot and send telemetry.
 
-Simulated time advances in `_advance` only. A datagram takes effect after all steps of 2 ms that are
-due before its arrival. Therefore the result does not depend on when the driver (the program that
-calls this class) wakes up.
+A datagram takes effect after all steps of the simulation that are due before its arrival. The
+result therefore does not depend on when the driver (the program that calls this class) wakes up.
 
 World's clock follows the machine's monotonic clock, but may fall behind. After a stall of the
-process, world simulates at most 50 ms of the lost time. The remaining lag is called slip, and
-stays. The guard therefore runs in every step, and world's clock never jumps.
+process, world simulates at most 50 ms of the lost time; the rest is a permanent lag, the slip. So
+the guard runs in every step, and world's clock never jumps.
 
 World numbers the sessions: a session's number is its epoch. A new epoch begins when a cloud takes
 control, and when a mission starts from the spawn.
@@ -60,8 +59,8 @@ class Orders:
         mission_id: Number of the mission that was started last, in this or an earlier session.
         reached: Number of waypoints of that mission that requests have reported as reached.
         pipes: Number of contacts with pipes since that mission started.
-        touch_speed: Speed of the arm's tip at its first contact with the board since that mission
-            started [m/s]; NaN before the contact.
+        touch_speed: Speed of the arm's tip when it first touched the board in that mission [m/s];
+            NaN before the contact.
     """
 
     def __init__(
@@ -86,9 +85,8 @@ class Orders:
     def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
         """Carry out a request at `now_ns` [ns], world's clock; return whether a mission begins.
 
-        `waited` tells whether the request may have waited in the socket while the process was
-        stalled. Raise the DecodeError "stale" for a start request that waited or is too old, and
-        "future" for a start request whose stamp is in the future.
+        `waited` tells whether the request may have waited in the socket during a stall. A start
+        that waited or is too old raises the DecodeError "stale", a start from the future "future".
         """
         kind, guard = request.request, self._guard
         starts = kind is Request.START
@@ -155,8 +153,7 @@ class PaceMonitor:
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
 CATCH_UP_NS = 50_000_000
-"""Largest lag of world's clock that world makes up after a stall [ns]; a larger lag becomes
-slip."""
+"""Largest lag of world's clock that world makes up after a stall [ns]; any further lag stays."""
 COUNT_PERIOD_NS = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # looking up a member of an enum is slow
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
@@ -178,9 +175,8 @@ class WorldEndpoint(TunnelEnd):
     ) -> None:
         """Connect a robot with stopped rotors to the tunnel; there is no session yet.
 
-        With `newest_wins`, a command that arrives after a newer command is dropped.
-        `command_age_max_ns` is the largest accepted age of a command [ns]. `start_ns` is the
-        monotonic clock now [ns].
+        With `newest_wins`, a command that arrives after a newer command is dropped. A command may
+        be `command_age_max_ns` old [ns]. `start_ns` is the monotonic clock now [ns].
         """
         super().__init__(identity, Direction.UPLINK, newest_wins)
         self.robot, self._sensors = robot, sensors
@@ -315,7 +311,6 @@ class WorldEndpoint(TunnelEnd):
         self._odometry_ns += ODOMETRY_PERIOD_NS
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
-        """Answer a hello; raise a DecodeError if the hello may have waited during a stall."""
         if now_ns == self._stalled_wake_ns:
             raise DecodeError("stale")
         answer = self._door.receive_hello(hello, counter, now_ns)
@@ -327,7 +322,6 @@ class WorldEndpoint(TunnelEnd):
         self._queue(answer.datagrams)
 
     def _begin_epoch(self, cause: str) -> None:
-        """Forget the commands and counters of the previous session; record the new session."""
         self._channel.reset()
         self.robot.guard.forget_commands()
         self._waiting = None
@@ -339,7 +333,6 @@ class WorldEndpoint(TunnelEnd):
             observer.see_session(now_ns)
 
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
-        """Carry out an operator request. A mission from the spawn begins a new session."""
         tick_ns, waited = self._tick_ns, now_ns == self._stalled_wake_ns
         number = self._orders.number
         starts = self._orders.obey(request, tick_ns, waited=waited)
@@ -356,7 +349,6 @@ class WorldEndpoint(TunnelEnd):
     def _receive_command(
         self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
     ) -> None:
-        """Record a command; give it to the guard if it is neither late, repeated nor stale."""
         command, guard = codec.decode_command(body), self.robot.guard
         outcome = self._channel.take(counter)
         if outcome != REPEATED:

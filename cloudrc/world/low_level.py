@@ -25,11 +25,9 @@ GRAVITY = 9.81
 """Gravity that the controller assumes [m/s^2]; the physics uses 9.8066 m/s^2.
 Source: docs/reference/plant.md, "Gravity"."""
 TILT_GAIN, YAW_GAIN = 1.0, 0.035
-"""Attitude gains k_R: torque per attitude error about the x and y axes, and about the z axis [N
-m]."""
+"""Attitude gains k_R: torque per attitude error about x and y, and about z [N m]."""
 TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
-"""Rate gains k_w: torque per angular velocity about the x and y axes, and about the z axis [N m
-s]."""
+"""Rate gains k_w: torque per angular velocity about x and y, and about z [N m s]."""
 THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
 """Largest thrust of one rotor [N]."""
 TINY = 1e-9
@@ -133,8 +131,9 @@ def attitude(force: Vector, readings: Readings) -> Effort:
     """Return the thrust and torque that turn the thrust axis towards `force` and the nose to +x.
 
     `force` is F [N], world frame, shape (3,); R is the body's orientation and w its rate.
-    z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R; e_R = 1/2 (Q21 -
-    Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R · e_R + k_w · w); thrust = F · (R z).
+        z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
+        e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R · e_R + k_w · w);
+        thrust = F · (R z).
     The code works in the body frame, where the wanted axes are the rows of Q.
     Deviation: a collision may turn the robot beyond NOSE_COSINE_MIN or YAW_SINE_MAX (a yaw error
     above 17 degrees). Then the code corrects the tilt about the body's present axes. The correction

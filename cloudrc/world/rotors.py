@@ -38,10 +38,7 @@ frame [N] and a torque in the body frame [N m], as MuJoCo's free joint requires.
 
 
 class Rotors:
-    """Four rotors with lag, thrust and drag.
-
-    `speeds` are the present speeds of the front, left, back and right rotor [rad/s].
-    """
+    """Four rotors with lag, thrust and drag; `speeds` are front, left, back, right [rad/s]."""
 
     def __init__(self, dt: float) -> None:
         """Begin with stopped rotors; `dt` is the duration of a step [s]."""
@@ -52,15 +49,13 @@ class Rotors:
     def step(self, commands: RotorSpeeds, readings: Readings) -> Controls:
         """Advance the rotor speeds by `dt` towards `commands`; return thrusts and drag.
 
-        Lag: w(t + dt) = w + (command - w) · (1 - exp(-dt/T)), where T is 12.5 ms for a rotor that
-        speeds up and 25 ms for a rotor that slows down. This is exact for a constant command.
-        Thrust: kf · w^2.
-        Drag: at each rotor F = -w · c · vh, where c is DRAG_COEFFICIENT and vh is the hub's
-        velocity across the rotor's axis. With body velocity (u, v, .), rates (p, q, r) and a hub at
-        (x, y, h), vh is (u + q · h - r · y, v + r · x - p · h). The hubs have x = (l, 0, -l, 0), y
-        = (0, l, 0, -l). The sum of r x F over the hubs is the torque (-h · Fy, h · Fx, sum of x ·
-        Fy - y · Fx).
-        Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
+        Lag: w(t + dt) = w + (command - w) · (1 - exp(-dt/T)), with T = 12.5 ms for a rotor that
+        speeds up, 25 ms for a rotor that slows down. Thrust: kf · w^2.
+        Drag: at each rotor F = -w · c · vh, where vh is the hub's velocity across the rotor's axis.
+        With body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h), vh is (u + q · h - r ·
+        y, v + r · x - p · h). The hubs have x = (l, 0, -l, 0), y = (0, l, 0, -l).
+        The sum of r x F over the hubs is the torque (-h · Fy, h · Fx, sum of x · Fy - y · Fx).
+                Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
         """
         up, down, k = self._up, self._down, THRUST_COEFFICIENT
         front, left, back, right = self.speeds

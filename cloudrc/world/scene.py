@@ -26,8 +26,7 @@ ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 TIMESTEP = 0.002
 """Step of the physics [s]. Source: docs/reference/plant.md, "Physics step"."""
 INERTIA = (0.0121, 0.0116, 0.0226)
-"""Inertia of the robot `pelican` about x, y and z, for which the attitude gains were tuned [kg
-m^2]."""
+"""Inertia about x, y, z for which the attitude gains were tuned: the pelican's [kg m^2]."""
 TIP = (0.40, 0.0, 0.17)
 """Position of the arm's tip that a robot model must have [m], body frame."""
 SHOWN = 6
@@ -38,9 +37,8 @@ FOLDER = Path(__file__).parent
 def import_mujoco() -> Any:
     """Import MuJoCo without OpenGL, which a flight does not need.
 
-    With MUJOCO_GL=egl on a machine without libEGL, `import mujoco` fails. Therefore MUJOCO_GL is
-    `disable` during the import. Afterwards it gets its old value back, for a child process that
-    renders.
+    With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. MUJOCO_GL is therefore `disable` during
+    the import. Afterwards it has its old value, for a child process that renders.
     """
     wanted = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "disable"
@@ -65,8 +63,7 @@ mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 def model_path(kind: str, name: str) -> Path:
     """Find a shipped model by its name, or a user's model by the path of its .xml file.
 
-    `kind` is "robots" or "scenes". If there is no such file, raise a BadInputError that lists the
-    names of the shipped models.
+    `kind` is "robots" or "scenes". A missing file raises a BadInputError.
     """
     path = Path(name) if name.endswith(".xml") else FOLDER / kind / f"{name}.xml"
     if not path.is_file():
@@ -106,7 +103,6 @@ def compile_model(robot: str, scene: str) -> Any:
 
 
 def _check(model: Any, robot_path: Path, scene_path: Path) -> None:
-    """Raise a BadInputError if a robot or scene lacks what the simulation needs."""
     actuators = [model.actuator(number).name for number in range(model.nu)]
     if actuators != [f"{ROBOT_PREFIX}{rotor}" for rotor in ROTORS]:
         raise BadInputError(f"{robot_path}: needs the actuators {', '.join(ROTORS)}, in this order")
@@ -147,8 +143,8 @@ def _compare(name: str, found: Iterable[float], wanted: Iterable[float], slack: 
 def _robot_differences(model: Any) -> list[str]:
     """List in words where a robot differs from what the onboard controller and the rotors assume.
 
-    The velocity loop compensates for a weight that differs by 1 N, and the attitude gains work for
-    an inertia that differs by half. The tolerances follow from these limits.
+    The tolerances: the velocity loop compensates for a weight that differs by 1 N, and the attitude
+    gains work for an inertia that differs by half.
     """
     base = model.jnt_bodyid[0]
     turned, centre = _axes(model.body_iquat[base]), model.body_ipos[base]

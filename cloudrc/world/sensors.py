@@ -1,6 +1,6 @@
-"""Sensors that add seeded noise to odometry, at 100 Hz.
+"""Add seeded noise to the odometry that goes to cloud, at 100 Hz.
 
-Only the odometry for cloud has noise; the onboard controller uses the true state.
+The onboard controller uses the true state, without noise.
 """
 
 from __future__ import annotations

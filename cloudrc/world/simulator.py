@@ -41,8 +41,7 @@ class Simulator:
         steps: Number of steps since the last reset.
         readings: State of the base after the last step.
         touches: Contacts that began since the last call of `take_contacts`, with stamp 0.
-        tape: List to which every step appends its controls, for `replay`; None for no list. A reset
-            empties the list.
+        tape: Controls of every step since the last reset, for `replay`; None if not recorded.
     """
 
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
@@ -108,7 +107,7 @@ class Simulator:
 
     @property
     def touch_age(self) -> float:
-        """Time since the robot last touched something [s]; a reset puts the robot on the floor."""
+        """Time since the robot last touched something [s]; a reset counts as a touch."""
         return (self.steps - max(self._last_touch.values())) * self.dt
 
     @property

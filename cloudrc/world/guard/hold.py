@@ -1,8 +1,8 @@
 """Brake, hold a position, land and take off with the onboard sensors alone.
 
-The deceleration is large when braking begins and small when it ends, because the low-level
-controller follows late and overshoots. The robot always stops within the distance of the stop rule
-(reaction time REACTION, then deceleration BRAKE).
+Braking begins hard and ends gently, because the low-level controller follows late and overshoots.
+The robot always stops within the distance of the stop rule (time REACTION, then deceleration
+BRAKE).
 """
 
 from __future__ import annotations
@@ -26,32 +26,30 @@ STILL_SPEED = 0.1
 LAND_SPEED = 0.5
 """Speed of the descent [m/s]. Source: docs/reference/plant.md, "Landing"."""
 STILL_SHARE = 0.2
-"""In a descent with a low speed cap, the robot counts as at rest below this share of the planned
-speed [1], because the whole descent may be slower than STILL_SPEED."""
+"""A descending robot is at rest below this share of the planned speed [1], and below STILL_SPEED.
+With a low speed cap, the planned speed itself may be below STILL_SPEED."""
 TOUCH_DOWN_NS = 400_000_000
 """Time at rest after which a descending robot has touched down [ns]."""
 STILL_TICKS = 200
-"""Number of steps of 2 ms at rest after which the robot lies still (0.4 s). A robot that was thrown
-up is also at rest at its highest point, but for less time."""
+"""Number of steps at rest after which the robot lies still (0.4 s). A robot that was thrown up is
+also at rest at its highest point, but for less time."""
 POSITION_GAIN = 0.8
 """Gain of the position hold [1/s]: velocity reference per distance from the hold point."""
 DAMPING_GAIN = 1.6
-"""Damping of the position hold [1]: this factor times the robot's velocity is subtracted from the
-velocity reference."""
+"""Damping of the position hold [1]: velocity reference per velocity of the robot, subtracted."""
 HOLD_SPEED_MAX = 0.5
 """Largest velocity reference of the position hold [m/s]."""
 INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
 """Integral term of the position hold: gain [1/s^2], limit per axis [m/s], and largest distance from
-the hold point at which the term changes [m]. Without this term the robot would hover 30 mm off the
-hold point, because the arm makes it lopsided."""
+the hold point at which the term changes [m]. Without this term the robot, which the arm makes
+lopsided, would hover 30 mm off the hold point."""
 TAKE_OFF_MARGIN = 0.5
 """Smallest distance from the fence's walls at which a robot may take off after its rotors were
-stopped [m]. A tilted robot slides along the floor before it rises, by at most 0.35 m. Test: `pytest
--m "" -k scrapes tests/world`."""
+stopped [m]. A tilted robot slides along the floor before it rises, by at most 0.35 m:
+`pytest -m "" -k scrapes tests/world`."""
 LIFT_OFF_HEIGHT, GROUND_SPEED_MAX = 0.02, 0.2
 """The robot has left the ground once its height has changed by LIFT_OFF_HEIGHT [m]. Before that,
-the guard may stop the rotors if the robot is slower than GROUND_SPEED_MAX [m/s]: the robot then
-falls from a small height, at low speed."""
+the guard may stop the rotors if the robot is slower than GROUND_SPEED_MAX [m/s]."""
 
 
 class PositionHold:
@@ -61,10 +59,7 @@ class PositionHold:
     """
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Set the corners `low` and `high` [m], world frame, between which the robot may hold.
-
-        `speed_max` limits the velocity reference [m/s].
-        """
+        """Hold between `low` and `high` [m], world frame, at no more than `speed_max` [m/s]."""
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
         self._hold_point: Vector | None = None
@@ -114,9 +109,8 @@ class PositionHold:
 def brake_start(reference: Vector, velocity: Vector) -> Vector:
     """Return the velocity reference when braking begins [m/s]: slower than the robot.
 
-    The robot follows the reference late. With a reference faster than the robot, the robot would
-    first speed up. `reference` is the finite reference of the last step, `velocity` the velocity of
-    the robot, both in [m/s], world frame, shape (3,).
+    With a faster reference, the robot would first speed up, because it follows late. `reference`
+    (of the last step, finite) and `velocity` (of the robot) are in [m/s], world frame, shape (3,).
     """
     start = velocity if hypot(*velocity) < hypot(*reference) else reference
     speed = hypot(*start)
@@ -136,8 +130,7 @@ class Descent:
     """Detect the touch-down of a descent, and decide whether the descent may end in the air.
 
     After the operator's acknowledgement, a descent may end in the air if the robot sinks freely and
-    is high enough. A robot that held its position lower, or on an obstacle, would scrape along the
-    ground or the obstacle.
+    is high enough. Otherwise the robot would scrape along the ground or an obstacle.
 
     Attributes:
         speed: Planned speed of the descent [m/s].
@@ -155,7 +148,7 @@ class Descent:
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
-        """Tell whether the descent may end in the air: acknowledged, free and high enough."""
+        """Tell whether the descent may end in the air: acknowledged, sinking freely and high."""
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
 
@@ -172,14 +165,13 @@ class Descent:
 class TakeOff:
     """Detect when the robot has left the ground (`over`), and decide whether it may take off.
 
-    A robot that held its position before it left the ground would scrape along the floor; therefore
-    its rotors stop. A robot whose rotors were stopped in the air may still fall, or lie outside the
-    fence, when the operator acknowledges. It may take off once it lies still, at least
-    TAKE_OFF_MARGIN inside the fence.
+    A robot whose rotors were stopped in the air may still fall, or lie outside the fence, when the
+    operator acknowledges. It may take off once it lies still, at least TAKE_OFF_MARGIN inside the
+    fence.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
-        """Set the corners of the fence, `low` and `high` [m], world frame; the robot stands."""
+        """Set the corners of the fence, `low` and `high` [m], world frame; begin on the ground."""
         (ax, ay, az), (bx, by, bz) = low, high
         self._low = (ax + TAKE_OFF_MARGIN, ay + TAKE_OFF_MARGIN, az)
         self._high = (bx - TAKE_OFF_MARGIN, by - TAKE_OFF_MARGIN, bz)
@@ -219,5 +211,5 @@ class TakeOff:
                 self._still_ticks = self._still_ticks + 1 if at_rest else 0
 
     def may_end(self, readings: Readings) -> bool:
-        """Tell whether the rotors may stop: the robot is still on the ground, and slow."""
+        """Tell whether the robot is still on the ground, and slow enough to stop its rotors."""
         return not self.over and hypot(*readings.velocity) < GROUND_SPEED_MAX

@@ -1,10 +1,9 @@
 """The limits of the guard, and functions that keep a velocity reference within these limits.
 
 The limits come from world's experiment; no message changes them. Each limit is finite and above 0,
-so no value switches a limit off. Unless a docstring restricts the input, a function accepts any
-numbers, NaN and infinity included, and returns a result within the limit. Every comparison is
-therefore written so that NaN leads to the safe branch. `tests/world/guard/test_proof.py` proves the
-bounds of the scalar functions for all 64-bit floats.
+so no value switches a limit off. Functions accept NaN and infinity unless their docstring says
+otherwise; for this, comparisons are written so that NaN leads to the safe branch.
+`tests/world/guard/test_proof.py` proves the bounds of the scalar functions for all floats.
 """
 
 from __future__ import annotations
@@ -39,11 +38,11 @@ RECHECK_DISTANCE, RECHECK_NS = 0.25, 10_000_000
 only once per RECHECK_NS [ns]. In that time the robot moves by less than RECHECK_DISTANCE, because
 the robot is never faster than 25 m/s."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
-"""How a robot that is too close to the fence, or outside, returns: velocity per distance [1/s], and
+"""Return of a robot that is too close to the fence, or outside: velocity per distance [1/s], and
 largest speed [m/s]."""
 LOW_HEIGHT, LOW_SPEED = 0.25, 1.0
-"""With the base less than LOW_HEIGHT [m] above the fence's floor, the horizontal speed is at most
-LOW_SPEED [m/s]."""
+"""Largest horizontal speed, LOW_SPEED [m/s], of a robot that is less than LOW_HEIGHT [m] above the
+fence's floor."""
 SINK_LEAD_MAX = 0.5
 """Largest difference by which the velocity reference may sink faster than the robot [m/s]. With a
 larger difference the low-level controller would turn the robot over."""
@@ -52,10 +51,7 @@ ROUNDING_FACTOR = 1.0 - 2.0**-45
 
 
 def stopping_distance(speed: float, reaction: float) -> float:
-    """Return the distance in which the robot stops from `speed` [m/s], in [m].
-
-    Braking begins after `reaction` [s].
-    """
+    """Return the stopping distance [m] from `speed` [m/s]; braking begins after `reaction` [s]."""
     return speed * (reaction + speed * STOP_COEFFICIENT)
 
 
@@ -69,9 +65,8 @@ def clamp(value: float, low: float, high: float) -> float:
 def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
     """Return the largest velocity towards a face of the fence [m/s].
 
-    `distance` is the distance to the face minus the margin [m], `reaction` the reaction time [s].
-    The result is the v with reaction · v + v^2/6 = distance. If `distance` is negative, the result
-    is negative, too: the robot returns.
+    The result v solves reaction · v + v^2/6 = distance, with the reaction time [s] and the distance
+    to the face minus the margin [m]. Beyond the margin v is negative: the robot returns.
     """
     if distance > FAR:
         return inf
@@ -82,10 +77,7 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
 
 
 def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether the fence limits nothing within RECHECK_DISTANCE of `position`.
-
-    The arguments are those of `limit_to_fence`.
-    """
+    """Tell whether `limit_to_fence` changes nothing within RECHECK_DISTANCE of `position`."""
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if vx > 0.0:
         bx -= vx * (FENCE_REACTION + vx * STOP_COEFFICIENT)
@@ -110,9 +102,8 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
     """Slow a finite `velocity` [m/s], axis by axis, so that the robot can stop before the fence.
 
     Near the floor the horizontal velocity is limited, too, because a rotor that touches the floor
-    at speed turns the robot over. `position` is the position of the base [m]; `low` and `high` are
-    the corners of the fence minus the margins [m]. All arguments are in the world frame, shape
-    (3,).
+    at speed turns the robot over. `position` is that of the base [m]. `low` and `high` are the
+    corners of the fence minus the margins [m]. All are in the world frame, shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if not z >= az - FLOOR_MARGIN + LOW_HEIGHT:
@@ -156,8 +147,8 @@ def step_towards(start: Vector, end: Vector, step: float) -> Vector:
 def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
     """Limit how much a velocity speeds up in one step to `step` [m/s]; it may slow down freely.
 
-    `before` and `after` are finite velocities [m/s], shape (3,). The limit applies to all axes
-    together, because the fence may reverse one axis while another axis speeds up.
+    `before` and `after` are finite velocities [m/s]. The limit applies to all axes together,
+    because the fence may reverse one axis while another axis speeds up.
     """
     (ax, ay, az), (bx, by, bz) = before, after
     x, y, z = growth(ax, bx), growth(ay, by), growth(az, bz)
@@ -193,13 +184,13 @@ def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float
 AGE_MAX_NS = 10_000_000_000
 """Largest command age limit that an experiment may set [ns]."""
 GROUND_WAIT_MIN_NS = 10_000_000_000
-"""Shortest time for which a robot on the ground waits for the first command of its mission [ns].
-The command arrives a round trip after the start."""
+"""Shortest time for which a robot on the ground waits for the first command of its mission [ns]."""
 RAMP_MIN = 1.0
-"""Shortest time after a HOLD in which the velocity reference may speed up by at most BRAKE [s]."""
+"""Shortest time after the guard state HOLD in which the reference speeds up by at most BRAKE
+[s]."""
 COMMAND_MAX = 1000.0
 """Largest component of a command that the guard accepts [m/s, rad/s]. A larger component comes from
-a bug, which may have corrupted the direction of the command, too.
+a bug, and the direction of the command is then wrong, too.
 Source: docs/reference/faults.md, "F23"."""
 
 
@@ -210,8 +201,7 @@ class Limits:
     Attributes:
         fence_low: Lower corner of the box that the base may not leave [m], world frame, shape (3,).
         fence_high: Upper corner of the box [m], world frame, shape (3,).
-        command_age_max_ns: Largest accepted age of a command [ns], counted from the odometry from
-            which cloud computed the command.
+        command_age_max_ns: Largest accepted age of the odometry behind a command [ns].
         speed_max: Largest speed of the velocity reference [m/s].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
@@ -229,9 +219,8 @@ class Limits:
     def __post_init__(self) -> None:
         """Check the limits; raise a ValueError that names the first invalid limit.
 
-        Each limit has to be finite and above 0. With a command as old as `command_age_max_ns`, the
-        robot has to stop from `speed_max` within STOPPING_DISTANCE. The fence has to be larger than
-        its margins.
+        Each limit has to be finite and above 0. The robot has to stop in time from `speed_max` with
+        a command as old as `command_age_max_ns`. The fence has to be larger than its margins.
         """
         for name in self.__slots__[2:]:
             value = getattr(self, name)
@@ -253,8 +242,8 @@ class Limits:
     def ramp_ns(self) -> int:
         """Time after a HOLD in which the velocity reference speeds up by at most BRAKE [ns].
 
-        In this time the reference can reach the speed cap. Only time ends the slow growth, because
-        the first commands after a silence may be zero.
+        The time is long enough to reach the speed cap. The limit ends by time, not by speed,
+        because the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)

@@ -1,8 +1,8 @@
 """The guard: the state machine that decides which commands the robot flies.
 
-The guard stands between the tunnel and the low-level controller. Every 2 ms it gives the low-level
-controller a velocity reference. The guard trusts only its own clock and the onboard sensors, and
-assumes that the cloud is hostile.
+The guard stands between the tunnel and the low-level controller, and gives the controller a
+velocity reference every 2 ms. It trusts only its own clock and the onboard sensors. It assumes that
+the cloud is hostile.
 
                  fresh command of a         command too old, mission over,
                   started mission                   new session
@@ -17,14 +17,13 @@ assumes that the cloud is hostile.
 The *basis* of a command is the odometry from which cloud computed the command. A command is fresh
 while its basis is at most `command_age_max` old.
 
-- Every state can change to ESTOP: by the operator's request, or when the robot has turned over. The
-  rotors of a robot that has turned over would push it in any direction. An acknowledgement leads
-  from ESTOP to GROUND.
+- Every state can change to ESTOP: by the operator's request, or when the robot has turned over,
+  because its rotors would then push it in any direction. An acknowledgement leads to GROUND.
 - In LAND, an acknowledgement in the air leads to HOLD. An acknowledgement near the ground or on an
   obstacle leads to GROUND at touch-down.
 - LAND and ESTOP end the mission. Afterwards only a new start arms the robot again.
-- If HOLD begins before the robot has left the ground, it becomes GROUND: the rotors stop, and the
-  mission continues. The robot then waits 60 s for cloud's commands.
+- HOLD before the robot has left the ground becomes GROUND: the rotors stop and the mission
+  continues. The robot then waits 60 s for cloud's commands.
 - HOLD within a mission has a time limit, because the operator may be gone. HOLD after a mission has
   no time limit: the robot waits for the next mission.
 
@@ -71,11 +70,10 @@ class Guard:
         cause: Why the guard is in this state; after touch-down in LAND, why the robot landed.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
-        yaw_rate: Yaw rate of the newest command, limited [rad/s]; the published low-level
-            controller ignores the yaw rate.
+        yaw_rate: Limited yaw rate [rad/s]; the published low-level controller ignores it.
         changes: Changes of the state since the last `take_changes`.
         counts: How often a limit changed a command: "limited_speed" and "limited_yaw_rate" count
-            commands, "limited_fence" counts steps of 2 ms.
+            commands, "limited_fence" counts steps.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -104,7 +102,7 @@ class Guard:
 
     @property
     def latched(self) -> bool:
-        """Whether only the operator's acknowledgement leads out of this state."""
+        """Whether the state is LAND or ESTOP, which only the operator's acknowledgement ends."""
         return self.state is LAND or self.state is ESTOP
 
     def take_changes(self) -> list[GuardChange]:
@@ -159,8 +157,7 @@ class Guard:
         """Accept or reject a command at `now_ns` [ns]; its numbers may have any value, even NaN.
 
         Return None, or the reason of the rejection: "range" for a number that is too large or NaN;
-        "future" or "stale" if the odometry behind the command has a stamp in the future or is too
-        old.
+        "future" or "stale" for odometry (the basis) from the future or too old.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
@@ -194,7 +191,6 @@ class Guard:
         return None
 
     def _leave_hold(self, now_ns: int, fresh_until_ns: int) -> None:
-        """Count a fresh command; begin TRACK after RESUME_COMMANDS of them within RESUME_NS."""
         self._fresh_ns.append(now_ns)
         took_ns = now_ns - self._fresh_ns[0]
         enough = len(self._fresh_ns) == RESUME_COMMANDS and took_ns <= RESUME_NS
@@ -204,16 +200,11 @@ class Guard:
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Tell whether TRACK may begin.
-
-        The robot must be allowed to leave the ground, SETTLE_NS must have passed since the last
-        TRACK began, and the next HOLD must begin at least SETTLE_NS after the last HOLD.
-        """
+        """Tell whether TRACK may begin: take-off is allowed, and SETTLE_NS have passed."""
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS
 
     def _note_invalid(self, now_ns: int) -> None:
-        """Count an impossible command; land after INVALID_COMMANDS of them within INVALID_NS."""
         self._invalid_ns.append(now_ns)
         if len(self._invalid_ns) < INVALID_COMMANDS or now_ns - self._invalid_ns[0] > INVALID_NS:
             return
