@@ -1,8 +1,8 @@
 """Cloud's end of the tunnel: receive telemetry and send a command every 10 ms.
 
 Cloud asks for a session with HELLO datagrams, and uses the epoch (session number) that world
-assigns. While there is no command, cloud sends ALIVE datagrams: world gives the session to another
-cloud if it receives nothing from this cloud.
+assigns. While there is no command, cloud sends ALIVE datagrams, so that world does not give the
+session to another cloud.
 
 Cloud and teleop exchange messages only. Teleop gets the robot's status, and returns setpoints and
 the operator's requests.
@@ -31,15 +31,14 @@ from cloudrc.tunnel.keys import Key
 from cloudrc.tunnel.session import NO_EPOCH
 
 MISSED_MAX = 50
-"""Number of missed periods of 10 ms from which on cloud reports a fault. Forgiven periods do not
-count: every machine misses a few periods."""
+"""Number of missed periods of 10 ms at which cloud reports a fault. Forgiven periods do not
+count."""
 FORGIVEN_NS = 200_000_000
-"""Time after which one missed period of 10 ms is forgiven [ns]. With this value, 5 % of all periods
-may be missed without a fault."""
+"""Time in which one missed period is forgiven [ns]; 5 % of all periods may be missed."""
 
 
 class MissedPeriods:
-    """Report once that cloud misses many periods, and again only after all were forgiven."""
+    """Report a fault when cloud misses many periods, and again only after all were forgiven."""
 
     def __init__(self) -> None:
         self._missed, self._reported = 0, False
@@ -72,8 +71,7 @@ world has the new key, it counts these hellos as forged; 12 hellos a minute rais
 GIVE_UP_NS = 5_000_000_000
 """Longest time for which cloud tries to tell the robot that the mission has ended [ns]."""
 SILENCE_NS = 500_000_000
-"""Time without telemetry after which cloud asks for a session again [ns]; world may have
-restarted."""
+"""Time without telemetry after which cloud asks for a session again [ns]."""
 ALIVE_PERIOD_NS = 100_000_000
 """Time between two ALIVE datagrams while there is no command [ns]."""
 PATIENCE_NS = 5_000_000_000
@@ -121,7 +119,7 @@ class CloudEndpoint(TunnelEnd):
         self._alarm, self._missed_periods = EmergencyStopRepeater(), MissedPeriods()
         self._asked = 0  # highest number of an operator request in this session
         self._tick_ns = start_ns
-        self._hello_ns = start_ns - KEY_PERIOD_NS  # of the last periodic hello
+        self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
         self._alive_ns = start_ns
         self._heard_ns = start_ns
         self._flying_ns = start_ns
@@ -158,7 +156,7 @@ class CloudEndpoint(TunnelEnd):
             if now_ns - self._heard_ns > PATIENCE_NS:
                 self._records += self._complaints.say("no_session", SILENCE_TEXT, now_ns)
         elif self._session.is_outdated:
-            self._hellos = 0  # with the new key
+            self._hellos = 0  # the next hello has the new key
             self._say_hello_if_due(now_ns, KEY_PERIOD_NS)
         self.teleop.handle_deadline(now_ns)
         if self.teleop.outputs:
@@ -205,7 +203,7 @@ class CloudEndpoint(TunnelEnd):
     def _refuse(self, outcome: str, data: bytes, now_ns: int) -> None:
         self._counts[outcome] += 1
         if outcome == "old_epoch" and codec.peek(data)[1] > self._session.epoch:
-            self._say_hello_if_due(now_ns)  # world's acceptance of a new epoch may be lost
+            self._say_hello_if_due(now_ns)  # world's ACCEPT of a new session may be lost
         elif self._wants_session(now_ns):
             self._records += self._complaints.about(outcome, data, now_ns)
 
@@ -220,14 +218,12 @@ class CloudEndpoint(TunnelEnd):
         self._greet(self._handshake.make_hello(), key)
 
     def _wants_session(self, now_ns: int) -> bool:
-        """Whether cloud asks for a session: there is none, or no telemetry arrives."""
         return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
 
     def _greet(self, hello: bytes, key: Key) -> None:
         self._queue([self._session.greet(Kind.HELLO, hello, key)])
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
-        """Begin the session that world has opened for this process, unless it is known already."""
         asks = self._wants_session(now_ns)
         nonces = self._handshake.receive_accept(epoch, accept, asks=asks)
         if nonces is None:
@@ -247,9 +243,8 @@ class CloudEndpoint(TunnelEnd):
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
     def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
-        """Record telemetry; if it is neither late nor repeated, pass it to loop and teleop."""
         outcome = self._channel.take(counter)
-        if outcome != REPEATED:  # anybody can send repeats
+        if outcome != REPEATED:  # an attacker can repeat datagrams
             self._heard_ns = now_ns
         self._counts[outcome] += 1
         used = outcome == USED

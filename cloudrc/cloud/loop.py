@@ -42,7 +42,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class DelayMeter:
-    """Make samples for a delay estimator from echoes, and get the horizon from the estimator.
+    """Feed a delay estimator with the delays of echoes, and get the horizon from the estimator.
 
     Attributes:
         rtt: Last round trip, without the hold time on world [s]; NaN before the first echo.
@@ -57,10 +57,10 @@ class DelayMeter:
         self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Make a sample of new telemetry, which arrived at `now_ns` [ns], if its echo is new.
+        """Process telemetry that arrived at `now_ns` [ns]; only a new echo makes a sample.
 
-        If no command reaches world, telemetry repeats the last echo. The growing age of the
-        repeated echo would corrupt the estimate.
+        While no command reaches world, telemetry repeats the last echo, whose growing age would
+        corrupt the estimate.
         """
         self._stamp_ns = telemetry.stamp_ns
         echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
@@ -153,7 +153,7 @@ class ControlLoop:
         return self._basis is not None
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process new telemetry, which arrived at `now_ns` [ns], cloud's clock."""
+        """Process telemetry that arrived at `now_ns` [ns], cloud's clock."""
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
         if self._undated:
             self.faults += [fault._replace(stamp_ns=now_ns) for fault in self._undated]
@@ -214,8 +214,8 @@ class ControlLoop:
         faults, self.faults = self.faults, []
         return faults
 
-    # A sum is finite only if all its terms are finite. It may overflow, but a robot cannot fly
-    # numbers of that size anyway.
+    # A sum is finite only if all terms are finite. Finite terms whose sum overflows are refused,
+    # too, because no robot can fly them.
 
     def _predict(self, basis: Odometry, horizon: float, now_ns: int) -> Odometry:
         try:

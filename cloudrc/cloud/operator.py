@@ -44,8 +44,7 @@ def is_for_session(epoch: int, output: Output | Fault) -> bool:
     """Return whether a message from teleop is valid in the session with this epoch.
 
     Setpoints and starts are valid only in the session for which teleop made them, because another
-    cloud may have moved the robot since. Teleop repeats setpoints and starts. All other messages
-    are always valid, because none of them makes the robot fly.
+    cloud may have moved the robot since; teleop repeats both. No other message makes the robot fly.
     """
     if isinstance(output, Setpoint) or (
         isinstance(output, OperatorRequest) and output.request is Request.START
@@ -59,8 +58,7 @@ def make_robot_status(
 ) -> RobotStatus:
     """Make the status message for teleop from new telemetry.
 
-    `world` identifies world's process. `delays` are horizon, round trip and loop delay of the last
-    command [s], NaN before the first command.
+    `world` identifies world's process. `delays` are horizon, round trip and loop delay [s].
     """
     fields = (
         *(epoch, telemetry.odometry.position, telemetry.guard, telemetry.mission, world),
@@ -73,8 +71,7 @@ def make_robot_status(
 class EmergencyStopRepeater:
     """Number an emergency stop, and repeat it until telemetry shows that the robot has obeyed.
 
-    Teleop may request the stop any number of times. Without a session, the stop waits for a
-    session.
+    Teleop may request the stop any number of times. The stop waits while there is no session.
 
     Attributes:
         sounds: Whether the stop is being repeated.

@@ -159,7 +159,7 @@ def _login_errors(where: str) -> Iterator[None]:
             f"{' '.join(record.getMessage().split())}; install it, or run it by hand to see why"
         )
 
-    root = logging.getLogger()  # the logger of the client's module for kubeconfigs
+    root = logging.getLogger()  # the client's module for kubeconfigs uses it
     root.addFilter(refuse)
     try:
         yield
@@ -172,8 +172,7 @@ def connect(
 ) -> Release:
     """Select a release by the kubeconfig, without a request to the cluster.
 
-    By default, `context` is the current context, and `namespace` is that of the context, or
-    "default".
+    The defaults are the current context, and the namespace of the context or "default".
 
     Raises:
         MissingPrerequisiteError: If there is no valid kubeconfig, or if the context is unknown.
@@ -239,7 +238,6 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
 
 
 def _refusal(error: Any, status: int, doing: str) -> str:
-    """Describe why the API server has refused a request, and what the user can do."""
     try:
         message = json.loads(error.body)["message"]
     except (ValueError, KeyError, TypeError):
@@ -298,7 +296,7 @@ def run(
 ) -> str:
     """Run kubectl or helm with the standard input `given`, and return the program's output.
 
-    If `stdout` is a file, the output goes to that file, and the result is "".
+    With a file `stdout`, the output goes to the file, and the result is "".
 
     Raises:
         ClusterError: If the program fails; the message is that of the program.

@@ -32,8 +32,7 @@ HELM_LIMIT = 120.0
 FAILURE_TIME = 5.0
 """Time that a failure lasts before it is reported [s]; some objects appear after their pod."""
 FLUSH = 1.0
-"""Time after which a recorder has certainly written its buffer [s]; the buffer holds at most half a
-second of records."""
+"""Time after which a recorder has certainly written its buffer of half a second [s]."""
 FETCHES = 4
 """Largest number of attempts to fetch recordings that contain the end of the mission."""
 FLOWN = (0, 1, 6, 130)
@@ -74,7 +73,6 @@ def current_values(release: Release) -> dict[str, Any]:
 
 
 def _helm(arguments: Sequence[str], given: str = "") -> str:
-    """Run helm, and add advice to helm's error message."""
     try:
         return run("helm", arguments, timeout=HELM_LIMIT, given=given)
     except ClusterError as error:
@@ -136,10 +134,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
 
 
 def refuse_second_flight(release: Release, ask: Ask) -> None:
-    """Raise a ClusterError if a mission is under way, because an installation replaces both pods.
-
-    `ask` gets the state of robot and missions from the release's API.
-    """
+    """Raise a ClusterError if a mission is under way; an installation would replace both pods."""
     if found := find_flight(release, ask):
         raise ClusterError(
             f"{found[0]} is under way on release '{release.name}' {release.where}; wait for it, "
@@ -154,8 +149,7 @@ def fly_in_cluster(
 
     Args:
         experiment: A complete and checked experiment.
-        folder: Folder of the run; after the flight it gets configuration, recordings, metrics, logs
-            and report.
+        folder: Folder of the run, which gets configuration, recordings, metrics, logs and report.
         release: The release that flies; it is installed if it is missing, and stays afterwards.
         timeout: Time limit for the release to become ready [s].
         tell: Receives the progress, one line per call.
@@ -179,7 +173,7 @@ def fly_in_cluster(
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
     """Put an experiment and its link into a release's values; all other values stay as `before`."""
     link = {**before.get("link", {}), "profile": ""}
-    # The chart's own Job would fly its mission at the same time.
+    # With a mission, the chart would start a second Job.
     mission = {**before.get("mission", {}), "enabled": False}
     flown = experiment.model_dump(mode="json")
     return {**before, "link": link, "mission": mission, "experiment": flown}
@@ -216,7 +210,6 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
-    """Fly the mission by a Job; if the user interrupts, cancel the mission."""
     mission, limit = experiment.mission.model_dump(mode="json"), experiment.criteria.time_limit_s
     document = {
         "name": experiment.name,
@@ -242,9 +235,8 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Contents:
     """Fetch recordings, metrics and logs into a folder; return the merged recording.
 
-    If metrics or logs cannot be fetched, `tell` receives the error, because the report does not
-    need them. With `want_end`, fetch the recordings again until they contain the end of the
-    mission.
+    The report does not need metrics and logs: `tell` receives their errors. With `want_end`, fetch
+    the recordings again until they contain the end of the mission.
     """
     from cloudrc.record.merge import cut_to_last_mission, merge
 

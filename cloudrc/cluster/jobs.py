@@ -34,8 +34,7 @@ from cloudrc.cluster.pods import (
 from cloudrc.errors import CloudrcError, TimedOutError
 
 EXAMPLE = "examples/mission-job.yaml"
-"""File in the chart with the Job and the ConfigMap of a mission; `run_job` adapts both to a
-release."""
+"""File in the chart with the Job and the ConfigMap of a mission, the template for `run_job`."""
 COMPONENT = "mission"
 """Label `component` of the Jobs, pods and ConfigMaps of missions."""
 FILE = "mission.yaml"
@@ -97,7 +96,7 @@ def run_job(
         mission: Mission in the API's format: name, start, time_limit_s, waypoints.
         name: Name of the Job; default: an unused name.
         limit: Time limit of the mission [s].
-        queue: Whether the mission waits for another mission; without, the API refuses it.
+        queue: Whether to wait while another mission flies; otherwise the API refuses the mission.
 
     Raises:
         ClusterError: If the cluster refuses the Job, or if the release does not exist.
@@ -106,7 +105,7 @@ def run_job(
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
     plan, job = yaml.safe_load_all((chart_folder() / EXAMPLE).read_text("utf-8"))
     labels = {
-        **release.labels(COMPONENT),  # the NetworkPolicies select by these
+        **release.labels(COMPONENT),  # used by the NetworkPolicies
         "app.kubernetes.io/part-of": "cloudrc",
         "app.kubernetes.io/managed-by": "cloudrc",
     }
@@ -139,7 +138,6 @@ def _owner(version: str, kind: str, owner: Any) -> dict[str, Any]:
 def _fill_pod(
     pod: dict[str, Any], release: Release, deployment: Any, name: str, queue: bool
 ) -> None:
-    """Adapt the example's pod to a release: image, nodes, address of the API, tokens."""
     volumes = {volume["name"]: volume for volume in pod["volumes"]}
     volumes["mission"]["configMap"]["name"] = name
     volumes["tokens"]["secret"]["secretName"] = tokens_secret(release)
@@ -211,7 +209,7 @@ def delete_job(release: Release, name: str) -> None:
 def _status(job: Any, pod: Any) -> JobStatus:
     exit_code, message, state = None, "", "pending"
     for container in container_statuses(pod) if pod is not None else ():
-        if container.name == COMPONENT:  # beside it, a mesh may have its own containers
+        if container.name == COMPONENT:  # a service mesh may add containers
             ended = container.state.terminated
             state = "flying" if ended or container.state.running else state
             exit_code = ended and ended.exit_code
@@ -225,7 +223,6 @@ def _status(job: Any, pod: Any) -> JobStatus:
 
 
 def _failure(condition: Any) -> str:
-    """Describe why Kubernetes ended a Job."""
     if condition.reason == "DeadlineExceeded":
         return "the Job took longer than its activeDeadlineSeconds"
     return f"{condition.reason}: {condition.message}"

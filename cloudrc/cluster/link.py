@@ -2,11 +2,11 @@
 
 The new profile goes first to the link containers of both pods, which use it within a second. Then
 it goes into the ConfigMap, which restarted containers read. If a container refuses the profile, the
-ConfigMap stays unchanged. An error message lists which containers have the change, and whether the
-ConfigMap has it. Traces are further files beside the profile.
+ConfigMap stays unchanged. After a failure, the message lists where the change is in force. Traces
+are further files beside the profile.
 
-This module uses kubectl instead of the Python client, because kubectl starts in 0.1 s and the
-client takes 0.5 s. For the same reason it runs `sh` in the containers, not Python.
+This module uses kubectl, which starts in 0.1 s; the Python client takes 0.5 s. For the same reason
+it runs `sh` in the containers, not Python.
 """
 
 from __future__ import annotations
@@ -47,8 +47,7 @@ class LinkParts:
 
     Attributes:
         name: Name of the ConfigMap that the link containers follow.
-        files: Name -> content of the files in the ConfigMap: profile, traces, record of the last
-            change.
+        files: Files of the ConfigMap by name: profile, traces, record of the last change.
         pods: Component -> name of its newest running pod.
     """
 
@@ -62,7 +61,7 @@ def read_link(release: Release) -> LinkParts | None:
     selector = f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={release.name}"
     words = [*release.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
     found = json.loads(run("kubectl", words, timeout=READ_LIMIT))["items"]
-    # The newest pod comes last and wins.
+    # The newest pod comes last, and replaces older pods in the dictionary below.
     found.sort(key=lambda item: str(item["metadata"]["creationTimestamp"]))
     maps = [each for each in found if PROFILE in each.get("data", {})]
     pods = {
@@ -187,7 +186,6 @@ def keep(release: Release, link: LinkParts, sent: Sent) -> None:
 
 
 def _needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
-    """Select the profile, and the files that the profile names."""
     ways = [value for value in values.values() if isinstance(value, dict)]
     named = {Path(str(way[key])).name for way in ways for key in FILE_READERS if way.get(key)}
     return {name: text for name, text in files.items() if name == PROFILE or name in named}

@@ -27,10 +27,7 @@ _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 
 
 class Spheres(NamedTuple):
-    """Spheres that represent the robot, in the frame of its base.
-
-    `positions` are the centres [m], shape (k, 3); `radii` are in [m], shape (k,).
-    """
+    """Spheres, body frame: centres `positions` [m], shape (k, 3), and `radii` [m], shape (k,)."""
 
     positions: Array
     radii: Array
@@ -50,7 +47,7 @@ def robot_points() -> Spheres:
 
 
 def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) -> Array:
-    """Transform points of the robot to the world frame [m], for n poses; shape (n, k, 3).
+    """Return the robot's points in the world frame [m], for n poses, shape (n, k, 3).
 
     Args:
         points: Points in the body frame.

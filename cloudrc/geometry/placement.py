@@ -16,7 +16,7 @@ The value is above 32 mm, the steady error of a hover with the published gains."
 STEP_MIN = 0.02
 """Shortest step in which a straight way is checked [m], so that the check near a wall ends."""
 _SEARCH = 1.5  # [m] largest distance of a suggested legal point
-_AT_ONCE = 50  # candidates whose ways are looked at together
+_AT_ONCE = 50  # number of candidates whose ways are checked together
 _FAR = 1e3  # [m] limit of coordinates, so that no square overflows
 
 
@@ -52,7 +52,7 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
     """Find the first pipe that the robot, level and with yaw 0, would touch on a straight way.
 
     The check moves along each way in steps as long as the robot's distance from the nearest wall. A
-    way that begins nearer to a wall than `CLEARANCE_MIN` may lead away from this wall.
+    way may begin nearer to a wall than `CLEARANCE_MIN` if it leads away from this wall.
 
     Args:
         scene: The scene; its board does not count.
@@ -72,7 +72,7 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
         at = starts[flying] + share[:, None] * (ends - starts)[flying]
         distances = _distances(scene, at, np.zeros(len(at)))
         nearest = distances.min(axis=1)
-        if np.isinf(least).any():  # where the robot begins, it may be
+        if np.isinf(least).any():  # a way may begin near a wall
             least = np.minimum(CLEARANCE_MIN, nearest - STEP_MIN)
         touching = nearest < least[flying]
         result[flying[touching]] = distances[touching].argmin(axis=1)

@@ -43,8 +43,7 @@ from cloudrc.teleop.wire import Leg
 LOOK_PERIOD = 0.1
 """Time between two checks for new events, for the stream of events [s]."""
 ALIVE_PERIOD = 10.0
-"""Time without an event after which the stream of events sends a comment [s], so that no proxy
-closes the connection."""
+"""Time without an event after which the event stream sends a comment to the client [s]."""
 ANSWER_LIMIT = 2.0
 """Time limit for the mission service to answer [s]."""
 BODY_MAX = 256 * 1024
@@ -130,10 +129,9 @@ class Bridge:
 
         Raises:
             UnavailableError: If the bridge is closed, or if the loop does not answer within
-                `ANSWER_LIMIT`. In the second case an urgent call stays queued; another call is
-                withdrawn.
+                `ANSWER_LIMIT`. An urgent call then stays queued; any other call is withdrawn.
         """
-        try:  # a stop is queued before the robot can be seen to have stopped
+        try:  # queue the stop first: later, telemetry may show it already
             asked = asyncio.wrap_future(self.submit(call, urgent))
         finally:
             if urgent == "stop":
@@ -173,7 +171,7 @@ class Bridge:
             try:
                 result = call(self._service, now_ns)
                 future.set_result(result.as_json() if isinstance(result, Mission) else result)
-            except Exception as error:  # the client has to get it
+            except Exception as error:  # the client gets the error
                 future.set_exception(error)
 
 
@@ -195,7 +193,7 @@ def create_app(
         title="cloudrc teleop",
         version=__version__,
         description=ABOUT,
-        docs_url=None,  # the pages load scripts from elsewhere
+        docs_url=None,  # its page loads scripts from other sites
         redoc_url=None,
         redirect_slashes=False,
     )
@@ -226,7 +224,6 @@ def _bridge(request: Request) -> Any:
 
 
 async def _body(request: Request) -> bytes:
-    """Read the body of a request; refuse a body longer than BODY_MAX."""
     body = b""
     async for chunk in request.stream():
         body += chunk
@@ -340,12 +337,12 @@ async def show_state(bridge: Bridged) -> Any:
 async def stream_events(
     request: Request, bridge: Bridged, after: After = 0, last_event_id: LastEvent = 0
 ) -> StreamingResponse:
-    """Stream the events of all missions after the event `after` as server-sent events.
+    """Stream the events of all missions after event number `after` as server-sent events.
 
     A browser that connects again sends the number of its last event as the header Last-Event-ID.
     """
     after = max(after, last_event_id)
-    await bridge.ask(lambda service, now_ns: None)  # refuse now what cannot be served
+    await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
     stream, headers = _stream(request, bridge, after), {"Cache-Control": "no-store"}
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
@@ -386,8 +383,7 @@ class ApiServer(uvicorn.Server):
         """Bind the address; with port 0 the kernel chooses a port.
 
         Raises:
-            BadInputError: If the address cannot be bound, or if a TCP address has no tokens: then
-                everybody could command the robot.
+            BadInputError: If the address cannot be bound, or if a TCP address has no tokens.
         """
         if gate.tokens is None and not isinstance(address, Path):
             raise BadInputError(
@@ -403,7 +399,7 @@ class ApiServer(uvicorn.Server):
                 log_level="critical",  # a flood does not fill the log
                 access_log=False,  # the audit log has the commands
                 server_header=False,
-                proxy_headers=False,  # the audit log names whoever connects
+                proxy_headers=False,  # the audit log has the true address
                 # No limit_concurrency: uvicorn would refuse an emergency stop, too.
                 timeout_graceful_shutdown=STOP_LIMIT,
             )
@@ -434,7 +430,6 @@ class ApiServer(uvicorn.Server):
 
 
 def _bind(address: Address) -> tuple[socket.socket, str]:
-    """Listen at an address; return socket and URL."""
     unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     url = f"unix:{address}"
     try:
@@ -450,7 +445,7 @@ def _bind(address: Address) -> tuple[socket.socket, str]:
         url = f"http://[{host}]:{port}" if is_6 else f"http://{host}:{port}"
         family = socket.AF_INET6 if is_6 else socket.AF_INET
         server = socket.create_server((host, port), family=family, dualstack_ipv6=is_6)
-    except (OSError, UnicodeError) as error:  # no host has a name with an empty label
+    except (OSError, UnicodeError) as error:  # UnicodeError: the host has an invalid name
         unix.close()
         reason = getattr(error, "strerror", None) or error
         raise BadInputError(f"--api {url}: {reason}; choose another address") from error

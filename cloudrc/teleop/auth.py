@@ -84,8 +84,7 @@ class Tokens:
     def caller(self, token: str) -> Caller | None:
         """Return the caller with this token; None if the token is not valid.
 
-        A changed file takes effect at once. While a file has no valid token, all tokens are
-        invalid.
+        A changed file counts at once. While a file has no valid token, no token is valid.
         """
         versions = [version(path) for path in self._paths]
         if versions != self._versions:

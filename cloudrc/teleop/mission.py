@@ -8,8 +8,8 @@
 
 The command cancel leads from STARTING, FLYING and HELD to CANCELLED. A time limit, a restart of
 world, a guard in LAND or an emergency stop leads to FAILED. At the end of a mission teleop asks the
-robot to hold. It also makes the robot's position the setpoint, because a robot that misses the
-request still flies to the last setpoint.
+robot to hold. Until the robot gets this request, it flies to the setpoint; therefore teleop also
+makes the robot's position the setpoint.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
 
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
-"""Lowest z at which teleop holds the robot [m], world frame. The floor is at z = 0; lower, the
-robot would scrape along the floor.
+"""Lowest z at which teleop holds the robot [m], world frame; lower, the robot would scrape along
+the floor at z = 0.
 Source: docs/safety.md, "The guard"."""
 NO_WAYPOINT = -1
 """Waypoint index in a setpoint or event that belongs to no waypoint."""
@@ -51,7 +51,7 @@ GAP_MAX_NS = 500_000_000
 """Largest part of a gap between two telemetry messages that counts as time of flight [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
 """Time without telemetry after which the dwell time at a waypoint starts again [ns]."""
-# Looking up an enum's member is slow, and these are used in every period.
+# Looking up a member of an enum is slow.
 GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
 
 
@@ -81,7 +81,7 @@ class LegWatch:
             self._near_since_ns = NEVER_NS
             return False
         if before_ns >= 0:
-            if seen.guard is not GROUND:  # where the robot waits for take-off
+            if seen.guard is not GROUND:  # in GROUND the robot waits
                 self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
             if now_ns - before_ns > UNSEEN_MAX_NS:
                 self._near_since_ns = NEVER_NS  # the robot's path in the gap is unknown
@@ -96,10 +96,9 @@ class LegWatch:
 class Teleop:
     """State machine that flies missions one after the other.
 
-    Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, and one of the other methods
-    for each command of the operator. After each call, send the messages of `take_outputs`. A
-    setpoint is valid until the next setpoint or the next session. All times `now_ns` are on the
-    caller's clock [ns].
+    Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, and another method for each
+    command of the operator. After each call, send the messages of `take_outputs`. A setpoint is
+    valid until the next setpoint or session. All times `now_ns` are on the caller's clock [ns].
 
     Attributes:
         state: State of the mission; "idle" before the first mission.
@@ -112,10 +111,7 @@ class Teleop:
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission.
-
-        `ended` returns whether the mission with a given number has ended.
-        """
+        """Begin without a mission; `ended` returns whether the mission with a number has ended."""
         self.state, self.leg = "idle", 0
         self.outcome: MissionEvent | None = None
         self.outputs: list[Output] = []
@@ -124,8 +120,8 @@ class Teleop:
         self._is_ended = ended
         self.seen: RobotStatus | None = None
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
-        self._continued = self._was_held = False  # whether an earlier teleop began it or held it
-        self._world = ""  # in which the mission started; "": any
+        self._continued = self._was_held = False  # by an earlier teleop
+        self._world = ""  # process of world in which the mission started; "": any
         self._expected: tuple[int, ...] = ()  # missions that the robot may report; empty: any
         self._watch = LegWatch()
         self._setpoint: Setpoint | None = None
@@ -167,7 +163,7 @@ class Teleop:
         self.requests.ask(Request.START, Start.HERE)
         self._is_pending = not self._was_held
         if self.seen:
-            self.see(self.seen, now_ns)  # the mission may be over, or the world another one
+            self.see(self.seen, now_ns)  # the mission may be over, or world restarted
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
         """Fly to a point during a held mission; raise BadInputError unless the mission is held."""
@@ -224,7 +220,7 @@ class Teleop:
         last, onboard, legs = self._setpoint, self._onboard, self._plan.legs
         started = self.requests.see(seen, now_ns) is Request.START and self.state == STARTING
         if self.state == STARTING and not self._expected and self._plan.start is Start.HERE:
-            # The order came before the first telemetry.
+            # The mission was ordered before the first telemetry.
             self._expected = (seen.mission_id, self._mission_id)
         if self.state not in UNDER_WAY:
             if new_session or (before and before.mission_id != seen.mission_id):
@@ -236,7 +232,7 @@ class Teleop:
         elif self._is_pending:
             self._select_early()
         while self.leg < onboard and self.state in (FLYING, HELD):
-            self._advance("reached, as the robot reports,", now_ns)  # teleop lost it
+            self._advance("reached, as the robot reports,", now_ns)  # the event was lost
         while self.state == FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
         if new_session and last is self._setpoint:
@@ -272,7 +268,6 @@ class Teleop:
         return None
 
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
-        """Find a time limit that has passed; return the event's code and text."""
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
         if self.elapsed(now_ns) >= limit and self.state == STARTING:
             return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
@@ -295,7 +290,6 @@ class Teleop:
         self._select_here()
 
     def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
-        """Store plan and number of a new mission, and when it began [ns]."""
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
         self._continued = self._was_held = False
@@ -319,14 +313,13 @@ class Teleop:
             self._report("resumed", self.leg, text, now_ns)
 
     def _advance(self, how: str, now_ns: int) -> None:
-        """Go on to the next waypoint, or end the mission."""
         text = f"{self._leg_name} {how} at {self.elapsed(now_ns):.2f} s"
         self._report("reached", self.leg, text, now_ns)
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
             self._watch = LegWatch()
-            if self.state == FLYING and self.leg >= self._onboard:  # not back to earlier waypoints
+            if self.state == FLYING and self.leg >= self._onboard:  # never fly back
                 self._select_leg(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
@@ -345,7 +338,7 @@ class Teleop:
         if code != "taken_over" or on_ground:  # commands would drag a robot along the ground
             self.requests.ask(Request.END)
         else:
-            self.requests.forget()  # another teleop's mission must not be ended
+            self.requests.forget()  # the new mission must not end
         self._select_here()
         self.outcome = self._report(code, waypoint, text, now_ns)
 
@@ -357,7 +350,6 @@ class Teleop:
 
     @property
     def _from_spawn(self) -> bool:
-        """Whether the mission begins at the spawn."""
         return self._plan.start is Start.SPAWN and not self._continued
 
     @property
@@ -394,7 +386,6 @@ class Teleop:
             self._select(Setpoint(to.position, to.yaw, leg))
 
     def _select_here(self) -> None:
-        """Select the robot's position, if telemetry has arrived."""
         if self.seen is not None:
             x, y, z = self.seen.position
             yaw = 0.0 if self._setpoint is None else self._setpoint.yaw

@@ -1,7 +1,7 @@
 """Define the requests and answers of the API, and check the orders in requests.
 
 The OpenAPI document comes from these models. An order has the form of a section of a configuration
-file. The same code therefore checks orders and configuration files, and describes the problems.
+file, so that the same code checks both and describes the problems.
 """
 
 from __future__ import annotations
@@ -82,7 +82,6 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
 
 
 def _field(text: str) -> Any:
-    """Describe a field of an answer in the OpenAPI document."""
     return Field(description=text)
 
 
@@ -247,7 +246,7 @@ def read_order(
             reason = f"at most {MAX_WAYPOINTS}; split the mission"
             raise RefusedError([ConfigProblem(("waypoints",), str(count), reason)])
     request = _parse(body, MissionRequest)
-    if not request.waypoints:  # an experiment's mission may have steps in their place
+    if not request.waypoints:  # only an experiment may have steps instead
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
     mission = Mission(start=request.start, waypoints=request.waypoints)
     if problems := check_mission(mission, scene):

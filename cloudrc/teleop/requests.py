@@ -8,16 +8,15 @@ from cloudrc.teleop.wire import RobotStatus
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
 UNNUMBERED = 0
-"""Number of a request to which no number was given yet."""
+"""Number of a request that has no number yet."""
 NOT_ENDED = (-1, 0)
-"""Session and request number for a robot that has not ended a mission."""
+"""Epoch and request number that mean: the robot has not ended a mission."""
 IDLE_NS = 3_000_000_000
 """Longest time for which a robot may hold or stand during a mission [ns]. After this time teleop
 sends the start again, because somebody else has probably stopped the robot."""
 PREDECESSORS = 1_000
-"""How far the first number of a new teleop process is above the newest number in telemetry.
-Requests of the earlier process may have the numbers between, and telemetry may not show them
-yet."""
+"""Gap between the newest request number in telemetry and the first number of a new teleop process,
+for requests of the earlier process that telemetry does not show yet."""
 CLOCK_MAX = 65_536
 """The first number of a new teleop process also contains the time in units of 100 ms, modulo this
 value, so that two new processes have different numbers."""
@@ -35,12 +34,12 @@ class RequestSender:
     def __init__(self) -> None:
         self._seen: RobotStatus | None = None
         self._pending: OperatorRequest | None = None
-        self._next: OperatorRequest | None = None  # sent after the pending one
+        self._next: OperatorRequest | None = None  # sent after the pending request
         self._progress = OperatorRequest(UNNUMBERED, Request.PROGRESS)
         self._number = UNNUMBERED
         self._asked_epoch = 0
-        self._ended = NOT_ENDED  # epoch and number of the last END acted on, unless a START follows
-        self._is_started = False  # whether the robot has acted on a START as the last request
+        self._ended = NOT_ENDED  # epoch and number of an END; NOT_ENDED after a START
+        self._is_started = False  # whether the last request carried out is a START
         self._flies_ns = 0  # when the robot last flew its mission
         self._due_ns = 0
 
@@ -92,7 +91,7 @@ class RequestSender:
         self._is_started = pending.request is Request.START and self._pending is None
         if pending.request is Request.START:
             self._ended = NOT_ENDED
-        elif pending.request is not Request.ACKNOWLEDGE:  # which ends no mission
+        elif pending.request is not Request.ACKNOWLEDGE:  # an acknowledgement ends no mission
             self._ended = seen.epoch, seen.mission
         return pending.request
 
@@ -103,8 +102,8 @@ class RequestSender:
             return None
         if pending is None:
             return self._progress_due(seen, now_ns)
-        # Telemetry shows a higher number, for example of an emergency stop, or the same number of
-        # an earlier teleop: ours would be acknowledged by now.
+        # A new number is needed if telemetry shows a higher number (of an emergency stop), or the
+        # same number (of an earlier teleop; `see` would have removed this teleop's request).
         if pending.number == UNNUMBERED or seen.mission >= pending.number:
             rise = 1 if self._number else PREDECESSORS + now_ns // REPEAT_NS % CLOCK_MAX
             self._number = max(self._number, seen.mission) + rise
@@ -136,6 +135,6 @@ class RequestSender:
     def _is_acknowledged(self, pending: OperatorRequest, seen: RobotStatus) -> bool:
         if pending.number == UNNUMBERED or seen.mission != pending.number:
             return False
-        # Until the epoch changes, telemetry is from before the reset to the spawn.
+        # Telemetry of the old epoch was sent before the reset to the spawn.
         from_spawn = pending.request is Request.START and pending.start is Start.SPAWN
         return not from_spawn or seen.epoch != self._asked_epoch

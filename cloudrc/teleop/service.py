@@ -28,8 +28,7 @@ LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
 SILENCE = 1.0
 """Age from which on telemetry, or the last message from cloud, is too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
-"""Time between two copies of the setpoint to cloud [ns]; a cloud that has restarted needs a
-copy."""
+"""Time between two copies of the setpoint [ns]; a restarted cloud needs the copies."""
 QUEUE_MAX = 16
 """Largest number of missions that wait while another mission flies."""
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
@@ -97,8 +96,8 @@ class MissionService:
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
-        self._ends = False  # whether this process ends; the next one starts the queued missions
-        self._trouble = ""  # of the store, as last reported
+        self._ends = False  # whether this process ends; the next process starts the queue
+        self._trouble = ""  # trouble of the store that was last reported
 
     @property
     def seen(self) -> RobotStatus | None:
@@ -146,7 +145,7 @@ class MissionService:
         mission = self.book.find(mission_id)
         if not mission.ended and mission is self._start_next(now_ns):
             return self._operate(self._teleop.cancel, now_ns)
-        if mission.ended:  # also if it has just failed, because world restarted
+        if mission.ended:  # maybe just now, because world has restarted
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
         self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
@@ -206,7 +205,7 @@ class MissionService:
         """Process telemetry that has arrived at `now_ns`."""
         before, mission = self.seen, self._current
         if self._inherits_stop and seen.mission_id == self._inherits_stop.number:
-            if seen.guard in AIRBORNE:  # the robot has not heard of the stop
+            if seen.guard in AIRBORNE:  # the stop has not reached the robot
                 self._teleop.stop(now_ns)
         self._heard_ns = self._seen_ns = now_ns
         if before is None or (before.world, before.guard) != (seen.world, seen.guard):
@@ -272,7 +271,7 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """Mission that an earlier process stopped, until the first telemetry shows its effect."""
+        """Mission that an earlier process stopped, until telemetry arrives; else None."""
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 

@@ -39,7 +39,7 @@ class Order:
 
     plan: Plan
     name: str = ""  # shown to people
-    key: str = ""  # a second order with the same key, unless "", makes no second mission
+    key: str = ""  # orders with the same key make one mission; "": no key
     contact: bool = False  # whether the arm has to touch the board
     queue: bool = False  # whether the order waits for the mission under way; else it is refused
 
@@ -50,13 +50,13 @@ class Mission:
 
     id: str  # such as "m1"
     order: Order
-    number: int  # of the mission on board; below 2^63
+    number: int  # identifies the mission on board; below 2^63
     state: str = QUEUED  # one of the values of `STATES`
-    world: str = ""  # in which the mission was started; "" before the start
+    world: str = ""  # world's process in which the mission started; "" before
     elapsed: float = 0.0  # duration of the mission at its last event [s]
     reached: list[dict[str, Any]] = field(default_factory=list)  # waypoints with their times [s]
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=SHOWN))  # the newest
-    happened: Counter[str] = field(default_factory=Counter)  # number of events of each kind, ever
+    happened: Counter[str] = field(default_factory=Counter)  # all events, by kind
     witness: Observations = field(default_factory=Observations)  # what the robot has touched
     verdict: dict[str, Any] | None = None  # as the API shows it; None until the mission has ended
 
@@ -73,11 +73,10 @@ class Mission:
     def apply(
         self, number: int, event: str, text: str, *, waypoint: int | None = None, **changed: Any
     ) -> None:
-        """Update the mission with an event.
+        """Update the mission with an event; `changed` has new values of the mission's attributes.
 
-        `number` is the number of the event; all missions share one count. `waypoint` is an index,
-        by default that of the current waypoint. `changed` has new values of the mission's
-        attributes.
+        `number` is the number of the event among those of all missions. `waypoint` is an index; the
+        default is the current waypoint.
         """
         waypoint = self.waypoint if waypoint is None else waypoint
         for name, value in changed.items():
@@ -121,10 +120,7 @@ class StoreLockedError(CloudrcError):
 
 
 class ConflictError(CloudrcError):
-    """Report that the present state forbids a request.
-
-    `mission` is the id of the mission in the way, or "".
-    """
+    """Report that the present state forbids a request; `mission` is the conflicting id or ""."""
 
     exit_code = 5
 
@@ -163,13 +159,13 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
         return MissionStore(connect(path), salt)
     except sqlite3.DatabaseError as error:
         reason = " ".join(str(error).split())
-        code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # without its extension
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # without the extended code
         if code == sqlite3.SQLITE_BUSY:
             text = f"{path}: another teleop has this journal open; waiting until it ends"
             raise StoreLockedError(text) from None
         with path.open("rb") as file:
             is_sqlite = file.read(len(MAGIC)) == MAGIC
-        if code == sqlite3.SQLITE_NOTADB and not is_sqlite:  # else its head is damaged
+        if code == sqlite3.SQLITE_NOTADB and not is_sqlite:  # else the header is damaged
             text = "is no journal; move it away, or name another file"
             raise BadInputError(f"--journal {path}: {text}") from None
         if isinstance(error, sqlite3.OperationalError):  # the disk fails; the content is intact
@@ -313,13 +309,13 @@ class MissionStore:
 
     def events_after(self, number: int) -> list[Event]:
         """Return the events of all missions after the event `number`, oldest first."""
-        if number > self._events:  # the reader knows an earlier file
+        if number > self._events:  # the reader has a number of an earlier file
             number = 0
         if number == self._events:
             return []
         kept = (event for mission in self.missions.values() for event in mission.events)
         found = sorted((e for e in kept if e["id"] > number), key=lambda event: event["id"])
-        if number:  # a new reader has missed nothing
+        if number:  # 0 is a new reader, who has missed nothing
             self.dropped += self._events - number - len(found)
         return found
 
@@ -328,11 +324,7 @@ class MissionStore:
         self._db.close()
 
     def _commit(self, new: Mission | None = None, old: Sequence[str] = ()) -> None:
-        """Write all events that are not on the disk, and a new mission; delete old missions.
-
-        Raises:
-            UnavailableError: If the disk refuses the transaction.
-        """
+        """Write all events that are not on the disk, and a new mission; delete old missions."""
         db = self._db
         try:
             db.execute("BEGIN")

@@ -29,15 +29,14 @@ from cloudrc.records import FAILURES, MissionEvent
 class Leg:
     """A waypoint, and the conditions under which it counts as reached.
 
-    If `tolerance` is infinite, the waypoint is reached after the time `dwell`, wherever the robot
-    is. Missions of random steps use this.
+    With an infinite `tolerance` (for random steps) the waypoint is reached after the time `dwell`.
     """
 
     position: Vector  # [m], world frame, shape (3,)
     yaw: float = 0.0  # heading to hold [rad]
     tolerance: float = 0.10  # largest distance from the waypoint that counts as reached [m]
     dwell: float = 0.5  # time to stay within the tolerance without interruption [s]
-    time_limit: float = 60.0  # of the leg, without the time in which it is held [s]
+    time_limit: float = 60.0  # for reaching the waypoint, without holds [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +45,7 @@ class Plan:
 
     legs: tuple[Leg, ...]  # in order; at least one
     start: Start = Start.SPAWN  # the spawn (world is reset), or the robot's position
-    time_limit: float = 60.0  # of the mission, including the time in which it is held [s]
+    time_limit: float = 60.0  # of the mission, with holds [s]
 
 
 NO_PLAN = Plan((Leg(ZERO),))
@@ -91,8 +90,7 @@ Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 """Messages from teleop to cloud."""
 Message: TypeAlias = RobotStatus | Output
 ALARM = OperatorRequest(0, Request.ESTOP)
-"""Emergency stop without a number, which cloud adds. It may be sent without the state machine
-`Teleop`."""
+"""Emergency stop without a number, which needs no state machine; cloud numbers it."""
 _KINDS: dict[str, TypeAdapter[Message]] = {
     kind.__name__: TypeAdapter(kind)
     for kind in (RobotStatus, Setpoint, OperatorRequest, MissionEvent)

@@ -39,8 +39,8 @@ NUMBER_MAX = 2**32 - 1
 class Kind(IntEnum):
     """Kind of a datagram's content. In each direction, every kind has a counter of its own.
 
-    Kinds up to LAST_GREETING, the greetings, open a session and are authenticated with the
-    pre-shared key. The other kinds belong to a session and are encrypted with the session's keys.
+    Kinds up to LAST_GREETING belong to the handshake and are authenticated with the pre-shared key.
+    The other kinds belong to a session and are encrypted with the session's keys.
     """
 
     HELLO = 1
@@ -72,8 +72,8 @@ class Hello(NamedTuple):
     """Cloud's request for a session.
 
     `nonce` identifies the cloud and `clock` its monotonic clock, each by 16 random bytes. `cookie`
-    repeats the 13 bytes of world's challenge; before the challenge it is zero. `epoch` is the
-    newest session number that cloud knows; world continues to count from this number.
+    has the 13 bytes of world's challenge, or zeros. World counts on from `epoch`, the newest
+    session number that cloud knows.
     """
 
     nonce: bytes

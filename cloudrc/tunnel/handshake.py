@@ -87,7 +87,7 @@ class ServerHandshake:
         self._age_max_ns = age_max_ns
         self._fresh_until_ns = -1
         self._incumbent = Hello(b"", b"", b"", NO_EPOCH)
-        self._repeated = 0  # repeated ACCEPTs since the last sealed datagram of the cloud
+        self._repeated = 0  # repeated ACCEPTs since the last encrypted datagram
         self._challenged_ns = -CHALLENGE_NS
         self._counters: dict[bytes, int] = {}  # newest counter answered, by nonce
         self._windows = {
@@ -122,12 +122,12 @@ class ServerHandshake:
             return HelloAnswer("hello", [session.greet(Kind.CHALLENGE, challenge, key)])
         if counter <= self._counters.get(hello.nonce, -1):
             return HelloAnswer(REPEATED, [])
-        self._counters.pop(hello.nonce, None)  # so that the nonce answered last is forgotten last
+        self._counters.pop(hello.nonce, None)  # the nonce answered last comes last
         self._counters[hello.nonce] = counter
         if len(self._counters) > CLOUDS_MAX:
             del self._counters[next(iter(self._counters))]
         if hello.nonce == self._incumbent.nonce:
-            if self._keeps_epoch(now_ns):  # cloud takes the answer's key as the key of the epoch
+            if self._keeps_epoch(now_ns):  # with the epoch's key
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
             return HelloAnswer(
@@ -188,7 +188,7 @@ class ClientHandshake:
         """Begin without a session; `nonce` and `clock` are as in `ServerHandshake`."""
         self._seed, self._clock = nonce, clock
         self._nonce, self._nonces = nonce, 0
-        self._epoch = NO_EPOCH  # the newest one
+        self._epoch = NO_EPOCH  # the newest known epoch
         self._cookie = NO_COOKIE
         self._replies = 0
         self._cookies: dict[bytes, None] = {}  # received so far, oldest first
@@ -237,7 +237,7 @@ class ClientHandshake:
         if known and not is_newer(epoch, self._epoch):
             return None
         if self._world and not known:
-            self._old_worlds.append(self._world)  # a dead process does not come back
+            self._old_worlds.append(self._world)  # an ended process does not come back
         self._world, self._epoch = accept.world_nonce, epoch
         return accept.nonce + accept.world_nonce
 

@@ -67,7 +67,7 @@ class LowLevel:
             dt: Time between two updates [s].
         """
         dx, dy, dz = gain_d
-        # Gains of the error, its integral and its change per tick; one tuple unpacks fastest.
+        # Gains of the error, its integral and its change per step; one tuple unpacks fastest.
         self._gains = (*gain_p, *gain_i, dx / dt, dy / dt, dz / dt)
         self._limits = (integral_limit_xy, integral_limit_z, dt)
         self.reset()
@@ -143,7 +143,7 @@ def attitude(force: Vector, readings: Readings) -> Effort:
     _, _, _, (p, q, r), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings
     thrust = fx * zx + fy * zy + fz * zz
 
-    # A zero force, or one along the nose, leaves an axis undefined and causes no torque there.
+    # A zero force, or a force along the nose, leaves an axis undefined, without torque about it.
     across = fy * fy + fz * fz
     scale = 1.0 / (sqrt(fx * fx + across) or TINY)
     z0 = scale * (fx * xx + fy * xy + fz * xz)
@@ -179,7 +179,7 @@ def allocate(effort: Effort) -> RotorSpeeds:
     front, back = with_yaw - pitch, with_yaw + pitch
     left, right = against_yaw + roll, against_yaw - roll
     if thrust <= THRUST_MAX and front >= 0.0 and left >= 0.0 and back >= 0.0 and right >= 0.0:
-        # None is negative and their sum is the thrust, so none exceeds the limit.
+        # No share is negative and their sum is the thrust, so no share exceeds the limit.
         k = THRUST_COEFFICIENT
         return sqrt(front / k), sqrt(left / k), sqrt(back / k), sqrt(right / k)
     return _speed(front), _speed(left), _speed(back), _speed(right)

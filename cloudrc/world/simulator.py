@@ -63,7 +63,7 @@ class Simulator:
         self._tip_offset: Vector = tuple(model.site_pos[self._tip].tolist())
         self._tip_radius = float(model.site_size[self._tip, 0])
         names = [model.geom(number).name for number in range(model.ngeom)]
-        # The robot's geoms get an empty name: in a contact the other geom names the body.
+        # The robot's geoms get an empty name, because a contact has the name of the other body.
         self._bodies = ["" if n.startswith(ROBOT_PREFIX) else n.split("/")[0] for n in names]
         self._gap_steps = round(TOUCH_GAP / self.dt)
         self.reset()
@@ -77,7 +77,7 @@ class Simulator:
         if self.tape is not None:
             self.tape.clear()
         self.touches: list[Contact] = []
-        # The robot stands on the floor: a contact with it is new only after a flight.
+        # The robot stands on the floor: only after a flight is the next contact a new contact.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
 
@@ -100,7 +100,7 @@ class Simulator:
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
         contacts = data.ncon
         if contacts or self._contacts:
-            # Look at once if their number has changed, else only every few steps.
+            # Check at once if the number of contacts has changed, else only every few steps.
             if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
                 self._note_contacts(before)
             self._contacts = contacts

@@ -79,7 +79,6 @@ class Pid(Controller):
         return ControlOutput(velocity, yaw_rate, proportional, integral, derivative)
 
     def _limit(self, wanted: Vector) -> Vector:
-        """Clamp each axis to `velocity_max`, then shorten the vector to `speed_max`."""
         x, y, z = (
             max(min(value, limit), -limit)
             for value, limit in zip(wanted, self._velocity_max, strict=True)

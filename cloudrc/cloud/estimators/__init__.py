@@ -1,8 +1,8 @@
 """Delay estimators compute the horizon: how far ahead the predictor predicts.
 
-Their input are echoes: telemetry contains the stamp of the newest command that world has applied.
-Each estimator is a plug-in in a file of its own. The file defines `build(**parameters)`, which
-returns an `Estimator`; all parameters are annotated.
+Telemetry echoes the stamp of the newest command that world has applied; estimators get the delays
+that these echoes show. Each estimator is a plug-in in a file of its own. The file defines
+`build(**parameters)`, which returns an `Estimator`; all parameters are annotated.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """The delays that the first echo of a command shows.
+    """The delays that telemetry shows when it first echoes the stamp of a command.
 
     Attributes:
         loop_delay: Arrival of the echo minus the command's stamp [s]. The loop delay includes the
@@ -30,7 +30,7 @@ class Estimator:
     """Estimates the horizon: the time from the measurement to the application of the command."""
 
     def update(self, sample: DelaySample) -> None:
-        """Add one sample, which comes from the first echo of a command."""
+        """Add one sample; each command gives at most one sample."""
         raise NotImplementedError
 
     def horizon(self, age: float) -> float:

@@ -3,9 +3,10 @@
 Each predictor is a plug-in in a file of its own. The file defines `build(**parameters)`, which
 returns a `Predictor`; all parameters are annotated.
 
-All predictors except `last_sample` extrapolate the orientation by q(t + tau) = q(t) * exp(omega ·
-tau / 2), where * is the product of quaternions. The formula is exact while the body's angular
-velocity is constant. The paper says only "similarly the orientation".
+All predictors except `last_sample` extrapolate the orientation by
+q(t + tau) = q(t) * exp(omega · tau / 2), where * is the product of quaternions. The formula is
+exact while the body's angular velocity is constant. The paper gives no formula ("similarly the
+orientation").
 
 Source: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, eqs. (101), (214).
 """

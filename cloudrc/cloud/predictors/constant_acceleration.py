@@ -52,7 +52,7 @@ class ConstantAcceleration(Predictor):
         vx, vy, vz = odometry.velocity
         ax, ay, az = self._acceleration
         rate = odometry.angular_velocity_body
-        # From here on the change of the velocity over the horizon [m/s].
+        # From here on, a is the change of the velocity over the horizon [m/s].
         ax, ay, az = ax * horizon, ay * horizon, az * horizon
         return Odometry(
             odometry.stamp_ns + round(horizon * 1e9),

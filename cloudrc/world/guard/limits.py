@@ -111,7 +111,7 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
     return (
         clamp(vx, -approach_speed(x - ax), approach_speed(bx - x)),
         clamp(vy, -approach_speed(y - ay), approach_speed(by - y)),
-        # A robot that stands on the floor is not told to climb.
+        # At most 0: a robot that stands on the floor does not have to climb.
         clamp(vz, min(0.0, -approach_speed(z - az, REACTION)), approach_speed(bz - z)),
     )
 

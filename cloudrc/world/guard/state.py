@@ -217,7 +217,7 @@ class Guard:
         Return the velocity reference for the low-level controller [m/s], world frame, shape (3,).
         Return None while the rotors are stopped.
         """
-        # The usual case: the same command as in the last tick, far from the fence.
+        # The usual case: the same command as in the last step, far from the fence.
         if now_ns <= self._steady_until_ns and self.reference is self._wanted:
             return self.reference
         if self._flies and readings.axes[8] < OVERTURNED_COSINE:
