@@ -29,7 +29,8 @@ from cloudrc.records import Control, Fault
 HORIZON_MAX = 1.0
 """Longest horizon of a prediction [s]. Source: docs/reference/control.md, "Predictors"."""
 FREEZE_NS = 400_000_000
-"""The loop freezes when no new echo has arrived for the horizon plus this time [ns].
+"""If no telemetry shows that the robot follows a new command, the loop freezes after the horizon
+plus this time [ns].
 Source: docs/reference/plant.md, "Frozen reference"."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 INSTEAD = {
@@ -37,17 +38,18 @@ INSTEAD = {
     "predictor": "cloud uses the last sample without a prediction",
     "controller": "cloud commands zero velocity",
 }
-"""Kind of plug-in -> what cloud does when the plug-in fails."""
+"""Kind of plug-in -> what cloud does when a plug-in of this kind fails."""
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class DelayMeter:
-    """Feed a delay estimator with the delays of echoes, and get the horizon from the estimator.
+    """Feed a delay estimator with the delays of commands, and get the horizon from the estimator.
 
     Attributes:
-        rtt: Last round trip, without the hold time on world [s]; NaN before the first echo.
-        loop_delay: Last round trip, with the hold time on world [s]; NaN before the first echo.
-        newest_echo_ns: Stamp of the newest command whose echo has arrived [ns], cloud's clock.
+        rtt: Last round trip, without the hold time on world [s]; NaN before the first.
+        loop_delay: Last round trip, with the hold time on world [s]; NaN before the first.
+        newest_echo_ns: Stamp of the newest command that telemetry shows as applied [ns], cloud's
+            clock.
     """
 
     def __init__(self, estimator: Estimator, counts: Counter[str]) -> None:
@@ -57,10 +59,10 @@ class DelayMeter:
         self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process telemetry that arrived at `now_ns` [ns]; only a new echo makes a sample.
+        """Process telemetry that arrived at `now_ns` [ns]; each applied command gives one sample.
 
-        While no command reaches world, telemetry repeats the last echo, whose growing age would
-        corrupt the estimate.
+        While no command reaches world, telemetry repeats the stamp of the last command. The growing
+        age of this command would corrupt the estimate.
         """
         self._stamp_ns = telemetry.stamp_ns
         echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
@@ -248,7 +250,7 @@ class ControlLoop:
             return STAND_STILL
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether no new echo has arrived for the horizon [s] plus FREEZE_NS."""
+        """Whether the robot has followed no new command for the `horizon` [s] plus FREEZE_NS."""
         if self._echoed_ns < self._delays.newest_echo_ns:
             self._echoed_ns = self._delays.newest_echo_ns
         elif self._echoed_ns == NEVER_NS:

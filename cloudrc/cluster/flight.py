@@ -30,7 +30,7 @@ LOOK_PERIOD = 1.0
 HELM_LIMIT = 120.0
 """Time limit for one helm command [s]; helm does not wait for pods."""
 FAILURE_TIME = 5.0
-"""Time that a failure lasts before it is reported [s]; some objects appear after their pod."""
+"""Time after which a pod's failure is reported [s]; objects that the pod needs may come late."""
 FLUSH = 1.0
 """Time after which a recorder has certainly written its buffer of half a second [s]."""
 FETCHES = 4
@@ -171,7 +171,7 @@ def fly_in_cluster(
 
 
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Put an experiment and its link into a release's values; all other values stay as `before`."""
+    """Put an experiment and its link into a release's values; other values stay as in `before`."""
     link = {**before.get("link", {}), "profile": ""}
     # With a mission, the chart would start a second Job.
     mission = {**before.get("mission", {}), "enabled": False}
@@ -268,7 +268,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
 
 
 def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) -> None:
-    """If a container was restarted, fetch the recording that it made before."""
+    """Fetch the recording that a restarted container made before its last restart."""
     try:
         statuses = pods.container_statuses(pods.find_pod(release, component))
         if any(each.name == component and each.restart_count for each in statuses):

@@ -45,7 +45,7 @@ FATAL = {
 RESTARTS_MAX = 2
 """Largest number of restarts after which a container is still expected to start."""
 TOKENS, OPERATOR = "tokens", "operator"
-"""Volume with the API's tokens in the pods of cloud and missions; file of the operator's token."""
+"""Name of the volume with the API's tokens, and of the file in it with the operator's token."""
 API_PORT = 8080
 """TCP port of teleop's API in cloud's pod."""
 METRICS = {

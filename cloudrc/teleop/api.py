@@ -76,7 +76,7 @@ operator's token may also command. `POST /v1/estop` stops the rotors at once. Te
 """
 STARTING = "teleop is starting"
 Call: TypeAlias = Callable[[MissionService, int], Any]
-"""Function that calls the service at a time [ns], and returns the answer or a mission."""
+"""Function of the service and the time [ns] that makes a call and returns the answer."""
 Urgent: TypeAlias = Literal["stop", "hold", ""]
 Address: TypeAlias = tuple[str, int] | Path
 """Host and port, or the path of a Unix socket."""
@@ -104,7 +104,7 @@ class Bridge:
         self._service, self.closed = service, ""
 
     def close(self, why: str) -> None:
-        """Refuse all calls from now on, and fail the emergency stops that still wait."""
+        """Refuse all calls from now on; answer the waiting emergency stops with an error."""
         self.closed, stops = why, self._lanes["stop"]
         while stops:
             stops.popleft()[1].set_exception(UnavailableError(why))

@@ -75,7 +75,7 @@ class LegWatch:
         return self._flown_ns * 1e-9
 
     def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
-        """Tell whether the robot, observed at `now_ns` [ns], has stayed for the dwell time."""
+        """Tell whether the robot has stayed at the waypoint for the dwell time by `now_ns` [ns]."""
         before_ns, self._seen_ns = self._seen_ns, now_ns
         if seen.guard is HOLD:
             self._near_since_ns = NEVER_NS
@@ -111,7 +111,7 @@ class Teleop:
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission; `ended` returns whether the mission with a number has ended."""
+        """Begin without a mission; `ended` tells whether a mission (by its number) has ended."""
         self.state, self.leg = "idle", 0
         self.outcome: MissionEvent | None = None
         self.outputs: list[Output] = []
@@ -295,7 +295,7 @@ class Teleop:
         self._continued = self._was_held = False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
-        """Begin the mission once telemetry shows its start; its time begins now."""
+        """Begin the mission and its time, once telemetry shows the start."""
         self._world, self._expected = seen.world, (self._mission_id,)
         self._watch = LegWatch()
         if not self._continued:
@@ -354,7 +354,7 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether the robot may still fly an earlier mission, before this mission begins."""
+        """Whether the robot may still fly an earlier mission while this mission has not begun."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self) -> None:

@@ -90,7 +90,7 @@ Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 """Messages from teleop to cloud."""
 Message: TypeAlias = RobotStatus | Output
 ALARM = OperatorRequest(0, Request.ESTOP)
-"""Emergency stop without a number, which needs no state machine; cloud numbers it."""
+"""Emergency stop without a number. Cloud adds the number, so every part of teleop can send this."""
 _KINDS: dict[str, TypeAdapter[Message]] = {
     kind.__name__: TypeAdapter(kind)
     for kind in (RobotStatus, Setpoint, OperatorRequest, MissionEvent)

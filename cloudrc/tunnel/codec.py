@@ -1,8 +1,8 @@
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
 A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body with a fixed
-length for each kind, and a 16-byte authentication tag, which `session` adds and verifies. The
-functions raise no exception except DecodeError.
+length for each kind, and a 16-byte authentication tag, which `session` adds and verifies. The epoch
+is the number of the session. The functions raise no exception except DecodeError.
 
 The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
 nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
@@ -61,7 +61,7 @@ class Direction(IntEnum):
 
 
 class DecodeError(ValueError):
-    """Report an invalid datagram; the text is the name under which the datagram is counted."""
+    """Report an invalid datagram; the text is the name of the counter for such datagrams."""
 
 
 Header: TypeAlias = tuple[int, int, int, int, int]

@@ -57,7 +57,7 @@ WORLDS_MAX = 64
 
 
 def is_newer(epoch: int, than: int) -> bool:
-    """Return whether `epoch` comes after `than`, by less than half of all session numbers."""
+    """Return whether `epoch` is later than `than`; session numbers start again after the last."""
     return 0 < (epoch - than) % (EPOCH_MAX + 1) <= EPOCH_MAX // 2
 
 
@@ -76,7 +76,7 @@ class ServerHandshake:
         """Begin without a session.
 
         Args:
-            session: Keys and counters of world's session; this class begins each epoch.
+            session: Keys and counters of world's session; this class begins the sessions.
             nonce: 16 bytes that identify this process, new at every start.
             clock: 16 bytes that identify the monotonic clock of this machine.
             age_max_ns: Silence of a cloud after which another cloud can get a session [ns].

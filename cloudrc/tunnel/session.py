@@ -57,7 +57,7 @@ class Session:
         epoch: Number of the session; `NO_EPOCH` without a session.
         sealed: Whether datagrams of the session are encrypted and authenticated.
         ring: The pre-shared keys; `follow_keys` adopts changes.
-        greeting_key: Pre-shared key that verified the last greeting.
+        greeting_key: Pre-shared key that verified the last handshake datagram.
         epoch_key: Pre-shared key of the session.
         is_outdated: Whether the key file has a newer key than the session.
     """
@@ -158,7 +158,7 @@ class Session:
 
 
 def pair(epoch: int = 1, secret: bytes | None = b"p" * 32) -> tuple[Session, Session]:
-    """Make both ends of a session for tests, world's end first; None: without encryption."""
+    """Make world's and cloud's end of a session for tests; no encryption if `secret` is None."""
     ring = None if secret is None else KeyRing(KeySet(Key(secret)))
     ends = Session(Direction.UPLINK, ring), Session(Direction.DOWNLINK, ring)
     for end in ends:

@@ -76,7 +76,7 @@ class Orders:
         self.touch_speed = nan
 
     def note_touch(self, touch: Contact) -> None:
-        """Count a contact with a pipe; keep the tip's speed at its first contact with the board."""
+        """Count a contact with a pipe; store the tip's speed at the first touch of the board."""
         if touch.body.startswith("pipe"):
             self.pipes += 1
         elif touch.body == "board" and touch.tip and isnan(self.touch_speed):
@@ -85,8 +85,8 @@ class Orders:
     def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
         """Carry out a request at `now_ns` [ns], world's clock; return whether a mission begins.
 
-        `waited` tells whether the request may have waited in the socket during a stall. A start
-        that waited or is too old raises the DecodeError "stale", a start from the future "future".
+        `waited` tells whether the request may have waited in the socket during a stall. Raise the
+        DecodeError "stale" for a start that waited or is too old, "future" for a later stamp.
         """
         kind, guard = request.request, self._guard
         starts = kind is Request.START
@@ -121,7 +121,7 @@ class Orders:
 
 
 REPORT_AGAIN_NS = 10_000_000_000
-"""World reports a slowdown as a new fault if the last slowdown was longer ago than this [ns]."""
+"""World reports a slowdown as a new fault only after this time without a slowdown [ns]."""
 
 
 class PaceMonitor:

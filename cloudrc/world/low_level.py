@@ -40,8 +40,8 @@ _HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
 _TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
 
 NOSE_COSINE_MIN, YAW_SINE_MAX = 0.5, 0.3
-"""Smallest cosine of the error about the nose, and largest sine of the yaw error, up to which the
-controller uses the published attitude error [1]. Beyond, the published error uses wrong axes."""
+"""Largest errors for which the controller uses the published attitude error [1], as the cosine of
+the roll error and the sine of the yaw error. For larger errors the published formula is wrong."""
 
 
 class LowLevel:

@@ -40,7 +40,7 @@ class Simulator:
         dt: Duration of a step [s].
         steps: Number of steps since the last reset.
         readings: State of the base after the last step.
-        touches: Contacts that began since the last call of `take_contacts`, with stamp 0.
+        touches: Contacts that began since the last call of `take_contacts`.
         tape: Controls of every step since the last reset, for `replay`; None if not recorded.
     """
 

@@ -144,11 +144,11 @@ class Descent:
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Begin a descent at `now_ns` [ns]; the operator has not acknowledged it yet."""
+        """Begin a descent at `now_ns` [ns]; an earlier acknowledgement no longer counts."""
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
-        """Tell whether the descent may end in the air: acknowledged, sinking freely and high."""
+        """Tell whether the descent may end in the air; the class describes the conditions."""
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
 
@@ -166,8 +166,8 @@ class TakeOff:
     """Detect when the robot has left the ground (`over`), and decide whether it may take off.
 
     A robot whose rotors were stopped in the air may still fall, or lie outside the fence, when the
-    operator acknowledges. It may take off once it lies still, at least TAKE_OFF_MARGIN inside the
-    fence.
+    operator acknowledges. Such a robot may take off once it lies still, at least TAKE_OFF_MARGIN
+    inside the fence.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
