@@ -52,7 +52,7 @@ def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) ->
     Args:
         points: Points in the body frame.
         positions: Positions of the base [m], world frame, shape (n, 3).
-        orientations_wxyz: Orientations of the base, unit quaternions, body to world, shape (n, 4).
+        orientations_wxyz: Orientations, each a unit quaternion, body to world, shape (n, 4).
     """
     w, x, y, z = np.moveaxis(orientations_wxyz, -1, 0)
     rows = (

@@ -86,7 +86,7 @@ class LowLevel:
         return allocate(attitude(force, readings))
 
     def brake(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
-        """Compute rotor speeds as `update` does, but keep the integral of the error constant.
+        """Follow `velocity_reference` [m/s] as `update` does, but keep the integral constant.
 
         Deviation: the published controller always integrates. Its integral winds up while the robot
         brakes, and pushes the robot back for a second afterwards.

@@ -16,7 +16,7 @@ class Sensors:
     def __init__(
         self, position_noise: float, velocity_noise: float, rng: np.random.Generator
     ) -> None:
-        """Set the standard deviations of the noise per axis [m], [m/s]; 0 means no noise."""
+        """Set the standard deviations per axis, `position_noise` [m] and `velocity_noise` [m/s]."""
         self._position_noise, self._velocity_noise = position_noise, velocity_noise
         self._rng = rng
         self._exact = position_noise == velocity_noise == 0.0

@@ -138,7 +138,7 @@ class Descent:
     """
 
     def __init__(self, floor: float, speed_max: float) -> None:
-        """Set `floor`, the lowest z at which the robot may hold [m], and the speed cap [m/s]."""
+        """Set `floor`, the lowest z at which the robot may hold [m], and the `speed_max` [m/s]."""
         self._floor, self.speed = floor, min(LAND_SPEED, speed_max)
         self._still_speed = min(STILL_SPEED, STILL_SHARE * self.speed)
         self.begin(0)

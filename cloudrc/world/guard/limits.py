@@ -77,7 +77,10 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
 
 
 def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether `limit_to_fence` changes nothing within RECHECK_DISTANCE of `position`."""
+    """Tell whether `limit_to_fence` changes nothing within RECHECK_DISTANCE of `position`.
+
+    `velocity` [m/s], `position` [m], `low` and `high` are those of `limit_to_fence`.
+    """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if vx > 0.0:
         bx -= vx * (FENCE_REACTION + vx * STOP_COEFFICIENT)
