@@ -1,8 +1,8 @@
-"""Delay estimators compute the horizon of the prediction from echoes; one file each.
+"""Delay estimators compute the horizon: how far ahead the predictor predicts.
 
-The horizon is the time by which the predictor predicts. Telemetry echoes the stamp of the newest
-command that world has applied. A plug-in file defines `build(**parameters)`, which returns an
-`Estimator`. All parameters are annotated.
+Telemetry echoes the stamp of the newest command that world has applied; estimators get the delays
+that these echoes show. Each estimator is a plug-in in a file of its own. The file defines
+`build(**parameters)`, which returns an `Estimator`; all parameters are annotated.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """The delays that one telemetry with a fresh echo shows.
+    """The delays that telemetry shows when world applied the echoed command shortly before.
 
     Attributes:
-        loop_delay: Arrival of the echo minus the command's stamp [s]. The difference includes the
-            hold time: how long world had the command before it sent the echo.
+        loop_delay: Arrival of the echo minus the command's stamp [s]. The loop delay includes the
+            hold time: the time between the application of the command and the sending of the echo.
         rtt: `loop_delay` minus the hold time [s].
     """
 

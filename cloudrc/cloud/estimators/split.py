@@ -18,10 +18,10 @@ from cloudrc.cloud.estimators import Estimator
 
 
 class Split(Estimator):
-    """Adds the exact age of the newest odometry and the average of `applied_minus_stamp`."""
+    """Adds the age of the newest odometry and the average of `applied_minus_stamp`."""
 
     def __init__(self, gain: float) -> None:
-        """Set the weight of a new sample of the downlink, `gain` [1]."""
+        """Set `gain` [1], the weight of a new sample in the average."""
         self._gain = gain
         self._applied_minus_stamp: float | None = None
 
@@ -35,7 +35,7 @@ class Split(Estimator):
             )
 
     def horizon(self, age: float) -> float:
-        """Return `age` [s] plus the average of the downlink [s]; the clock offsets cancel."""
+        """Return `age` plus the average of `applied_minus_stamp` [s]; the clock offsets cancel."""
         if self._applied_minus_stamp is None:
             return 0.0
         return max(0.0, age + self._applied_minus_stamp)
