@@ -98,11 +98,10 @@ class LinkContainer(Values):
 
     mode: Literal["auto", "netem", "relay"] = "auto"
     """What emulates the network. netem: the kernel, needs NET_ADMIN. relay: a process without
-    privileges. auto: relay if the namespace enforces Pod Security baseline or restricted, or is
-    unknown at install; otherwise netem if the kernel has it, else relay"""
+    privileges. auto: netem if the kernel and the namespace allow it, else relay"""
     profile: str | Profile | None = None
-    """Either the name of a shipped profile, or a mapping with the keys of a file in link/profiles.
-    A change takes effect in flight and restarts nothing. null: the experiment's link"""
+    """Either the name of a shipped profile, or a mapping with the keys of a link profile. A change
+    takes effect in flight, without a restart. null: the experiment's link"""
     traces: Texts = Field(
         {},
         json_schema_extra={
@@ -142,15 +141,15 @@ class WorldPod(Placement):
     """No longer used; values of earlier versions are accepted"""
     resources: Resources = resources("60m", "96Mi", "1", "256Mi")
     recording_size_limit: Quantity = "1Gi"
-    """Size limit of the volume for recordings [bytes]. The volume also keeps the recording from
-    before a restart; at 90 % of the limit for both together, the recording ends"""
+    """Size limit of the volume for recordings [bytes]. At 90 % of the limit the recording ends; the
+    recording from before a restart counts, too"""
 
 
 class BackgroundLoad(Values):
     """A container that burns CPU beside the controller, for a cloud under load."""
 
     enabled: bool = False
-    """Whether the pod has a container that only uses CPU time"""
+    """Whether the pod has a further container, which only uses CPU time"""
     workers: Annotated[int, Field(ge=1, le=64)] = 1
     """Number of busy loops [count]; each uses up to one core, within the CPU limit"""
     resources: Resources = resources("10m", "8Mi", "1", "16Mi")
@@ -161,8 +160,8 @@ class CloudPod(Placement):
 
     resources: Resources = resources("60m", "64Mi", "1", "192Mi")
     recording_size_limit: Quantity = "1Gi"
-    """Size limit of the volume for recordings [bytes]. The volume also keeps the recording from
-    before a restart; at 90 % of the limit for both together, the recording ends"""
+    """Size limit of the volume for recordings [bytes]. At 90 % of the limit the recording ends; the
+    recording from before a restart counts, too"""
     background_load: BackgroundLoad = BackgroundLoad()
     """CPU load in the cloud pod"""
 
@@ -220,15 +219,15 @@ class MissionJob(Values):
     """Either the name of a shipped mission, or a mapping with the keys of a mission. null: the
     experiment's mission"""
     queue: bool = False
-    """true: the mission waits while another mission flies; false: it is refused"""
+    """Whether the mission waits while another mission flies; false: it is then refused"""
     active_deadline_seconds: Seconds = 600
     """Time limit of the Job, waiting included [s]; beyond it the Job fails"""
     ttl_seconds_after_finished: Seconds = 86_400
     """Time for which the finished Job is kept [s]; an upgrade after this time flies the mission
     again"""
     pod_annotations: Texts = {}
-    """Further annotations of the pods of missions and of helm test. With the sidecar of a mesh, a
-    Job never ends; to leave out Istio's sidecar: sidecar.istio.io/inject: "false"
+    """Further annotations of the pods of missions and of helm test; for example, to leave out
+    Istio's sidecar: sidecar.istio.io/inject: "false"
     """
     resources: Resources = resources("10m", "48Mi", "500m", "128Mi")
 
@@ -237,12 +236,12 @@ class Monitor(Values):
     """An object of the Prometheus operator, made only if the cluster knows its kind."""
 
     enabled: bool = False
-    """Whether the chart makes this object"""
+    """Whether the chart makes the object"""
     force: bool = False
     """Whether the chart makes the object even if the cluster does not know its kind (helm
     template)"""
     labels: Texts = {}
-    """Labels by which your Prometheus selects it"""
+    """Labels by which your Prometheus selects the object"""
 
 
 class PodMonitor(Monitor):
@@ -335,8 +334,7 @@ class ChartValues(Values):
         "fsGroup": 10_001,
         "seccompProfile": {"type": "RuntimeDefault"},
     }
-    """Security context of all pods, as in Kubernetes. null: no security context, for OpenShift,
-    which gives each namespace its own user ids"""
+    """Security context of all pods, as in Kubernetes. null: no security context, for OpenShift"""
     container_security_context: dict[str, Any] | None = {
         "allowPrivilegeEscalation": False,
         "readOnlyRootFilesystem": True,
@@ -345,6 +343,6 @@ class ChartValues(Values):
     """Security context of all containers, except the link container with netem, which has its own.
     null: no security context"""
     termination_grace_period_seconds: Seconds = 10
-    """Time in which the pods must end [s], else they are killed; they need 2 s"""
+    """Time that the pods have to end [s]; they need 2 s"""
     global_: dict[str, Any] | None = Field(None, alias="global")
     """Values that Helm passes to subcharts; this chart ignores them"""

@@ -41,23 +41,23 @@ ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
 _PERIOD = "100 Hz, while there is telemetry and a setpoint"
 _LINK = "once per change; again when a session, a mission or a state of the guard begins"
 _STAMPS = {
-    ("departure of the telemetry, which is the instant of the measurement", "100 Hz, in a session"):
+    ("instant of the measurement, when the telemetry leaves", "100 Hz, in a session"):
         "/odometry /telemetry",
     ("instant of the physics step", "100 Hz"): "/ground_truth /contact_force /reference",
     ("arrival at cloud", "once per telemetry that arrives"): "/uplink_delay",
     ("arrival at world", "once per command that arrives"): "/downlink_delay",
     ("first physics step that follows the command", "once per command applied"): "/command_applied",
     ("physics step in which the state changes", "once per event"): "/guard",
-    ("the first odometry after the contact, at most 10 ms later", "once per event"): "/contact",
-    ("begin of the session at this end", "once per event"): "/session",
+    ("first odometry after the contact, at most 10 ms later", "once per event"): "/contact",
+    ("when the session begins at this end", "once per event"): "/session",
     ("departure of the command", _PERIOD):
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
     ("instant of the event", "once per event"): "/mission",
     ("when this end notices the fault", "once per fault; repetitions are only counted"): "/fault",
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
-    ("when this end notices it", _LINK): "/link",
+    ("when this end notices the change", _LINK): "/link",
     ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
-    ("when the deadline was handled", "100 Hz per end"): "/lateness",
+    ("when the loop handles the deadline", "100 Hz per end"): "/lateness",
 }  # fmt: skip
 SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.split()}
 """Topic -> meaning of a row's stamp, and how often a row is written."""
@@ -76,7 +76,7 @@ def outputs() -> dict[Path, str]:
         **_insert(ROOT / "docs" / "experiment.md", _experiment()),
         **_insert(ROOT / "docs" / "topics.md", _topics()),
         **_insert(ROOT / "docs" / "metrics.md", _metrics()),
-        **_insert(CHART / "README.md", table("key | default | meaning", _values(ChartValues()))),
+        **_insert(CHART / "README.md", f"\n{_chart()}"),
         CHART / "values.yaml": VALUES_HEAD + _values_text(ChartValues()),
         CHART / "values.schema.json": json.dumps(_chart_schema(), indent=2) + "\n",
         **{
@@ -248,15 +248,14 @@ def _topics() -> str:
     blocks = ["\n## All topics\n", table("topic | message | written by | how often", overview)]
     for name, topic in TOPICS.items():
         text = re.sub(r", (world's clock|cloud's clock|clock of its end)", "", topic.text)
-        stamp, often = SAMPLING[name]
+        stamp, _ = SAMPLING[name]
         clock = f"{topic.end}'s clock"
         if topic.end == "either":
             clock = "the clock of the end that wrote the row"
         blocks += [
             f"## `{name}`\n",
             f"{text}.\n",
-            f"- Message: `{topic.ros_type}`, written by {ENDS[topic.end]}, {often}.\n"
-            f"- Stamp: {stamp}, on {clock}.\n",
+            f"Stamp: {stamp}, on {clock}.\n",
             table(
                 "field | type | unit | meaning",
                 ((f"`{field.name}`", field.kind, field.unit, field.text) for field in topic.fields),
@@ -280,7 +279,13 @@ def _metrics() -> str:
         for metric in METRICS.values()
         if metric.buckets
     ]
-    return f"\n{table('metric | type | from | meaning', rows)}\n## Buckets\n\n{''.join(buckets)}"
+    head = "## Buckets\n\nUpper bounds of the buckets of each histogram [s]:\n"
+    return f"\n{table('metric | type | from | meaning', rows)}\n{head}{''.join(buckets)}"
+
+
+def _chart() -> str:
+    """Write the table of all values of the chart."""
+    return table("key | default | meaning", _values(ChartValues()))
 
 
 VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"

@@ -108,10 +108,10 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         """
         cloudrc_build_info: Always 1; the labels name the process, its version and its
             configuration. Both ends of a run have the same configuration.
-        cloudrc_ready: 1 while this process hears its peer, else 0.
-        cloudrc_cpu_periods_total: CFS periods in which this container wanted to run.
-        cloudrc_cpu_throttled_periods_total: CFS periods in which the CPU limit stopped this
-            container.
+        cloudrc_ready: 1 while this process receives messages from its peer, else 0.
+        cloudrc_cpu_periods_total: Scheduler periods (CFS) in which this container wanted CPU time.
+        cloudrc_cpu_throttled_periods_total: Scheduler periods (CFS) in which the CPU limit stopped
+            this container.
         cloudrc_cpu_throttled_seconds_total: Time for which the CPU limit stopped this container.
         """,
     ),
@@ -121,59 +121,56 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         cloudrc_session_epoch: Epoch number of the current session.
         cloudrc_sessions_opened_total: Sessions opened since this process started.
         cloudrc_datagrams_total: Datagrams by outcome; updated once a second.
-        cloudrc_datagrams_expected_total: Incoming telemetry or command datagrams whose fate is
-            known: arrived or lost.
-        cloudrc_datagrams_lost_total: Expected datagrams that had not arrived when the peer had
-            sent 128 newer ones.
+        cloudrc_datagrams_expected_total: Incoming telemetry or command datagrams that have arrived
+            or count as lost.
+        cloudrc_datagrams_lost_total: Datagrams that had not arrived when the peer had sent 128
+            newer ones.
         cloudrc_datagrams_reordered_total: Telemetry or command datagrams that arrived after a
             newer one.
         cloudrc_link_gap_seconds: Time between two arrivals: of telemetry at cloud, of commands at
             world.
-        cloudrc_link_believed: 1 if the incoming direction of the link behaves as configured, 0 if
-            it does not (/link.json on the same port says why); absent while there are too few
+        cloudrc_link_believed: 1 if the incoming direction of the link matches its profile, 0 if it
+            does not (/link.json on the same port says why); absent while there are too few
             datagrams to decide.
-        cloudrc_age_of_information_seconds: Age of the newest datagram used, sampled every period:
-            odometry in cloud, commands in world; absent unless both ends prove that they share a
+        cloudrc_age_of_information_seconds: Age of the newest odometry in cloud, of the newest
+            command in world, sampled every period; absent unless both ends prove that they share a
             clock.
-        cloudrc_loop_period_seconds: Time between two handled deadlines.
-        cloudrc_loop_lateness_seconds: Delay from a deadline to the wake of the loop.
-        cloudrc_loop_busy_seconds_total: Time spent handling deadlines.
+        cloudrc_loop_period_seconds: Time between two periods of the loop.
+        cloudrc_loop_lateness_seconds: Time from the deadline of a period to the wake of the loop.
+        cloudrc_loop_busy_seconds_total: Time for which the loop computed.
         cloudrc_recorder_dropped_records_total: Records that did not reach the recording.
-        cloudrc_recorder_sync_age_seconds: Time since the start of the newest completed sync of
-            the recording: the part that a power cut would lose; absent without a recording,
-            rising forever after recording failed.
-        cloudrc_clock_steps_total: Times that the wall clock was set, each recorded as a fault
-            with its size; flight does not depend on the wall clock.
+        cloudrc_recorder_sync_age_seconds: Time since the newest completed sync of the recording to
+            disk began: the part that a power cut would lose; absent without a recording.
+        cloudrc_clock_steps_total: Times that somebody set the wall clock; the flight does not
+            depend on the wall clock.
         """,
     ),
     (
         (WORLD,),
         f"""
-        cloudrc_clouds_admitted_total: Cloud processes that got a session: the first, one that
-            restarted, or another one.
+        cloudrc_clouds_admitted_total: Cloud processes that got a session, restarted ones included.
         cloudrc_sessions_refused_total: Session requests refused because another cloud controls
             the robot.
         cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams
             included; absent unless both ends prove that they share a clock.
         cloudrc_position_meters: True position of the base, world frame.
         cloudrc_tip_force_newtons: Force on the touch sensor at the arm's tip.
-        cloudrc_command_age_seconds: Age of the current command, sampled every period in TRACK:
-            time since the odometry that it was computed from, on world's clock, as the guard sees
-            it.
+        cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every period:
+            time since the odometry from which cloud computed the command, on world's clock.
         cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
         cloudrc_guard_transitions_total: Changes of the guard's state, by new state.
         cloudrc_guard_limited_total: Commands that a limit of the guard changed; for the fence,
-            ticks instead of commands.
+            physics steps instead of commands.
         cloudrc_guard_held_seconds_total: Time in HOLD during missions; updated once a second.
-        cloudrc_guard_starts_refused_total: Mission starts refused: in LAND or ESTOP.
-        cloudrc_contacts_total: Times that the robot came into contact with a body of the scene,
-            by kind of body.
+        cloudrc_guard_starts_refused_total: Mission starts refused because the guard was in LAND or
+            ESTOP.
+        cloudrc_contacts_total: Contacts of the robot with bodies of the scene, by kind of body.
         cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below
             0.95 a run is invalid.
         cloudrc_world_slip_seconds_total: Time by which world's clock has fallen behind the
             machine's clock.
-        cloudrc_world_stalls_total: Wakes so late that the datagrams waiting in the socket were
-            stale.
+        cloudrc_world_stalls_total: Times that world woke up so late that the datagrams waiting in
+            the socket were stale.
         """,
     ),
     (
@@ -181,14 +178,13 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         """
         cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included;
             absent unless both ends prove that they share a clock.
-        cloudrc_rtt_seconds: Round trip of applied commands, without the hold time in world; one
-            sample per echo.
-        cloudrc_loop_delay_seconds: Time from a command's stamp to its echo, with the hold time in
-            world: the paper's tau.
-        cloudrc_delay_estimate_seconds: Delay estimate, clamped: the horizon over which the newest
-            odometry is predicted.
+        cloudrc_rtt_seconds: Round trip of applied commands, without their time in world.
+        cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world: the
+            paper's tau.
+        cloudrc_delay_estimate_seconds: Delay estimate, clamped: how far ahead cloud predicts the
+            newest odometry.
         cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry
-            to the application of the command, for the newest echoed command.
+            to the application of the command, for the newest command that the robot confirmed.
         cloudrc_prediction_error_meters: Newest prediction error: predicted minus measured
             position at the same instant.
         cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction
@@ -200,12 +196,13 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         cloudrc_command_velocity_meters_per_second: Commanded velocity, world frame.
         cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
         cloudrc_horizon_clamped_total: Delay estimates above 1 s or below 0, which were clamped.
-        cloudrc_commands_frozen_total: Zero-velocity commands sent because no echo arrives.
+        cloudrc_commands_frozen_total: Zero-velocity commands sent because the robot confirmed no
+            newer command.
         cloudrc_plugin_failures_total: Plug-in calls that raised an exception or returned a value
             that is not finite.
         cloudrc_words_dropped_total: Teleop messages dropped because they were for another session
             or no request number was left.
-        cloudrc_loop_missed_periods_total: Commands that a late loop skipped.
+        cloudrc_loop_missed_periods_total: Periods without a command because the loop was late.
         """,
     ),
     (
@@ -233,17 +230,18 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
     (
         (LINK,),
         """
-        cloudrc_link_info: Always 1; the labels say what shapes a direction of the link, and the
+        cloudrc_link_info: Always 1; the labels name the shaper of a direction of the link, and the
             configured mode.
         cloudrc_link_delay_seconds: Mean one-way delay that the current link profile sets.
-        cloudrc_link_step_lateness_seconds: Lateness of the last 10,000 changes of netem's qdisc
+        cloudrc_link_step_lateness_seconds: Lateness of the last 10,000 changes of netem's settings
             on the profile's time line; absent without changes.
         cloudrc_link_datagrams_total: Datagrams at the shaper, by outcome.
-        cloudrc_link_restored_total: Times that another program removed or changed netem's qdisc.
+        cloudrc_link_restored_total: Times that another program removed or changed netem's
+            settings.
         cloudrc_link_release_error_seconds: Lateness of datagrams that left the relay in the last
             10 s; absent with netem.
-        cloudrc_link_released_early_total: Datagrams that left the relay before they were due;
-            above 0 the relay has a bug; absent with netem.
+        cloudrc_link_released_early_total: Datagrams that left the relay too early; above 0 the
+            relay has a bug; absent with netem.
         cloudrc_dns_errors_total: Failed look-ups of the peer's name; the last known address stays
             in use.
         """,
