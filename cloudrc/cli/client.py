@@ -26,8 +26,8 @@ from cloudrc.files import read, readable_by_others
 REQUEST_TIMEOUT = 10.0
 """Time limit of one request [s]."""
 STREAM_TIMEOUT = 30.0
-"""Longest silence of an event stream before the client gives up [s]; the API sends an event or a
-comment every 10 s."""
+"""Time without data after which the client stops reading a stream of events [s]. The API sends data
+at least every 10 s."""
 RETRY_STATUSES = (408, 429, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
 UNIX = "unix:"
@@ -165,7 +165,7 @@ def token_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def token_file(options: argparse.Namespace) -> Path | None:
-    """Return the token file from the command line, else from the environment, else None."""
+    """Return the path of the token file from the flag, else from the environment, else None."""
     given = options.token_file or os.environ.get(VARIABLE)
     return Path(given) if given else None
 

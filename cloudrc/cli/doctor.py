@@ -40,9 +40,9 @@ COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 
 
 class Check(NamedTuple):
-    """The result of one check: the text `found`, and the advice `fix`.
+    """The result of one check, with a text `found` and the advice `fix`.
 
-    If `state` is "missing", the modes in `modes` cannot run. If `state` is "warn", they can.
+    If `state` is "missing", the modes in `modes` cannot run. If `state` is "warn", all modes can.
     """
 
     name: str
@@ -60,7 +60,7 @@ def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = (
 
 
 def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Check]:
-    """Yield the results of all checks; in mode "cluster" also of a kubeconfig's `context`."""
+    """Yield the results of all checks; in mode "cluster" also check the cluster of `context`."""
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
     yield mujoco_steps()
@@ -108,7 +108,7 @@ def udp_loopback() -> Check:
 
 
 def timer(rounds: int = 100) -> Check:
-    """Check how late a sleep of 1 ms ends, by the result of `rounds` sleeps."""
+    """Check how late sleeps of 1 ms end; sleep `rounds` times."""
     late = []
     for _ in range(rounds):
         start = time.monotonic()

@@ -1,4 +1,4 @@
-"""The optional dependencies: which mode needs which, and how to install missing packages."""
+"""List optional dependencies, the modes that need them, and how to install missing packages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "kube": ("kubernetes",),
     "api": ("fastapi", "uvicorn"),
 }
-"""Extra in pyproject.toml -> the modules that it installs, named like their packages on PyPI."""
+"""Name of an extra in pyproject.toml -> the modules that it installs."""
 MODES: dict[str, tuple[str, ...]] = {
     "local": ("world", "record", "report"),
     "virtual": ("world", "record", "report"),

@@ -81,7 +81,6 @@ def _minutes(text: str) -> float:
 
 
 def _folder(text: str) -> Path:
-    """Parse the path of an output folder; refuse one that cannot be made."""
     path = Path(text)
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
     if not (existing.is_dir() and os.access(existing, os.W_OK)):

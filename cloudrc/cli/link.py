@@ -1,7 +1,7 @@
 """Run `cloudrc link ACTION`.
 
-This module contains the action `show`; `cli/link_<action>.py` contain the other actions. To keep
-`--help` fast, the arguments of `verify` are here, too: its module imports large packages.
+This module contains the action `show`; the modules `cli/link_<action>.py` contain all others. The
+arguments of `verify` are here, too, because the module of `verify` imports large packages.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def _way(
 
 
 def _row_times(times: Sequence[float]) -> list[int]:
-    """Return the sending times [ns]: one per row of a trace, but `ROWS` or more in total."""
+    """Return when to send packets [ns]: at each row of a trace, and between rows if it is short."""
     rows = [round(time * 1e9) for time in times]
     share = -(-ROWS // len(rows))
     if len(rows) == 1 or share == 1:

@@ -46,7 +46,7 @@ TOPICS = {
     "uplink": ("/telemetry", "/uplink_delay"),
     "downlink": ("/delay_estimate", "/downlink_delay"),
 }
-"""Direction -> two topics of the recording: one row per sent, and one row per arrived datagram."""
+"""Direction -> topic with one row per sent datagram, topic with one row per arrived datagram."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

@@ -44,7 +44,7 @@ TOOL_TIMEOUT = 5.0
 """Time limit of one call of tc or ip [s]."""
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
-"""Command after each other command of tc; its answer shows that the other answer is complete."""
+"""Command sent to tc after every command: the answer to `_END` marks the end of the answer."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -125,7 +125,7 @@ def make_profile_loader(direction: str) -> Load:
     from cloudrc.link.follow import Loaded
 
     def load(path: Path) -> Loaded:
-        profile = load_profile(path.absolute())  # absolute: never the name of a shipped profile
+        profile = load_profile(path.absolute())  # absolute: not a shipped name
         values = profile.model_dump(mode="json", exclude_defaults=True)
         return Loaded(link_profile(getattr(profile, direction)), values)
 
@@ -228,7 +228,7 @@ class Programs:
         self._tc: subprocess.Popen[bytes] | None = None
 
     def __call__(self, words: Sequence[str]) -> Answer:
-        """Run a command and return its answer."""
+        """Run a command of tc or ip, and return its answer."""
         try:
             match list(words):
                 case ["tc", "qdisc", "change", *_]:

@@ -65,7 +65,7 @@ from cloudrc.tunnel.codec import SIZES, Kind
 RELEASE_TIMEOUT = 270.0
 """Default time limit for the verdict on a release [s]."""
 START_LIMIT = 90.0
-"""Time limit for both processes to start, long enough for a slow disk [s]."""
+"""Time limit for the processes of both directions to start, long enough for a slow disk [s]."""
 COUNTS_WAIT = 1.3
 """Wait after the last probe [s]: the link's processes update their counts once a second."""
 POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0
@@ -80,7 +80,7 @@ WAYS = {
 }
 """Direction -> sender, receiver, and the kind of datagram that the sender sends."""
 KEYS = ("asked", "measured", "low", "high")
-"""Values of a row, in the order of the table's columns."""
+"""Keys of the values in a row of the report, in the order of the table's columns."""
 NOT_JUDGED = "NOT JUDGED"
 """Mark in the notes on quantities of the profile that the command could not verify."""
 TOLD = {
@@ -95,7 +95,7 @@ VERDICTS = {
     "open": ("undecided", "yellow", "was not measured for long enough: give more --seconds"),
     "ok": ("believed", "green", "matches its profile"),
 }
-"""Worst verdict on any quantity, the worst first -> verdict on the link, its colour and text."""
+"""Worst verdict on a quantity of the link -> verdict on the link, its colour and text."""
 _CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
 Report: TypeAlias = dict[str, Any]
@@ -121,7 +121,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
-    """Read the experiment `target`; if `target` is a profile, the default experiment with it."""
+    """Read the experiment `target`, or the default experiment with the link profile `target`."""
     experiments, profiles = shipped.names("experiment"), shipped.names("profile")
     is_profile = target not in experiments
     if shipped.is_path(target):
@@ -214,12 +214,12 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, 
 def run_link(
     experiment: ResolvedExperiment, shaper: str, applied: Profile | None = None
 ) -> Iterator[dict[str, Way]]:
-    """Run both directions of a link while the block runs: on loopback, or for netem in namespaces.
+    """Run both directions of a link while the block runs: on loopback, netem in two namespaces.
 
     `applied` is for tests: the profile of the link's processes if it differs from the experiment's.
 
     Raises:
-        CloudrcError: If a process ends early, with its message and exit code, or starts too slowly.
+        CloudrcError: If a process of the link ends early or starts too slowly.
     """
     profile = applied or Profile(uplink=experiment.uplink, downlink=experiment.downlink)
     text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
@@ -383,7 +383,7 @@ def fetch(url: str) -> str:
 
 
 def _may_change(found: Mapping[str, Any]) -> bool:
-    """Return whether a verdict is still open and may change; that of a looping time line cannot."""
+    """Return whether a verdict is "open" and may change; with a looping time line it never does."""
     loops = any(row["quantity"] == "time_line" and row.get("measured") for row in found["rows"])
     return bool(found["verdict"] == "open") and not loops
 

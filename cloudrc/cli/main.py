@@ -1,4 +1,4 @@
-"""Run the program `cloudrc`: run a command, and print an error as one line."""
+"""Run the program `cloudrc`: run the given command; print an error in one line."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def describe_unknown(given: str, names: Iterable[str]) -> str:
 
 
 def whole_number(low: int, high: int) -> Callable[[str], int]:
-    """Return a function that reads a whole number in a range, as a type for argparse."""
+    """Return a type for argparse: a function that parses a whole number from `low` to `high`."""
 
     def read(text: str) -> int:
         if not text.isdecimal() or not low <= int(text) <= high:
@@ -94,7 +94,7 @@ read_count = whole_number(1, COUNT_MAX)
 
 
 def input_file(text: str) -> Path:
-    """Read the path of an input file, as a type for argparse.
+    """Parse the path of an input file, as a type for argparse.
 
     Refuse pipes and devices, because opening them could block forever.
     """

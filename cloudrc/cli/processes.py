@@ -1,7 +1,7 @@
 """Run the processes `cloudrc world`, `cloudrc cloud` and `cloudrc relay` of a local run or a pod.
 
-`cloudrc link set` writes the first two of these files, and the relay started with `--link DIR`
-writes the others:
+With `--link DIR`, the relay and `cloudrc link set` exchange files: `link set` writes the files in
+the first line of this list, the relay writes the others.
 
     DIR/profile.json, change.json            requested profile; missing before the first change
     DIR/uplink.json, downlink.json           applied state of the link (`cloudrc/link/state.py`)

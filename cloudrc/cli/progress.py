@@ -1,4 +1,4 @@
-"""Progress of a flight: a status line on a terminal, one line per event elsewhere."""
+"""Show the progress of a flight: a line per event and, on a terminal, a status line."""
 
 from __future__ import annotations
 

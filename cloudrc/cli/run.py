@@ -147,7 +147,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
 def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
     """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
-    With `latest`, point the symbolic link `runs/latest` to the folder in `runs`.
+    With `latest` and without `out`, point the symbolic link `runs/latest` to the new folder.
 
     Raises:
         BadInputError: If `out` exists and is not an empty folder, or if no folder can be made.

@@ -43,7 +43,7 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
 
 
 def summarise(reports: Sequence[Report]) -> dict[str, Any]:
-    """Count all and the successful runs; compute median and interval of each measurement."""
+    """Count all runs and successful runs; compute median and interval of each measurement."""
     numbers = {}
     for name, unit in _units(reports).items():
         found = [r["numbers"][name]["value"] for r in reports if name in r["numbers"]]

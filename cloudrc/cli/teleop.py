@@ -34,7 +34,7 @@ emergency stop."""
 LOCK_PERIOD = 0.2
 """Time between two attempts to open the journal while another teleop process locks it [s]."""
 PAUSE_LIMIT_NS = 500_000_000
-"""Longest time that a process asked to end waits until the robot holds its position [ns]."""
+"""Longest time for which teleop, asked to end, waits until the robot holds its position [ns]."""
 EPILOG = """\
 teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. It ends
 on SIGTERM, on Ctrl-C and when its parent process has ended; with --start also
@@ -78,7 +78,7 @@ def api_address(text: str) -> Address | Path:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run teleop until its mission has ended or a signal stops the process."""
+    """Run teleop until a signal stops the process or, with --start, the mission has ended."""
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.geometry.scene import load_scene

@@ -37,7 +37,7 @@ _SCALARS = {
         [*"-+.0123456789"],
     ),
 }
-"""YAML tag of a type of scalar -> pattern of its text, and possible first characters.
+"""Type of a scalar -> pattern of its text, and possible first characters of the text.
 Source: YAML 1.2.2, section 10.3.2."""
 _TAG = "tag:yaml.org,2002:"
 
@@ -206,7 +206,7 @@ class Document:
 
 
 def child(node: Any, key: str) -> Any:
-    """Return the value of a mapping at `key` or of a list at the index `key`, or None."""
+    """Return the value at a key of a mapping or at an index of a list; None if there is none."""
     if isinstance(node, dict):
         return node.get(key)
     if isinstance(node, list) and key.isdecimal() and int(key) < len(node):

@@ -196,7 +196,7 @@ def _is_inside_name(path: KeyPath) -> bool:
 def _validate(
     document: Document, model: type[_Model], name: str, found: Sequence[Problem] = ()
 ) -> _Model:
-    """Check a document against its model; raise an error about all problems, also in `found`."""
+    """Check a document against its model; raise an error about all problems, including `found`."""
     known = {problem.path for problem in found}
     # Error messages describe a file, in which for example the mission may be a name.
     file_model = Experiment if model is ResolvedExperiment else model
@@ -217,7 +217,7 @@ def _default(document: Document, path: KeyPath, value: Any) -> None:
 
 @contextmanager
 def _collect(found: list[Problem], path: KeyPath) -> Iterator[None]:
-    """Convert a BadInputError of the block to a problem of the value at `path`, in `found`."""
+    """If the block raises a BadInputError, add a problem of the value at `path` to `found`."""
     try:
         yield
     except BadInputError as error:

@@ -1,8 +1,8 @@
 """Check whether the robot can fly a mission in a scene.
 
-Each waypoint must be in the region in which the guard lets the robot fly. The robot must not come
-near the wall of a pipe: neither at a waypoint, nor on the straight path to it from the spawn point
-or the previous waypoint. The board is not checked: the paper's last waypoint is behind the board.
+Each waypoint must be in the region in which the guard lets the robot fly. The robot must keep a
+distance from the walls of pipes at each waypoint, and on the straight path to the waypoint from the
+spawn point or from the previous waypoint. The board may be in the way, as in the paper's mission.
 """
 
 from __future__ import annotations

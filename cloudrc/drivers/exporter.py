@@ -77,10 +77,10 @@ class _Server(socketserver.ThreadingTCPServer):
         super().server_bind()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer on a new thread; close the oldest of too many connections."""
+        """Answer on a new thread; above `CONNECTIONS_MAX`, close the oldest connection."""
         self._newest.append(request)
         if len(self._newest) > CONNECTIONS_MAX:
-            with suppress(OSError):  # it has been answered
+            with suppress(OSError):  # the client has its answer
                 self._newest.popleft().shutdown(socket.SHUT_RDWR)
         super().process_request(request, client_address)
 
@@ -185,7 +185,7 @@ class Exporter:
         self._live.see([Counted(0, "link", "unresolved", count)])
 
     def recording(self, sync_age: Callable[[], float | None]) -> None:
-        """Set the function that returns the time since the recording's last sync [s], or None."""
+        """Set the function that returns the time since the recording's last sync to disk [s]."""
         self._sync_age = sync_age
 
     @property
@@ -248,7 +248,7 @@ class Exporter:
         return Answer(200, "ready\n") if self.is_ready else Answer(503, "no peer yet\n")
 
     def _liveness(self) -> Answer:
-        """Answer whether the loop of this process runs; link and peer play no role."""
+        """Answer whether the loop of this process runs, even if the link or the peer is down."""
         still = 0.0 if self._seen_at is None else time.monotonic() - self._seen_at
         if still <= STILL_MAX:
             return Answer(200, "alive\n")

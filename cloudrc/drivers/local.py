@@ -58,7 +58,7 @@ UNANNOUNCED = (
 
 
 def places() -> list[Path]:
-    """List the folders for flight files: XDG_RUNTIME_DIR, which a cron job lacks, and the state's.
+    """List the folders for flight files: in XDG_RUNTIME_DIR, if it is set, and XDG_STATE_HOME.
 
     Source: XDG Base Directory Specification.
     """

@@ -128,7 +128,7 @@ class Feed:
         return ask
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Write those of the records that belong to the feed."""
+        """Write the records that belong to the feed: all of `EVENTS`, some of `SAMPLED`."""
         for record in records:
             if isinstance(record, EVENTS):
                 if not isinstance(record, LinkChanged) or self._is_news(record):
@@ -149,7 +149,7 @@ class Feed:
         return True
 
     def _write(self, line: str) -> None:
-        """Write a line, after the unwritten end of the last line; drop the line without space."""
+        """Complete the last line, then write a new line; drop the new line if the pipe is full."""
         data = line.encode(errors="backslashreplace") + b"\n"
         with suppress(OSError):  # the pipe is full or closed: continue without the feed
             self._rest = self._rest[os.write(self._descriptor, self._rest) :]
@@ -198,7 +198,7 @@ def _from_json(kind: Any, value: Any) -> Any:
 
 
 class LinkNotes:
-    """Turns the state of the link in the sending direction of world or cloud into records.
+    """Makes records of the state of the link, for the direction in which this process sends.
 
     The process of the link writes its state to a file, and the lateness of its datagrams to a
     second file. World and cloud do not trust the content of these files.
@@ -267,7 +267,7 @@ class EndProcess:
         keys: Key file, which is reloaded when it changes.
         feed: Sends records to the supervisor.
         exporter: Turns the records into metrics; None for no metrics.
-        flights_only: Whether the recorder keeps events only while the robot does not fly.
+        flights_only: Whether to record events but no samples while the robot does not fly.
         link: File with the state of the link; None if the state is not recorded.
         check: Compares the received datagrams with the link profile; None for no comparison.
     """

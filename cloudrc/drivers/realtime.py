@@ -85,8 +85,8 @@ class Peer:
     def follow(self, now_ns: int) -> None:
         """Update the address from the route file, if a check is due at `now_ns` [ns].
 
-        If the file is missing or incomplete, keep the last address; also if it contains a host
-        name, because a query to a name server would block the loop.
+        If the file is missing or incomplete, or contains a host name, keep the last address: a
+        query to a name server would block the loop.
         """
         if self.route is None or now_ns < self._followed_ns:
             return

@@ -73,7 +73,7 @@ def _read_clocks() -> tuple[float, float]:
 class FlightsOnly:
     """Keeps all records during a flight, and only events between flights.
 
-    Otherwise the records of an idle robot would fill a pod's volume within hours.
+    All records of an idle robot would fill a pod's volume within hours.
     """
 
     def __init__(self, flies: Callable[[], bool]) -> None:
@@ -110,7 +110,7 @@ class RecordingThread:
             thread.start()
 
     def sync_age(self) -> float | None:
-        """Return for how long records have not been on the disk [s]; None before the first sync."""
+        """Return the time since the last sync to disk began [s]; None before the first sync."""
         return None if self._safe_since is None else time.monotonic() - self._safe_since
 
     def take_steps(self) -> list[float]:

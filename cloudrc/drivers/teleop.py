@@ -1,6 +1,6 @@
 """Run teleop in its own process, and connect the processes of teleop and cloud by Unix sockets.
 
-    cloud process: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  serve_teleop - machine
+    cloud: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  teleop: serve_teleop - machine
 
 No call blocks. A datagram is lost if the socket of the receiver is full or missing. Each process
 may restart while the other runs: teleop repeats its setpoint and requests, and stores mission
@@ -48,7 +48,7 @@ Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
 """Function that decodes a message; it raises a ValueError if the bytes are not a message."""
 Calls = Callable[[], Iterable[Callable[[int], None]]]
-"""Function that returns the calls that other threads have queued; they take the time [ns]."""
+"""Function that returns the queued calls of other threads. A call gets the time [ns]."""
 
 
 class UnixPeer:

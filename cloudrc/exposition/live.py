@@ -68,16 +68,16 @@ COUNTS = {
 }
 """Metric -> `Counted.name` of its count; {} stands for the value of the metric's label."""
 ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
-"""Metrics that only one of relay and netem has; absent unless a record with their count exists."""
+"""Metrics that only one kind of shaper has; they are left out while there is no count for them."""
 PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "cloudrc_link_release_error_seconds": ("release_error", table.RELEASE_PERCENTILES),
     "cloudrc_link_step_lateness_seconds": ("step_lateness", table.STEP_PERCENTILES),
 }
-"""Metric -> first part of the names of its counts [ns], and label value -> last part of a name."""
+"""Metric -> parts of the names of its counts, such as `release_error_p50_ns`, by label value."""
 
 
 def read_counts(role: str, counts: Mapping[str, int]) -> Iterator[tuple[str, dict[Labels, float]]]:
-    """Yield the metrics of a process of `role` that are equal to counts: name and values."""
+    """Yield name and values of each metric that is a count of a process of `role`."""
     for metric in of_role(role):
         pattern = COUNTS.get(metric.name)
         if pattern is None or (metric.name in ONE_SHAPER and pattern not in counts):
@@ -123,14 +123,14 @@ class LinkVerdict:
         return json.dumps(document, indent=2) + "\n"
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         if self.verdict == "open":
             return {}
         return {"cloudrc_link_believed": {(self._direction,): float(self.verdict == "ok")}}
 
 
 CLOCK_SET = "wall_clock"
-"""Code of the fault that the wall clock made a step."""
+"""Fault code for a step of the wall clock."""
 SILENCE_NS = 2_000_000_000
 """Time without a new datagram from the peer after which the peer counts as disconnected [ns]."""
 
@@ -207,7 +207,7 @@ class End:
             self._age.observe(delay + (now_ns - self._newest_ns) * 1e-9)
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         counts, stream, incoming = self._counts, self._stream, self._incoming
         datagrams: dict[Labels, float] = {
             (incoming, name): counts.get(name, 0) for name in self._outcomes
@@ -240,7 +240,6 @@ class WorldEnd(End):
     """Metrics of world: those of `End`, and robot, guard, contacts, real-time factor."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        """Set the counts; the guard is in the state GROUND at first."""
         super().__init__(table.WORLD, counts)
         self._truth: GroundTruth | None = None
         self._guard = GuardState.GROUND
@@ -292,7 +291,7 @@ class WorldEnd(End):
             self._instants.append((record.stamp_ns, now_ns))
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         readings = super().read() | {
             "cloudrc_clouds_admitted_total": unlabelled(self._admitted),
             "cloudrc_guard_state": unlabelled(self._guard),
@@ -315,7 +314,6 @@ class CloudEnd(End):
     """Metrics of cloud: those of `End`, and delays in the loop, prediction, control."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        """Set the counts; there is no control period yet."""
         super().__init__(table.CLOUD, counts)
         self._rtt = self._histograms["cloudrc_rtt_seconds"]
         self._loop = self._histograms["cloudrc_loop_delay_seconds"]
@@ -347,7 +345,7 @@ class CloudEnd(End):
         self._delay.sent(record)
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         prediction, control = self._prediction, self._control
         readings = super().read() | {
             "cloudrc_delay_estimate_error_seconds": unlabelled(self._delay.error),
@@ -381,7 +379,6 @@ class Link:
     """
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        """Set the counts of the process; nothing is shaped yet."""
         self.tell: Callable[[], str] = lambda: "{}\n"
         self._counts = counts
         self._shapers: dict[str, Labels] = {}
@@ -402,7 +399,7 @@ class Link:
         self._delays[direction] = delay
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         counts = dict(self._counts)  # an atomic copy: another thread may change the counts
         readings: Readings = {
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
@@ -424,12 +421,7 @@ class Mission:
     """Metrics of missions, computed from mission events."""
 
     def __init__(self, *, always: bool) -> None:
-        """Set the state to idle: there is no mission yet.
-
-        Args:
-            always: True to expose these metrics before the first event; False in a process that
-                may have no mission.
-        """
+        """Set whether to expose these metrics `always` or only after the first event."""
         self._shown = always
         self._state, self._waypoint, self._reached = "idle", NO_WAYPOINT, 0
         self._ended = dict.fromkeys(table.MISSION_OUTCOMES, 0)
@@ -452,7 +444,7 @@ class Mission:
             self._state, self._waypoint = "starting", NO_WAYPOINT
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         if not self._shown:
             return {}
         return {
@@ -522,7 +514,7 @@ class LiveMetrics:
                 handle(record)
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         readings: Readings = dict(read_counts(self._role, dict(self._counts)))
         for part in self._parts:
             readings |= part.read()

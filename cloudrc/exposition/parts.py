@@ -63,7 +63,7 @@ def per_axis(vector: Vector) -> dict[Labels, float]:
 
 
 def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """Make the reading of a metric with one label from label value -> value of the metric."""
+    """Make the reading of a metric with one label; `counts` maps label to metric values."""
     return {(name,): count for name, count in counts.items()}
 
 
@@ -93,7 +93,7 @@ class DatagramTally:
 
     @property
     def expected(self) -> int:
-        """Number of datagrams about which it is decided whether they have arrived or are lost."""
+        """Number of datagrams at least `WINDOW` older than the newest: arrived or lost."""
         return self._before + max(0, self._newest - self._first - WINDOW + 1)
 
     def take(self, epoch: int, counter: int) -> bool:
@@ -135,7 +135,7 @@ class PredictionJudge:
     """Compares each predicted position with the position measured at the same instant.
 
     Attributes:
-        error: Newest error: predicted minus measured position [m], shape (3,); NaN before that.
+        error: Newest error: predicted minus measured position [m], shape (3,); NaN at first.
         square: Sum of the squared lengths of all errors [m^2].
         judged: Number of compared predictions.
     """

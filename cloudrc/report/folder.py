@@ -48,7 +48,7 @@ class _EarlierReport(BaseModel):
 def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     """Read the folder of a run; return arguments for `write_report`.
 
-    The run may be incomplete. If it did not merge the recordings of world and cloud, merge them.
+    The run may be incomplete. If the recordings of world and cloud are not merged yet, merge them.
 
     Raises:
         BadInputError: If the folder has no experiment or no readable recording, or if data that a

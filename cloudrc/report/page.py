@@ -48,7 +48,7 @@ GROUPS = {
 """Title of a group in the table of numbers -> names of its metrics. Other metrics are under
 "Others"."""
 SHARES = ("loss_", "late_")
-"""First parts of the names of metrics that the page shows in per cent."""
+"""Prefixes of the names of metrics that the page shows in per cent."""
 
 
 def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:

@@ -21,8 +21,8 @@ FIGURES: dict[str, tuple[Draw, Write, str]] = {
     "error": (curves.draw_error, lambda s: curves.ERROR + marks.legend(s), curves.ERROR_ALT),
     "snapshots": (snapshots.draw, lambda s: snapshots.CAPTION, snapshots.ALT),
 }
-"""Name of a figure -> functions for the figure and its caption, and a text for readers who cannot
-see it; in the order of the page. The paper has the figures delay, odom and error."""
+"""Name of a figure -> function that draws the figure, function that returns the caption, text for
+readers who cannot see the figure. The figures of the paper are delay, odom and error."""
 NAMES = tuple(FIGURES)
 
 
@@ -38,9 +38,9 @@ class Picture:
 
 
 def draw_all(subject: Subject) -> list[Picture]:
-    """Draw all figures. Only one thread of a process may draw at a time.
+    """Draw all figures.
 
-    The reason is that matplotlib has one set of settings for the whole process.
+    Only one thread at a time may draw, because matplotlib's settings are global in a process.
     """
     pictures = []
     with matplotlib.rc_context():

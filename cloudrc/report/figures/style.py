@@ -62,7 +62,7 @@ def panel(axes: Axes, letter: str, title: str = "") -> None:
 
 
 def legend_above(axes: Axes, columns: int) -> None:
-    """Draw a panel's legend, if there is one, above the panel, with a number of columns."""
+    """Draw the legend of a panel, if there is one, above the panel in `columns` columns."""
     if axes.get_legend_handles_labels()[0]:
         axes.legend(
             loc="lower right",
@@ -76,7 +76,7 @@ def legend_above(axes: Axes, columns: int) -> None:
 def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1.8) -> None:
     """Draw dots of `size` [points] at `x` and `y`, any unit, and add them to the legend.
 
-    In an SVG file the dots are a bitmap, because thousands of vector shapes would make it slow.
+    In an SVG file the dots are a bitmap, because thousands of vector shapes are slow to display.
     """
     axes.plot(x, y, ".", ms=size, mew=0, color=colour, rasterized=True, zorder=2)
     axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label=name)
