@@ -77,7 +77,7 @@ class Api:
             return json.loads(answer.read())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
-        """Yield all missions' events with an event id above `after`, until teleop ends."""
+        """Yield the events of all missions, after the event with the id `after`; end with teleop."""
         with self._answer("GET", f"/v1/events?after={after}", None, STREAM_TIMEOUT) as stream:
             for line in stream:
                 if line.startswith(b"data: "):

@@ -74,8 +74,8 @@ def map_in_order(
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    At most `jobs` worker processes run, and at most one per core. If that is one, this process
-    makes all calls itself. The function has to be at module level, so that a worker can import it.
+    At most `jobs` worker processes run, and at most one per core. In place of a single worker, this
+    process makes all calls. The function has to be at module level: a worker imports the function.
     Ctrl-C or closing the generator kills the workers and drops all calls that have not ended.
     """
     workers = min(jobs, len(work), os.cpu_count() or 1)

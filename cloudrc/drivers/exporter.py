@@ -106,7 +106,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing: a request comes every few seconds."""
+        """Log nothing, because a request arrives every few seconds."""
 
 
 def read_throttling(root: Path = CGROUP) -> Readings:

@@ -333,10 +333,10 @@ class EndProcess:
     def look_around(
         self, records: list[Record], slip_ns: int, clock_steps: list[float]
     ) -> list[Record]:
-        """Return records about `clock_steps` of the wall clock [s], new keys and the link.
+        """Return records about steps of the wall clock, new keys, and the state of the link.
 
         `records` are the newest records of the endpoint. `slip_ns` is the lag of the endpoint's
-        clock behind the machine's monotonic clock [ns].
+        clock behind the machine's monotonic clock [ns]. `clock_steps` are in seconds.
         """
         now_ns = time.monotonic_ns()
         noted: list[Record] = [

@@ -34,7 +34,7 @@ TELL_NS = PERIOD_NS - 5_000_000
 ALIVE_NS = 200_000_000
 """Period of the empty datagrams that show teleop that cloud runs if no telemetry arrives [ns]."""
 STALL_NS = 100_000_000
-"""Lateness of a loop above which it was stalled [ns]: the datagrams in its full socket are old."""
+"""Lateness above which a loop counts as stalled [ns]: its socket is full of old datagrams."""
 BLIND_WAKES = 5
 """Largest number of periods for which teleop waits for a new state of the robot after a stall."""
 SILENCE_NS = 1_000_000_000
@@ -48,7 +48,8 @@ Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
 """Function that decodes a message; it raises a ValueError if the bytes are not a message."""
 Calls = Callable[[], Iterable[Callable[[int], None]]]
-"""Function that returns the queued calls of other threads. A call gets the time [ns]."""
+"""Function that returns the calls that other threads have queued. Each call has one argument, the
+time [ns], monotonic clock."""
 
 
 class UnixPeer:

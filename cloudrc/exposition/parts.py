@@ -63,7 +63,7 @@ def per_axis(vector: Vector) -> dict[Labels, float]:
 
 
 def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """Make the reading of a metric with one label; `counts` maps label to metric values."""
+    """Make the reading of a metric with one label from its count for each label value."""
     return {(name,): count for name, count in counts.items()}
 
 
@@ -93,7 +93,7 @@ class DatagramTally:
 
     @property
     def expected(self) -> int:
-        """Number of datagrams at least `WINDOW` older than the newest: arrived or lost."""
+        """Number of datagrams for which the receiver no longer waits: arrived or lost."""
         return self._before + max(0, self._newest - self._first - WINDOW + 1)
 
     def take(self, epoch: int, counter: int) -> bool:

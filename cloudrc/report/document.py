@@ -48,7 +48,7 @@ class Assessment:
     flight: Flight
     numbers: dict[str, Number]  # metric -> value, for metrics with a known value
     verdict: Verdict
-    operator: Verdict | None  # verdict of teleop at the end of the mission, if it differs
+    operator: Verdict | None  # verdict at the end of the mission, if it differs
     notes: tuple[str, ...]  # sentences for the reader of the report
 
     @property

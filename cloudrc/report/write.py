@@ -16,7 +16,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.report.document import Assessment, Run, environment_document, write_json
 
 DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
-"""Start of the note that teleop's verdict at the end of the mission differs from the report's."""
+"""Start of the note that the verdict at the end of the mission differs from the report's."""
 RECORDING_NOTE = "The recording "
 """Start of the notes about a recording, by which a new report recognises and drops old notes."""
 
