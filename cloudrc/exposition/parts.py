@@ -35,7 +35,7 @@ class Histogram:
         self._counts = [0] * (len(bounds) + 1)
 
     def observe(self, value: float) -> None:
-        """Count a `value`, which has the unit of the bounds."""
+        """Count a `value` [unit of the bounds]."""
         self._counts[bisect_left(self.bounds, value)] += 1
         self.total += value
 
@@ -49,12 +49,15 @@ Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 
 
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Make the reading of a metric without labels; if `value` is NaN, the reading is empty."""
+    """Make the reading of a metric without labels from `value` [unit of the metric].
+
+    The reading of NaN is empty.
+    """
     return {} if isnan(value) else {(): value}
 
 
 def per_axis(vector: Vector) -> dict[Labels, float]:
-    """Make the reading of a metric with the label `axis` from the three values of `vector`.
+    """Make the reading of a metric with the label `axis` from `vector` [unit of the metric].
 
     Leave out axes whose value is NaN.
     """

@@ -42,7 +42,7 @@ ROTOR_COLOUR, BOARD_COLOUR = (0.10, 0.10, 0.12), (0.95, 0.84, 0.58)
 
 
 class Face(NamedTuple):
-    """A flat convex polygon; `corners` are k points [m], world frame, shape (k, 3)."""
+    """A flat convex polygon: k corners [m], world frame, shape (k, 3); opacity in [0, 1]."""
 
     corners: Array
     colour: Colour
