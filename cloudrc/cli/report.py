@@ -1,4 +1,4 @@
-"""`cloudrc report RUN`: write the report of a recorded run again, and print its summary."""
+"""`cloudrc report RUN`: write the report of a recorded run again, and print a summary."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAIN = {
     "hold_count": "times in HOLD",
     "real_time_factor": "real-time factor",
 }
-"""Number in the summary -> its label; report.html and report.json contain all numbers."""
+"""Numbers that the summary shows, and their labels. The report files contain all numbers."""
 EPILOG = """\
 examples:
   cloudrc report runs/latest
@@ -72,7 +72,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def summary(report: Mapping[str, Any], folder: Path) -> str:
-    """Return the verdict, the failures, the main numbers and the path of report.html as text."""
+    """Summarize a report as text: verdict, failures, main numbers and path of report.html."""
     from cloudrc.metrics import Number
     from cloudrc.report.page import readable
 

@@ -1,8 +1,8 @@
 """Define every key of experiments, missions and link profiles, with its unit, range and default.
 
 The name of a key ends with its unit (`delay_ms`); `cloudrc/assembly.py` converts the values to SI
-units. Unknown keys are refused. The defaults are the paper's scheme with the published gains.
-`Experiment` is what a file may contain; `config.load.ResolvedExperiment` is what a run flies.
+units. Unknown keys are refused. The defaults are the control scheme and the gains of the paper.
+`Experiment` describes a file. `config.load.ResolvedExperiment` is the result of loading the file.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ Point = tuple[Finite, Finite, Finite]
 NotNegative = Annotated[float, Field(ge=0)]
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 Positive = Annotated[float, Field(gt=0)]
-# The guard's limits have bounds on both sides: none of them can be switched off.
+# Every limit of the guard has a smallest and a largest value, so that nobody can switch it off.
 COMMAND_AGE_MS = 1, 10_000
-"""Range of the age limit of commands: smallest and largest value [ms]."""
+"""Smallest and largest value of guard.command_age_max_ms [ms]."""
 CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
 Speed = Annotated[float, Field(ge=0.01, le=10)]
 Acceleration = Annotated[float, Field(ge=0.1, le=100)]
 YawRate = Annotated[float, Field(ge=0.01, le=10)]
 HoldTime = Annotated[float, Field(ge=0.1, le=3600)]
 DURATION_MAX = 1_000_000
-"""Largest value for a time limit or a dwell in a mission [s]: eleven days."""
+"""Largest value of a time limit, or of a dwell time in a mission [s]: eleven days."""
 Dwell = Annotated[float, Field(ge=0, le=DURATION_MAX)]
 TimeLimit = Annotated[float, Field(gt=0, le=DURATION_MAX)]
 Probability = Annotated[float, Field(ge=0, le=1)]

@@ -1,7 +1,7 @@
-"""The table of all Prometheus metrics: name, type, meaning, labels, and the exposing processes.
+"""Define all Prometheus metrics: name, type, meaning, labels, and the processes that expose them.
 
-Names follow the rules of Prometheus: prefix `cloudrc_`, base units, counters end in `_total`. Each
-label has a closed set of values, so that one pod has fewer than 200 series.
+Names follow the rules of Prometheus: prefix `cloudrc_`, base units, `_total` at the end of
+counters. The values of a label are known in advance: one pod has fewer than 200 series.
 """
 
 from __future__ import annotations
@@ -27,44 +27,45 @@ OUTCOMES = (
     *("sent", "used", "late", "stale", "repeated", "old_epoch", "range", "future", "malformed"),
     *("version", "direction", "accept_ignored", "tag", "hello", "busy", "unanswered"),
 )
-"""What can happen to a datagram. The sender counts "sent", the receiver the other outcomes."""
+"""Outcomes of a datagram. The sender counts "sent", the receiver counts all other outcomes."""
 ONLY_WORLD = {"stale", "range", "future", "hello", "unanswered"}
 """Outcomes that only world counts."""
 ONLY_CLOUD = {"accept_ignored"}
 """Outcomes that only cloud counts."""
 LIMITS = ("speed", "yaw_rate", "fence")
-"""Limits of the guard."""
+"""Limits to which the guard restricts commands."""
 PLUGINS = ("estimator", "predictor", "controller")
 GUARD_STATES = ("ground", "track", "hold", "land", "estop")
 """States of the guard, in the order of `cloudrc.messages.GuardState`."""
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
-"""States of a mission; the index of a state is the value of `cloudrc_mission_state`."""
+"""States of a mission; the value of `cloudrc_mission_state` is the index of the state."""
 MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
 API_REFUSALS = ("token", "role", "busy")
-"""Reasons for which the API rejects a request: no valid token; a reader's token for a request of an
-operator; too many requests at the same time."""
+"""Reasons for which the API rejects a request. "token": no valid token; "role": the token does not
+allow this request; "busy": too many requests at the same time."""
 ORDER_REFUSALS = ("invalid", "conflict")
-"""Reasons for which the API refuses an order: a value is invalid; another mission is active."""
+"""Reasons for which the API refuses a mission. "invalid": a value is invalid; "conflict": another
+mission is active."""
 BODIES = ("pipe", "board", "floor", "other")
-"""Kinds of bodies: `pipe_2` is a "pipe"; a body of any other kind counts as "other"."""
+"""Kinds of bodies that the robot can touch, such as "pipe" for the body `pipe_2`."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
-"""What can happen to a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains each."""
+"""Outcomes of a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains them."""
 SHAPERS = ("relay", "netem")
 LINK_MODES = ("auto", "relay", "netem")
 
 DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
-"""Upper bounds for delays and ages [s]."""
+"""Upper bounds of the buckets of delays and ages [s]."""
 GAP_BUCKETS = (0.05, 0.25)
-"""Upper bounds for gaps between arrivals [s]: a gap that jitter cannot explain, and the age at
-which the guard holds. There are only two bounds, to stay below 200 series per pod."""
+"""Upper bounds of the buckets of times between two arrivals [s]: 50 ms, more than jitter can cause,
+and 250 ms, after which the guard holds."""
 PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
-"""Upper bounds for loop periods [s], around the 10 ms of both loops."""
+"""Upper bounds of the buckets of loop periods [s]; the nominal period is 10 ms."""
 LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)
-"""Upper bounds for late wakes [s]."""
+"""Upper bounds of the buckets of the lateness of loops [s]."""
 RELEASE_PERCENTILES = {"50": "p50", "99": "p99", "99.9": "p999"}
-"""Label value -> name in the relay's `release_error_*` counts."""
+"""Value of the label `percentile` -> part of the name of the relay's count `release_error_*`."""
 STEP_PERCENTILES = {"50": "p50", "99": "p99"}
-"""Label value -> name in netem's `step_lateness_*` counts."""
+"""Value of the label `percentile` -> part of the name of netem's count `step_lateness_*`."""
 
 Labels = tuple[str, ...]
 
@@ -81,12 +82,12 @@ class Metric(NamedTuple):
     """One Prometheus metric.
 
     Attributes:
-        name: Name in the scrape; a histogram adds `_bucket`, `_sum` and `_count`.
+        name: Name of the metric; a histogram adds `_bucket`, `_sum` and `_count`.
         kind: Type of the metric.
         meaning: The HELP text, one or two sentences.
         roles: Processes that expose the metric.
         labels: Label name -> all possible values of the label.
-        buckets: Upper bounds of a histogram, rising, in the metric's unit.
+        buckets: Upper bounds of a histogram's buckets, in rising order and the metric's unit.
     """
 
     name: str
@@ -247,7 +248,7 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         """,
     ),
 )
-"""Exposing processes, and the names and meanings of the metrics that they expose."""
+"""Processes -> names and meanings of the metrics that they expose."""
 
 _BY_DIRECTION: Mapping[str, Labels] = {"direction": DIRECTIONS}
 _BY_AXIS: Mapping[str, Labels] = {"axis": AXES}
@@ -277,7 +278,7 @@ _LABELS: Mapping[str, Mapping[str, Labels]] = {
     "cloudrc_link_datagrams_total": {"outcome": LINK_OUTCOMES},
     "cloudrc_link_release_error_seconds": {"percentile": tuple(RELEASE_PERCENTILES)},
 }
-"""Name of a metric -> label -> all values of the label; () if the set is open."""
+"""Name of a metric -> label -> all values of the label; () if the values are not known."""
 _BUCKETS: Mapping[str, tuple[float, ...]] = {
     "cloudrc_link_gap_seconds": GAP_BUCKETS,
     "cloudrc_uplink_delay_seconds": DELAY_BUCKETS,
