@@ -176,9 +176,8 @@ def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
 def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfile) -> list[float]:
     """Draw jitter for a block in units of the profile's `jitter`, with mean 0, shape (256,).
 
-    Uniform jitter is in (-1, 1); normal and pareto jitter have standard deviation 1. Pareto jitter
-    has exponent 3 and is cut off at the 99.9 % quantile: it ranges from -0.69 to 12.1, with median
-    -0.32.
+    Uniform jitter is in (-1, 1); other jitter has standard deviation 1. Pareto jitter has exponent
+    3 and is cut off at the 99.9 % quantile: it ranges from -0.69 to 12.1, with median -0.32.
 
     With a correlation c, the function transforms normal variates of correlation c. So the
     distribution stays exact, but the jitter has another correlation: (6/π) · asin(c/2) if uniform,

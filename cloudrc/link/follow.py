@@ -55,8 +55,7 @@ class Loaded(NamedTuple):
 
 
 Load = Callable[[Path], Loaded]
-"""Function that reads and checks a profile's file; raises a BadInputError if the profile is
-invalid."""
+"""Function that reads and checks a profile's file; raises a BadInputError if it is invalid."""
 
 
 class ProfileFile:
@@ -64,8 +63,7 @@ class ProfileFile:
 
     Kubernetes mounts a ConfigMap as links into the folder `..data`. `..data` is itself a link,
     which Kubernetes replaces in one step, so that the same path leads to another file. A check for
-    a change takes one system call, because it runs 20 times per second and must not delay the
-    shaper.
+    a change runs 20 times per second, so it takes only one system call.
     """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:

@@ -111,9 +111,8 @@ class Log:
     def packets(self) -> Packets:
         """Check the packets, sort them by time of sending, and note what was changed.
 
-        Raises a BadInputError if more than 1 % of the rows cannot be used, if more than 1 % repeat
-        the time of an earlier row, if no packet arrived, if a delay is negative, or if the times
-        jump back.
+        Raises a BadInputError if no packet arrived, if a delay is negative, if the times jump back,
+        or if more than 1 % of the rows are unusable or repeat the time of an earlier row.
         """
         self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
         arrived = [delay for _, delay in self.entries if delay is not None]
@@ -176,8 +175,7 @@ def trace_of(packets: Packets) -> Trace:
     """Make a trace that repeats the delays and losses of a log at the log's packet rate.
 
     Each row holds for half a period before and after the time at which its packet was sent. So a
-    packet that is replayed slightly early or late still gets the right row. Time 0 is the first
-    packet.
+    packet that is replayed a little early or late gets the right row. Time 0 is the first packet.
     """
     sent = packets.sent
     halfway = [(before + after) / 2 - sent[0] for before, after in pairwise(sent)]
@@ -201,8 +199,7 @@ _OTHERS = {
         "the output of traceroute or mtr, which has no delay of each packet; give one of ping -D"
     ),
 }
-"""Pattern in a file's first lines -> name of the tool that wrote the file, and remedy for the
-user."""
+"""Pattern in a file's first lines -> the tool that wrote the file, and remedy for the user."""
 
 
 def refuse_others(lines: list[str], name: str) -> None:
@@ -296,7 +293,7 @@ _IRTT_NAMES = {
     "uplink": ("true_down", "send"),
     "downlink": ("true_up", "receive"),
 }
-"""Delays to read -> value of irtt's key `lost` for packets to leave out, and irtt's key of the
+"""Delays to read -> irtt's value of `lost` for packets to leave out, and irtt's key of the
 delay."""
 
 
@@ -457,8 +454,7 @@ def _csv_delay(row: Row, column: str, loss: str | None) -> float | None:
 def _without_marks(raw: list[Entry], column: str, decimals: int, log: Log) -> list[Entry]:
     """Replace numbers that mark lost packets, such as -1, by None, and count these packets.
 
-    `decimals` is the largest number of decimals in the column; -1 if a column `loss` marks lost
-    packets.
+    `decimals` is the largest number of decimals in the column; -1 if a column `loss` marks losses.
     """
     values = {value for _, value in raw if value is not None}
     below = {value for value in values if value < 0.0}
@@ -480,8 +476,7 @@ _STAMP = re.compile(
     r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"
     r"|(?P<date>\d{4}-\d\d-\d\d)?[T ]?(?P<hour>\d\d):(?P<minute>\d\d):(?P<second>\d\d\.\d+)\S* +"
 )
-"""Time stamp at the start of a line, as `ping -D`, `ts '[%.s]'` or `ping --apple-time` writes
-it."""
+"""Time stamp at the start of a line, from `ping -D`, `ts '[%.s]'` or `ping --apple-time`."""
 _NUMBER = re.compile(r"\b(?:icmp6?_)?(?:seq|req)[= ](\d{1,12})\b|(?<= : )\[(\d{1,12})\], ")
 _ROUND_TRIP = re.compile(r"(?:[=<] ?|, )(\d+(?:[.,]\d+)?) ?(?:ms|msec|msek|мс|毫秒|ミリ秒)(?=\W|$)")
 _REPLY = re.compile(r"ttl=|hlim=|bytes from", re.IGNORECASE)
@@ -496,8 +491,7 @@ _NO_STAMPS = {
     r"\], \d+ bytes": "run fping with -D",
     "": "run ping with -D",
 }
-"""Pattern that identifies a kind of ping -> how to get time stamps from it; the first match
-counts."""
+"""Pattern of a kind of ping -> how to get time stamps from it; the first pattern found counts."""
 
 
 def is_ping(lines: list[str]) -> bool:

@@ -42,7 +42,7 @@ from cloudrc.link.relay import Address
 NOT_FOUND = 127
 """Exit code that stands for a program that does not exist."""
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
-"""Handles of the root qdisc, of its band for the tunnel's datagrams, and of the netem qdisc in that
+"""Handles of the root qdisc, of its band for the tunnel's datagrams, and of the netem in that
 band."""
 PERIOD_NS = 1_000_000_000
 """Time between two checks of the qdiscs [ns]."""

@@ -152,8 +152,7 @@ class Timeline:
     Attributes:
         pieces: The pieces of the time line; if the time line loops, the pieces of one pass.
         pass_ns: Start of each piece, as time since the link came up, rising [ns].
-        period_ns: Duration of one pass of a looping time line [ns]; None if the time line does not
-            loop.
+        period_ns: Duration of one pass of a looping time line [ns]; None if there is no loop.
     """
 
     def __init__(self, profile: DirectionProfile) -> None:

@@ -34,14 +34,12 @@ from cloudrc.link.profile import DirectionProfile
 
 Address: TypeAlias = tuple[str, int]
 Peek: TypeAlias = Callable[[bytes], tuple[int, int, int]]
-"""Function that returns kind, epoch and counter of a datagram; raises a ValueError if it has
-none."""
+"""Function that returns kind, epoch and counter of a datagram, or raises a ValueError."""
 Send: TypeAlias = Callable[[bytes], object]
 """Function that sends a datagram; raises an OSError if the kernel refuses."""
 
 IN_FLIGHT_MAX = 10_000
-"""Largest number of datagrams in flight in one direction; further datagrams are dropped and
-counted."""
+"""Largest number of datagrams in flight in one direction; more are dropped and counted."""
 DATAGRAM_MAX = 2_048
 """Largest length of a datagram [bytes], to limit the memory that a lane uses."""
 BATCH = 32
@@ -395,8 +393,7 @@ class RelayShaper(Lanes):
         """Open the two sockets. The model's origin is on the machine's monotonic clock.
 
         Args:
-            listen: Address to which this pod's end of the tunnel sends; with port 0 the kernel
-                chooses.
+            listen: Address to which this pod's end of the tunnel sends; port 0: the kernel chooses.
             direction: Model of the link.
             peek: Function that reads kind, epoch and counter of a datagram.
             end: Address from which this pod's end of the tunnel sends. None accepts any sender.

@@ -1,8 +1,7 @@
 """Run a pod's `link` container: choose relay or netem, and follow changes of profile and peer.
 
 The route file contains the address to which this pod's end of the tunnel has to send. Other threads
-set the attributes `peer` and `profile` of the `Sidecar`. Only the thread that calls `run` uses the
-shaper.
+set the attributes `peer` and `profile` of the `Sidecar`. Only the thread in `run` uses the shaper.
 """
 
 from __future__ import annotations
@@ -43,8 +42,7 @@ STEP = 0.05
 Shaper: TypeAlias = RelayShaper | Netem
 """Shapes the datagrams that this pod's end of the tunnel sends."""
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
-"""Function that makes a shaper from a profile and the start of its time line [ns], monotonic
-clock."""
+"""Function that makes a shaper from a profile and the start of its time line [ns], monotonic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +51,7 @@ class Near:
 
     Attributes:
         interface: Interface through which the tunnel's datagrams leave.
-        netems: Interface -> its netem qdiscs as objects of `tc -s -j qdisc show`; other interfaces
-            are left out.
+        netems: Interface -> its netem qdiscs, if any, as objects of `tc -s -j qdisc show`.
     """
 
     interface: str
@@ -173,8 +170,7 @@ class Sidecar:
         """Wait until the peer is known, then shape until `stop` returns True.
 
         Raises:
-            CloudrcError: If the mode is "relay" or "netem", and this shaper cannot realise the
-                profile.
+            CloudrcError: If the mode is not "auto" and its shaper cannot realise the profile.
         """
         self._route.unlink(missing_ok=True)  # an earlier process may have left one
         while self.peer is None:

@@ -18,14 +18,12 @@ from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 STATE_FILE = "link.json"
 """Name of the state file, in the folder of the route file."""
 PROFILE_FILE = "profile.json"
-"""Name of the profile file, in the folder of the state files, that the relay of a local run
-follows."""
+"""Name of the profile file for the relay of a local run, in the folder of the state files."""
 STATE_MAX = 1 << 16
 """Size limit of a state file that world or cloud reads [bytes]: room for a time line of about 800
 changes. Reading a file of 1 MiB could block the control loop for 2 s."""
 RELEASED_SUFFIX = ".released"
-"""Suffix of the file in which a relay reports how late datagrams left: names and integers as
-JSON."""
+"""Suffix of the file in which a relay reports how late datagrams left: JSON, name -> integer."""
 RELEASED = frozenset(
     {"released", "released_early", "overflow", "stalled"}
     | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}

@@ -22,8 +22,7 @@ from cloudrc.link.profile import Trace
 SIZE_MAX = 64 << 20
 """Size limit of a file [bytes]: half a day at 100 packets a second."""
 START_MAX = 600.0
-"""Latest time of a trace's first row [s]. With a later start, a whole flight might use only this
-row."""
+"""Latest time of a trace's first row [s]; with a later start a flight might use only this row."""
 UNIX_TIME = 1e8
 """If the time of the first row is at least this large, all times are Unix times [s] (1e8 is in
 March 1973). Then the time of the first row is subtracted."""
@@ -140,8 +139,7 @@ class Row(NamedTuple):
     Attributes:
         where: File and line of the row, for messages.
         cells: Column -> text without blanks at its ends; the last columns may be missing.
-        decimal: Decimal sign, "." or ",". A comma is possible if semicolons or tabs separate the
-            cells.
+        decimal: Decimal sign, "." or ",". A comma only if semicolons or tabs separate the cells.
     """
 
     where: str

@@ -1,8 +1,8 @@
-"""Define the topics of a recording and convert records to their rows.
+"""Define the topics of a recording, and convert records to rows of topics.
 
-A record gives a row in one or more topics. A topic is a table with the column `stamp_ns` and the
-fields below, which are named as in `cloudrc/records.py`. In these tables quaternions are `wxyz` and
-velocities are in the world frame; `cloudrc/record/ros.py` converts both for ROS.
+Each record gives a row in one or more topics. A topic is a table with the column `stamp_ns` and the
+fields below, which are named as in `cloudrc/records.py`. Quaternions are `wxyz` and velocities are
+in the world frame; `cloudrc/record/ros.py` converts both for ROS.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from cloudrc.records import Record
 Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
 Values: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = tuple[str, int, Values]
-"""Topic, stamp [ns] on the clock of the end that records, values in the order of the fields."""
+"""Topic, stamp [ns] on the clock of the recording end (world or cloud), and values of the
+fields."""
 
 
 class Field(NamedTuple):
@@ -224,7 +225,7 @@ _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Val
 
 
 def values_getter(paths: list[str]) -> Callable[[Any], Values]:
-    """Make a function that reads the values at dotted paths from a record, always as a tuple."""
+    """Make a function that returns the values at dotted paths in a record, as a tuple."""
     if not paths:
         return lambda record: ()
     get = attrgetter(*paths)
@@ -243,7 +244,7 @@ _UPLINK, _DOWNLINK = _EXTRACT.pop(rec.Arrival)
 
 
 def rows(record: Record) -> list[Row]:
-    """Convert a record to one row for each of its topics, in the order of `TOPICS`."""
+    """Convert a record to one row for each topic that it belongs to, in the order of `TOPICS`."""
     if isinstance(record, rec.Arrival):
         name, stamp, values = _UPLINK if record.uplink else _DOWNLINK
         return [(name, stamp(record), values(record))]

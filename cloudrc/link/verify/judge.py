@@ -44,8 +44,7 @@ TOLERANCES = {
 """Quantity -> tolerance in the unit of the quantity, and tolerance as a share of the requested
 value. The larger tolerance counts. For the deviation on a relay, half the share is used."""
 SHARE_TOLERANCE = (0.02, 0.25)
-"""Tolerance of loss, reordering and duplication: absolute [1], and as a share of the requested
-value."""
+"""Tolerance of loss, reordering and duplication: absolute [1], and as a share of the request."""
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; quantities that are not listed are shares with the unit "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
@@ -112,8 +111,7 @@ class Plan:
         sent: Time of sending of each datagram, since the link came up [s], shape (n,).
         train: Number of datagrams in a train, which is sent back to back. Before each train, as
             many datagrams are sent one by one. 0 if there are no trains.
-        pause: Function that is called every few hundred microseconds, so that other threads can
-            run.
+        pause: Function called every few hundred microseconds, so that other threads can run.
     """
 
     profile: DirectionProfile
@@ -193,7 +191,7 @@ class Plan:
         """Compute the judged quantities of a stream; an unknown quantity is NaN.
 
         "deviation" is the standard deviation from the delay requested at each time [s], so it shows
-        the jitter alone. "distribution" is the Kolmogorov-Smirnov distance to the expected delays
+        the jitter alone. "distribution" is the Kolmogorov-Smirnov distance to the delays in
         `pooled` [1].
         """
         singles = self._singles(stream)

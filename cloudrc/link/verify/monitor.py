@@ -39,11 +39,10 @@ from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Reco
 PERIOD = 0.01
 """Period of telemetry and of commands [s]."""
 CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
-"""Time between two verdicts [ns]. Time after a new session or profile in which datagrams are not
-judged [ns]."""
+"""Time between two verdicts [ns], and time after a change of session or profile without one
+[ns]."""
 KEPT, FINAL = 6000, 128
-"""Largest number of datagrams that are judged. A missing datagram counts as lost after FINAL newer
-datagrams."""
+"""Largest number of datagrams judged; a missing one counts as lost after FINAL newer datagrams."""
 ENDS = 2e-3
 """Largest delay that world and cloud, if they wake on time, add to a round trip [s]."""
 FOLLOW_PERIOD = 0.1
@@ -56,8 +55,7 @@ DELAYS = {"mean", "deviation"}
 Asked: TypeAlias = tuple[DirectionProfile, DirectionProfile]
 """Requested profiles of uplink and downlink."""
 Load: TypeAlias = Callable[[object], Asked]
-"""Function that converts the values of a profile's file; raises a CloudrcError if they are
-invalid."""
+"""Function that converts the values of a profile's file, or raises a CloudrcError."""
 
 
 class LinkMonitor:
