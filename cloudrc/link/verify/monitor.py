@@ -39,8 +39,7 @@ from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Reco
 PERIOD = 0.01
 """Period of telemetry and of commands [s]."""
 CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
-"""Time between two verdicts [ns], and time after a change of session or profile without one
-[ns]."""
+"""Period of the verdicts, and pause after a change of session or profile [ns]."""
 KEPT, FINAL = 6000, 128
 """Largest number of datagrams judged; a missing one counts as lost after FINAL newer datagrams."""
 ENDS = 2e-3
