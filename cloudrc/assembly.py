@@ -97,10 +97,9 @@ def build_cloud(
 
     Args:
         experiment: The experiment.
-        identity: Cloud's keys and names for the tunnel.
+        identity: Clock, process and keys of cloud, for the tunnel.
         clock: Cloud's monotonic clock [ns].
-        teleop: The source of setpoints. With None, a new one flies the experiment's mission at
-            once.
+        teleop: Source of setpoints; None: a new one, which flies the mission at once.
         make_loop: Makes the control loop from the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud

@@ -1,7 +1,6 @@
 """The messages between world, cloud and teleoperation.
 
-Messages are named tuples, which are made four times faster than frozen dataclasses. All values are
-in SI units.
+Messages are named tuples, which are four times as fast as frozen dataclasses, in SI units.
 
 - Stamps: integer nanoseconds on the monotonic clock of world or cloud, as stated. Only stamps of
   the same clock may be subtracted.
@@ -33,8 +32,7 @@ class GuardState(IntEnum):
     TRACK = 1
     """The robot follows fresh commands from the cloud."""
     HOLD = 2
-    """There is no fresh command: the robot brakes, then holds its position with onboard sensors
-    alone."""
+    """No command is fresh: the robot brakes, then holds its position with onboard sensors only."""
     LAND = 3
     """The robot descends slowly, and stops its rotors when it touches down. Lasts until the
     operator acknowledges."""
@@ -154,8 +152,7 @@ class Command(NamedTuple):
 
     Attributes:
         stamp_ns: Time of the computation [ns], cloud's clock.
-        basis_stamp_ns: Stamp of the odometry from which the command was computed [ns], world's
-            clock.
+        basis_stamp_ns: Stamp of the odometry that the command is based on [ns], world's clock.
         basis_hold_ns: Time from the arrival of that odometry at cloud to the computation [ns].
         velocity: Commanded velocity [m/s], world frame, shape (3,).
         yaw_rate: Commanded yaw rate [rad/s].
@@ -180,8 +177,7 @@ class OperatorRequest(NamedTuple):
         request: Kind of the request.
         start: Where the mission starts; only for `Request.START`.
         mission_id: Number of the mission, below 2^63.
-        reached: Number of waypoints reached in the mission; `MISSION_OVER` if the mission ended
-            early.
+        reached: Number of waypoints reached in the mission; `MISSION_OVER` if it ended early.
         basis_stamp_ns: Stamp of cloud's newest odometry when cloud forwarded the request [ns],
             world's clock; `NEVER_NS` before the first odometry.
         epoch: Session that teleop saw when it made the request; 0 for none. Only cloud uses it.

@@ -30,8 +30,7 @@ PACKAGES = {
     "controllers": "cloudrc.cloud.controllers",
     "metrics": "",
 }
-"""Kind of plug-in -> package with cloudrc's plug-ins of this kind. Metrics have no package, because
-those of cloudrc are rows of tables."""
+"""Kind of plug-in -> package with cloudrc's plug-ins of this kind; "" for metrics: tables."""
 
 
 def names(kind: str) -> list[str]:

@@ -1,27 +1,29 @@
 """Safety invariants, checked after every 2 ms step, independently of the guard.
 
 fence      The base stays inside the fence while the rotors turn. After an emergency stop or a hit
-           the robot may leave the fence, but at most by `FALL_MAX`. Rotors that have stopped turn
-           again only where the robot lies still inside.
-cap, stop  The reference stays below the caps and can be stopped before the fence; in LAND the floor
-           is no limit. After a HOLD the reference grows slowly at first.
-stale      World accepts no command, and flies none in TRACK, that was computed from odometry older
-           than the limit. HOLD ends in TRACK on `RESUME_COMMANDS` fresh commands in `RESUME_NS`.
+           the robot may leave the fence by at most `FALL_MAX`. Rotors that were stopped start
+           again only if the robot lies still inside the fence.
+cap, stop  The reference velocity stays within its limits, and the robot can always stop before the
+           fence. During LAND it may fly down to the floor. After a HOLD the reference velocity
+           grows slowly at first.
+stale      World neither accepts a command nor flies it in TRACK if the odometry that the command is
+           based on is too old. HOLD changes to TRACK only after `RESUME_COMMANDS` fresh commands
+           within `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
-           request, after a hit, or where the robot stands.
-collision  With an honest cloud only the arm's tip touches anything, and only the board. A robot
-           that lands, or that the operator stopped, may come down on anything: the guard does not
-           know what is below.
-latch      TRACK is for missions that the operator has started. LAND and ESTOP last until the
-           operator acknowledges them.
-hold       From one TRACK to the next, and from one HOLD for silence to the next, `SETTLE_NS` pass.
-           Commands from older odometry than before may cause a HOLD sooner. In a mission a robot
-           without commands lands after the configured time; impossible commands make the robot land
-           sooner.
-tick       Each step of the physics has a tick of the guard.
+           request, after a hit, or if the robot stands.
+collision  If the cloud is honest, only the arm's tip touches something, and only the board. A robot
+           that lands, or that the operator has stopped, may touch anything, because the guard does
+           not know what is below.
+latch      The robot is in TRACK only during a mission that the operator has started. LAND and ESTOP
+           last until the operator acknowledges them.
+hold       At least `SETTLE_NS` pass from one TRACK to the next, and from one HOLD due to missing
+           commands to the next, except after a command based on older odometry than the previous
+           one. In a mission, a robot without commands lands after the configured time; impossible
+           commands cause a landing sooner.
+tick       The guard runs once in each step of the physics.
 
-All limits come from the configuration and from docs/, none from the guard: from "Stop rule" and
-"Leaving HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, "The guard" in safety.md.
+All limits come from the configuration and docs/, not from the guard: from "Stop rule" and "Leaving
+HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, and "The guard" in safety.md.
 """
 
 from __future__ import annotations
@@ -51,10 +53,10 @@ FLOWN, LATCHED = (TRACK, HOLD, LAND), (LAND, ESTOP)
 REPORTED = 5  # number of breaches of each kind that are kept
 SLACK = 1e-9  # tolerance for rounding [m/s]
 STILL = 0.12
-"""Speed below which a robot lies still [m/s]: the guard's 0.1, plus one tick of free fall."""
+"""Largest speed of a robot that lies still [m/s]: the guard's 0.1, plus one step of free fall."""
 STANDS = 0.2  # speed per axis up to which a robot stands when its rotors stop [m/s]
 FALL = 1.0
-"""Speed of a robot that fell after its rotors stopped [m/s]; a drop from 0.02 m reaches 0.7."""
+"""Downward speed that proves a fall with stopped rotors [m/s]; a drop of 0.02 m reaches 0.7."""
 REST = 0.5
 """Length added to the stopping distance after TRACK [m]; the robot swings back by up to 0.2 m."""
 FALL_MAX = 1.5  # distance from the fence at which people are safe [m]
@@ -62,21 +64,21 @@ BRAKE_NS = 200_000_000  # time to stop a descent that the operator has acknowled
 REELS_NS = 1_000_000_000  # time after a hit in which the hit explains the robot's motion [ns]
 THROWN_NS = 3_000_000_000  # time after a hit in which the robot may be thrown out of the fence [ns]
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
-"""Number of fresh commands that end a HOLD, and the time within which they come [ns]."""
+"""Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""
 SETTLE_NS = 1_000_000_000
 """Shortest time from one TRACK to the next, and from one HOLD to the next [ns]."""
 INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
-"""Number of impossible commands that cause a landing, and the time within which they come [ns]."""
+"""Number of impossible commands that cause a landing, if they arrive within INVALID_NS [ns]."""
 INVALID = ("range", "future")  # reasons for which the guard rejects impossible commands
 GROUND_NS = 10_000_000_000
-"""Shortest time for which a robot on the ground waits for a mission's first command [ns]."""
+"""Shortest time that a robot on the ground waits for a mission's first command [ns]."""
 RAMP = 3.0  # largest growth of the reference after a HOLD [m/s^2]
 RAMP_MIN = 1.0
-"""Shortest time for which the reference grows slowly [s]; it is longer if the cap is higher."""
+"""Shortest time for which the reference velocity grows slowly [s]; longer with a higher limit."""
 
 
 class Breach(NamedTuple):
-    """An invariant that did not hold: its name, and what happened."""
+    """A violation of an invariant: the invariant's name, and what happened."""
 
     time: float  # on world's clock [s]
     kind: str
@@ -84,7 +86,7 @@ class Breach(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Limits that the guard has to keep."""
+    """Limits that the guard must keep."""
 
     speed: float = 6.0  # of the reference [m/s]
     acceleration: float = 12.0  # growth of the reference [m/s^2]
@@ -105,7 +107,7 @@ class Limits(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of a flight; each restart of world brings another robot to check."""
+    """Collects the breaches of a flight; also after a restart of world, which has a new robot."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
@@ -115,11 +117,11 @@ class Watch:
         self.speed = 0.0  # largest reference [m/s]
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
-        """Check a robot's steps from `start_ns` [ns] on; if `honest`, contacts are breaches."""
+        """Check a robot from `start_ns` [ns] on; if `honest`, wrong contacts are breaches."""
         robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
-        """Note a breach at `now_ns` [ns]."""
+        """Record a breach at `now_ns` [ns]."""
         self.counts[kind] += 1
         if self.counts[kind] <= REPORTED:
             self.breaches.append(Breach(now_ns * 1e-9, kind, text))
@@ -159,7 +161,7 @@ class RobotInvariants:
     # What the robot shows.
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
-        """See `Observer`."""
+        """Implement `Observer.see_step`: check all invariants."""
         guard, steps, was = self._guard, self._simulator.steps, self._was
         state, reference, position = guard.state, guard.reference, readings.position
         if now_ns != self._next_ns or steps != self._steps + 1:
@@ -193,7 +195,7 @@ class RobotInvariants:
         self._was, self._state, self._before = state, state, reference
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """See `Observer`; count the fresh commands in a HOLD, and the impossible ones."""
+        """Implement `Observer.see_command`: count fresh and impossible commands."""
         if rejection is None:
             basis_ns = command.basis_stamp_ns
             if not 0 <= now_ns - basis_ns <= self._limits.age_ns:
@@ -215,7 +217,7 @@ class RobotInvariants:
         self._state = self._guard.state
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """See `Observer`."""
+        """Implement `Observer.see_request`: note what the operator allows."""
         match request.request:
             case Request.START:
                 if request.start is Start.SPAWN:
@@ -237,7 +239,7 @@ class RobotInvariants:
         self._state = self._guard.state
 
     def see_session(self, now_ns: int) -> None:
-        """See `Observer`."""
+        """Implement `Observer.see_session`: commands of the old session no longer count."""
         self._fresh_ns.clear()
         self._invalid_ns.clear()
 
@@ -246,7 +248,7 @@ class RobotInvariants:
     def _check_fence(
         self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
     ) -> None:
-        """Check where the base is; a robot that fell takes off only where it lies still."""
+        """Check the base's position; a robot that fell may take off only if it lies still."""
         self._falls = self._falls or (self._was in FLOWN and state is ESTOP)
         if self._falls and state in FLOWN:
             self._falls, speed = False, hypot(*velocity)
@@ -293,7 +295,7 @@ class RobotInvariants:
                 self._note(now_ns, "cap", f"{text}{' after a HOLD' if after else ''}")
 
     def _leave_track(self, readings: Readings, now_ns: int) -> None:
-        """Note where TRACK ended, and how far the robot may move from there until it stops."""
+        """Store where TRACK ended, and the distance within which the robot must stop."""
         speed = max(hypot(*readings.velocity), hypot(*self._before))
         self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
         if now_ns - self._touched_ns < REELS_NS:
@@ -307,7 +309,7 @@ class RobotInvariants:
     # What it touches, and how its rotors stop.
 
     def _check_touches(self, state: GuardState, now_ns: int) -> None:
-        """Check the contacts that began in this step; after one the robot may leave the fence."""
+        """Check new contacts; after a contact the robot may leave the fence."""
         touches = self._simulator.touches
         if touches is not self._touches:
             self._touches, self._seen = touches, 0
@@ -327,10 +329,10 @@ class RobotInvariants:
     def _check_rotors(
         self, state: GuardState, velocity: Vector, rotor_speeds: RotorSpeeds, now_ns: int
     ) -> None:
-        """Check how the rotors stop: on a request, after a hit, or where the robot stands.
+        """Check that the rotors stop only on a request, after a hit, or if the robot stands.
 
-        Speeds of 0 do not prove that the rotors are stopped: hard braking commands them, too.
-        Therefore the check looks for the constant `STOPPED`, which only a stop gives the simulator.
+        A rotor speed of 0 does not prove that the rotors were stopped: hard braking also commands
+        0. Therefore the check looks for the constant `STOPPED`, which only a stop uses.
         """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
         is_hit = state is ESTOP and self._was is not ESTOP and not asked
@@ -350,13 +352,12 @@ class RobotInvariants:
 
     @property
     def _just_touched(self) -> bool:
-        """Whether the robot has touched something within `REELS_NS`."""
+        """Whether the robot touched something within the last `REELS_NS`."""
         return self._simulator.touch_age <= REELS_NS * 1e-9
 
     # What the operator allows, the wait for commands, and the way out of HOLD.
 
     def _check_change(self, was: GuardState, state: GuardState, now_ns: int) -> None:
-        """Check a change of the guard's state."""
         if was in LATCHED and self._released.isdisjoint(LATCHED) and state is not ESTOP:
             self._note(now_ns, "latch", f"{was.name} left for {state.name} without the operator")
         self._released.intersection_update({state})
@@ -386,7 +387,7 @@ class RobotInvariants:
         self._is_reset = self._impossible = False
 
     def _check_wait(self, state: GuardState, now_ns: int) -> None:
-        """Check how long the robot waits for its cloud in a mission."""
+        """Check how long the robot waits for commands in a mission."""
         if state is TRACK:
             if not self._armed:
                 self._note(now_ns, "latch", "TRACK without the operator's start")
@@ -398,22 +399,22 @@ class RobotInvariants:
             self._alone_ns = now_ns
 
     def _check_settled(self, name: str, last_ns: int, now_ns: int) -> None:
-        """Check that enough time has passed since the last TRACK or HOLD."""
+        """Check that `SETTLE_NS` have passed since the last TRACK or HOLD."""
         if now_ns - last_ns < SETTLE_NS:
             self._note(now_ns, "hold", f"{name} again after {(now_ns - last_ns) * 1e-9:.3f} s")
 
     def _wait_ns(self, state: GuardState) -> float:
-        """Return how long a robot in a mission waits for its cloud [ns]."""
+        """Return how long a robot in a mission may wait for commands [ns]."""
         if state is GROUND:
             return max(self._limits.hold_ns, GROUND_NS)
         return self._limits.hold_ns if state is HOLD else inf
 
 
 def can_stop(speed: float, below: float, above: float) -> bool:
-    """Tell whether the robot can stop before the face of the fence that it flies towards.
+    """Return whether the robot can stop before the side of the fence that it flies towards.
 
-    Along one axis the robot has a `speed` [m/s]; `below` and `above` are the distances to the two
-    faces of the fence [m].
+    Along one axis, the robot has the velocity `speed` [m/s], and the distances `below` and `above`
+    to the two sides of the fence [m].
     Source: docs/reference/plant.md, "Stop rule": 0.2 v + v^2/6 <= distance - 0.1.
     """
     if speed > 0.0:
@@ -422,7 +423,7 @@ def can_stop(speed: float, below: float, above: float) -> bool:
 
 
 def growth(before: Vector, after: Vector) -> float:
-    """Compute how much a reference grows between two ticks, `before` and `after` [m/s]."""
+    """Compute how much the reference velocity grows from `before` to `after` [m/s]."""
     (ux, uy, uz), (vx, vy, vz) = before, after
     return sqrt(_grown(ux, vx) ** 2 + _grown(uy, vy) ** 2 + _grown(uz, vz) ** 2)
 

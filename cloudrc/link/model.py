@@ -190,8 +190,8 @@ class Numbers:
         correlation: Correlation of the delays of successive packets [1].
         loss: Share of packets that did not arrive, in [0, 1].
         runs: Length of each run of successive losses.
-        overtaken: Share of the arrived packets that arrived after a packet that was sent later, in
-            [0, 1]. Source: RFC 4737, section 3.
+        overtaken: Share of arrived packets that a later packet overtook, in [0, 1]. Source: RFC
+            4737, section 3.
         duplicated: Share of packets of which two copies arrived, in [0, 1].
     """
 

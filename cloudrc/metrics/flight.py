@@ -142,8 +142,7 @@ class Flight:
     def applied(self) -> Columns:
         """Commands that world applied during the flight, with the values of their control periods.
 
-        `stamp_ns` is the time of application [ns], `position` the position that cloud predicted for
-        it [m].
+        `stamp_ns` is the time of application [ns], `position` the predicted position [m].
         """
         return self.join_control(self.during("/command_applied"))
 

@@ -16,8 +16,8 @@ PRESSING_NS = 2_000_000_000
 RESTING_NS = 5_000_000_000
 """Last part of the flight, over which the steady error is averaged [ns]."""
 SETTLING_NS = 10_000_000_000
-"""Time before the last RESTING_NS in which the setpoint must be constant [ns]. If the setpoint
-moved, there is no steady error.
+"""Time before the last RESTING_NS in which the setpoint must be constant [ns]. If it moved, there
+is no steady error.
 Source: docs/reference/control.md, "Steady state": the slowest variant that settles needs 8 to 15 s
 to stay within 1 cm."""
 FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizon_clamped")
@@ -87,8 +87,8 @@ def _pipe_contacts(flight: Flight) -> float | None:
 def _steady_error(flight: Flight, axis: int) -> float | None:
     """Average the distance from setpoint to true position [m] along x, y or z (`axis` 0, 1 or 2).
 
-    Return None if the setpoint moved or the arm touched something in the last 15 s, or if the
-    flight is shorter than 15 s.
+    None if the flight is shorter than 15 s, or if in its last 15 s the setpoint moved or the arm
+    touched something.
     """
     control, force = flight.control, flight.during("/contact_force")
     if flight.end_ns is None or flight.start_ns is None:

@@ -29,8 +29,7 @@ from cloudrc.records import REAL_TIME_FACTOR_MIN
 
 SLIP_MAX = 0.25
 """Largest time that world's clock may lose in a valid flight [s]: the guard's default limit on the
-age of a command. With a larger loss, the guard could react to a slow machine instead of the
-network."""
+age of a command. With a larger loss, the guard might react to a slow machine."""
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 """Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
 ADVICE = "close other programs or give the run more cores"
@@ -275,8 +274,7 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
 
 
 AWAY = -1
-"""Value for an unknown slip of world's clock [ns]: after a restart of teleop, until telemetry
-arrives."""
+"""Value for an unknown slip of world's clock [ns]: after a restart of teleop, before telemetry."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,8 +298,7 @@ class Observations:
 
         Args:
             pipe_contacts: Number of contacts with pipes since the robot was reset.
-            touch_speed: Speed of the arm's tip when it touched the board [m/s]; NaN before the
-                touch.
+            touch_speed: Speed of the arm's tip at the touch of the board [m/s]; NaN before.
             slip_ns: Lag of world's clock behind its machine's clock [ns].
         """
         touch = finite_or_none(touch_speed)
