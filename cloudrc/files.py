@@ -22,7 +22,7 @@ class TooLongError(ValueError):
 
 
 def version(path: Path | str) -> tuple[int, int, int] | None:
-    """Return a value that changes with the file, by one system call; None without a file."""
+    """Return a value that changes with a file's content (one system call); None if missing."""
     try:
         status = os.stat(path)
     except OSError:
@@ -35,7 +35,7 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If `path` is not a regular file, or as TooLongError if the file is too large.
+        ValueError: If `path` is no regular file; as TooLongError, if the file is too large.
     """
     with BufferedReader(open_file(path)) as file:
         status = os.fstat(file.fileno())

@@ -1,6 +1,6 @@
 """The messages between world, cloud and teleoperation.
 
-Messages are named tuples, which are four times as fast as frozen dataclasses, in SI units.
+Messages are named tuples in SI units; to make a frozen dataclass takes four times as long.
 
 - Stamps: integer nanoseconds on the monotonic clock of world or cloud, as stated. Only stamps of
   the same clock may be subtracted.
@@ -85,9 +85,9 @@ class Request(IntEnum):
     END = 1
     """End the mission: the robot holds its position until the next mission starts."""
     ESTOP = 2
-    """Stop the rotors at once, in any state; they stay stopped until the operator acknowledges."""
+    """Stop the rotors at once, in any state. The state ESTOP lasts until acknowledged."""
     ACKNOWLEDGE = 3
-    """End the state LAND or ESTOP after the operator has seen its cause; the rotors stay off."""
+    """End the state LAND or ESTOP after the operator has seen its cause. This starts no rotor."""
     PROGRESS = 4
     """Store the mission's progress on board, for a cloud that restarts. The request number is 0."""
 

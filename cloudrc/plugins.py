@@ -30,7 +30,7 @@ PACKAGES = {
     "controllers": "cloudrc.cloud.controllers",
     "metrics": "",
 }
-"""Kind of plug-in -> package with cloudrc's plug-ins of this kind; "" for metrics: tables."""
+"""Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" for metrics."""
 
 
 def names(kind: str) -> list[str]:

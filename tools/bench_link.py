@@ -330,7 +330,6 @@ def _open(address: Address) -> socket.socket:
 
 
 def _drain(sink: socket.socket, source: socket.socket, flow: Flow) -> None:
-    """Read all datagrams that arrived, and the kernel's time stamps of those that were sent."""
     with suppress(BlockingIOError):
         while True:
             data, ancillary, _, _ = sink.recvmsg(SIZE, 512)

@@ -44,7 +44,7 @@ class Quantities(Values):
 
 
 class Resources(Values):
-    """Requests and limits of one container; if all are equal, the pod is of class Guaranteed."""
+    """Requests and limits of one container; if all are equal, the pod's QoS class is Guaranteed."""
 
     requests: Quantities = Quantities()
     """Amounts that the scheduler reserves on the node"""
@@ -300,8 +300,7 @@ class ChartValues(Values):
     image: Image = Image()
     """Images of the pods"""
     experiment: Experiment = Experiment()
-    """The experiment, with the keys of a file for 'cloudrc run'. A missing key has the value of the
-    paper"""
+    """The experiment, with the keys of a file for 'cloudrc run'; missing keys: as in the paper"""
     link: LinkContainer = LinkContainer()
     """The emulated network between the pods"""
     world: WorldPod = WorldPod()

@@ -133,7 +133,6 @@ def flow(value: Any) -> str:
 
 
 def _experiment() -> str:
-    """Write the tables of all keys of an experiment, a mission and a link profile."""
     own = [key for key, info in Experiment.model_fields.items() if not _is_section(info.annotation)]
     blocks = ["\n## Top level\n", _keys(Experiment, own)]
     for key, info in Experiment.model_fields.items():
@@ -199,7 +198,6 @@ def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
 
 
 def _plug_ins() -> str:
-    """Write the tables of the shipped plug-ins and their parameters."""
     blocks = [
         "A plug-in is a name, or a mapping with the key `name` and one key per parameter. The\n"
         "parameters of your own file are those of its function `build`: [plugins.md](plugins.md).\n"
@@ -242,7 +240,6 @@ def _shipped() -> str:
 
 
 def _topics() -> str:
-    """Write the tables of all topics."""
     overview = (
         (f"[`{name}`](#{name[1:]})", f"`{topic.ros_type}`", ENDS[topic.end], SAMPLING[name][1])
         for name, topic in TOPICS.items()
@@ -268,7 +265,6 @@ def _topics() -> str:
 
 
 def _metrics() -> str:
-    """Write the tables of all metrics and of the histograms' buckets."""
     rows = []
     for metric in METRICS.values():
         labels = [
@@ -355,7 +351,6 @@ def _adapt(part: Any) -> Any:
 
 
 def _values(part: BaseModel, above: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield a row for each value of the chart."""
     for key, value, text in _keys_of(part):
         if isinstance(value, BaseModel) and not isinstance(value, (*COMPACT, Experiment)):
             yield from _values(value, f"{above}{key}.")

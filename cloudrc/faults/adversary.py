@@ -38,7 +38,7 @@ from cloudrc.world.robot import STEP_NS
 
 Generator: TypeAlias = np.random.Generator
 Lie: TypeAlias = Callable[[Command, Control], Command]
-"""Function that changes an honest command; the record contains what cloud knew."""
+"""Function that changes an honest command; it also gets cloud's record of the control period."""
 Policy: TypeAlias = Callable[[Generator], Lie]
 Words: TypeAlias = Callable[[int, RobotStatus], OperatorRequest | None]
 """Function that makes a false operator request, or None, at a time on cloud's clock [ns]. The
@@ -186,7 +186,6 @@ NONSENSE_NS = 80_000_000  # duration of impossible commands that makes the guard
 
 
 def _fly(command: Command, velocity: Sequence[float], **others: Any) -> Command:
-    """Replace a command's velocity [m/s], and `others` of its fields."""
     x, y, z = velocity
     return command._replace(velocity=(x, y, z), **others)
 
@@ -262,7 +261,6 @@ def _shaking(rng: Generator) -> Lie:
 
 
 def _random(rng: Generator) -> Lie:
-    """Change to a random velocity at random times."""
     velocity, until_ns = list(ZERO), 0
 
     def lie(command: Command, control: Control) -> Command:

@@ -1,25 +1,25 @@
 """Safety invariants, checked after every 2 ms step, independently of the guard.
 
-fence      The base stays inside the fence while the rotors turn. After an emergency stop or a hit
-           the robot may leave the fence by at most `FALL_MAX`. Rotors that were stopped start
-           again only if the robot lies still inside the fence.
+fence      The base stays inside the fence while the rotors turn. After a collision or an
+           emergency stop the robot may leave the fence by at most `FALL_MAX`. Rotors that were
+           stopped start again only if the robot lies still inside the fence.
 cap, stop  The reference velocity stays within its limits, and the robot can always stop before the
            fence. During LAND it may fly down to the floor. After a HOLD the reference velocity
            grows slowly at first.
-stale      World neither accepts a command nor flies it in TRACK if the odometry that the command is
+stale      World never accepts a command, or flies it in TRACK, if the odometry that the command is
            based on is too old. HOLD changes to TRACK only after `RESUME_COMMANDS` fresh commands
            within `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
-           request, after a hit, or if the robot stands.
+           request, after a collision, or if the robot stands.
 collision  If the cloud is honest, only the arm's tip touches something, and only the board. A robot
            that lands, or that the operator has stopped, may touch anything, because the guard does
            not know what is below.
 latch      The robot is in TRACK only during a mission that the operator has started. LAND and ESTOP
            last until the operator acknowledges them.
-hold       At least `SETTLE_NS` pass from one TRACK to the next, and from one HOLD due to missing
-           commands to the next, except after a command based on older odometry than the previous
-           one. In a mission, a robot without commands lands after the configured time; impossible
-           commands cause a landing sooner.
+hold       At least `SETTLE_NS` pass from one TRACK to the next, and from one HOLD without commands
+           to the next. A HOLD may come sooner if a command is based on older odometry than the
+           command before. In a mission, a robot without commands lands after the configured time,
+           or sooner after impossible commands.
 tick       The guard runs once in each step of the physics.
 
 All limits come from the configuration and docs/, not from the guard: from "Stop rule" and "Leaving
@@ -329,10 +329,10 @@ class RobotInvariants:
     def _check_rotors(
         self, state: GuardState, velocity: Vector, rotor_speeds: RotorSpeeds, now_ns: int
     ) -> None:
-        """Check that the rotors stop only on a request, after a hit, or if the robot stands.
+        """Check that the rotors stop only on a request, after a collision, or if the robot stands.
 
         A rotor speed of 0 does not prove that the rotors were stopped: hard braking also commands
-        0. Therefore the check looks for the constant `STOPPED`, which only a stop uses.
+        it. Therefore the check looks for the constant `STOPPED`, which only a stop uses.
         """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
         is_hit = state is ESTOP and self._was is not ESTOP and not asked
@@ -352,7 +352,6 @@ class RobotInvariants:
 
     @property
     def _just_touched(self) -> bool:
-        """Whether the robot touched something within the last `REELS_NS`."""
         return self._simulator.touch_age <= REELS_NS * 1e-9
 
     # What the operator allows, the wait for commands, and the way out of HOLD.
@@ -387,7 +386,6 @@ class RobotInvariants:
         self._is_reset = self._impossible = False
 
     def _check_wait(self, state: GuardState, now_ns: int) -> None:
-        """Check how long the robot waits for commands in a mission."""
         if state is TRACK:
             if not self._armed:
                 self._note(now_ns, "latch", "TRACK without the operator's start")
@@ -399,7 +397,6 @@ class RobotInvariants:
             self._alone_ns = now_ns
 
     def _check_settled(self, name: str, last_ns: int, now_ns: int) -> None:
-        """Check that `SETTLE_NS` have passed since the last TRACK or HOLD."""
         if now_ns - last_ns < SETTLE_NS:
             self._note(now_ns, "hold", f"{name} again after {(now_ns - last_ns) * 1e-9:.3f} s")
 

@@ -43,7 +43,7 @@ def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
 
 
 def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Record]:
-    """Return the records of world, cloud or teleop, up to the virtual time `until` [s]."""
+    """Return the records of `role`: world, cloud or teleop; up to the virtual time `until` [s]."""
     records: Iterable[Record] = flight.of_world if role == "world" else flight.of_cloud
     records = flight.teleop.events if role == "teleop" else records
     if until is None:
@@ -121,7 +121,7 @@ def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> 
 
 
 def basis_age_at_hold(flight: Flight) -> float:
-    """Return the largest age, at the start of a HOLD, of the last command's odometry [s]."""
+    """Return the largest age that the last command's odometry had when a HOLD began [s]."""
     return max((age for _, age in _ages_at_hold(flight) if age == age), default=nan)
 
 
@@ -152,12 +152,12 @@ def busiest_second(changes: Sequence[GuardChange]) -> int:
 
 
 def told(records: Iterable[Record], code: str) -> list[Fault]:
-    """Return the recorded faults with a code."""
+    """Return the faults with this code."""
     return [each for each in records if isinstance(each, Fault) and each.code == code]
 
 
 def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
-    """Return the events with a name in teleop's log; none while teleop is not running."""
+    """Return the events with this name in teleop's log; none while teleop is not running."""
     service = flight.teleop.service
     events = service.book.events_after(0) if service is not None else []
     return [event for event in events if event["event"] == name]
@@ -193,8 +193,7 @@ def silence_told(
 ) -> None:
     """Check, `silent` [s] after a silence began at `at` [s], that teleop's status reports it.
 
-    The robot is silent; unless `cloud` is true, cloud is, too. Each check's text begins with
-    `what`.
+    The robot is silent. If `cloud` is false, cloud is silent, too. `what` begins each check's text.
     """
 
     def check(now_ns: int) -> None:
@@ -221,7 +220,7 @@ def calm_after(flight: Flight, start: float, end: float) -> float:
 
 
 def drift(flight: Flight, start: float, end: float) -> float:
-    """Return the robot's largest distance from its position at `start` [s] until `end` [s] [m]."""
+    """Return the robot's largest distance [m] from its position at `start` [s], until `end` [s]."""
     path = [r.odometry for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
     return max((dist(path[0].position, each.position) for each in path), default=nan)
 

@@ -114,7 +114,7 @@ class RestartableEndpoint:
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram to the process, without `tamper`."""
+        """Pass a datagram to the process without a call of `tamper`."""
         if self.inner is None:
             return
         if self._frozen_until_ns <= now_ns:
@@ -221,7 +221,6 @@ class _Peer(UnixPeer):
         self.waiting: list[bytes] = []
 
     def receive(self) -> list[bytes]:
-        """Implement `UnixPeer.receive`."""
         return _take_all(self.waiting)
 
     def send(self, data: bytes) -> bool:
@@ -254,8 +253,7 @@ class TeleopModel:
         Args:
             contact_speed_max: Limit of the speed of the arm's tip at the board [m/s].
             name: Makes the mission numbers differ from those of another teleop.
-            phase_ns: First wake of teleop's own process [ns, virtual time]; None: it runs in
-                cloud's process.
+            phase_ns: First wake of teleop's own process [ns, virtual time]; None: no own process.
         """
         self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
         self._disk = b""  # the bytes of its database

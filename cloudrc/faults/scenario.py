@@ -74,7 +74,7 @@ class Outcome:
         self.checks.append(Check(text, measured, "==", limit))
 
     def true(self, text: str, holds: bool) -> None:
-        """Check that `holds`, the truth of the statement `text`, is True."""
+        """Check that the statement `text` is true."""
         self.checks.append(Check(text, float(holds), "==", 1.0, YES))
 
     @property

@@ -93,7 +93,6 @@ class Search:
         return self.failures[-1]
 
     def _keep(self, finding: Finding) -> dict[str, Any]:
-        """Simplify and store a failing schedule."""
         kinds, until = finding.kinds, time.monotonic() + SHRINK_MAX
 
         def fails(schedule: Schedule) -> bool:

@@ -170,7 +170,6 @@ class Operator:
             self._flight.watch.note(self._flight.run.now_ns, "obeyed", text)
 
     def _look(self, records: list[Record], now_ns: int) -> None:
-        """React every 100 ms to world's new records."""
         flight = self._flight
         state, _ = flight.guard_now()
         if state is GuardState.TRACK:

@@ -1,7 +1,7 @@
 """Draw the random impairments of each packet from counter-based random numbers.
 
-Seed, direction, epoch and kind of datagram select a stream of random numbers. The packet's counter
-is the position in the stream. So the impairment of a packet does not depend on earlier calls.
+Seed, direction, session (epoch) and kind of datagram select a stream of random numbers. The counter
+of the packet is its position in the stream. So its impairment does not depend on earlier calls.
 
 Numbers are drawn for blocks of 256 packets, in a separate column for each purpose. So a purpose
 that a profile does not use does not change the numbers of other purposes. The functions are pure; a

@@ -2,8 +2,8 @@
 
 `cloudrc link set` changes the release's ConfigMap, so that the change is permanent. A kubelet may
 need a minute to copy the ConfigMap to a pod. Therefore `cloudrc link set` also writes the same
-files, as one JSON document, into the folder of the route file. Both carry the number of the change.
-Whichever arrives first takes effect, and the later one is ignored.
+files, as one JSON document, into the folder of the route file. ConfigMap and document contain the
+number of the change: the first to arrive takes effect, the other is ignored.
 """
 
 from __future__ import annotations

@@ -253,7 +253,6 @@ def _arrived(trip: dict[str, Any]) -> bool:
 
 
 def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log) -> None:
-    """Raise an error if irtt's statistics contradict the packets in the same log."""
     arrived = sum(map(_arrived, trips))
     copies = int(stats.get("duplicates", 0))
     log.counts["duplicates left out"] += copies
@@ -293,8 +292,7 @@ _IRTT_NAMES = {
     "uplink": ("true_down", "send"),
     "downlink": ("true_up", "receive"),
 }
-"""Delays to read -> irtt's value of `lost` for packets to leave out, and irtt's key of the
-delay."""
+"""Delays to read -> irtt's value of `lost` for packets to leave out, irtt's key of the delay."""
 
 
 def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
@@ -602,7 +600,6 @@ class _Ping:
         return self._midnight + clock
 
     def _read_other(self, line: str) -> None:
-        """Read a line without a sequence number: header, summary, or another line."""
         log, summary, mean = self._log, _SUMMARY.search(line), _MEAN.search(line)
         if line.startswith(("PING ", "PING6(")):
             self._headers += 1

@@ -1,4 +1,4 @@
-"""Model one direction of a link: when does each packet arrive? Also compute statistics of packets.
+"""Compute when each packet arrives in one direction of a link, and statistics of many packets.
 
 The model has no clock, no socket and no stateful random generator. Runs in virtual time and the
 relay use the same model, so both get the same delays and losses.
@@ -30,10 +30,10 @@ class LinkDirection:
     """Model of one direction of the link.
 
     The random impairment of a packet depends only on seed, direction, epoch, kind and counter. The
-    order of calls, the mode of the run and other kinds of datagram have no effect.
+    order of calls and other kinds of datagram have no effect.
 
-    Only two settings depend on earlier packets: `rate` (the queue of the bottleneck) and
-    `keep_order`. If the profile uses one of them, call `send` in the order of sending.
+    With the settings `rate` (the queue of the bottleneck) and `keep_order`, the arrival also
+    depends on earlier packets. Then call `send` in the order of sending.
 
     Attributes:
         corrupts: Whether the link may damage datagrams; if true, call `corrupted` for each.

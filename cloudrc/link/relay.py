@@ -51,8 +51,7 @@ STOP_PERIOD = 0.1
 ANCILLARY_SIZE = 64
 """Size of the buffer for the kernel's time stamp and its count of dropped datagrams [bytes]."""
 AGE_MAX_NS = 50_000_000
-"""Largest time between a datagram's arrival and its reading that is corrected [ns]; longer waits
-count as this time."""
+"""Largest time between arrival and reading of a datagram for which the relay compensates [ns]."""
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 """Name -> probability of each percentile of the lateness in reports."""
 
@@ -149,8 +148,7 @@ class Lane:
     Attributes:
         source: Bound UDP socket at which the datagrams arrive; the caller closes it.
         direction: Model of this direction of the link.
-        origin_ns: When the model's time starts [ns], monotonic clock; None until the first datagram
-            arrives, if that starts the time.
+        origin_ns: Start of the model's time [ns], monotonic; None until the first datagram sets it.
         errors: Histogram of how late datagrams left.
     """
 
@@ -296,7 +294,7 @@ class Lanes:
     def take_in(self, readable: Collection[socket.socket] | None = None) -> None:
         """Read waiting datagrams from the `readable` sockets, by default from all sockets.
 
-        Call this method before the profile changes, so that they get the old conditions.
+        Call this method before a profile changes: waiting datagrams get the old conditions.
         """
         for lane in self._lanes:
             if readable is None or lane.source in readable:

@@ -315,7 +315,6 @@ class Sidecar:
                 self._published = self._in_force[0]
 
     def _publish_route(self, route: Address) -> None:
-        """Write the route file: one line HOST:PORT."""
         publish(self._route, f"{route[0]}:{route[1]}\n")
 
 

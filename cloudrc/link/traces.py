@@ -36,8 +36,8 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
     """Read a trace from a CSV file of at most `size_max` bytes.
 
     Raises:
-        BadInputError: If the file cannot be read or is no trace; the text names file, line, value
-            and remedy.
+        BadInputError: If the file cannot be read or is no trace; names file, line, value and
+            remedy.
     """
     remedy = "give a CSV file with the columns time_s,delay_ms"
     return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
@@ -129,7 +129,6 @@ def write_trace(trace: Trace) -> str:
 
 
 def _short(value: float, digits: int) -> str:
-    """Format a number with at most `digits` decimals, without trailing zeros."""
     return f"{value:.{digits}f}".rstrip("0").rstrip(".")
 
 

@@ -161,7 +161,6 @@ class Flight:
         return periods | {name: column[known] for name, column in commands.items()}
 
     def _within(self, columns: Columns) -> Columns:
-        """Select the rows during the flight; none if the robot never flew."""
         stamps = columns["stamp_ns"]
         if self.start_ns is None or self.end_ns is None:
             rows = np.zeros(len(stamps), dtype=bool)

@@ -95,7 +95,7 @@ class Evidence:
 
 
 def judge(evidence: Evidence) -> Verdict:
-    """Judge a mission."""
+    """Apply the rules to the evidence of a mission."""
     violations, limit = evidence.violations, evidence.contact_speed_max
     if evidence.contact and evidence.touch is not None and evidence.touch[0] >= limit:
         speed, moment = evidence.touch
@@ -112,7 +112,6 @@ def judge(evidence: Evidence) -> Verdict:
 
 
 def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
-    """Yield a failure for each goal that the mission did not reach."""
     ending, end = evidence.ending, evidence.end
     if ending.code != "done":
         yield Failure(*ending, *end)
@@ -182,7 +181,6 @@ def _ending(flight: Flight, interrupted: bool) -> Ending:
 
 
 def _moment(flight: Flight, stamp_ns: int) -> Moment:
-    """Return the time and the robot's place at a stamp [ns]."""
     x, y, z = flight.true_position(np.array([stamp_ns]))[0]
     place = (float(x), float(y), float(z)) if np.isfinite((x, y, z)).all() else None
     return Moment(float(flight.seconds(stamp_ns)), place)
@@ -210,7 +208,6 @@ def _interventions(flight: Flight) -> Iterator[Failure]:
 
 
 def _restarts(flight: Flight) -> Iterator[Failure]:
-    """Yield a failure for each session that world began in flight."""
     session = flight.during("/session")
     rows = zip(session["stamp_ns"], session["end"], session["cause"], strict=True)
     for stamp_ns, end, cause in rows:
@@ -254,11 +251,11 @@ def _why_grounded(flight: Flight) -> str:
 
 
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
-    """Judge a recorded mission with only the information that the operator has at its end.
+    """Judge a recorded mission with only what the operator knows when the mission ends.
 
-    The operator's telemetry lacks contacts that it reports only after the end of the mission. The
-    operator also does not know the report's time limit, and judges timing only by the real-time
-    factor. All other facts are taken from the report's `evidence`.
+    Contacts that telemetry reports only after the end do not count. The operator does not know the
+    report's time limit, and judges timing only by the real-time factor. All other facts are those
+    of the report's `evidence`.
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0
@@ -290,7 +287,7 @@ class Observations:
 
     @classmethod
     def begin(cls, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Begin a mission with its first telemetry; `touch_speed` [m/s] etc. are as in `see`."""
+        """Begin with the first telemetry; `touch_speed` [m/s] and the others are as in `see`."""
         return cls(pipe_contacts, 0, finite_or_none(touch_speed), None, slip_ns, slip_ns)
 
     def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:

@@ -6,8 +6,8 @@
 A recording comes from a file or from records in memory; both give the same tables. A topic without
 records has a table without rows.
 
-The log time of a row is its stamp, or the previous row's log time if that is later. So the log
-times of world, and those of cloud, never decrease, and the two can be merged by log time.
+The log time of a row is its stamp, or the previous row's log time if that is later. So log times
+never decrease within world's rows or within cloud's rows, which can then be merged.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Compute one SHA-256 over all records of a run, to compare runs.
 
-A record is hashed as little-endian bytes, which are the same in every process. They contain in this
-order:
+A record is hashed as little-endian bytes, equal in every process. They contain in this order:
 
 - the length and the name of the record's type;
 - the numbers: integers with 64 bits, floats as IEEE 754 doubles, truth values with one byte;
@@ -30,7 +29,7 @@ _CODES = {int: "q", float: "d", bool: "?", str: "s"}
 
 
 class RecordHash:
-    """SHA-256 over records in their order; it does not depend on how `update` divides them."""
+    """SHA-256 over records in their order, no matter how many records each `update` gets."""
 
     def __init__(self) -> None:
         self._sha256 = hashlib.sha256()

@@ -6,7 +6,7 @@ their description names.
 The offset between the clocks is estimated from the packets, because no packet arrives before it was
 sent. Each telemetry datagram shows that world's clock is ahead of cloud's by at least (sent -
 arrived). Each command datagram shows that world's clock is ahead by at most (arrived - sent). The
-fastest packets give the narrowest interval; its width is the sum of the two delays.
+fastest packet of each direction gives the narrowest interval: as wide as the sum of both delays.
 
 World's clock is also behind the clock of world's machine if world's process was stalled.
 """
@@ -81,7 +81,7 @@ def _share_clock(world: Contents, cloud: Contents) -> bool:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest (arrival - departure) [ns], each on the clock of world or cloud."""
+    """Return the smallest difference of arrival and departure [ns], which includes the offset."""
 
     def packets(table: Table) -> list[tuple[tuple[int, int], int]]:
         epochs, counters, stamps_ns = (

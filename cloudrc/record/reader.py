@@ -176,7 +176,7 @@ class Records:
 
     @property
     def unread(self) -> int:
-        """Size of the part that was not read [bytes], without a damaged index."""
+        """Size of the part that was not read [bytes]; 0 if only the index is damaged."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
     def _take_room(self, size: int) -> None:
@@ -365,7 +365,6 @@ def _changed(contents: Contents) -> Iterator[str]:
 
 
 def _list(topics: list[str]) -> str:
-    """Format the first topics, and the number of further topics."""
     more = len(topics) - LISTED_MAX
     return ", ".join(topics[:LISTED_MAX]) + f" and {more} more topics" * (more > 0)
 

@@ -37,8 +37,7 @@ _ROS_NAMES: dict[Kind, str] = {
     "quaternion": "geometry_msgs/Quaternion",
 }
 TEXT_MAX = 1 << 16
-"""Longest type definition that is parsed [characters]; those of cloudrc and ROS have a few
-thousand."""
+"""Longest type definition that is parsed [characters]; those of cloudrc and ROS are shorter."""
 STORE = get_typestore(Stores.ROS2_JAZZY)
 """All message types that rosbags can encode: those of ROS 2 Jazzy and of cloudrc."""
 
@@ -100,8 +99,7 @@ def is_known(ros_type: str, text: str) -> bool:
 
 _SECOND_NS = 1_000_000_000
 _ENCAPSULATION = 4
-"""Size of the encapsulation header [bytes]; its second byte is 1 if the message is little-
-endian."""
+"""Size of the encapsulation header [bytes]; its second byte is 1 in little-endian messages."""
 
 _type: dict[str, Any] = dict(STORE.types)
 _Time, _Header = _type["builtin_interfaces/msg/Time"], _type["std_msgs/msg/Header"]
@@ -189,8 +187,7 @@ _STANDARD: dict[str, _Codec] = {
         lambda message: (_xyz(message.point),),
     ),
 }
-"""Standard ROS type -> functions to encode and decode it; topics may use only some of its
-fields."""
+"""Standard ROS type -> functions to encode and decode it; topics may use a part of its fields."""
 _TO_ROS: dict[Kind, Callable[[Any], Any]] = {
     "int": int,
     "float": float,

@@ -18,8 +18,7 @@ from cloudrc.records import Record
 Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
 Values: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = tuple[str, int, Values]
-"""Topic, stamp [ns] on the clock of the recording end (world or cloud), and values of the
-fields."""
+"""Topic, stamp [ns] on the clock of the recording end (world or cloud), values of the fields."""
 
 
 class Field(NamedTuple):

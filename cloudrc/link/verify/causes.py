@@ -20,7 +20,7 @@ of datagrams not read in time; share of CPU periods in which the shaper was thro
 RAISED = ("mean", "round_trip", "deviation", "loss")
 """Quantities that rise if the shaper lacks CPU time."""
 PASSED = 0.9
-"""If the shaper received a smaller share of the datagrams that arrived, the others bypassed it."""
+"""If the shaper counts less than this share of the arrived datagrams, the others bypass it."""
 
 
 class Evidence(NamedTuple):

@@ -27,7 +27,7 @@ RUNS, RUN_LENGTH = 200, 1000
 """Number of simulated links for a band, and number of datagrams on each simulated link. The band is
 scaled for measurements with another number of datagrams."""
 TAIL = 1e-3
-"""Share of correct links that measure less than a band, and share that measure more, in [0, 1]."""
+"""Share of correct links with a value below a band, and share with a value above it, in [0, 1]."""
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
 """Limits above which a link counts as a relay with the predicted random numbers: correlation of
 measured and predicted delays; share of datagrams whose loss or arrival was predicted."""
@@ -191,8 +191,7 @@ class Plan:
         """Compute the judged quantities of a stream; an unknown quantity is NaN.
 
         "deviation" is the standard deviation from the delay requested at each time [s], so it shows
-        the jitter alone. "distribution" is the Kolmogorov-Smirnov distance to the delays in
-        `pooled` [1].
+        the jitter alone. "distribution" is the Kolmogorov-Smirnov distance to `pooled` [1].
         """
         singles = self._singles(stream)
         found, shape = numbers(singles), self._shape(singles)

@@ -39,7 +39,7 @@ from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Reco
 PERIOD = 0.01
 """Period of telemetry and of commands [s]."""
 CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
-"""Period of the verdicts, and pause after a change of session or profile [ns]."""
+"""Period of the verdicts [ns]; pause after a change of session or profile [ns]."""
 KEPT, FINAL = 6000, 128
 """Largest number of datagrams judged; a missing one counts as lost after FINAL newer datagrams."""
 ENDS = 2e-3
@@ -90,7 +90,7 @@ class LinkMonitor:
             ]
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Process this end's newest records at `now_ns` [ns]; return new records about the link."""
+        """Process the newest records of this end at `now_ns` [ns]; return records of the link."""
         if self._inbox is None:
             return self._see(records, now_ns)
         self._inbox.put((records, now_ns))
@@ -215,8 +215,8 @@ class LinkMonitor:
 def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
     """Sort arrivals by counter, and mark missing counters between them as lost.
 
-    Also return the first counter, and whether the two ends share a clock. Without a common clock,
-    the delays have an unknown constant offset.
+    Also return the first counter, and whether world and cloud share a clock. Without a common
+    clock, the delays have an unknown constant offset.
     """
     last = max((one.counter for one in arrivals), default=0) - FINAL
     arrivals = [one for one in arrivals if last - KEPT < one.counter <= last]
