@@ -140,7 +140,7 @@ def mission_plan(
         legs = _step_legs(mission.steps, seed)
     else:
         starts = (None, *mission.waypoints)
-        ways = zip(starts, mission.waypoints, strict=False)  # no leg starts at the last waypoint
+        ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
         legs = tuple(_leg(start, waypoint, speed_max) for start, waypoint in ways)
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
@@ -174,7 +174,7 @@ def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> Direc
 def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: float) -> Leg:
     limit = waypoint.time_limit_s
     if limit is None:
-        # The start of the first leg is unknown: assume the longest way.
+        # Where the robot starts is unknown: assume the longest way.
         way = FENCE_SPAN if start is None else dist(start.position_m, waypoint.position_m)
         expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
         limit = round(LEG_FACTOR * expected, 1)

@@ -55,5 +55,5 @@ def describe_error(error: BaseException) -> str:
         return to_one_line(f"{name}: {error}")
     except KeyboardInterrupt:
         raise
-    except BaseException:  # the exception's __str__ is foreign code, too
+    except BaseException:  # the exception's __str__ may raise, too
         return to_one_line(name)

@@ -65,7 +65,7 @@ def load(kind: str, name: str, **parameters: Any) -> Any:
     build = _build(kind, name)
     try:
         return build(**parameters)
-    except Exception as error:  # foreign code may raise anything; the user gets one line
+    except Exception as error:  # a plug-in may raise anything; the user gets one line
         raise BadInputError(f"{_one(kind)} {name!r} cannot be built: {_reason(error)}") from error
 
 
@@ -133,7 +133,7 @@ def _installed(kind: str) -> dict[str, EntryPoint]:
 def _load_file(kind: str, path: Path) -> ModuleType:
     if not path.is_file():
         raise BadInputError(f"{_one(kind)} {str(path)!r}: there is no such file")
-    # The module name has the whole path, because two files may have the same name.
+    # The module name contains the whole path, because two files may have the same name.
     module_name = f"cloudrc_plugin:{path.resolve()}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:

@@ -210,7 +210,7 @@ def measure_profiles(folder: Path, chosen: Iterable[str], duration: float) -> di
     """
     fifo, links = fifo_allowed(), {name: dict[str, object](profile=name) for name in chosen}
     relays = {name: RelayProcess(folder, link, fifo=fifo) for name, link in links.items()}
-    # Once all senders are up: to start one takes 0.6 s of processor time from the others.
+    # When all senders run: the start of one takes 0.6 s of CPU time from the others.
     begin = time.monotonic() + 0.6 * (len(links) + 1)
     tasks = [(relay.ways, duration, begin) for relay in relays.values()]
     with ProcessPoolExecutor(len(tasks), mp_context=get_context("spawn")) as pool:

@@ -109,7 +109,7 @@ class Tree:
             command = ["helm", "template", "net", str(chart), "--kube-version", "1.34", "--values"]
             command.append(str(values))
             text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-            # Secrets are made anew by each rendering, and comments are prose.
+            # Each rendering makes new Secrets, and comments are prose.
             text = re.sub(r"(?m)^(\s+(key|operator|reader|psk)[\w.-]*: ).*$", r"\1made anew", text)
             yield values.name, re.sub(r"(?m)^\s*#.*\n", "", text)
 

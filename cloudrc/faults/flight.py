@@ -58,9 +58,9 @@ class Flight:
 
     def __init__(
         self,
-        *settings: str,  # of the experiment `paper`, as `--set` takes them
+        *settings: str,  # settings of the experiment `paper`, as for `--set`
         seed: int = 1,
-        cloud_clock: Clock | None = None,  # None if the two ends share a clock
+        cloud_clock: Clock | None = None,  # None if world and cloud share a clock
         link: Shape = replace,  # changes both directions of the link; by default nothing
         uplink: Shape | None = None,  # changes the direction from world to cloud instead
         downlink: Shape | None = None,  # changes the direction from cloud to world instead
@@ -69,9 +69,9 @@ class Flight:
         start: bool = True,  # whether the experiment's mission is ordered at once
         life: int = 1,  # makes the nonces differ from those of another flight
         lies: Sequence[Lie] = (),  # change cloud's commands, one after the other
-        words: Words | None = None,  # takes the operator's place in cloud
+        words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,
-        separate: bool = False,  # whether teleop is a process of its own, not in cloud's
+        separate: bool = False,  # whether teleop has its own process
     ) -> None:
         """Prepare a flight; at `second` [s], if given, another cloud asks for the robot."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])

@@ -59,10 +59,10 @@ FALL = 1.0
 """Downward speed that proves a fall with stopped rotors [m/s]; a drop of 0.02 m reaches 0.7."""
 REST = 0.5
 """Length added to the stopping distance after TRACK [m]; the robot swings back by up to 0.2 m."""
-FALL_MAX = 1.5  # distance from the fence at which people are safe [m]
+FALL_MAX = 1.5  # largest distance that a falling robot may leave the fence [m]
 BRAKE_NS = 200_000_000  # time to stop a descent that the operator has acknowledged [ns]
-REELS_NS = 1_000_000_000  # time after a hit in which the hit explains the robot's motion [ns]
-THROWN_NS = 3_000_000_000  # time after a hit in which the robot may be thrown out of the fence [ns]
+REELS_NS = 1_000_000_000  # time after a collision in which it explains the robot's motion [ns]
+THROWN_NS = 3_000_000_000  # time after a collision in which the robot may leave the fence [ns]
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
 """Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""
 SETTLE_NS = 1_000_000_000
@@ -80,7 +80,7 @@ RAMP_MIN = 1.0
 class Breach(NamedTuple):
     """A violation of an invariant: the invariant's name, and what happened."""
 
-    time: float  # on world's clock [s]
+    time: float  # time on world's clock [s]
     kind: str
     text: str
 
@@ -88,10 +88,10 @@ class Breach(NamedTuple):
 class Limits(NamedTuple):
     """Limits that the guard must keep."""
 
-    speed: float = 6.0  # of the reference [m/s]
+    speed: float = 6.0  # speed of the reference [m/s]
     acceleration: float = 12.0  # growth of the reference [m/s^2]
     yaw_rate: float = 1.0  # [rad/s]
-    age_ns: int = 250_000_000  # of a command's basis [ns]
+    age_ns: int = 250_000_000  # age of a command's odometry [ns]
     hold_ns: int = 60_000_000_000  # time in a mission after which HOLD becomes LAND [ns]
 
     @classmethod
@@ -113,7 +113,7 @@ class Watch:
         self.limits = limits
         self.breaches: list[Breach] = []  # the first ones of each kind
         self.counts: Counter[str] = Counter()  # of breaches, by kind
-        self.margin = 9.0  # smallest distance of the base to the fence, the floor excepted [m]
+        self.margin = 9.0  # smallest distance of the base to the fence, without the floor [m]
         self.speed = 0.0  # largest reference [m/s]
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
@@ -136,16 +136,16 @@ class RobotInvariants:
         self._was = self._state = robot.guard.state  # after the last step; after the last event
         self._next_ns, self._steps = start_ns, 0
         self._before = ZERO  # the last reference [m/s]
-        self._newest_ns = -1  # basis of the accepted commands
-        # Motion: after a stop or a hit, and after TRACK.
+        self._newest_ns = -1  # newest odometry stamp of accepted commands [ns]
+        # Motion after a stop or a collision, and after TRACK.
         self._comes_down = False  # whether it lands, or fell after an emergency stop
-        self._falls = False  # after a stop or a hit, until it flies again
+        self._falls = False  # after a stop or a collision, until it flies again
         self._landed_ns = -2 * BRAKE_NS
         self._left, self._way = ZERO, inf  # where TRACK ended, and how far the robot may go
         # Contacts and rotors.
         self._touches, self._seen = robot.simulator.touches, 0
         self._touched_ns = -THROWN_NS
-        self._is_thrown = False  # by a hit, and not yet back inside the fence
+        self._is_thrown = False  # by a collision, and not yet back inside the fence
         self._turned = self._halted = self._is_asked = False
         # The operator, and the wait for commands.
         self._ramp_ns = round(max(RAMP_MIN, watch.limits.speed / RAMP) * 1e9)
@@ -154,11 +154,11 @@ class RobotInvariants:
         self._armed = False  # whether a mission is on
         self._released = set[GuardState]()  # states acknowledged since the last change
         self._is_reset = self._impossible = self._goes_back = False
-        self._basis_ns = -1  # of the commands in a mission
+        self._basis_ns = -1  # newest odometry stamp of commands in a mission [ns]
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
 
-    # What the robot shows.
+    # Calls of the robot.
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
         """Implement `Observer.see_step`: check all invariants."""
@@ -243,7 +243,7 @@ class RobotInvariants:
         self._fresh_ns.clear()
         self._invalid_ns.clear()
 
-    # Where the robot is, and the reference that it flies.
+    # Position and reference velocity.
 
     def _check_fence(
         self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
@@ -288,7 +288,7 @@ class RobotInvariants:
             self._watch.speed = speed
         if not speed <= self._limits.speed + SLACK:  # or it is NaN
             self._note(now_ns, "cap", f"reference {speed:.3f} m/s")
-        if ramped:  # braking may be as hard as needed: at the fence, or after a hit
+        if ramped:  # braking is not limited: at the fence, or after a collision
             grown, after = growth(self._before, reference), now_ns < self._ramp_until_ns
             if not grown <= (RAMP if after else self._limits.acceleration) * STEP + SLACK:
                 text = f"reference grows by {grown:.9f} m/s in a tick"
@@ -306,7 +306,7 @@ class RobotInvariants:
         if dx * dx + dy * dy > self._way * self._way:
             self._note(now_ns, "rest", f"{hypot(dx, dy):.2f} m from where the last command ended")
 
-    # What it touches, and how its rotors stop.
+    # Contacts and stops of the rotors.
 
     def _check_touches(self, state: GuardState, now_ns: int) -> None:
         """Check new contacts; after a contact the robot may leave the fence."""
@@ -315,7 +315,7 @@ class RobotInvariants:
             self._touches, self._seen = touches, 0
         for _, body, _, _, _, tip in touches[self._seen :]:
             self._touched_ns, self._way, self._is_thrown = now_ns, inf, True
-            # Acknowledged right above a pipe, a robot that lands cannot stop in time.
+            # A landing that is acknowledged just above a pipe cannot stop in time.
             lands = state is LAND or (state is HOLD and now_ns - self._landed_ns <= BRAKE_NS)
             low = lands or state not in FLOWN
             allowed = (body == "board" and tip) or (
@@ -354,7 +354,7 @@ class RobotInvariants:
     def _just_touched(self) -> bool:
         return self._simulator.touch_age <= REELS_NS * 1e-9
 
-    # What the operator allows, the wait for commands, and the way out of HOLD.
+    # Requests of the operator, the wait for commands, and the end of HOLD.
 
     def _check_change(self, was: GuardState, state: GuardState, now_ns: int) -> None:
         if was in LATCHED and self._released.isdisjoint(LATCHED) and state is not ESTOP:
@@ -372,7 +372,7 @@ class RobotInvariants:
                     text = f"HOLD left for TRACK on {len(fresh_ns)} fresh commands"
                     self._note(now_ns, "stale", text)
         elif state is HOLD or (was is TRACK and state is GROUND and not self._is_reset):
-            # In GROUND it had not left the ground yet.
+            # To GROUND: the robot had not left the ground yet.
             if state is HOLD and self._guard.cause is Cause.SILENCE and not self._goes_back:
                 self._check_settled("HOLD", self._held_ns, now_ns)
             self._held_ns = self._alone_ns = now_ns

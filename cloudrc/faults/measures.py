@@ -93,7 +93,7 @@ def moves(
     for metric in metrics:
         role, *name = metric.split()
         before, after = (reading(flight, role, *name, until=each) for each in (since, last))
-        moved = after == after and before != after  # absent before is as good as another value
+        moved = after == after and before != after  # a new metric counts as changed
         outcome.true(f"metric {' '.join(name)} moves within {SOON:g} s{end}", moved)
 
 

@@ -67,7 +67,7 @@ class Clock:
 class RestartableEndpoint:
     """World or cloud in a process that a scenario can kill, freeze and start; an `Endpoint`."""
 
-    sealed = True  # a flight's ends have keys
+    sealed = True  # world and cloud have keys
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
         """Start the first process; `build` makes world or cloud at a time on its clock [ns]."""
@@ -147,7 +147,7 @@ class RestartableEndpoint:
             own_ns = self.clock.at(now_ns)
             if own_ns >= inner.next_deadline_ns():
                 inner.handle_deadline(own_ns)
-            if own_ns > was_due_ns + 1000:  # a clock that drifts is off by a nanosecond
+            if own_ns > was_due_ns + 1000:  # rounding of a drifting clock: 1 ns
                 self._note_late_wake(inner, own_ns, own_ns - was_due_ns)
         self._set_deadline()
 
@@ -184,7 +184,7 @@ class EndpointGroup:
 
     def __init__(self, members: Sequence[Endpoint]) -> None:
         self.members = members
-        self.others: list[Record] = []  # of all ends but the first, oldest first
+        self.others: list[Record] = []  # records of all clouds but the first, oldest first
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
         """Implement `Endpoint.receive_datagram`."""
@@ -298,7 +298,7 @@ class TeleopModel:
         """Return the `Operator` for a cloud that starts at `start_ns` on its clock [ns]."""
         if self._phase_ns is None:
             return self
-        self._clouds.waiting.clear()  # lost with the cloud before
+        self._clouds.waiting.clear()  # lost with the previous cloud
         return RemoteTeleop(self._clouds, wire.encode, wire.decode, start_ns)
 
     @property
@@ -336,7 +336,7 @@ class TeleopModel:
         """Freeze teleop's own process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
         if self.service is not None and self._phase_ns is not None and self._host is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
-            self._host.at(self._free_ns * 1e-9, self._turn)  # who is late wakes at once
+            self._host.at(self._free_ns * 1e-9, self._turn)  # a late process wakes at once
 
     # The `Operator` of a cloud in the same process.
 
@@ -386,7 +386,7 @@ class TeleopModel:
             late_ns=now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0,
             now_ns=self._host.clock.at(now_ns),
         )
-        # Events wait for a cloud that is there; everything else is repeated.
+        # Events wait until cloud runs; all other outputs are repeated.
         send(self._take(self.service), self._unsent, self._peer, wire.encode)
 
 

@@ -52,7 +52,7 @@ class Outcome:
     """Result of a scenario: its checks in order."""
 
     checks: list[Check] = field(default_factory=list)
-    sha256: str = ""  # of the records of all its flights
+    sha256: str = ""  # hash of the records of all its flights
     seconds: float = 0.0  # how long it ran [s]
     error: str = ""  # the exception that ended it, if any
 

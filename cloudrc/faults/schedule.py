@@ -105,12 +105,12 @@ class Schedule:
     seed: Annotated[int, Field(ge=0, le=2**63)]
     profile: str = "paper-p2"
     events: tuple[Event, ...] = ()
-    duplicate: Share = 0.0  # of datagrams that arrive twice
-    reorder: Share = 0.0  # of datagrams that overtake others
+    duplicate: Share = 0.0  # share of datagrams that arrive twice
+    reorder: Share = 0.0  # share of datagrams that overtake others
     cloud_offset: Annotated[float, Field(ge=-OFFSET_MAX, le=OFFSET_MAX)] = 0.0
     """Cloud's clock minus world's clock [s]; 0 if they share one clock."""
-    cloud_drift: Annotated[int, Field(ge=-100_000, le=100_000)] = 0  # how fast cloud's is [ppm]
-    policy: str = ""  # of a hostile cloud; "" for an honest one
+    cloud_drift: Annotated[int, Field(ge=-100_000, le=100_000)] = 0  # drift of cloud's clock [ppm]
+    policy: str = ""  # policy of a dishonest cloud; "" for an honest cloud
     duration: Annotated[float, Field(ge=0.1, le=DURATION_MAX)] = 60.0  # [s]
     separate: bool = False
     hold_max: Annotated[float, Field(ge=0.1, le=3600.0)] = 60.0  # HOLD becomes LAND then [s]
@@ -202,12 +202,12 @@ def load(path: Path) -> Schedule:
     raise BadInputError(f"{path}: is no schedule of faults: {text}")
 
 
-CALM = 45.0  # time from which on there are no faults, so that the robot has to recover [s]
+CALM = 45.0  # time after which there are no faults and the robot must recover [s]
 DURATION = 60.0  # duration of a flight [s]
 PROFILES = ("ideal", "wifi", "lte", "5g", "lossy", "paper-p1", "paper-p2", "paper-p3")
 PAPER = PROFILES[-3:]
-HOLDS = 0.8, 3.0  # shortest and longest `hold_max` that is drawn [s]; to fly on takes 0.75 s
-ONCE = ("second_cloud", "key_rotated")  # kinds of which a flight has one at most
+HOLDS = 0.8, 3.0  # range of a random `hold_max` [s]; to end a HOLD takes 0.75 s
+ONCE = ("second_cloud", "key_rotated")  # kinds of fault that a flight has at most once
 
 
 def compose(seed: int) -> Schedule:
@@ -232,7 +232,7 @@ def compose(seed: int) -> Schedule:
         cloud_drift=int(rng.integers(-500, 501)) if rng.random() < 0.3 else 0,
         duration=DURATION,
         separate=bool(rng.random() < 0.5),
-        # In a third of the schedules it is shorter than many a silence: the robot lands.
+        # In a third of the schedules it is shorter than most silences, so the robot lands.
         hold_max=round(float(rng.uniform(*HOLDS)), 1) if rng.random() < 1 / 3 else 60.0,
     )
 

@@ -48,7 +48,7 @@ INVARIANTS = {
     "error": "errors in an end",
 }
 """Name of an invariant -> name of its breaches in a table."""
-BACK = 10.0  # time of calm in which the robot must have flown [s]
+BACK = 10.0  # time without faults in which the robot must have flown [s]
 FORGETFUL = ("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down")
 """Faults after which the robot or teleop is new, so that teleop may not know of an earlier stop."""
 PATIENCE_NS = 1_000_000_000  # shortest time between two actions of the operator [ns]
@@ -65,10 +65,10 @@ class Finding:
 
     schedule: Schedule
     breaches: tuple[Breach, ...]  # the first ones of each kind
-    sha256: str = ""  # of all records, if they were kept
+    sha256: str = ""  # hash of all records, if they were kept
     margin: float = 9.0  # smallest distance of the base to the fence's walls and ceiling [m]
     speed: float = 0.0  # largest reference [m/s]
-    missions: int = 0  # that were done
+    missions: int = 0  # number of completed missions
 
     @property
     def kinds(self) -> set[str]:
@@ -89,7 +89,7 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
     inject(flight, schedule)
     try:
         flight.fly(schedule.duration)
-    except Exception as error:  # an end has to survive whatever comes
+    except Exception as error:  # world and cloud must survive every fault
         watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
     checks: dict[str, Callable[[], None]] = {
         "waypoint": order.check_waypoints,
@@ -180,7 +180,7 @@ class Operator:
         service = flight.teleop.service
         if service is None or now_ns < self._next_ns or flight.cloud.inner is None:
             return
-        # What the operator sees: a world that was restarted is in GROUND, and changes nothing.
+        # A restarted world is in GROUND without a change of state, so ask for the state.
         own_ns = flight.cloud.clock.at(now_ns)
         seen = service.state(own_ns)["seen"]
         is_over = not flight.teleop.missions or flight.mission.ended
@@ -260,7 +260,7 @@ def _actions(
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
     """Return the actions of each kind of fault with their times [s]; `process` is affected."""
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
-    gone = at + event.value * lasts  # for teleop that was asked to end
+    gone = at + event.value * lasts  # end of teleop after it was asked to end
 
     def ask(call: Call) -> Action:
         return lambda now_ns: teleop.ask(call, flight.cloud.clock.at(now_ns))

@@ -121,7 +121,7 @@ class Log:
         self.refuse_early(min(arrived))
         times = np.array([sent for sent, _ in self.entries])
         self._refuse_steps(times)
-        unique = dict(reversed(self.entries))  # of packets with the same time the first remains
+        unique = dict(reversed(self.entries))  # of packets with the same time, the first is kept
         repeated = len(times) - len(unique)
         same = f"{repeated} of {len(times)} packets have the same time as another one"
         self._refuse_beyond_limit(repeated, f"{self.name}: {same}; give times with more digits")
@@ -278,7 +278,7 @@ def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
         passed, wall = (
             np.diff([int(stamp[clock]) for stamp in stamps]) for clock in ("monotonic", "wall")
         )
-        # 1 ms, and 0.1 % for a clock in adjustment.
+        # 1 ms, plus 0.1 % for a clock that NTP adjusts.
         far = np.flatnonzero(np.abs(wall - passed) > 1_000_000 + passed // 1000)
         if len(far):
             raise log.error(
@@ -519,7 +519,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     known = np.array(sorted(ping.replies))
     sent = np.array([ping.replies[number][0] for number in known])
     numbers = np.arange(first, last + 1)
-    # Without a reply, the time of sending lies on a straight line between the replies around.
+    # Without a reply, the time of sending is interpolated between the neighbouring replies.
     outside = np.minimum(numbers - known[0], 0) + np.maximum(numbers - known[-1], 0)
     times = np.interp(numbers, known, sent) + outside * ping.period()
     for number, at in zip(numbers.tolist(), times.tolist(), strict=True):
@@ -538,8 +538,8 @@ class _Ping:
     def __init__(self, lines: list[str], log: Log) -> None:
         self.replies: dict[int, tuple[float, float]] = {}
         self._log, self._text = log, "\n".join(lines[:1000])
-        self._told: dict[int, float] = {}  # number -> time stamp of its line, 0 without one [s]
-        self._trips: list[float] = []  # with those of duplicates [s]
+        self._told: dict[int, float] = {}  # number -> time stamp of its line, or 0 [s]
+        self._trips: list[float] = []  # round trips, including duplicates [s]
         self._summaries: list[tuple[int, int]] = []  # packets sent and received
         self._headers, self._base = 0, 1  # lines that begin a log; first number of this ping
         self._wraps = self._newest = 0

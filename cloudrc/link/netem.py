@@ -75,7 +75,7 @@ _PACKET_BITS = 8 * 116
 """Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
 _PACKETS = 1_000
 """Assumed packet rate if there is no bottleneck [1/s]; tunnel and probes send fewer packets."""
-# The kernel's own default for three bands: nothing falls into the fourth by its type of service.
+# The kernel's default for three bands: no type of service selects the fourth band.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
 _INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
 
@@ -182,7 +182,7 @@ def distribution_name(profile: DirectionProfile) -> str:
     """Return the name under which tc finds the table of a profile's distribution."""
     if profile.distribution != "table":
         return profile.distribution
-    # tc makes a file name of it, so only letters and digits; another table is another file.
+    # tc makes a file name of it: only letters and digits, and another name for each table.
     return "table" + blake2b(repr(profile.table).encode(), digest_size=8).hexdigest()
 
 
@@ -263,10 +263,10 @@ def options(profile: DirectionProfile, conditions: Conditions, room: int) -> lis
         words += [_microseconds(conditions.jitter * 1e9 * stretch(profile))]
         words += [_percent(profile.correlation), "distribution", distribution_name(profile)]
     words += ["loss", *_loss(1.0 if conditions.blackout else conditions.loss)]
-    # Of a packet that is doubled and lost one copy arrives: in a blackout none may.
+    # netem delivers one copy of a packet that is both duplicated and lost; a blackout must not.
     copied = 0.0 if conditions.blackout else profile.duplicate
     words += ["duplicate", _percent(copied), "corrupt", _percent(profile.corrupt)]
-    # tc refuses it without a delay, where there is nothing to overtake.
+    # tc rejects it without a delay, as no packet can then be overtaken.
     if profile.reorder and conditions.delay_ns and not profile.keep_order:
         words += ["reorder", _percent(profile.reorder)]
     if conditions.rate is not None:
@@ -454,7 +454,7 @@ class Netem:
             raise MissingPrerequisiteError(self._damage)
         before, room = (self._profile, self._origin_ns), self._room
         self._take(profile, self._clock() if restart else self._origin_ns)
-        if self._room < room:  # netem takes nothing in while it holds more than its limit
+        if self._room < room:  # netem drops all packets while it holds more than its limit
             self._room += counters(qdiscs).get("held", 0)
         try:
             self._apply("change")
@@ -467,7 +467,7 @@ class Netem:
         """Make the changes of the time line that are due within the next `timeout` [s]."""
         until_ns = self._clock() + round(timeout * 1e9)
         if self._clock() - self._looked_ns >= PERIOD_NS:
-            # The limit is as asked again once what was under way at a change has left.
+            # Restore the limit when packets from before the change have left.
             if counters(self._look()).get("held", 0) < self._least_room:
                 self._room = self._least_room
         while True:
@@ -545,7 +545,7 @@ class Netem:
             place = ("dev", self._device, "parent", BAND, "handle", LEAF)
             self._iproute2.tc("qdisc", verb, *place, "netem", *wanted)
             self._applied, self._listed = wanted, None
-        if 0 <= before < self._piece:  # the first piece of a time line is no step
+        if 0 <= before < self._piece:  # the first piece of a time line is no change
             self._stepped_ns = self._clock()
             due_ns = self._origin_ns + starts_ns[self._piece]
             self.steps.note(self._stepped_ns - due_ns, self._piece - before - 1)

@@ -50,7 +50,7 @@ def mean_loss(loss: Loss) -> float:
 class Change:
     """A change of the conditions at one instant; None leaves a value unchanged."""
 
-    at: float  # since the link came up [s]
+    at: float  # time since the link came up [s]
     delay: float | None = None  # mean one-way delay [s]
     jitter: float | None = None  # [s]
     loss: Loss | None = None

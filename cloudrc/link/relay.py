@@ -102,7 +102,7 @@ class ReleaseErrors(Counter[int]):
 def ask_for_stamps(one: socket.socket) -> None:
     """Let the kernel record arrival times and count dropped datagrams, if it supports that."""
     for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():
-        with suppress(OSError):  # without stamps a datagram arrives when it is read
+        with suppress(OSError):  # without a stamp, the time of reading counts as arrival
             one.setsockopt(socket.SOL_SOCKET, option, 1)
 
 
@@ -161,7 +161,7 @@ class Lane:
         self.origin_ns: int | None = None
         self.errors = ReleaseErrors()
         self._output, self._peek = send, peek
-        # Due instant [ns], a number that keeps equal instants in order, data.
+        # Due time [ns], a number that keeps the order of equal times, data.
         self._in_flight: list[tuple[int, int, bytes]] = []
         self._numbers = count()
         self._stamps = Stamps()
@@ -177,13 +177,13 @@ class Lane:
         for _ in range(BATCH):
             try:
                 data, beside, flags, _ = self.source.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
-            except ConnectionRefusedError:  # an earlier datagram found nobody at this end
+            except ConnectionRefusedError:  # an earlier datagram had no receiver
                 continue
-            except OSError:  # nothing waits
+            except OSError:  # no datagram waits
                 return
             self._counts["received"] += 1
             age_ns = self._stamps.age_ns(beside, time_ns())
-            # The wall clock first: a pause between both makes a datagram later, never earlier.
+            # The wall clock first: a pause between the two makes a datagram late, never early.
             received_ns = monotonic_ns() - age_ns
             self._stalled += age_ns >= AGE_MAX_NS
             try:
@@ -247,7 +247,7 @@ class Lane:
         for _ in range(2):
             try:
                 self._output(data)
-            except ConnectionRefusedError:  # of an earlier datagram: this one was not sent
+            except ConnectionRefusedError:  # reports an earlier datagram; this one was not sent
                 continue
             except OSError:
                 return False
@@ -285,10 +285,10 @@ class Lanes:
         if due_ns and due_ns - monotonic_ns() <= SPIN_NS:
             while monotonic_ns() < due_ns:
                 pass
-            for lane in self._lanes:  # first: new datagrams have a time stamp and can wait
+            for lane in self._lanes:  # before reading: new datagrams have a time stamp and can wait
                 lane.release()
         self.take_in(readable)
-        for lane in self._lanes:  # what has no delay
+        for lane in self._lanes:  # datagrams without delay
             lane.release()
 
     def take_in(self, readable: Collection[socket.socket] | None = None) -> None:
@@ -423,7 +423,7 @@ class RelayShaper(Lanes):
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         """Use this profile from now on; its time line starts now (`restart`) or continues."""
-        self.take_in()  # what has arrived until now belongs to the old profile
+        self.take_in()  # datagrams that have arrived belong to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
 
     def counts(self) -> dict[str, int]:

@@ -304,7 +304,7 @@ class Sidecar:
             self._metrics.see([Counted(now_ns, "link", name, number) for name, number in counts])
         self._publish()
         if released := shaper.released():
-            with suppress(OSError):  # a full disk is no reason to stop shaping
+            with suppress(OSError):  # shaping continues even if the disk is full
                 publish(self._released_file, json.dumps(released))
 
     def _publish(self) -> None:

@@ -43,7 +43,7 @@ class Failure:
 
     code: str  # one word, for programs
     text: str  # for people
-    time: float | None = None  # since the start of the mission [s]; None without an instant
+    time: float | None = None  # time since the start of the mission [s]; None if unknown
     place: Vector | None = None  # true position of the base at that time [m]; None if unknown
 
 
@@ -91,7 +91,7 @@ class Evidence:
     time_limit: float = inf  # limit of the time of `end` [s]
     touch: tuple[float, Moment] | None = None  # speed of the first touch of the board [m/s]
     violations: tuple[Failure, ...] = ()  # other events that must not happen
-    slow: str = ""  # why the run did not keep real time; "" if it did or did not have to
+    slow: str = ""  # why the run failed to keep real time; "" if it did not fail
 
 
 def judge(evidence: Evidence) -> Verdict:
@@ -282,7 +282,7 @@ class Observations:
     pipe_touches: int = 0  # contacts since the mission began
     touch_before: float | None = None  # speed of an earlier mission's touch [m/s]
     touch_speed: float | None = None  # speed of this mission's touch of the board [m/s]
-    slip_began_ns: int = 0  # slip before the mission and during a restart of teleop: not counted
+    slip_began_ns: int = 0  # slip that does not count: before the mission, in restarts of teleop
     slip_ns: int = 0  # world's slip in the last telemetry; AWAY after a restart of teleop
 
     @classmethod

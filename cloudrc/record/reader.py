@@ -140,11 +140,11 @@ class Records:
             yield from self._read()
         except CRCValidationError as error:
             self.fault = "damaged: a checksum is wrong"
-            if isinstance(error.record, mcap.DataEnd):  # all was read
+            if isinstance(error.record, mcap.DataEnd):  # everything was read
                 self.data_ended = self.ended = True
                 self.position = self.size
                 self.fault = "damaged: a byte outside the chunks is wrong"
-        except (EndOfFile, RecordLengthLimitExceeded):  # a record that ends behind the file
+        except (EndOfFile, RecordLengthLimitExceeded):  # a record longer than the rest of the file
             self.fault, self.cut = "cut short", True
         except _StopError as error:
             self.fault = str(error)
@@ -163,7 +163,7 @@ class Records:
                 raise ValueError("the first record, and only the first, must be a header")
             if isinstance(record, mcap.Chunk):
                 yield from map(self._check, self._unpack(record))
-            elif not self.data_ended:  # what follows repeats the definitions
+            elif not self.data_ended:  # records after the data repeat the definitions
                 yield self._check(record)
             if isinstance(record, mcap.Statistics):
                 self.stated = record.message_count
@@ -211,7 +211,7 @@ class Records:
         if chunk.uncompressed_crc not in (0, checksum := zlib.crc32(data)):
             raise CRCValidationError(chunk.uncompressed_crc, checksum, chunk)
         stream = BytesIO(data)
-        # `emit_chunks`: the library would unpack a chunk in a chunk without a bound.
+        # `emit_chunks`: the library would unpack a chunk inside a chunk without a limit.
         records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
         try:
             while stream.tell() < size:  # one at a time: a chunk may hold millions
@@ -341,7 +341,7 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool], total: in
     if records.ended and records.stated not in (None, total):
         changed.append(f"the index states {records.stated} messages, {total} were read")
     changed += _changed(contents) if records.data_ended else ()
-    if before := to_one_line(metadata.get(CHANGED, "")):  # by an earlier reader of the file
+    if before := to_one_line(metadata.get(CHANGED, "")):  # noted by an earlier reader of the file
         changed.append(before)
     if changed:
         metadata[CHANGED] = "; ".join(changed)
@@ -373,10 +373,10 @@ def _list(topics: list[str]) -> str:
 class Recovery:
     """The result of `recover`."""
 
-    size: int  # of the damaged file [bytes]
+    size: int  # size of the damaged file [bytes]
     kept: dict[str, int]  # number of objects in the new file, by kind
     dropped: dict[str, int]  # number of objects that are known to be lost (only "messages")
-    bytes_lost: int  # behind the last intact record [bytes]
+    bytes_lost: int  # number of bytes after the last intact record
     notes: list[str]  # what is missing or doubtful, in words
     index_is_new: bool  # whether the old file had no readable index
 

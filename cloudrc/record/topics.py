@@ -24,9 +24,9 @@ Row: TypeAlias = tuple[str, int, Values]
 class Field(NamedTuple):
     """A column of a topic."""
 
-    name: str  # of the column and of the ROS field
-    kind: Kind  # of a value; vectors have shape (3,), quaternions shape (4,)
-    unit: str  # of the values; "" without a unit
+    name: str  # name of the column and of the ROS field
+    kind: Kind  # kind of a value; vectors have shape (3,), quaternions (4,)
+    unit: str  # unit of the values; "" without a unit
     text: str  # meaning of the values
     path: str = ""  # dotted path of the value in the record; "" if it follows from the name
 
@@ -34,14 +34,14 @@ class Field(NamedTuple):
 class Topic(NamedTuple):
     """A table of the recording."""
 
-    name: str  # in the MCAP file, with its slash
+    name: str  # name in the MCAP file, with its slash
     ros_type: str  # a type of `cloudrc_msgs` is defined by `fields`
     source: type[Record]  # class of the records
-    end: Literal["world", "cloud", "either"]  # that records the topic
+    end: Literal["world", "cloud", "either"]  # end that records the topic
     text: str  # meaning of a row
     fields: tuple[Field, ...]  # the columns after `stamp_ns`
     stamp_path: str = "stamp_ns"  # dotted path of the row's stamp in the record
-    part: str = ""  # path to a nested record, with a dot at its end; it has what the record has not
+    part: str = ""  # path of a nested record with the other fields, with a dot at its end
 
     def paths(self) -> list[str]:
         """Return the dotted path of each field's value in the record."""

@@ -78,7 +78,7 @@ class McapWriter:
         self._noted: dict[str, str] = {}
         self._latest_ns = 0
         self._chunk_start_ns: int | None = None
-        self._number = 0  # of the last message
+        self._number = 0  # log time of the last message [ns]
         self._counts: Counter[str] = Counter()
         self._sha256 = hashlib.sha256()
         self._mcap._Writer__chunk_indices = _ChunkIndexes()  # type: ignore[attr-defined]

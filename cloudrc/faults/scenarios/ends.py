@@ -90,7 +90,7 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     coded = "world_restarted" in str(flight.mission.verdict)
     outcome.true("with the code world_restarted", coded)
     _check_epochs(outcome, flight)
-    refused = "world datagrams_total downlink old_epoch"  # what cloud says to the world before
+    refused = "world datagrams_total downlink old_epoch"  # commands for the old world
     failed = "cloud missions_total world_restarted"
     moves(outcome, flight, refused, "world session_epoch", failed, since=at + 2.0)
 

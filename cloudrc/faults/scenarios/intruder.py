@@ -44,9 +44,9 @@ class HostileSender:
         self.sent += 1
         rose = Counter(inner.counts) - before
         sent = rose.pop("sent", 0)  # an answer, or a hello to a peer that may have a new epoch
-        # The ticks before a greeting may limit a command.
+        # In the ticks before a hello message the guard may limit a command.
         rose = Counter({name: n for name, n in rose.items() if not name.startswith("limited_")})
-        # A challenge that nobody has asked for is neither counted nor answered.
+        # A challenge without a request is neither counted nor answered.
         ignored = not rose and not sent and codec.peek(data)[0] == codec.Kind.CHALLENGE
         refused = rose.total() == 1 and rose.keys() <= {*REFUSED, *GREETED}
         self.taken += epoch != inner.epoch or not (ignored or refused)

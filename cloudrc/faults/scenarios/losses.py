@@ -154,7 +154,7 @@ def _bursts(outcome: Outcome, seed: int) -> None:
         if packets < 50:  # else it hardly ever rests on the board for 4 s, and a leg may time out
             measures.done(outcome, flight)
         outcome.true("the mission has ended", flight.mission.ended)
-        # Most bursts do nothing: the fault is the first one that is too long.
+        # Most bursts have no effect; the fault begins with the first that is too long.
         since = measures.first_into(flight, GuardState.HOLD) - measures.AGE_MAX
         moves(outcome, flight, HOLDS, since=since)
         text, busiest = f"bursts of {packets * 10} ms", measures.busiest_second(flight.changes)

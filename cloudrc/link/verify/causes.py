@@ -26,14 +26,14 @@ PASSED = 0.9
 class Evidence(NamedTuple):
     """Facts about the shaper of one direction, reported by its machine; None or "" if unknown."""
 
-    shaper: str = ""  # "relay", "netem"; "none" if the kernel has none where the flow leaves
-    why: str = ""  # why this shaper, in words
-    interface: str = ""  # through which the flow leaves
+    shaper: str = ""  # "relay", "netem"; "none" if the interface has no netem qdisc
+    why: str = ""  # why this shaper was chosen, in words
+    interface: str = ""  # interface through which the flow leaves
     elsewhere: tuple[str, ...] = ()  # other interfaces that have a netem qdisc
     layers: int = 1  # number of shapers that the flow passes
-    sent: int | None = None  # datagrams that the end sent
-    passed: int | None = None  # of these, those that the shaper counted
-    starved: str = ""  # how a lack of CPU time shows
+    sent: int | None = None  # datagrams that world or cloud sent
+    passed: int | None = None  # datagrams that the shaper counted
+    starved: str = ""  # signs of a lack of CPU time; "" if there are none
     restored: int = 0  # times that another program removed or changed the qdisc
 
 
@@ -61,7 +61,7 @@ def read_evidence(told: Told, metrics: Mapping[str, float], sent: int | None = N
         (stopped > STOPPED * periods, f"stopped in {stopped} of {periods} CPU periods"),
     )
     near, netem = told.near or Near("", {}), told.shaper == "netem"
-    ways = {near.interface} if netem else {near.interface, "lo"}  # an end reaches a relay over lo
+    ways = {near.interface} if netem else {near.interface, "lo"}  # the relay receives through lo
     here = [one for way in ways for one in near.netems.get(way, ())]
     passed = received + unread if metrics and not netem else None
     if netem and here:

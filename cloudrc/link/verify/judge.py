@@ -55,7 +55,7 @@ tolerance, for the verdict "ok"."""
 class Flow(NamedTuple):
     """The datagrams of one kind in one direction."""
 
-    seed: int  # of the experiment
+    seed: int  # seed of the experiment
     uplink: bool
     kind: int  # as in the tunnel's header
     size: int  # UDP payload [bytes]
@@ -69,19 +69,19 @@ class Row(NamedTuple):
 
     name: str  # as in `Plan.quantities`, or "round_trip"
     unit: str  # "s", "1" or "bit/s"
-    asked: float  # mean on links of the requested profile
+    asked: float  # mean value of links with the requested profile
     measured: float
-    low: float  # lowest value that is believed
-    high: float  # highest value that is believed
+    low: float  # lowest accepted value
+    high: float  # highest accepted value
     verdict: str  # "ok", "off", "open" or "told"
 
 
 class Expected(NamedTuple):
     """Values that a link with the requested profile would measure."""
 
-    bands: dict[str, tuple[float, float, float]]  # mean; a share TAIL is below, TAIL above the rest
+    bands: dict[str, tuple[float, float, float]]  # mean; limits of the band
     pooled: Floats  # delays minus the requested delays, with median 0, sorted [s]
-    known: bool  # True if the link's random numbers are known: then a band has no width
+    known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
         """Return half the width of a quantity's band, divided by the quantity's tolerance [1]."""

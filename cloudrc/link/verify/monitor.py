@@ -66,7 +66,7 @@ class LinkMonitor:
         self._arrivals = deque[Arrival](maxlen=KEPT)
         self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
         self._asked: Asked | None = None
-        self._plans: list[Plan] = []  # of what is received, and of the other direction
+        self._plans: list[Plan] = []  # for the received flow, and for the other direction
         self._epoch, self._fresh, self._seen = -1, True, ""
         self._since_ns, self._due_ns = 0.0, 0
         self._suspects, self._complained = set[str](), False
@@ -103,10 +103,10 @@ class LinkMonitor:
             if text != self._seen:
                 self._seen = text
                 self.follow(load(from_text(text).profile))
-        except TooLongError:  # a long time line: what was asked before holds no more
+        except TooLongError:  # a long time line: the profiles are unknown
             self._seen = ""
             self.follow(None)
-        except Exception:  # not there yet, half written or nonsense: what was asked holds
+        except Exception:  # no file yet, or an invalid one: the profiles stay
             pass
 
     def _run(self, path: Path | None, load: Load) -> None:
@@ -118,7 +118,7 @@ class LinkMonitor:
                 records, now_ns = self._inbox.get()
                 try:
                     found = self._see(records, now_ns)
-                except Exception as error:  # the next look may do better
+                except Exception as error:  # the next attempt may succeed
                     text = f"the monitor of the link failed ({describe_error(error)}); it goes on"
                     found = [] if failed else [Fault(now_ns, "link_check", text)]
                     failed = True
@@ -140,7 +140,7 @@ class LinkMonitor:
                     self._trips.append(record.rtt)
         if self._asked is None:
             return []
-        if self._fresh:  # a time line that runs is not judged: where it began is not known here
+        if self._fresh:  # a running time line is not judged, because its start is not known here
             last_ns = max(Timeline(profile).last_ns for profile in self._asked)
             settled_ns = now_ns + SETTLE_NS
             self._since_ns, self._due_ns = settled_ns + last_ns, settled_ns + CHECK_NS
@@ -181,14 +181,14 @@ class LinkMonitor:
         rows, skipped = list[Row](), UNJUDGED if timed else UNJUDGED | DELAYS
         if len(stream.sent) >= FEWEST:
             rows = self._plans[0].judge(stream, self._epoch, first)
-        elif self._arrivals:  # of a new session or profile: an older verdict holds no more
+        elif self._arrivals:  # a new session or profile ends the old verdict
             rows = [told("loss", nan)._replace(verdict="open")]
         rows = [row for row in rows if row.name not in skipped]
         if not timed and len(self._trips) >= FEWEST:
             rows.append(self._round_trip())
         rows = [self._excuse(row) for row in rows]
         timelines = [Timeline(one) for one in self._asked or ()]
-        if any(one.only() is None for one in timelines):  # 1: it loops, and is never judged
+        if any(one.only() is None for one in timelines):  # 1: it loops, so it is never judged
             rows.append(told("time_line", 1, float(any(isinf(one.last_ns) for one in timelines))))
         return rows
 
@@ -227,10 +227,10 @@ def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
     if not arrivals:
         return Stream(delays, delays, copies), first, False
     begin_ns, timed = arrivals[0].stamp_ns, not any(isnan(one.delay) for one in arrivals)
-    numbers, index, times = np.unique(  # the first copy comes first
+    numbers, index, times = np.unique(  # the copy that arrived first
         [one.counter - first for one in arrivals], return_index=True, return_counts=True
     )
-    # A nanosecond apart: what is read in one wake has the same time, but has not lost its order.
+    # Datagrams read in one wake have the same time: 1 ns apart they keep their order.
     stamps_ns = [one.stamp_ns - begin_ns + place for place, one in enumerate(arrivals)]
     stamps = np.array(stamps_ns)[index] * 1e-9
     known = np.array([one.delay for one in arrivals])[index]

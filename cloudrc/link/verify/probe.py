@@ -103,7 +103,7 @@ class ProbeEnd:
 
     def receive(self, far: socket.socket) -> None:
         """Read one datagram from the other end's socket `far`; record a probe of this end."""
-        with suppress(OSError, ValueError):  # nobody listened to an earlier probe; foreign data
+        with suppress(OSError, ValueError):  # an earlier probe had no receiver; no probe
             data, ancillary, _, _ = far.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
             at_ns, number = self._stamps.wall_ns(ancillary) or time.time_ns(), peek(data)[2]
             if number < len(self.probes) and data == self.probes[number]:
@@ -135,7 +135,7 @@ def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
                 heard[far].receive(far)
 
     gc.collect()
-    gc.disable()  # a collection takes milliseconds
+    gc.disable()  # a garbage collection takes milliseconds
     try:
         for due_ns, place, number in schedule:
             listen(due_ns)
