@@ -97,7 +97,7 @@ def build_cloud(
 
     Args:
         experiment: The experiment.
-        identity: Clock, process and keys of cloud, for the tunnel.
+        identity: Names cloud's clock and process in the tunnel, and holds the keys.
         clock: Cloud's monotonic clock [ns].
         teleop: Source of setpoints; None: a new one, which flies the mission at once.
         make_loop: Makes the control loop from the arguments of `ControlLoop`.

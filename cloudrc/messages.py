@@ -34,10 +34,10 @@ class GuardState(IntEnum):
     HOLD = 2
     """No command is fresh: the robot brakes, then holds its position with onboard sensors only."""
     LAND = 3
-    """The robot descends slowly, and stops its rotors when it touches down. Lasts until the
-    operator acknowledges."""
+    """The robot descends slowly and stops its rotors at touch-down. LAND lasts until
+acknowledged."""
     ESTOP = 4
-    """The rotors were stopped at once. Lasts until the operator acknowledges."""
+    """The rotors were stopped at once. ESTOP lasts until the operator acknowledges."""
 
 
 class Cause(IntEnum):

@@ -107,7 +107,7 @@ class Limits(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of a flight; also after a restart of world, which has a new robot."""
+    """Collects the breaches of a flight, also those of the new robot after a restart of world."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits

@@ -60,7 +60,7 @@ STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
 tc gets the jitter multiplied by the same factor."""
 _ONE = 8192
 _END_OF_TABLE = 32_767 / _ONE
-"""Largest 16-bit entry, in units of the jitter."""
+"""Largest 16-bit entry of a table, as a multiple of the jitter."""
 _KEPT = 10_000
 """Number of recent changes from which the percentiles of the lateness are computed."""
 _IN_ORDER = "100gbit"

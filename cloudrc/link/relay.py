@@ -114,7 +114,6 @@ class Stamps:
     """
 
     def __init__(self) -> None:
-        """Start before the first datagram."""
         self.dropped = 0
 
     def wall_ns(self, ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
@@ -257,7 +256,7 @@ class Lane:
 
 
 class Lanes:
-    """Runs several lanes in one thread.
+    """Runs several `Lane` objects in one thread.
 
     The models' time starts at `origin_ns` [ns], monotonic clock. With None, it starts when the
     first datagram arrives on any lane, as in virtual time.

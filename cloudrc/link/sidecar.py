@@ -128,7 +128,7 @@ class Metrics(Protocol):
         """Export whether the route file exists."""
 
     def asked(self, direction: str, delay: float) -> None:
-        """Export the mean one-way delay that the profile requests, `delay` [s]."""
+        """Export `delay` [s], the mean one-way delay that the profile requests."""
 
     def see(self, records: Iterable[Counted]) -> None:
         """Export the number of datagrams by outcome; called once a second."""

@@ -81,7 +81,7 @@ def _share_clock(world: Contents, cloud: Contents) -> bool:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest difference of arrival and departure [ns], which includes the offset."""
+    """Return the smallest difference of arrival and departure [ns], including the clock offset."""
 
     def packets(table: Table) -> list[tuple[tuple[int, int], int]]:
         epochs, counters, stamps_ns = (

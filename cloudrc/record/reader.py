@@ -186,7 +186,7 @@ class Records:
             raise _StopError(text)
 
     def _check(self, record: mcap.McapRecord) -> mcap.McapRecord:
-        """Store definitions; check that each number has one definition, before its messages."""
+        """Store definitions of schemas and channels; check that each number is defined once."""
         if isinstance(record, mcap.Message):
             self._take_room(MESSAGE_COST)
             if record.channel_id not in self.channels:

@@ -42,7 +42,7 @@ CHUNK_NS = 500_000_000
 METADATA = "cloudrc"
 """Name of the file's metadata record."""
 CLOCK = "clock"
-"""Metadata key: "world" or "cloud", the clock of the stamps."""
+"""Metadata key: whose clock the stamps use, "world" or "cloud"."""
 MISSING = "missing"
 """Metadata key: what is missing from the file, in words."""
 CHANGED = "changed"

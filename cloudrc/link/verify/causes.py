@@ -24,7 +24,7 @@ PASSED = 0.9
 
 
 class Evidence(NamedTuple):
-    """Facts about the shaper of one direction, reported by its machine; None or "" if unknown."""
+    """Facts about the shaper of one direction, as its machine reports; None or "" means unknown."""
 
     shaper: str = ""  # "relay", "netem"; "none" if the interface has no netem qdisc
     why: str = ""  # why this shaper was chosen, in words

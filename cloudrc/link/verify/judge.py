@@ -84,7 +84,7 @@ class Expected(NamedTuple):
     known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return half the width of a quantity's band, divided by the quantity's tolerance [1]."""
+        """Return half a band's width, divided by the tolerance [1]; the limit is `CHANCE_MAX`."""
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
@@ -141,7 +141,7 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """Simulated streams over 200 links with netem, of up to `RUN_LENGTH` datagrams each."""
+        """Simulated streams of up to `RUN_LENGTH` datagrams over 200 links with netem."""
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
@@ -212,7 +212,7 @@ class Plan:
         return measured
 
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
-        """Return whether the measured delays match the predicted ones; without jitter, losses."""
+        """Return whether the delays match the prediction or, without jitter, the losses do."""
         lost = np.isnan(measured.delays), np.isnan(drawn.delays)
         both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)
         pair = [(one.delays - requested)[both] for one in (measured, drawn)]
