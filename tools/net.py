@@ -1,8 +1,8 @@
-"""Compare this working tree with an older commit: the same flights, the same texts.
+"""Compare this working tree with an older commit: the same flights must give the same results.
 
-`python -m tools.net` flies experiments in virtual time on both trees and compares each recorded
-column except free text bit by bit, all numbers, verdict, failure codes and exit code. It compares
-as text: both schemas without descriptions, the rendered charts, /metrics, topics, `--help`.
+`python -m tools.net` flies experiments in virtual time with both trees. All numbers, the verdict,
+failure codes, exit code and every recorded column except free text must be equal, bit by bit. Texts
+are compared, too: schemas without descriptions, rendered charts, /metrics, topics, `--help`.
 """
 
 from __future__ import annotations
@@ -59,23 +59,23 @@ print(json.dumps(Experiment.model_json_schema()))
 
 
 class Tree:
-    """A checkout, and what is run in it."""
+    """A checkout of the project, and the programs that run in it."""
 
     def __init__(self, path: Path, out: Path) -> None:
-        """Take the checkout at `path`; runs go below `out`."""
+        """Use the checkout at `path`; write results to `out`."""
         self.path, self.out = path, out
         self.environment = {**os.environ, "PYTHONPATH": str(path), "COLUMNS": "80"}
         self.environment.pop("CI", None)
 
     def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run Python with this tree's package."""
+        """Run Python with the package of this tree."""
         command = [sys.executable, *arguments]
         return subprocess.run(
             command, cwd=self.path, env=self.environment, capture_output=True, text=True
         )
 
     def fly(self, experiment: str, profile: str, seed: int) -> dict[str, Any]:
-        """Fly once in virtual time, and keep what is compared."""
+        """Fly one experiment in virtual time, and store what is compared."""
         folder = self.out / f"{experiment}-{profile}-{seed}"
         flags = ["--mode", "virtual", "--seed", str(seed), "--set", f"link.profile={profile}"]
         flags += ["--out", str(folder), "-o", "json"]
@@ -92,7 +92,7 @@ class Tree:
         }
 
     def texts(self) -> dict[str, Any]:
-        """Collect what users type or parse."""
+        """Collect the texts that users type or parse."""
         values = json.loads((self.path / "charts/cloudrc/values.schema.json").read_text())
         return {
             "experiment schema": bare(json.loads(self.python("-c", SCHEMA).stdout)),
@@ -103,18 +103,18 @@ class Tree:
         }
 
     def charts(self) -> Iterator[tuple[str, str]]:
-        """Render the chart with each file of values."""
+        """Render the chart with each file of test values."""
         chart = self.path / "charts" / "cloudrc"
         for values in sorted(chart.glob("ci/*-values.yaml")):
             command = ["helm", "template", "net", str(chart), "--kube-version", "1.34", "--values"]
             command.append(str(values))
             text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-            # Secrets are made anew by each rendering, and comments are prose.
+            # Each rendering makes new Secrets, and comments are prose.
             text = re.sub(r"(?m)^(\s+(key|operator|reader|psk)[\w.-]*: ).*$", r"\1made anew", text)
             yield values.name, re.sub(r"(?m)^\s*#.*\n", "", text)
 
     def metrics(self) -> dict[str, list[str]]:
-        """Scrape world and cloud in flight: name, type and labels of each series."""
+        """Read the metrics of world and cloud in flight: name, type and labels of each series."""
         self.out.mkdir(parents=True, exist_ok=True)
         (self.out / "key").write_bytes(bytes(range(32)))
         ports = {"world": (47310, 47311, 47312), "cloud": (47311, 47310, 47313)}
@@ -142,7 +142,7 @@ class Tree:
         return found
 
     def help(self) -> Iterator[tuple[str, list[str]]]:
-        """Walk through all commands: their verbs and options."""
+        """Collect the names and options of all commands."""
         todo: list[tuple[str, ...]] = [()]
         while todo:
             verb = todo.pop()
@@ -156,7 +156,7 @@ class Tree:
 
 
 def series(text: str) -> set[str]:
-    """Give name, type and label names of each series of an exposition."""
+    """List name, type and label names of each series in the text of /metrics."""
     kinds = dict(re.findall(r"(?m)^# TYPE (\S+) (\S+)$", text))
     found = set()
     for name, labels in re.findall(r"(?m)^([a-z]\w*)(?:\{(.*?)\})? ", text):
@@ -169,7 +169,7 @@ def series(text: str) -> set[str]:
 
 
 def bare(schema: Any) -> Any:
-    """Take descriptions and titles out of a JSON schema."""
+    """Remove descriptions and titles from a JSON schema."""
     if isinstance(schema, dict):
         return {
             key: bare(value)
@@ -180,7 +180,7 @@ def bare(schema: Any) -> Any:
 
 
 def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
-    """Say where two documents differ."""
+    """List the differences between two documents, each with its path."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in [*old, *(key for key in new if key not in old)]:
             if key not in new or key not in old:
@@ -199,7 +199,7 @@ def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:
 
 
 def main() -> int:
-    """Compare; 1 if anything differs."""
+    """Compare both trees; return 1 if anything differs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--hash", action="store_true", help="compare records_sha256 as well")
     parser.add_argument("--only", default="", help="flights whose name holds this")

@@ -1,8 +1,8 @@
-"""Define the topics of a recording and convert records to their rows.
+"""Define the topics of a recording, and convert records to rows of topics.
 
-A record gives a row in one or more topics. A topic is a table with the column `stamp_ns` and the
-fields below, which are named as in `cloudrc/records.py`. In these tables quaternions are `wxyz` and
-velocities are in the world frame; `cloudrc/record/ros.py` converts both for ROS.
+Each record gives a row in one or more topics. A topic is a table with the column `stamp_ns` and the
+fields below, which are named as in `cloudrc/records.py`. Quaternions are `wxyz` and velocities are
+in the world frame; `cloudrc/record/ros.py` converts both for ROS.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from cloudrc.records import Record
 Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
 Values: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = tuple[str, int, Values]
-"""Topic, stamp [ns] on the clock of the end that records, values in the order of the fields."""
+"""Topic, stamp [ns] on the clock of the recording end (world or cloud), values of the fields."""
 
 
 class Field(NamedTuple):
     """A column of a topic."""
 
-    name: str  # of the column and of the ROS field
-    kind: Kind  # of a value; vectors have shape (3,), quaternions shape (4,)
-    unit: str  # of the values; "" without a unit
+    name: str  # name of the column and of the ROS field
+    kind: Kind  # kind of a value; vectors have shape (3,), quaternions (4,)
+    unit: str  # unit of the values; "" without a unit
     text: str  # meaning of the values
     path: str = ""  # dotted path of the value in the record; "" if it follows from the name
 
@@ -34,14 +34,14 @@ class Field(NamedTuple):
 class Topic(NamedTuple):
     """A table of the recording."""
 
-    name: str  # in the MCAP file, with its slash
+    name: str  # name in the MCAP file, with its slash
     ros_type: str  # a type of `cloudrc_msgs` is defined by `fields`
     source: type[Record]  # class of the records
-    end: Literal["world", "cloud", "either"]  # that records the topic
+    end: Literal["world", "cloud", "either"]  # end that records the topic
     text: str  # meaning of a row
     fields: tuple[Field, ...]  # the columns after `stamp_ns`
     stamp_path: str = "stamp_ns"  # dotted path of the row's stamp in the record
-    part: str = ""  # path to a nested record, with a dot at its end; it has what the record has not
+    part: str = ""  # path of a nested record with the other fields, with a dot at its end
 
     def paths(self) -> list[str]:
         """Return the dotted path of each field's value in the record."""
@@ -226,7 +226,7 @@ _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Val
 
 
 def values_getter(paths: list[str]) -> Callable[[Any], Values]:
-    """Make a function that reads the values at dotted paths from a record, always as a tuple."""
+    """Make a function that returns the values at dotted paths in a record, as a tuple."""
     if not paths:
         return lambda record: ()
     get = attrgetter(*paths)
@@ -245,7 +245,7 @@ _UPLINK, _DOWNLINK = _EXTRACT.pop(rec.Arrival)
 
 
 def rows(record: Record) -> list[Row]:
-    """Convert a record to one row for each of its topics, in the order of `TOPICS`."""
+    """Convert a record to one row for each topic that it belongs to, in the order of `TOPICS`."""
     if isinstance(record, rec.Arrival):
         name, stamp, values = _UPLINK if record.uplink else _DOWNLINK
         return [(name, stamp(record), values(record))]
