@@ -137,7 +137,7 @@ class Direction(Section):
     rate_kbit: Positive | None = None
     """Rate of the bottleneck [kbit/s]; a packet has 28 bytes of headers; null: no bottleneck"""
     queue_packets: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
-    """Largest number of packets in the bottleneck; further packets are dropped"""
+    """Packets that the bottleneck holds; further packets are dropped"""
     changes: tuple[Change, ...] = ()
     """Changes of the conditions over time; at_s must rise from entry to entry"""
     trace: str | None = None
