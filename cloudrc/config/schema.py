@@ -346,6 +346,9 @@ class Criteria(Section):
     contact_speed_max_mps: Positive = 0.25
     """Largest speed of the tip when it touches the board [m/s]; with a higher speed the flight
     fails"""
+    settle_m: Positive | None = 0.15
+    """Largest distance from the setpoint in the last 0.5 s of each random step [m]. An oscillation
+    that does not decay fails every mission. null: neither is judged"""
     time_limit_s: TimeLimit = 60.0
     """Time limit of the mission [s], counted from its start; after this time the mission fails"""
 

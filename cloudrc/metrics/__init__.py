@@ -14,10 +14,10 @@ from pathlib import Path
 
 from cloudrc import plugins
 from cloudrc.errors import BadInputError
-from cloudrc.metrics import control, link, mission
+from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric
 
-__all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission"]
+__all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission", "response"]
 
 METRIC_NOTE = "metric "
 """Beginning of a note about a metric."""

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.schema import Criteria
+from cloudrc.config.schema import Criteria, Mission
 from cloudrc.geometry.clearance import clearance, pipe_index
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
@@ -31,14 +31,19 @@ CONTROL_TOPICS = (
 """Topics that the control loop writes in every period."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Flight:
-    """A recorded flight with the success criteria and the scene."""
+    """A recorded flight, its criteria, its mission and its scene."""
 
     recording: Recording  # all topics; cloud's stamps are shifted to world's clock
     criteria: Criteria
-    waypoints: int  # number of waypoints of the mission
+    mission: Mission  # with its waypoints or random steps
     scene: Scene  # pipes and board
+
+    @property
+    def waypoints(self) -> int:
+        """Number of waypoints or random steps of the mission."""
+        return self.mission.steps.count if self.mission.steps else len(self.mission.waypoints)
 
     @cached_property
     def start_ns(self) -> int | None:

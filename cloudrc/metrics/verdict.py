@@ -25,6 +25,7 @@ import numpy as np
 from cloudrc.messages import GuardState, Vector
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.mission import first_touch
+from cloudrc.metrics.response import steps
 from cloudrc.records import REAL_TIME_FACTOR_MIN
 
 SLIP_MAX = 0.25
@@ -176,6 +177,8 @@ def _violations(flight: Flight) -> Iterator[Failure]:
     yield from _interventions(flight)
     yield from _restarts(flight)
     yield from _plugins(flight)
+    if flight.criteria.settle_m is not None:
+        yield from _responses(flight, flight.criteria.settle_m)
 
 
 def _ending(flight: Flight, interrupted: bool) -> Ending:
@@ -240,6 +243,27 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
                 f"cloud.{kind} failed in {min(share, 1.0):.0%} of its periods, above {limit}{why}"
             )
             yield Failure("plugin_failed", text)
+
+
+def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
+    """Yield that steps did not settle within `settle` [m], and that the loop is unstable."""
+    found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
+    far = [step for step in found if step.last_error > settle]
+    if far and flight.mission.steps:
+        first = far[0]
+        text = (
+            f"{len(far)} of {len(found)} steps did not settle: in step {first.waypoint + 1} the "
+            f"robot was {first.last_error:.2f} m from the setpoint in the last 0.5 s, above "
+            f"criteria.settle_m {settle:g} m"
+        )
+        yield Failure("not_settled", text, first.start)
+    if unstable := [step for step in found if step.unstable]:
+        text = (
+            f"the loop is unstable: the error oscillates without decay in {len(unstable)} of "
+            f"{len(found)} {unit}s, first in {unit} {unstable[0].waypoint + 1}; lower the gains of "
+            "cloud.controller, or choose another cloud.predictor"
+        )
+        yield Failure("unstable", text, unstable[0].start)
 
 
 def _not_real_time(numbers: Mapping[str, Number]) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 from cloudrc.config.load import ResolvedExperiment, fingerprint
 from cloudrc.files import write_atomically
 from cloudrc.metrics import Flight, Number
+from cloudrc.metrics.response import steps
 from cloudrc.metrics.verdict import Verdict
 
 SCHEMA_VERSION = 1
@@ -68,6 +69,9 @@ class Assessment:
                 "shaper": self.run.shaper,
                 "records_sha256": self.run.records_sha256,
                 "numbers": values,
+                "steps": [_known(step._asdict()) for step in steps(self.flight)]
+                if self.experiment.mission.steps
+                else None,
                 "clock_offset": clock_offset_document(recording.metadata),
                 "complete": recording.complete,
                 "traceback": next(filter(None, recording["/fault"]["traceback"]), None),

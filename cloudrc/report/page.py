@@ -36,10 +36,13 @@ REPEAT = {
 """Whether the run was in virtual time -> text about how to repeat the run."""
 GROUPS = {
     "Mission": "duration waypoints_reached distance_flown speed_max contact_time tip_speed "
-    "peak_contact_force steady_contact_force steady_error_x steady_error_y steady_error_z",
+    "peak_contact_force contact_impulse steady_contact_force "
+    "steady_error_x steady_error_y steady_error_z",
+    "Steps": "overshoot_mean overshoot_max rise_time_mean settling_time_mean iae_mean ise_mean "
+    "control_effort_mean unstable_steps",
     "Distance to the pipes": "min_clearance min_clearance_flight pipe_contacts",
     "Estimation and tracking": "prediction_error_rms estimate_error_rms delay_estimate_error_rms "
-    "tracking_rms_measured tracking_rms_estimated",
+    "tracking_rms_measured tracking_rms_estimated tracking_error_p95 tracking_error_peak",
     "Link and loop": "uplink_delay_mean downlink_delay_mean loss_uplink loss_downlink late_uplink "
     "late_downlink rtt_mean rtt_p95 loop_delay_mean age_of_information_mean commands_applied",
     "Guard and faults": "hold_count hold_time fault_count recorder_dropped",
@@ -47,7 +50,7 @@ GROUPS = {
 }
 """Title of a group in the table of numbers -> names of its metrics. Other metrics are under
 "Others"."""
-SHARES = ("loss_", "late_")
+SHARES = ("loss_", "late_", "overshoot_")
 """Prefixes of the names of metrics that the page shows in per cent."""
 
 

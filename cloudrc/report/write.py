@@ -29,10 +29,8 @@ def assess(
     `own` are names or paths of the user's own metrics; files are executed. Metric files that the
     experiment names are not executed: the experiment may come from somebody else.
     """
-    mission = experiment.mission
-    waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
     scene = load_scene(experiment.world.scene)
-    flight = Flight(recording, experiment.criteria, waypoints, scene)
+    flight = Flight(recording, experiment.criteria, experiment.mission, scene)
     numbers, metric_notes = measure_all(flight, own)
     real_time, stopped = run.mode != "virtual", run.interrupted or not recording.complete
     evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)

@@ -13,7 +13,14 @@ from cloudrc.cli.run import new_folder
 from cloudrc.errors import BadInputError
 from cloudrc.metrics.verdict import EXIT_CODES
 
-SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
+SHORT = [
+    "--set",
+    "mission.steps.count=1",
+    "--set",
+    "mission.steps.period_s=1.0",
+    "--set",
+    "criteria.settle_m=null",
+]
 """Overrides of `steps` for one second of flight."""
 FLY = ["run", "steps", "--mode", "virtual", *SHORT]
 

@@ -20,7 +20,14 @@ from cloudrc.cli.pool import WorkerDiedError
 from cloudrc.cli.sweep import as_csv, as_table, interval, summarise
 from tests.conftest import nightly
 
-SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
+SHORT = [
+    "--set",
+    "mission.steps.count=1",
+    "--set",
+    "mission.steps.period_s=1.0",
+    "--set",
+    "criteria.settle_m=null",
+]
 """Overrides of `steps` for one second of flight."""
 
 

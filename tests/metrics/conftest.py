@@ -11,7 +11,7 @@ from functools import cache
 
 from cloudrc.cli.run import assemble
 from cloudrc.config.load import load_experiment
-from cloudrc.config.schema import Criteria
+from cloudrc.config.schema import Criteria, Mission, Waypoint
 from cloudrc.geometry.scene import Board, Pipe, Scene
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.metrics import Flight
@@ -68,7 +68,8 @@ class Log:
 
     def flight(self, scene=OPEN_AIR, *, contact=False, waypoints=1, time_limit=60.0):
         criteria = Criteria(contact=contact, time_limit_s=time_limit)
-        return Flight(Recording.from_records(*self.ends()), criteria, waypoints, scene)
+        mission = Mission(waypoints=(Waypoint(position_m=(10.0, 0.0, 1.0)),) * waypoints)
+        return Flight(Recording.from_records(*self.ends()), criteria, mission, scene)
 
     def ends(self):
         """Return the records of world and of cloud by stamp; equal stamps keep their order."""

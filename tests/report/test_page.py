@@ -64,9 +64,9 @@ def test_the_page_says_what_the_flight_did(folder):
     text = re.sub(r"\s", " ", re.sub(r"<[^>]+>", "", page))
     for said in (
         "The mission succeeded.",
-        "The drone reached all 7 waypoints in 30.9 s",
-        "It flew through 3 pipes and never came closer than 152 mm to a wall.",
-        "Its arm touched the board after 27.7 s at 0.12 m/s",
+        "The drone reached all 7 waypoints in 31.0 s",
+        "It flew through 3 pipes and never came closer than 153 mm to a wall.",
+        "Its arm touched the board after 27.8 s at 0.12 m/s",
         "cloudrc run config.yaml --mode virtual",
         "a" * 64,
         "Panel (c) ends at 0.8 m",

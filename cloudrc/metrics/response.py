@@ -1,0 +1,180 @@
+"""Metrics of the response to steps of the setpoint: overshoot, settling, errors, and stability.
+
+A step begins when the setpoint changes and ends when it changes again, or when the mission ends.
+Setpoints that last less than 0.5 s belong to a moving reference and are no steps. All errors are
+distances between the setpoint and the true position.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import numpy as np
+
+from cloudrc.metrics.flight import Array, Flight, add_metrics, mean, percentile
+
+SHORTEST_NS = 500_000_000
+"""Shortest step, and the part at the end of a step in which the robot must have settled [ns]."""
+LENGTH_MIN = 0.05
+"""Shortest distance of a step [m]; the values of a shorter one would be noise."""
+BAND = 0.05
+"""Settled means: an error of at most this share of the step [1]."""
+RISE = 0.1, 0.9
+"""Shares of the step between which the rise time is measured [1]."""
+GROWTH_MIN = 0.15
+"""Smallest amplitude of an unstable oscillation [m]: the default of criteria.settle_m."""
+
+
+class Step(NamedTuple):
+    """The response to one step; a value is None if the step does not show it.
+
+    Attributes:
+        waypoint: Index of the waypoint or step.
+        start: Time of the step since the start of the mission [s].
+        length: Distance from the position at the start of the step to the setpoint [m].
+        overshoot: Distance beyond the setpoint, as a share of `length` [1].
+        rise_time: Time from 10 % to 90 % of the way [s].
+        settling_time: Time after which the error stays within 5 % of `length` [s].
+        iae: Integral of the error over time [m s].
+        ise: Integral of the squared error over time [m^2 s].
+        effort: Integral of the squared commanded velocity over time [m^2/s].
+        last_error: Largest error in the last 0.5 s [m].
+        unstable: Whether the error oscillates without decay.
+    """
+
+    waypoint: int
+    start: float
+    length: float
+    overshoot: float
+    rise_time: float | None
+    settling_time: float | None
+    iae: float
+    ise: float
+    effort: float
+    last_error: float
+    unstable: bool
+
+
+@lru_cache(maxsize=1)  # ten metrics and the verdict ask for the same flight
+def steps(flight: Flight) -> tuple[Step, ...]:
+    """Measure the response to each step of a flight, in order."""
+    control = flight.control
+    if flight.end_ns is None or not len(control["stamp_ns"]):
+        return ()
+    changed = (np.diff(control["setpoint"], axis=0) != 0).any(axis=1)
+    begins = [0, *(np.flatnonzero(changed) + 1)]
+    ends_ns = [*control["stamp_ns"][begins[1:]], flight.end_ns]
+    found = (
+        _measure(flight, row, int(end_ns))
+        for row, end_ns in zip(begins, ends_ns, strict=True)
+        if end_ns - control["stamp_ns"][row] >= SHORTEST_NS
+    )
+    return tuple(step for step in found if step is not None)
+
+
+def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
+    """Measure the step from a row of `flight.control` to `end_ns` [ns]; None if it is too small."""
+    control, truth = flight.control, flight.truth
+    begin_ns, setpoint = int(control["stamp_ns"][row]), control["setpoint"][row]
+    rows = (truth["stamp_ns"] >= begin_ns) & (truth["stamp_ns"] < end_ns)
+    times = (truth["stamp_ns"][rows] - begin_ns) * 1e-9
+    errors = truth["position"][rows] - setpoint
+    sizes = np.linalg.norm(errors, axis=1)
+    length = float(sizes[0]) if len(sizes) else 0.0
+    if length < LENGTH_MIN:
+        return None
+    # Share of the way along the straight line from the start to the setpoint.
+    share = 1.0 - errors @ errors[0] / length**2
+    commands = (control["stamp_ns"] >= begin_ns) & (control["stamp_ns"] < end_ns)
+    speeds = np.linalg.norm(control["command"][commands], axis=1)
+    sent = (control["stamp_ns"][commands] - begin_ns) * 1e-9
+    late = truth["stamp_ns"][rows] >= end_ns - SHORTEST_NS
+    return Step(
+        waypoint=int(control["waypoint"][row]),
+        start=float(flight.seconds(begin_ns)),
+        length=length,
+        overshoot=max(0.0, float(share.max()) - 1.0),
+        rise_time=_rise_time(times, share),
+        settling_time=_settling_time(times, sizes, BAND * length),
+        iae=_integral(sizes, times),
+        ise=_integral(sizes**2, times),
+        effort=_integral(speeds**2, sent),
+        last_error=float(sizes[late].max(initial=0.0)),
+        unstable=any(_grows(errors[:, axis]) for axis in range(3)),
+    )
+
+
+def _integral(values: Array, times: Array) -> float:
+    """Integrate values over time [s] by the trapezoidal rule; `numpy.trapezoid` needs numpy 2."""
+    return float((values[1:] + values[:-1]) / 2 @ np.diff(times))
+
+
+def _rise_time(times: Array, share: Array) -> float | None:
+    low, high = (times[share >= bound] for bound in RISE)
+    return float(high[0] - low[0]) if len(high) else None
+
+
+def _settling_time(times: Array, sizes: Array, band: float) -> float | None:
+    outside = np.flatnonzero(sizes > band)
+    if not len(outside):
+        return 0.0
+    return float(times[outside[-1] + 1]) if outside[-1] + 1 < len(times) else None
+
+
+def _grows(error: Array) -> bool:
+    """Return whether an error along one axis [m] oscillates without decay, shape (n,).
+
+    A half-wave lies between two changes of sign; the part before the first change is the step
+    itself. The oscillation is unstable if a half-wave is as large as the one of the same sign
+    before it, and larger than `GROWTH_MIN`.
+    """
+    crossings = np.flatnonzero(np.signbit(error[1:]) != np.signbit(error[:-1])) + 1
+    waves = np.split(np.abs(error), crossings)[1:]
+    peaks = [float(wave.max()) for wave in waves if len(wave)]
+    return any(
+        later >= earlier and later > GROWTH_MIN
+        for earlier, later in zip(peaks, peaks[2:], strict=False)
+    )
+
+
+def _mean_of(flight: Flight, name: str) -> float | None:
+    values = [getattr(step, name) for step in steps(flight)]
+    return mean(np.array([value for value in values if value is not None], dtype=float))
+
+
+def _overshoot_max(flight: Flight) -> float | None:
+    return max((step.overshoot for step in steps(flight)), default=None)
+
+
+def _unstable_steps(flight: Flight) -> float | None:
+    return flight.count(sum(step.unstable for step in steps(flight)))
+
+
+def _tracking_errors(flight: Flight) -> Array:
+    control = flight.control
+    errors = control["setpoint"] - flight.true_position(control["stamp_ns"])
+    return np.asarray(np.linalg.norm(errors, axis=1))
+
+
+add_metrics(
+    ("overshoot_mean", "1", "Mean overshoot of the steps, as a share of the step.",
+     partial(_mean_of, name="overshoot")),
+    ("overshoot_max", "1", "Largest overshoot of a step, as a share of the step.", _overshoot_max),
+    ("rise_time_mean", "s", "Mean time from 10 % to 90 % of a step.",
+     partial(_mean_of, name="rise_time")),
+    ("settling_time_mean", "s", "Mean time until the error stays within 5 % of the step; steps "
+     "that did not settle do not count.", partial(_mean_of, name="settling_time")),
+    ("iae_mean", "m s", "Integral of the error over time, mean of the steps.",
+     partial(_mean_of, name="iae")),
+    ("ise_mean", "m^2 s", "Integral of the squared error over time, mean of the steps.",
+     partial(_mean_of, name="ise")),
+    ("control_effort_mean", "m^2/s", "Integral of the squared commanded velocity over time, mean "
+     "of the steps.", partial(_mean_of, name="effort")),
+    ("tracking_error_p95", "m", "Distance from setpoint to true position: 95th percentile.",
+     lambda flight: percentile(_tracking_errors(flight), 95.0)),
+    ("tracking_error_peak", "m", "Largest distance from the setpoint to the true position.",
+     lambda flight: percentile(_tracking_errors(flight), 100.0)),
+    ("unstable_steps", "1", "Number of steps in which the error oscillates without decay.",
+     _unstable_steps),
+)  # fmt: skip

@@ -1,0 +1,84 @@
+"""The response to steps: against second-order systems, whose overshoot and settling are known."""
+
+from math import cos, exp, pi, sin, sqrt
+
+import pytest
+
+from cloudrc.config.schema import Steps
+from cloudrc.metrics import SHIPPED
+from cloudrc.metrics.response import steps
+from cloudrc.metrics.verdict import flight_evidence, judge
+from cloudrc.records import Control
+from tests.metrics.conftest import SECOND, START, flown
+
+
+def second_order(damping, frequency=3.0):
+    """Return the position [m] over time [s] of a step by 1 m along x at t = 0, 1 m up."""
+    root = sqrt(1 - damping**2)
+
+    def path(t):
+        phase = frequency * root * max(t, 0.0)
+        decay = exp(-damping * frequency * max(t, 0.0))
+        return 1 - decay * (cos(phase) + damping / root * sin(phase)), 0.0, 1.0
+
+    return path
+
+
+def growing(t):
+    return 1 - exp(0.1 * t) * cos(3 * t), 0.0, 1.0
+
+
+def flight(path, setpoint=lambda t: (1.0, 0.0, 1.0), **mission):
+    log = flown(path)
+    log.change(Control, lambda n, c: c._replace(setpoint=setpoint((c.stamp_ns - START) / SECOND)))
+    made = log.flight(time_limit=60.0)
+    if mission:
+        object.__setattr__(made, "mission", made.mission.model_copy(update=mission))
+    return made
+
+
+@pytest.mark.parametrize("damping", [0.2, 0.5, 0.8])
+def test_a_step_of_a_second_order_system(damping):
+    (step,) = steps(flight(second_order(damping)))
+    assert (step.start, step.length) == (0.0, 1.0)
+    assert step.overshoot == pytest.approx(exp(-pi * damping / sqrt(1 - damping**2)), abs=0.005)
+    path = second_order(damping)
+    outside = [t for t in (n / 1000 for n in range(10_000)) if abs(path(t)[0] - 1.0) > 0.05]
+    assert step.settling_time == pytest.approx(outside[-1], abs=0.05)
+    # Integral of the squared error of a unit step: (1 + 4 damping^2) / (4 damping frequency).
+    assert step.ise == pytest.approx((1 + 4 * damping**2) / (12 * damping), rel=0.03)
+    assert step.last_error < 0.05
+    assert not step.unstable
+
+
+@pytest.mark.parametrize("path", [growing, second_order(0.0)])
+def test_an_oscillation_without_decay_is_unstable(path):
+    verdict = judge(flight_evidence(flight(path), {}, real_time=False, interrupted=False))
+    assert "unstable" in [failure.code for failure in verdict.failures]
+
+
+def test_a_small_or_decaying_oscillation_is_stable():
+    def shaking(t):
+        return 1.0 - exp(-t) + 0.1 * sin(5 * t), 0.0, 1.0
+
+    assert [step.unstable for step in steps(flight(shaking))] == [False]
+    assert SHIPPED["unstable_steps"].measure(flight(second_order(0.1))) == 0.0
+
+
+def test_each_change_of_the_setpoint_begins_a_step_and_a_moving_reference_none():
+    two = steps(flight(second_order(0.5), lambda t: (1.0 if t < 4 else 2.0, 0.0, 1.0)))
+    assert [(step.start, round(step.length, 2)) for step in two] == [(0.0, 1.0), (4.0, 1.0)]
+    assert two[1].settling_time is None, "it never went there"
+    assert two[1].last_error == pytest.approx(1.0, abs=0.01)
+    assert steps(flight(second_order(0.5), lambda t: (0.1 * t, 0.0, 1.0))) == ()
+
+
+def test_random_steps_must_settle_and_null_switches_it_off():
+    far = flight(second_order(0.5), lambda t: (1.3, 0.0, 1.0), steps=Steps(count=1))
+    judged = judge(flight_evidence(far, {}, real_time=False, interrupted=False))
+    texts = {failure.code: failure.text for failure in judged.failures}
+    assert "in step 1 the robot was 0.30 m from the setpoint" in texts["not_settled"]
+    assert "criteria.settle_m 0.15 m" in texts["not_settled"]
+    object.__setattr__(far, "criteria", far.criteria.model_copy(update={"settle_m": None}))
+    judged = judge(flight_evidence(far, {}, real_time=False, interrupted=False))
+    assert "not_settled" not in [failure.code for failure in judged.failures]
