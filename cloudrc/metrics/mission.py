@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from cloudrc.config.schema import Waypoint
 from cloudrc.messages import GuardState
 from cloudrc.metrics.flight import Array, Flight, add_metrics, mean
 
@@ -13,6 +14,8 @@ BOARD = "board"
 """Name of the board, which the arm must touch, in the scene."""
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
+ODOMETRY_NS = 10_000_000
+"""Time between two rows of the true position [ns]."""
 PRESSING_NS = 2_000_000_000
 """Last part of the mission, over which the steady contact force is averaged [ns]."""
 RESTING_NS = 5_000_000_000
@@ -47,8 +50,29 @@ def holds(flight: Flight) -> list[tuple[int, int]]:
 
 
 def _waypoints_reached(flight: Flight) -> float | None:
+    """Count the waypoints that the operator reported and that the true position confirms."""
     mission = flight.during("/mission")
-    return flight.count(len(np.unique(mission["waypoint"][mission["event"] == "reached"])))
+    rows = mission["event"] == "reached"
+    stamps = dict(zip(mission["waypoint"][rows], mission["stamp_ns"][rows], strict=True))
+    if flight.mission.steps:  # a step ends after its time, wherever the robot is
+        return flight.count(len(stamps))
+    points = enumerate(flight.mission.waypoints)
+    return flight.count(
+        sum(i in stamps and _was_at(flight, point, stamps[i]) for i, point in points)
+    )
+
+
+def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
+    """Return whether the robot truly stayed at a waypoint for its dwell time before an instant."""
+    truth = flight.truth
+    rows = truth["stamp_ns"] <= until_ns
+    distance = np.linalg.norm(truth["position"][rows] - waypoint.position_m, axis=1)
+    near = np.append(distance <= waypoint.tolerance_m, [False])
+    edges = np.flatnonzero(np.diff(near, prepend=[False]))
+    stamps = np.append(truth["stamp_ns"][rows], until_ns)
+    stays_ns = stamps[edges[1::2] - 1] - stamps[edges[::2]]
+    # The dwell time may lie between two samples.
+    return bool((stays_ns >= waypoint.dwell_s * 1e9 - ODOMETRY_NS).any())
 
 
 def _contact_time(flight: Flight) -> float | None:
@@ -141,8 +165,8 @@ def _recorder_dropped(flight: Flight) -> float | None:
 
 
 add_metrics(
-    ("waypoints_reached", "1", "Number of waypoints reached: the robot stayed within the tolerance "
-     "for the dwell time.", _waypoints_reached),
+    ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
+     "tolerance for the dwell time.", _waypoints_reached),
     ("contact_time", "s", "Time from the start of the mission to the arm's first touch of the "
      "board.", _contact_time),
     ("tip_speed", "m/s", "Speed of the arm's tip just before it first touches the board.",

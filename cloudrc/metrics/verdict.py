@@ -94,6 +94,7 @@ class Evidence:
     time_limit: float = inf  # limit of the time of `end` [s]
     touch: tuple[float, Moment] | None = None  # speed of the first touch of the board [m/s]
     violations: tuple[Failure, ...] = ()  # other events that must not happen
+    judged_by: str = ""  # how it is known that a waypoint was reached
     slow: str = ""  # why the run failed to keep real time; "" if it did not fail
 
 
@@ -121,7 +122,7 @@ def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
     if ending.code == "not_started":
         return
     if evidence.reached < evidence.waypoints:
-        text = f"{evidence.reached} of {evidence.waypoints} waypoints reached"
+        text = f"{evidence.reached} of {evidence.waypoints} waypoints reached{evidence.judged_by}"
         yield Failure("waypoint_not_reached", text, *end)
     if evidence.contact and evidence.touch is None:
         yield Failure("board_not_touched", "the arm never touched the board")
@@ -160,6 +161,7 @@ def flight_evidence(
     return Evidence(
         waypoints=flight.waypoints,
         reached=0 if reached is None else round(reached.value),
+        judged_by="" if flight.mission.steps else " by the true position",
         contact=criteria.contact,
         contact_speed_max=criteria.contact_speed_max_mps,
         ending=_ending(flight, interrupted),

@@ -304,7 +304,8 @@ class Teleop:
                 self._is_pending = False
                 self._select_leg(self.leg)
             place = "the spawn" if self._plan.start is Start.SPAWN else "here"
-            text = f"mission started from {place}, waypoints: {len(self._plan.legs)}"
+            count = f"waypoints: {len(self._plan.legs)}, judged by the measured position"
+            text = f"mission started from {place}, {count}"
             self._report("started", 0, text, now_ns)
         elif self._was_held:
             self._hold(now_ns)

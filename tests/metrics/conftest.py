@@ -68,7 +68,10 @@ class Log:
 
     def flight(self, scene=OPEN_AIR, *, contact=False, waypoints=1, time_limit=60.0):
         criteria = Criteria(contact=contact, time_limit_s=time_limit)
-        mission = Mission(waypoints=(Waypoint(position_m=(10.0, 0.0, 1.0)),) * waypoints)
+        mission = Mission(
+            waypoints=(Waypoint(position_m=(10.0, 0.0, 1.0), tolerance_m=10.0, dwell_s=0.0),)
+            * waypoints
+        )
         return Flight(Recording.from_records(*self.ends()), criteria, mission, scene)
 
     def ends(self):

@@ -4,7 +4,7 @@ from math import hypot, isfinite, nan
 
 import pytest
 
-from cloudrc.config.schema import Criteria
+from cloudrc.config.schema import Criteria, Mission, Waypoint
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Flight, measure_all
@@ -257,7 +257,7 @@ def test_numbers(fly, expected):
 
 
 def flight_of(recording):
-    return Flight(recording, Criteria(), 7, load_scene("pipes"))
+    return Flight(recording, Criteria(), paper()[0].mission, load_scene("pipes"))
 
 
 def test_the_paper_flight_has_all_numbers_of_virtual_flight():
@@ -281,4 +281,16 @@ def test_an_empty_recording_has_no_numbers():
 def test_a_missing_topic_makes_no_metric_fail(lost):
     recording = straight_flight().recording
     rows = {name: recording._rows[name] for name in TOPICS if name != lost}
-    assert measure_all(Flight(Recording(rows), Criteria(), 1, ONE_PIPE))[1] == []
+    assert measure_all(Flight(Recording(rows), Criteria(), Mission(), ONE_PIPE))[1] == []
+
+
+@pytest.mark.parametrize(
+    ("x", "tolerance", "dwell", "reached"),
+    [(9.0, 0.53, 1.0, 1.0), (9.0, 0.53, 1.1, 0.0), (9.0, 0.1, 0.0, 1.0), (10.5, 0.4, 0.0, 0.0)],
+)
+def test_a_waypoint_counts_if_the_true_position_confirms_it(x, tolerance, dwell, reached):
+    """The operator reports it at 10 s; the robot flies at 1 m/s along x."""
+    point = Waypoint(position_m=(x, 0.0, 1.0), tolerance_m=tolerance, dwell_s=dwell)
+    flight = flown().flight()
+    object.__setattr__(flight, "mission", Mission(waypoints=(point,)))
+    assert SHIPPED["waypoints_reached"].measure(flight) == reached

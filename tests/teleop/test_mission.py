@@ -33,7 +33,10 @@ def test_the_old_world_does_not_confirm_a_start_from_spawn():
 def test_a_mission_flies_its_legs_in_order_and_ends_in_a_hold():
     flight = flying()
     assert (flight.requests[0].request, flight.requests[0].start) == (Request.START, Start.SPAWN)
-    assert flight.events[0].text == "mission started from the spawn, waypoints: 3"
+    assert (
+        flight.events[0].text
+        == "mission started from the spawn, waypoints: 3, judged by the measured position"
+    )
     flight.step(position=A, seconds=0.6)
     assert flight.events[-1].text == "waypoint 1 of 3 reached at 0.52 s"
     assert flight.setpoints[-1] == Setpoint(B, 0.0, 1)
