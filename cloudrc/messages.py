@@ -87,7 +87,7 @@ class Request(IntEnum):
     ESTOP = 2
     """Stop the rotors at once, in any state. ESTOP lasts until the operator acknowledges."""
     ACKNOWLEDGE = 3
-    """End the state LAND or ESTOP; the operator has seen its cause. The rotors stay stopped."""
+    """End the state LAND or ESTOP; the operator has seen its cause. Stopped rotors stay stopped."""
     PROGRESS = 4
     """Store the mission's progress on board, for a cloud that restarts. The request number is 0."""
 

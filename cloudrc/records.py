@@ -17,7 +17,7 @@ class LinkChanged(NamedTuple):
     """Driver, in real time only: requested conditions of one link direction. Topic /link.
 
     World records the uplink, and cloud records the downlink: at the start, after every change, and
-    when a session or a mission begins. If conditions change over time, the first are recorded.
+    when a session or a mission begins. The values are those at the start of the time line.
 
     Attributes:
         uplink: True for the uplink, False for the downlink.

@@ -74,7 +74,7 @@ GROUND_NS = 10_000_000_000
 """Shortest time that a robot on the ground waits for a mission's first command [ns]."""
 RAMP = 3.0  # largest growth of the reference after a HOLD [m/s^2]
 RAMP_MIN = 1.0
-"""Time after a HOLD for which the reference velocity grows slowly [s]; longer above 3 m/s."""
+"""Time of slow growth of the reference velocity after a HOLD [s], if the limit is below 3 m/s."""
 
 
 class Breach(NamedTuple):

@@ -108,7 +108,7 @@ class RestartableEndpoint:
         self._set_deadline()
 
     def throttle(self, start: float, duration: float, share: float) -> None:
-        """Stop during the rest of each CFS period after a `share` [1], as CPU throttling does.
+        """Throttle the process: it runs for a `share` [1] of each CFS period, then it is stopped.
 
         The throttling begins at `start` [s] and lasts for `duration` [s].
         """

@@ -50,7 +50,7 @@ INVARIANTS = {
 """Name of an invariant -> name of its breaches in a table."""
 BACK = 10.0  # time without faults in which the robot must have flown [s]
 FORGETFUL = ("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down")
-"""Faults after which teleop may not know of an earlier stop, as the robot or teleop is new."""
+"""Faults that replace the robot or teleop, so that teleop may not know of an earlier stop."""
 PATIENCE_NS = 1_000_000_000  # shortest time between two actions of the operator [ns]
 CAPTURED = 2_000  # number of datagrams that an intruder keeps
 NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)

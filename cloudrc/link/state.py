@@ -58,7 +58,7 @@ class LinkState:
         reason: Why this shaper was chosen, in words.
         mode: Requested shaper: "auto", "relay" or "netem".
         direction: "uplink" or "downlink".
-        profile: Profile of both directions, as in its file, without defaults.
+        profile: Profiles of both directions, as in the file, without defaults.
         since: When the profile took effect, UTC, to show to users.
         since_ns: When the profile took effect, on the machine's monotonic clock [ns].
         changes: Number of changes since the link came up.

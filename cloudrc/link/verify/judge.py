@@ -33,7 +33,7 @@ SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
 measured and predicted delays; share of datagrams whose loss or arrival was predicted."""
 STILL, SHAPE_FLOOR = 1e-4, 2e-3
 """Standard deviations of the delay [s]. Below STILL, the correlation of delays is not used. Below
-SHAPE_FLOOR, the distribution is not judged, because late wakes of the machine change it."""
+SHAPE_FLOOR, the distribution is not judged, because delays of the machine itself change it."""
 TOLERANCES = {
     "mean": (2e-3, 0.05),
     "round_trip": (2e-3, 0.05),
