@@ -37,7 +37,7 @@ CRUISE_SPEED = 1.0
 SETTLE_TIME = 4.0
 """Expected extra time at the beginning and end of the way to a waypoint [s]."""
 LEG_FACTOR = 3.0
-"""Time limit of the way to a waypoint, divided by its expected time [1].
+"""Time limit for the way to a waypoint, as a multiple of the expected time.
 Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
 """Mission number in a cloud that flies only one mission."""
@@ -50,7 +50,8 @@ def build_world(
 ) -> WorldEndpoint:
     """Build world: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 
-    `clock` is the monotonic clock [ns]. It is read last, because compiling a scene takes a while.
+    `clock` is the monotonic clock [ns]. World's time starts only when the scene has been compiled,
+    which takes a while.
     """
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.guard.limits import Limits
@@ -97,9 +98,9 @@ def build_cloud(
 
     Args:
         experiment: The experiment.
-        identity: Names cloud's clock and process in the tunnel, and holds the keys.
+        identity: Identity of cloud's clock and process in the tunnel, with the keys.
         clock: Cloud's monotonic clock [ns].
-        teleop: Source of setpoints; None: a new one, which flies the mission at once.
+        teleop: Source of setpoints. None: a new `Teleop`, which flies the mission at once.
         make_loop: Makes the control loop from the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud
@@ -215,5 +216,5 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def _stream(name: str) -> int:
-    """Return the number of a random stream; streams are independent of each other."""
+    """Return the number of the stream of random numbers with this name."""
     return int.from_bytes(name.encode(), "little")

@@ -38,7 +38,7 @@ class Endpoint(Protocol):
         """Do the work that is due at `now_ns` [ns]; the driver may call this late."""
 
     def take_datagrams(self) -> list[bytes]:
-        """Return the datagrams to send since the last call, oldest first."""
+        """Return the datagrams to send that are new since the last call, oldest first."""
 
     def take_records(self) -> list[Record]:
-        """Return the new records since the last call, oldest first."""
+        """Return the records that are new since the last call, oldest first."""

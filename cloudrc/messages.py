@@ -28,14 +28,14 @@ class GuardState(IntEnum):
     """State of the guard."""
 
     GROUND = 0
-    """The rotors are stopped. Only the start of a mission by the operator ends this state."""
+    """The rotors are stopped. The state ends when the operator starts a mission."""
     TRACK = 1
     """The robot follows fresh commands from the cloud."""
     HOLD = 2
     """No command is fresh: the robot brakes, then holds its position with onboard sensors only."""
     LAND = 3
-    """The robot descends slowly and stops its rotors at touch-down. LAND lasts until
-acknowledged."""
+    """The robot descends slowly and stops its rotors at touch-down. LAND lasts until the operator
+acknowledges."""
     ESTOP = 4
     """The rotors were stopped at once. ESTOP lasts until the operator acknowledges."""
 
@@ -85,9 +85,9 @@ class Request(IntEnum):
     END = 1
     """End the mission: the robot holds its position until the next mission starts."""
     ESTOP = 2
-    """Stop the rotors at once, in any state. The state ESTOP lasts until acknowledged."""
+    """Stop the rotors at once, in any state. ESTOP lasts until the operator acknowledges."""
     ACKNOWLEDGE = 3
-    """End the state LAND or ESTOP after the operator has seen its cause. This starts no rotor."""
+    """End the state LAND or ESTOP; the operator has seen its cause. Stopped rotors stay stopped."""
     PROGRESS = 4
     """Store the mission's progress on board, for a cloud that restarts. The request number is 0."""
 
@@ -153,7 +153,7 @@ class Command(NamedTuple):
     Attributes:
         stamp_ns: Time of the computation [ns], cloud's clock.
         basis_stamp_ns: Stamp of the odometry that the command is based on [ns], world's clock.
-        basis_hold_ns: Time from the arrival of that odometry at cloud to the computation [ns].
+        basis_hold_ns: Time from the arrival of this odometry at cloud to the computation [ns].
         velocity: Commanded velocity [m/s], world frame, shape (3,).
         yaw_rate: Commanded yaw rate [rad/s].
     """

@@ -16,8 +16,8 @@ from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
 class LinkChanged(NamedTuple):
     """Driver, in real time only: requested conditions of one link direction. Topic /link.
 
-    World records the uplink, cloud the downlink: at the start, after every change, and when a
-    session or a mission begins. The values are those at the start of the profile's time line.
+    World records the uplink, and cloud records the downlink: at the start, after every change, and
+    when a session or a mission begins. The values are those at the start of the time line.
 
     Attributes:
         uplink: True for the uplink, False for the downlink.
@@ -48,18 +48,18 @@ class LinkChanged(NamedTuple):
 class LinkChecked(NamedTuple):
     """Driver, in real time only: verdict on one quantity of the link. Topic /link_check.
 
-    Cloud judges the uplink, world the downlink, by the datagrams received in the last 60 s.
+    Cloud judges the uplink, and world judges the downlink, from the datagrams of the last 60 s.
 
     Attributes:
         uplink: True for the uplink, False for the downlink.
-        quantity: Judged: "mean", "deviation", "round_trip", "loss", "reordered", "duplicated".
-            Others are not judged: "time_line", "rate", "correlation".
+        quantity: One of "mean", "deviation", "round_trip", "loss", "reordered", "duplicated"; or a
+            quantity that is not judged: "time_line", "rate", "correlation".
         asked: Expected value: delays [s], shares in [0, 1].
         measured: Measured value, likewise.
         low: Lowest accepted value, likewise.
         high: Highest accepted value, likewise.
-        verdict: "ok", "off", "open" (too few datagrams, to be confirmed, or explained by late wakes
-            of the ends) or "told" (not judged).
+        verdict: "ok"; "off"; "told" (not judged); or "open": datagrams are too few, the next check
+            must confirm "off", or late wakes of world and cloud may have caused "off".
         datagrams: Number of datagrams behind the measurement.
     """
 
@@ -110,13 +110,14 @@ class GroundTruth(NamedTuple):
 class Arrival(NamedTuple):
     """World or cloud: a datagram with a command or telemetry arrived, even if late.
 
-    If more datagrams were repeated than sent, further repeated datagrams are only counted. Topics
-    /uplink_delay (made by cloud) and /downlink_delay (made by world).
+    If an attacker repeats more datagrams in a session than the peer has sent, further repetitions
+    get no record, so that they cannot fill the recording. Topics /uplink_delay (made by cloud) and
+    /downlink_delay (made by world).
 
     Attributes:
         uplink: True for telemetry at cloud, False for commands at world.
         delay: One-way delay [s]; NaN if world and cloud cannot prove that they share a clock.
-        used: True if the datagram became the newest; False if late, stale, repeated or rejected.
+        used: True if the content was used; False if late, stale, repeated or rejected.
     """
 
     stamp_ns: int
@@ -164,7 +165,7 @@ class Contact(NamedTuple):
         body: Name of the touched body of the scene, such as pipe_1, board, floor.
         position: Position of the base just before the contact [m], world frame, shape (3,).
         velocity: Velocity of the base just before the contact [m/s], world frame, shape (3,).
-        tip_velocity: Velocity of the arm's tip just before it [m/s], world frame, shape (3,).
+        tip_velocity: Velocity of the tip just before the contact [m/s], world frame, shape (3,).
         tip: True if the arm's tip touched the body, False if another part of the robot did.
     """
 
@@ -177,7 +178,7 @@ class Contact(NamedTuple):
 
 
 class SessionOpened(NamedTuple):
-    """World or cloud: a session began under a new epoch, its number. Topic /session.
+    """World or cloud: a session began; a new epoch numbers it. Topic /session.
 
     Attributes:
         end: "world" or "cloud".
@@ -199,8 +200,8 @@ class Control(NamedTuple):
     Attributes:
         basis_stamp_ns: Stamp of the odometry used [ns], world's clock.
         horizon: Prediction horizon [s]: the estimated delay, clamped.
-        rtt: Last round trip, without the hold time on world [s]; NaN before the first echo.
-        loop_delay: Last `now - echo_stamp`, with the hold time [s]; the paper's tau_n; or NaN.
+        rtt: Round trip without the time that world held the command [s]; NaN if there was none yet.
+        loop_delay: Round trip with this time, the paper's tau_n [s]; NaN if there was none yet.
         measured: Position in the odometry used [m], shape (3,).
         position: Predicted position for `basis_stamp_ns + horizon` [m], shape (3,).
         orientation_wxyz: Predicted orientation, unit quaternion, shape (4,).

@@ -49,7 +49,7 @@ SIZE = 172
 """Length of a datagram, about that of telemetry [bytes]."""
 EPOCH, SEED = 1, 1
 TIE_NS = 5_000
-"""Difference between the due times of two datagrams below which their order does not count [ns]."""
+"""If two datagrams are due within this time [ns], their order is not checked."""
 # Source: Linux, include/uapi/asm-generic/socket.h, linux/net_tstamp.h, linux/errqueue.h.
 _SO_TIMESTAMPNS, _SO_TIMESTAMPING, _IP_RECVERR = 35, 37, 11
 _TX_SOFTWARE, _SOFTWARE, _ID, _STAMP_ONLY = 1 << 1, 1 << 4, 1 << 7, 1 << 11
@@ -143,7 +143,7 @@ def main() -> int:
 
 
 def releases(folder: Path, rounds: int, duration: float) -> list[Line]:
-    """Measure in turns how late the relay sends at 1 kHz, and how late the C program wakes.
+    """Alternately measure how late the relay sends at 1 kHz and how late the C program wakes.
 
     Both use SCHED_FIFO if this user is allowed to. Each measurement takes `duration` [s].
 
@@ -182,7 +182,7 @@ def releases(folder: Path, rounds: int, duration: float) -> list[Line]:
 
 
 def profiles(folder: Path, seconds: float) -> list[Line]:
-    """Compare all shipped profiles with the model at the same time, for `seconds` [s]."""
+    """Compare all shipped profiles with the model, all during the same `seconds` [s]."""
     judged = measure_profiles(folder, names("profile"), seconds)
     every = np.concatenate([one.errors for one in judged.values()])
     wrong = sum(one.wrongly_lost + one.wrongly_arrived for one in judged.values())
@@ -203,7 +203,7 @@ def profiles(folder: Path, seconds: float) -> list[Line]:
 
 
 def measure_profiles(folder: Path, chosen: Iterable[str], duration: float) -> dict[str, Judged]:
-    """Send through several profiles at once, both ways at 100 Hz, for `duration` [s].
+    """Send through several profiles at once, in both directions at 100 Hz, for `duration` [s].
 
     Returns:
         Name and direction of a profile -> comparison with the model.
@@ -242,7 +242,7 @@ def fifo_allowed() -> bool:
 def run_flow(
     ways: Sequence[Way], rate: float, duration: float, tail: float, begin: float = 0.0
 ) -> list[Flow]:
-    """Send in one or two directions in turns, each at `rate` [1/s] for `duration` [s], and receive.
+    """Send in one or two directions, each at `rate` [1/s] for `duration` [s], and receive.
 
     Receiving ends `tail` [s] after sending. Sending begins at `begin` [s], monotonic clock.
     """
@@ -274,9 +274,9 @@ def run_flow(
 def since_first_ns(number: int, turn: int, turns: int, period_ns: int) -> int:
     """Return when to send a datagram, as time since the first datagram [ns].
 
-    The first datagram starts the link's time. All others are sent some time away from whole
-    periods, at which a trace may change. Otherwise the relay, which receives a datagram a
-    microsecond later, might correctly use the trace's next row.
+    The first datagram starts the link's time. A trace may change at whole periods. Datagrams are
+    not sent near a whole period, because the relay receives them a microsecond later and could then
+    correctly use the trace's next row, unlike the model here.
     """
     if number == turn == 0:
         return 0

@@ -90,7 +90,7 @@ def outputs() -> dict[Path, str]:
 
 
 def leftovers() -> list[Path]:
-    """List copies in the chart that have no original any more."""
+    """List copies in the chart whose original has been deleted."""
     return sorted({*(CHART / "files").glob("*/*.yaml")} - outputs().keys())
 
 

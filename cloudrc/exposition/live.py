@@ -73,7 +73,8 @@ PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "cloudrc_link_release_error_seconds": ("release_error", table.RELEASE_PERCENTILES),
     "cloudrc_link_step_lateness_seconds": ("step_lateness", table.STEP_PERCENTILES),
 }
-"""Metric -> parts of the names of its counts, such as `release_error_p50_ns`, by label value."""
+"""Metric -> start of the names of its counts, and label value -> next part of the name. An example
+of such a name is `release_error_p50_ns`."""
 
 
 def read_counts(role: str, counts: Mapping[str, int]) -> Iterator[tuple[str, dict[Labels, float]]]:
@@ -201,7 +202,7 @@ class End:
         self._busy += busy
 
     def _count_age(self, now_ns: int) -> None:
-        """Count the age of the newest used datagram at `now_ns` [ns], this process's clock."""
+        """Store the age of the newest datagram at `now_ns` [ns], this process's clock."""
         delay = self._newest_delay
         if delay == delay:
             self._age.observe(delay + (now_ns - self._newest_ns) * 1e-9)
@@ -233,7 +234,7 @@ class End:
 STEP_NS, STEPS = 1_000_000_000, 10
 """The real-time factor is an average over `STEPS` intervals of `STEP_NS` [ns]."""
 ADMITTED = "cloud said hello"
-"""`SessionOpened.cause` if world opens a session because a cloud process has connected."""
+"""Text of `SessionOpened.cause` if a session begins because a cloud process has connected."""
 
 
 class WorldEnd(End):

@@ -82,8 +82,8 @@ class DatagramTally:
     The sender numbers datagrams by a counter, which restarts in each epoch (session).
 
     Attributes:
-        lost: Number of datagrams that have not arrived before `WINDOW` newer ones were sent.
-        reordered: Number of datagrams that arrived after a newer one, except repetitions.
+        lost: Number of datagrams that had not arrived when the peer had sent `WINDOW` newer ones.
+        reordered: Number of datagrams that arrived after a newer datagram, without repetitions.
     """
 
     __slots__ = ("_before", "_epoch", "_first", "_newest", "_seen", "lost", "reordered")
@@ -150,7 +150,7 @@ class PredictionJudge:
         self.reset()
 
     def reset(self) -> None:
-        """Drop all predictions and measurements, since a new session has started."""
+        """Drop all predictions and measurements, because a new session has started."""
         self._waiting: list[tuple[int, Vector]] = []
         self._measured_ns = NEVER_NS
         self._measured: Vector = (nan, nan, nan)
@@ -183,11 +183,11 @@ class DelayJudge:
     """Compares delay estimates with true delays.
 
     The delay is the time from the stamp of the odometry for which cloud computed a command until
-    world applies the command. Telemetry contains an echo: when cloud sent the newest applied
-    command, by cloud's clock, and for how long world has applied the command.
+    world applies the command. Telemetry contains an echo of the newest command that world has
+    applied: the stamp of the command on cloud's clock, and the time since world applied it.
 
     Attributes:
-        error: Newest error: estimated minus true delay [s]; NaN before the first.
+        error: Newest error: estimated minus true delay [s]; NaN before the first error.
     """
 
     def __init__(self) -> None:
@@ -195,7 +195,7 @@ class DelayJudge:
         self.reset()
 
     def reset(self) -> None:
-        """Drop all stored commands, since a new session has started."""
+        """Drop all stored commands, because a new session has started."""
         self._sent: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:

@@ -2,8 +2,8 @@
 
 A policy knows what an honest cloud knows: the newest odometry and its own estimate of the delay. It
 can send any command with a valid signature. Some policies also state a wrong odometry stamp, pause
-their commands, or make requests of the operator. World cannot detect such requests, because cloud
-forwards the operator's requests.
+their commands, or make requests of the operator. World cannot distinguish such requests from the
+operator's own requests, because cloud forwards both.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ REACHED = (0, 1, 7, MISSION_OVER)
 
 
 def at_bad_moments(rng: Generator) -> Words:
-    """Make requests after random pauses; half of them wait until the robot is near the fence."""
+    """Make requests after random pauses; half of the requests wait for a robot near the fence."""
     pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
     due_ns, waits = 0, False
 
@@ -312,12 +312,12 @@ def _stop_and_go(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Fly as one of the policies in `FASTEST`; `at_bad_moments` makes requests meanwhile."""
+    """Fly as one of the policies in `FASTEST`, while `at_bad_moments` makes requests."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
-    """Fly fast, sometimes cause a landing, and acknowledge the landing in the air."""
+    """Fly fast, sometimes cause a landing, and acknowledge it while the robot is in the air."""
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 
     def lie(command: Command, control: Control) -> Command:

@@ -73,7 +73,7 @@ class Flight:
         second: float | None = None,
         separate: bool = False,  # whether teleop has its own process
     ) -> None:
-        """Prepare a flight; at `second` [s], if given, another cloud asks for the robot."""
+        """Prepare a flight. If `second` is not None, a second cloud connects at this time [s]."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
@@ -144,7 +144,7 @@ class Flight:
         self.secrets[end] = self.rings[end].keys = keys
 
     def end_rival(self) -> None:
-        """Stop the second cloud; the first cloud must then get the robot back."""
+        """Stop the second cloud, so that the first cloud can control the robot again."""
         if isinstance(self.cloud.inner, EndpointGroup):
             self.cloud.inner.members = self.cloud.inner.members[:1]
         self._second = None
@@ -169,7 +169,7 @@ class Flight:
     def guard_now(self) -> tuple[GuardState, str]:
         """Return the guard's present state and its cause; GROUND while world is not running.
 
-        After a restart of world, the last recorded change belongs to the old guard.
+        The records are not enough: after a restart of world, they end with the old guard's state.
         """
         if self.world.inner is None:
             return GuardState.GROUND, "the world is down"
@@ -208,7 +208,7 @@ class Flight:
         return LinkDirection(shape(profile), self.experiment.seed, uplink=up)
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:
-        """Make the identity of a new process of `end`: a new nonce, and keys from its file."""
+        """Make the identity of a new process of `end`: a new nonce, and keys from its key file."""
         self.generations[end] += 1
         self.rings[end] = KeyRing(self.secrets[end])
         nonce = f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)

@@ -4,22 +4,22 @@ fence      The base stays inside the fence while the rotors turn. After a collis
            emergency stop the robot may leave the fence by at most `FALL_MAX`. Rotors that were
            stopped start again only if the robot lies still inside the fence.
 cap, stop  The reference velocity stays within its limits, and the robot can always stop before the
-           fence. During LAND it may fly down to the floor. After a HOLD the reference velocity
-           grows slowly at first.
-stale      World never accepts a command, or flies it in TRACK, if the odometry that the command is
-           based on is too old. HOLD changes to TRACK only after `RESUME_COMMANDS` fresh commands
-           within `RESUME_NS`.
+           fence. During LAND the robot may fly down to the floor. After a HOLD the reference
+           velocity grows slowly at first.
+stale      World rejects a command that is based on too old odometry. TRACK ends before the odometry
+           of the last command is too old. HOLD changes to TRACK only after `RESUME_COMMANDS` fresh
+           commands within `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
-           request, after a collision, or if the robot stands.
-collision  If the cloud is honest, only the arm's tip touches something, and only the board. A robot
-           that lands, or that the operator has stopped, may touch anything, because the guard does
-           not know what is below.
+           request, after a collision, or if the robot does not move.
+collision  If the cloud is honest, only the arm's tip touches something, and it touches only the
+           board. A robot that lands, or that the operator has stopped, may touch anything, because
+           the guard does not know what is below the robot.
 latch      The robot is in TRACK only during a mission that the operator has started. LAND and ESTOP
            last until the operator acknowledges them.
-hold       At least `SETTLE_NS` pass from one TRACK to the next, and from one HOLD without commands
-           to the next. A HOLD may come sooner if a command is based on older odometry than the
-           command before. In a mission, a robot without commands lands after the configured time,
-           or sooner after impossible commands.
+hold       At least `SETTLE_NS` pass between two changes to TRACK, and between two changes to HOLD
+           for lack of commands. A HOLD may begin sooner if a command is based on older odometry
+           than an earlier command. In a mission, a robot without commands lands after the
+           configured time, or sooner after impossible commands.
 tick       The guard runs once in each step of the physics.
 
 All limits come from the configuration and docs/, not from the guard: from "Stop rule" and "Leaving
@@ -53,12 +53,12 @@ FLOWN, LATCHED = (TRACK, HOLD, LAND), (LAND, ESTOP)
 REPORTED = 5  # number of breaches of each kind that are kept
 SLACK = 1e-9  # tolerance for rounding [m/s]
 STILL = 0.12
-"""Largest speed of a robot that lies still [m/s]: the guard's 0.1, plus one step of free fall."""
+"""Largest speed of a robot that lies still [m/s]: the guard's limit, 0.1, and one step of fall."""
 STANDS = 0.2  # speed per axis up to which a robot stands when its rotors stop [m/s]
 FALL = 1.0
-"""Downward speed that proves a fall with stopped rotors [m/s]; a drop of 0.02 m reaches 0.7."""
+"""Downward speed that proves a fall with stopped rotors [m/s]; a drop of 2 cm ends at only 0.7."""
 REST = 0.5
-"""Length added to the stopping distance after TRACK [m]; the robot swings back by up to 0.2 m."""
+"""Tolerance of the stopping distance after TRACK [m]; it includes a swing of up to 0.2 m."""
 FALL_MAX = 1.5  # largest distance that a falling robot may leave the fence [m]
 BRAKE_NS = 200_000_000  # time to stop a descent that the operator has acknowledged [ns]
 REELS_NS = 1_000_000_000  # time after a collision in which it explains the robot's motion [ns]
@@ -66,7 +66,7 @@ THROWN_NS = 3_000_000_000  # time after a collision in which the robot may leave
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
 """Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""
 SETTLE_NS = 1_000_000_000
-"""Shortest time from one TRACK to the next, and from one HOLD to the next [ns]."""
+"""Shortest time between two changes to TRACK, or between two changes to HOLD [ns]."""
 INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
 """Number of impossible commands that cause a landing, if they arrive within INVALID_NS [ns]."""
 INVALID = ("range", "future")  # reasons for which the guard rejects impossible commands
@@ -74,7 +74,7 @@ GROUND_NS = 10_000_000_000
 """Shortest time that a robot on the ground waits for a mission's first command [ns]."""
 RAMP = 3.0  # largest growth of the reference after a HOLD [m/s^2]
 RAMP_MIN = 1.0
-"""Shortest time for which the reference velocity grows slowly [s]; longer with a higher limit."""
+"""Time of slow growth of the reference velocity after a HOLD [s], if the limit is below 3 m/s."""
 
 
 class Breach(NamedTuple):
@@ -107,7 +107,7 @@ class Limits(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of a flight, also those of the new robot after a restart of world."""
+    """Collects the breaches of a flight, including those after a restart of world."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
@@ -117,7 +117,7 @@ class Watch:
         self.speed = 0.0  # largest reference [m/s]
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
-        """Check a robot from `start_ns` [ns] on; if `honest`, wrong contacts are breaches."""
+        """Check a robot from `start_ns` [ns] on; if cloud is `honest`, check its contacts, too."""
         robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
@@ -239,7 +239,7 @@ class RobotInvariants:
         self._state = self._guard.state
 
     def see_session(self, now_ns: int) -> None:
-        """Implement `Observer.see_session`: commands of the old session no longer count."""
+        """Implement `Observer.see_session`: forget the commands of the old session."""
         self._fresh_ns.clear()
         self._invalid_ns.clear()
 
@@ -329,7 +329,7 @@ class RobotInvariants:
     def _check_rotors(
         self, state: GuardState, velocity: Vector, rotor_speeds: RotorSpeeds, now_ns: int
     ) -> None:
-        """Check that the rotors stop only on a request, after a collision, or if the robot stands.
+        """Check that the rotors stop only on a request, after a collision, or without motion.
 
         A rotor speed of 0 does not prove that the rotors were stopped: hard braking also commands
         it. Therefore the check looks for the constant `STOPPED`, which only a stop uses.

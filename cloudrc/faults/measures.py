@@ -35,7 +35,7 @@ ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose a random time from `first` to `last` [s]; by default the robot is among the pipes."""
+    """Choose a random time from `first` to `last` [s]; by default, a time among the pipes."""
     return float(generator(seed, 77).uniform(first, last))
 
 
@@ -66,7 +66,7 @@ def reading(
 def above(
     flight: Flight, role: str, name: str, bound: float, until: float | None = None
 ) -> tuple[int, float]:
-    """Return number and share [1] of a histogram's values above `bound` until `until` [s]."""
+    """Return number and share of a histogram's values above `bound`, at the time `until` [s]."""
     shown: Histogram = _read(flight, role, name, until)
     counts = shown.cumulative()
     count = counts[-1] - counts[shown.bounds.index(bound)]
@@ -84,9 +84,9 @@ def moves(
 ) -> None:
     """Check that metrics change within 5 s after a fault that begins at `since` [s].
 
-    If `over` [s] is given, the 5 s begin with the end of the fault at that time: a frozen process
-    exports nothing, and losses become known only with newer datagrams. Each metric is written as
-    role, name and labels, such as "world guard_transitions_total hold".
+    If the fault ends at `over` [s], the 5 s begin at its end: a frozen process exports no metrics,
+    and losses are known only when newer datagrams arrive. Each metric is written as role, name and
+    labels, such as "world guard_transitions_total hold".
     """
     last = (since if over is None else over) + SOON
     end = "" if over is None else " of its end"
@@ -126,7 +126,7 @@ def basis_age_at_hold(flight: Flight) -> float:
 
 
 def _ages_at_hold(flight: Flight) -> list[tuple[GuardChange, float]]:
-    """Return every HOLD in a mission with the age of the last command's odometry [s], or NaN."""
+    """Return each HOLD with the age of the last command's odometry [s]; NaN without a command."""
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     ages = []
     for change in held(flight):
@@ -191,7 +191,7 @@ def status(flight: Flight) -> dict[str, Any]:
 def silence_told(
     outcome: Outcome, flight: Flight, at: float, silent: float, what: str = "", *, cloud: bool
 ) -> None:
-    """Check, `silent` [s] after a silence began at `at` [s], that teleop's status reports it.
+    """Check that teleop's status reports a silence that began at `at` [s], `silent` [s] before.
 
     The robot is silent. If `cloud` is false, cloud is silent, too. `what` begins each check's text.
     """
@@ -213,7 +213,7 @@ def silence_told(
 
 
 def calm_after(flight: Flight, start: float, end: float) -> float:
-    """Return the time from `start` [s] until the robot stood still [s]; check until `end` [s]."""
+    """Return the time from `start` [s] to the robot's last motion before `end` [s]; 0 if none."""
     path = [(r.stamp_ns * 1e-9, hypot(*r.odometry.velocity)) for r in flight.trajectory()]
     fast = [time for time, speed in path if start <= time < end and speed >= STANDS]
     return fast[-1] + SAMPLE - start if fast else 0.0

@@ -108,7 +108,10 @@ class RestartableEndpoint:
         self._set_deadline()
 
     def throttle(self, start: float, duration: float, share: float) -> None:
-        """Run for only a `share` [1] of each CFS period, from `start` [s] for `duration` [s]."""
+        """Throttle the process: it runs for a `share` [1] of each CFS period, then it is stopped.
+
+        The throttling begins at `start` [s] and lasts for `duration` [s].
+        """
         stall = (1.0 - share) * CFS_PERIOD
         for n in range(int(duration / CFS_PERIOD)):
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
@@ -224,7 +227,7 @@ class _Peer(UnixPeer):
         return _take_all(self.waiting)
 
     def send(self, data: bytes) -> bool:
-        """Implement `UnixPeer.send`; datagrams wait in the other socket while it has room."""
+        """Implement `UnixPeer.send`: put a datagram into the other socket if it has room."""
         sent = self.other._is_open() and len(self.other.waiting) < UNIX_SOCKET_MAX
         if sent:
             self.other.waiting.append(data)
@@ -314,7 +317,7 @@ class TeleopModel:
     def ask(self, call: Call, now_ns: int) -> None:
         """Call teleop's API at `now_ns` on cloud's clock [ns]; a refusal is ignored.
 
-        In its own process, teleop processes the call at its next wake.
+        If teleop has its own process, it handles the call when the process wakes next.
         """
         if self._phase_ns is None:
             self._call(call, now_ns)
@@ -324,7 +327,8 @@ class TeleopModel:
     def stop_rotors(self, now_ns: int) -> None:
         """Make an emergency stop at `now_ns` on cloud's clock [ns].
 
-        In its own process, teleop sends an alarm to cloud at once, and stores the stop later.
+        In its own process, teleop sends an alarm to cloud at once, and stores the stop at its next
+        wake.
         """
         if self.service is not None and self._phase_ns is not None:
             self._stops.append(partial(self._call, MissionService.stop_rotors))

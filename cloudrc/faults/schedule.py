@@ -1,4 +1,4 @@
-"""Describe the faults of one flight and their times: drawn at random, or from a YAML file."""
+"""Describe the faults of one flight and their times: chosen at random, or from a YAML file."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ ONCE = ("second_cloud", "key_rotated")  # kinds of fault that a flight has at mo
 def compose(seed: int) -> Schedule:
     """Make the schedule of a seed: up to 12 faults in 45 s, then 15 s without faults.
 
-    A schedule without faults uses a link on which every HOLD is a false alarm.
+    A schedule without faults uses a profile of the paper, with which no HOLD should happen.
     """
     rng, kinds, events = generator(seed, 40), sorted(KINDS), list[Event]()
     for _ in range(int(rng.integers(13))):

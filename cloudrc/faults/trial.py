@@ -50,7 +50,7 @@ INVARIANTS = {
 """Name of an invariant -> name of its breaches in a table."""
 BACK = 10.0  # time without faults in which the robot must have flown [s]
 FORGETFUL = ("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down")
-"""Faults after which the robot or teleop is new, so that teleop may not know of an earlier stop."""
+"""Faults that replace the robot or teleop, so that teleop may not know of an earlier stop."""
 PATIENCE_NS = 1_000_000_000  # shortest time between two actions of the operator [ns]
 CAPTURED = 2_000  # number of datagrams that an intruder keeps
 NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)
@@ -202,7 +202,7 @@ class OrderInvariant:
         flight.listeners.append(self.see)
 
     def see(self, records: list[Record], now_ns: int) -> None:
-        """Check that no applied command is older than an earlier one, or belongs to an old session.
+        """Check that each applied command is newer than the last, and not of an old session.
 
         A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
         world starts with the first epoch again, which is allowed.
@@ -258,7 +258,7 @@ def inject(flight: Flight, schedule: Schedule) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return the actions of each kind of fault with their times [s]; `process` is affected."""
+    """Return kind of fault -> times [s] and actions; some actions apply to `process`."""
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # end of teleop after it was asked to end
 
@@ -318,7 +318,7 @@ def flipped(data: bytes, rng: np.random.Generator, flips: int) -> bytes:
 
 
 def _bugs(schedule: Schedule, clock: Clock) -> Lie:
-    """Make a function that adds `value` impossible commands per second of virtual time."""
+    """Make a function that replaces commands by impossible ones, `Event.value` per second."""
     rng, events = generator(schedule.seed, 43), schedule.of(*BUGS)
     due = [event.at for event in events]
 
@@ -334,7 +334,7 @@ def _bugs(schedule: Schedule, clock: Clock) -> Lie:
 
 
 def _ruined(command: Command, event: Event, rng: np.random.Generator) -> Command:
-    """Replace one of the four numbers by NaN or infinity, or the velocity by a huge one."""
+    """Replace a random number in a command by NaN or infinity, or the velocity by a huge one."""
     if event.kind == "values_huge":
         x, y, z = rng.choice([1e308, -1e308], 3).tolist()
         return command._replace(velocity=(x, y, z))

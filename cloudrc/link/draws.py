@@ -1,18 +1,18 @@
-"""Draw the random impairments of each packet from counter-based random numbers.
+"""Compute the random impairments of each packet with a counter-based random number generator.
 
 Seed, direction, session (epoch) and kind of datagram select a stream of random numbers. The counter
 of the packet is its position in the stream. So its impairment does not depend on earlier calls.
 
-Numbers are drawn for blocks of 256 packets, in a separate column for each purpose. So a purpose
-that a profile does not use does not change the numbers of other purposes. The functions are pure; a
-cache makes them fast.
+Random numbers are generated for blocks of 256 packets. Loss, jitter and each other purpose have a
+separate column of numbers, so that adding loss to a profile does not change the jitter. The
+functions are pure; a cache makes them fast.
 
-Bursts and correlated jitter carry a state from packet to packet. The state restarts from its
-stationary distribution every 64 blocks (16,384 packets), which bounds the work for any counter.
+Bursts and correlated jitter depend on the packet before. To limit this recursion, they restart from
+their stationary distribution every 64 blocks (16,384 packets).
 
 The impairment of a packet is a tuple with one entry for each copy that arrives: no entry for a lost
-packet, two entries for a duplicated packet. An entry is the extra delay from jitter and bad state
-[ns], which may be negative, or the constant OVERTAKES.
+packet, two entries for a duplicated packet. An entry is the constant OVERTAKES, or the extra delay
+from jitter and loss bursts [ns], which may be negative.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 
 BLOCK = 256
-"""Number of packets whose random numbers are drawn together."""
+"""Number of packets whose random numbers are generated together."""
 CHAIN_BLOCKS = 64
 """Number of blocks after which bursts and correlated jitter restart."""
 OVERTAKES = -(1 << 62)
@@ -53,7 +53,7 @@ Fate: TypeAlias = tuple[int, ...]
 
 
 class Purpose(IntEnum):
-    """Use of a column of random numbers: one decision about each packet."""
+    """Purpose of a column of random numbers, such as the loss of packets."""
 
     DELAY = 0
     COPY_DELAY = 1
@@ -90,7 +90,7 @@ def uniforms(key: StreamKey, purpose: Purpose, block: int) -> Floats:
 
 @lru_cache(maxsize=_CACHED)
 def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) -> tuple[float, ...]:
-    """Draw standard normal variates of a block; neighbours have this `correlation`, in [0, 1].
+    """Draw normal variates of a block; `correlation`, in [0, 1], is that of successive variates.
 
     The variates follow the autoregression z_n = c · z_(n-1) + sqrt(1 - c²) · e_n. So every variate
     is exactly standard normal. Their shape is (256,).
@@ -115,10 +115,10 @@ def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) ->
 
 @lru_cache(maxsize=_CACHED)
 def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> tuple[bool, ...]:
-    """Simulate the two-state burst chain over a block: True for bad packets, shape (256,).
+    """Simulate loss bursts for a block: True for each packet in the bad state, shape (256,).
 
-    `bad_start` is the probability per packet that the bad state starts, and `bad_end` that the bad
-    state ends, both in [0, 1].
+    At each packet, the bad state starts with the probability `bad_start` or ends with the
+    probability `bad_end`, both in [0, 1].
     """
     if not bad_start:
         return (False,) * BLOCK
@@ -140,9 +140,9 @@ def impairments(
 ) -> list[Fate]:
     """Draw the impairments of the 256 packets of a block.
 
-    `jitter` [s] and `loss` are the values in force, which a time line may change. A lost packet is
-    neither duplicated nor reordered. The copy of a duplicated packet has an independent delay with
-    the same distribution.
+    `jitter` [s] and `loss` are the present values, because a profile can change them over time. A
+    lost packet is neither duplicated nor reordered. The copy of a duplicated packet has its own
+    random delay with the same distribution.
 
     Deviation: tc-netem delivers one copy of a packet that is both duplicated and lost.
     """
@@ -164,10 +164,10 @@ def impairments(
 
 @lru_cache(maxsize=_CACHED)
 def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
-    """Draw the damaged packets of a block: index in the block -> position of the flipped bit.
+    """Select damaged packets at random: index in the block -> position of the flipped bit.
 
-    The position is a share of the datagram's length, in [0, 1]. `corrupt` is the probability of
-    damage per packet, in [0, 1].
+    The position is a share of the datagram's length, in [0, 1]. Each packet is damaged with the
+    probability `corrupt`, in [0, 1].
     """
     places = uniforms(key, Purpose.CORRUPT_BIT, block)
     return {n: float(places[n]) for n in _packets_hit(key, Purpose.CORRUPT, block, corrupt)}
@@ -180,8 +180,8 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
     3 and is cut off at the 99.9 % quantile: it ranges from -0.69 to 12.1, with median -0.32.
 
     With a correlation c, the function transforms normal variates of correlation c. So the
-    distribution stays exact, but the jitter has another correlation: (6/π) · asin(c/2) if uniform,
-    which is at most 0.018 below c; if pareto, 0.39 for c = 0.5 and 0.86 for c = 0.9.
+    distribution stays exact, but the correlation of the jitter differs from c. For uniform jitter
+    it is (6/π) · asin(c/2), at most 0.018 below c. For Pareto jitter it is 0.39 if c = 0.5.
 
     Source: tc-netem(8) for the meaning of jitter, iproute2 netem/pareto.c for the exponent.
     Deviation: netem cuts its Pareto table at 4, so its jitter has only 0.82 of the specified
@@ -223,7 +223,7 @@ def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) ->
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
-    """Remove lost packets from a table of impairments; delay the packets in the bad state."""
+    """Change a table of impairments: lose packets, and delay packets in the bad state."""
     extra = round(loss.delay_bad * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
     for n, bad in enumerate(bad_states(key, block, loss.bad_start, loss.bad_end)):

@@ -2,8 +2,8 @@
 
 `cloudrc link set` changes the release's ConfigMap, so that the change is permanent. A kubelet may
 need a minute to copy the ConfigMap to a pod. Therefore `cloudrc link set` also writes the same
-files, as one JSON document, into the folder of the route file. ConfigMap and document contain the
-number of the change: the first to arrive takes effect, the other is ignored.
+files, as one JSON document, into the pod, beside the route file. ConfigMap and document contain
+the same number of the change: the first to arrive takes effect, and the other is ignored.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Loaded(NamedTuple):
     """A profile as read from its file.
 
     Attributes:
-        direction: The direction that this process shapes, in SI units.
-        values: Both directions as in the file, without defaults, to show to users.
+        direction: Profile of the direction that this process shapes, in SI units.
+        values: Content of the file, without defaults, to show to users.
         change: The last change of the profile: its number and cause.
     """
 
@@ -62,8 +62,8 @@ class ProfileFile:
     """Reads a profile's file again whenever the file changes.
 
     Kubernetes mounts a ConfigMap as links into the folder `..data`. `..data` is itself a link,
-    which Kubernetes replaces in one step, so that the same path leads to another file. A check for
-    a change runs 20 times per second, so it takes only one system call.
+    which Kubernetes replaces in one step, so that the same path leads to another file. The check
+    for a change takes one system call, because it runs 20 times per second.
     """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
@@ -78,8 +78,8 @@ class ProfileFile:
     def poll(self) -> Loaded | None:
         """Return the new profile if the file has changed and the profile is valid, otherwise None.
 
-        An invalid profile is logged. If the file changes while it is read, another process is still
-        writing; then the next call reads the file again.
+        If the profile is invalid, log why. If the file changes while it is being read, return None,
+        so that the next call reads the file again.
         """
         seen = version(self._path)
         if seen == self._seen:
@@ -153,8 +153,8 @@ class _HandedFile(ProfileFile):
     def _read(self) -> Loaded:
         """Read the document; raise a ValueError if the file belongs to another user.
 
-        This protects a sidecar that runs as root: the other containers of the pod can write to the
-        folder, but do not run as root.
+        All containers of the pod can write to the folder, but only the sidecar may run as root. So
+        a sidecar that runs as root follows only changes that root has made.
         """
         if self._path.lstat().st_uid != os.geteuid():
             raise ValueError(f"{self._path} belongs to another user")
@@ -231,7 +231,7 @@ class PeerName:
     def poll(self) -> Address | None:
         """Resolve the name once and return the peer's address; log each change of the address.
 
-        If the resolution fails, return the last known address, or None if there is none yet.
+        If the resolution fails, return the last known address; None before the first success.
         """
         before = self._known[-1:]
         try:

@@ -4,7 +4,7 @@
     irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
 irtt's option -l sets the packet size: a telemetry datagram has 204 bytes, a command datagram 88.
-irtt measures both directions if the clocks of the two hosts agree. ping measures round trips; with
+irtt measures each direction if the clocks of the two hosts agree. ping measures round trips; with
 `halve`, half of each round trip counts as the delay. The columns of a CSV log name their units,
 such as `time_ms,delay_us,loss` or `timestamp_ns,rtt_ms`.
 
@@ -47,8 +47,8 @@ GAP, GAP_OF_PING, GAP_MIN = 20, 2, 1.0
 than GAP (for ping GAP_OF_PING) times the median time between packets. ping sends regularly, so its
 limit is lower."""
 STEPS_MAX = 3
-"""Largest number of jumps back in time that count as clock steps or new sessions. With more jumps,
-the rows are only out of order and are sorted."""
+"""Largest number of jumps back in time that count as clock steps or new sessions, which are errors.
+A log with more jumps is regarded as unordered, and its rows are sorted."""
 PACKETS_MAX = 10_000_000
 """Largest number of packets in a log of ping: three weeks at five packets per second. The limit
 rejects wrong sequence numbers before they use up the memory."""
@@ -143,7 +143,7 @@ class Log:
         return BadInputError(f"{self.name}: {text}")
 
     def refuse_early(self, least: float) -> None:
-        """Raise an error if the shortest delay, `least` [s], is negative: the clocks differ."""
+        """Raise an error if the shortest delay, `least` [s], is negative, because clocks differ."""
         if least < 0.0:
             raise self.error(
                 f"a packet arrived {-least * 1e3:.4g} ms before it was sent: the two clocks differ;"
@@ -151,7 +151,7 @@ class Log:
             )
 
     def _refuse_steps(self, times: Floats) -> None:
-        """Raise an error after one to three long jumps back: sorting would mix sessions."""
+        """Raise an error if times jump far back once to three times: sorting would mix sessions."""
         steps = np.diff(times)
         back = np.flatnonzero(steps < -self._far(steps))
         if 1 <= len(back) <= STEPS_MAX:
@@ -174,7 +174,7 @@ class Log:
 def trace_of(packets: Packets) -> Trace:
     """Make a trace that repeats the delays and losses of a log at the log's packet rate.
 
-    Each row holds for half a period before and after the time at which its packet was sent. So a
+    Each row applies from half a period before its packet was sent until half a period after. So a
     packet that is replayed a little early or late gets the right row. Time 0 is the first packet.
     """
     sent = packets.sent
@@ -203,7 +203,7 @@ _OTHERS = {
 
 
 def refuse_others(lines: list[str], name: str) -> None:
-    """Raise an error that names the tool, if its output lacks the delay of each packet."""
+    """Raise an error if the lines are from a tool that does not report the delay of each packet."""
     head = "\n".join(lines[:50])
     for pattern, what in _OTHERS.items():
         if re.search(pattern, head, re.MULTILINE):
@@ -217,7 +217,7 @@ _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeE
 def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool) -> Packets:
     """Read the output of `irtt client -o FILE.json`.
 
-    The client stands for the robot: its packets are the uplink. If irtt does not know in which
+    The packets that irtt's client sends count as the uplink. If irtt does not know in which
     direction a packet was lost, the packet counts as lost in both directions. The times of sending
     are on the client's monotonic clock, so steps of the client's wall clock have no effect.
 
@@ -450,7 +450,7 @@ def _csv_delay(row: Row, column: str, loss: str | None) -> float | None:
 
 
 def _without_marks(raw: list[Entry], column: str, decimals: int, log: Log) -> list[Entry]:
-    """Replace numbers that mark lost packets, such as -1, by None, and count these packets.
+    """Replace each number that marks a lost packet, such as -1, by None; count these packets.
 
     `decimals` is the largest number of decimals in the column; -1 if a column `loss` marks losses.
     """
@@ -489,7 +489,7 @@ _NO_STAMPS = {
     r"\], \d+ bytes": "run fping with -D",
     "": "run ping with -D",
 }
-"""Pattern of a kind of ping -> how to get time stamps from it; the first pattern found counts."""
+"""Pattern of a kind of ping -> how to get time stamps from it; the first match is used."""
 
 
 def is_ping(lines: list[str]) -> bool:

@@ -29,11 +29,11 @@ _TABLES = 64
 class LinkDirection:
     """Model of one direction of the link.
 
-    The random impairment of a packet depends only on seed, direction, epoch, kind and counter. The
-    order of calls and other kinds of datagram have no effect.
+    The random impairment of a packet depends only on seed, direction, epoch, kind and counter. It
+    does not depend on the order of calls, or on other datagrams.
 
-    With the settings `rate` (the queue of the bottleneck) and `keep_order`, the arrival also
-    depends on earlier packets. Then call `send` in the order of sending.
+    If the profile has a `rate` (a bottleneck with a queue) or `keep_order`, the arrival depends
+    also on earlier packets. Then `send` must be called in the order of sending.
 
     Attributes:
         corrupts: Whether the link may damage datagrams; if true, call `corrupted` for each.
@@ -44,7 +44,7 @@ class LinkDirection:
     ) -> None:
         """Create the model; `uplink` is True for world to cloud.
 
-        The time line starts at `origin_ns` [ns], when the link came up, on the clock of `send`.
+        `origin_ns` is when the link came up and the time line starts [ns], on the clock of `send`.
         """
         self._seed, self._uplink = seed, uplink
         self._origin_ns: int | None = origin_ns
@@ -57,9 +57,9 @@ class LinkDirection:
     def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         """Replace the profile from the next packet on.
 
-        Seed, counts and the bottleneck's queue are kept. The random draws are the same as if the
-        link had used this profile from the start. With `restart`, the new time line starts at the
-        next packet; otherwise it starts where the old time line started.
+        Seed, counts and the bottleneck's queue are kept. The random impairments are the same as if
+        the link had used this profile from the start. With `restart`, the new time line starts at
+        the next packet; otherwise it starts at the same time as the old time line.
         """
         if restart:
             self._origin_ns = None
@@ -123,9 +123,9 @@ class LinkDirection:
     def counts(self) -> dict[str, int]:
         """Return the number of packets by outcome, since the start.
 
-        The outcomes are `passed` (at least one copy arrives), `duplicated` (two copies arrive),
-        `corrupted` (a bit is flipped), and by cause of the loss: `lost` (at random), `blackout`,
-        `queue` (full).
+        The outcomes are `passed` (at least one copy arrives), `duplicated` (two copies arrive) and
+        `corrupted` (a bit is flipped). Packets that do not arrive count as `lost` (at random),
+        `blackout` or `queue` (the queue was full).
         """
         return dict(self._counts)
 
@@ -154,7 +154,7 @@ class LinkDirection:
         return True
 
     def _draw(self, key: tuple[int, int, int, float, Loss]) -> list[Fate]:
-        """Draw the impairments of a block, and keep them for its other packets."""
+        """Compute the impairments of a block, and keep them for the other packets of the block."""
         epoch, kind, block, jitter, loss = key
         stream = stream_key(self._seed, self._uplink, epoch, kind)
         if len(self._fates) >= _TABLES:
@@ -209,7 +209,7 @@ class Numbers:
 
 
 def sample(link: LinkDirection, kind: int, sent_ns: Sequence[int], size: int) -> Stream:
-    """Send packets of `size` bytes at rising times [ns] through a new link that came up at 0."""
+    """Send packets of `size` bytes at rising times [ns] through a link that came up at time 0."""
     delays = np.full(len(sent_ns), np.nan)
     copies = np.zeros(len(sent_ns), dtype=np.int64)
     for n, now_ns in enumerate(sent_ns):

@@ -5,8 +5,8 @@
                                           only UDP to the peer's tunnel port
 
 After a restart, `Netem` finds its qdiscs by their handles. In flight it changes them with `tc qdisc
-change`, which keeps queued packets. That command leaves options unchanged that it does not name, so
-every call names all options.
+change`, which keeps queued packets. An option that is missing in this command keeps its old value,
+so every call contains all options.
 
 `Netem` never touches a root qdisc of another program. If another program removes or changes the
 qdiscs of `Netem`, `Netem` logs an error and counts it in a metric.
@@ -47,8 +47,8 @@ band."""
 PERIOD_NS = 1_000_000_000
 """Time between two checks of the qdiscs [ns]."""
 STEP_NS = 5_000_000
-"""Shortest time between two changes of the qdisc that a time line makes [ns]. Changes that follow
-sooner are skipped."""
+"""Shortest time between two changes that a time line makes to the qdisc [ns]. Of several changes
+within this time, only the last is made."""
 LIMIT = 10_000
 """Largest number of packets in a qdisc without a bottleneck, as in the relay."""
 DELAY_MAX_MS = 274_000
@@ -64,7 +64,7 @@ _END_OF_TABLE = 32_767 / _ONE
 _KEPT = 10_000
 """Number of recent changes from which the percentiles of the lateness are computed."""
 _IN_ORDER = "100gbit"
-"""A rate that limits nothing. With any rate, netem keeps the order of packets."""
+"""Rate too high to limit anything, set because netem keeps packets in order if it has a rate."""
 _ETHERNET_BYTES = 14
 """Length of the Ethernet header, which netem counts and the model does not [bytes]."""
 _RATE_MIN = 8.0
@@ -141,7 +141,7 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
 
 
 def may_shape(status: str) -> bool:
-    """Check the text of a process's /proc/PID/status: is the process root with NET_ADMIN?
+    """Return whether a process is root with NET_ADMIN; `status` is the text of /proc/PID/status.
 
     Source: Linux, include/uapi/linux/capability.h: CAP_NET_ADMIN is bit 12.
     """
@@ -327,7 +327,7 @@ def _is_ours(root: dict[str, Any]) -> bool:
 
 
 def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
-    """Read netem's counts from the objects of `tc -s -j qdisc show`; empty if the qdisc is missing.
+    """Read netem's counts from the objects of `tc -s -j qdisc show`; {} if the qdisc is missing.
 
     Returns:
         Numbers of datagrams: `forwarded` (including copies), `lost` (dropped at random or because
@@ -397,10 +397,10 @@ class Netem:
         tables: Path | None = None,
         log: Callable[[str], None] = lambda line: None,
     ) -> None:
-        """Prepare, without changing the network yet.
+        """Store the arguments; the network does not change yet.
 
-        `origin_ns` is when the link came up [ns], on `clock`; `wait` sleeps for a time [s];
-        `tables` is the folder for the table of a measured distribution.
+        `origin_ns` is the time on `clock` at which the link came up [ns]; `wait` sleeps for a time
+        [s]; `tables` is the folder for the table of a measured distribution.
         """
         self._iproute2 = Iproute2(run)
         self._clock, self._wait = clock, wait
@@ -443,9 +443,10 @@ class Netem:
         return peer
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Use this profile from now on; its time line starts now (`restart`) or continues.
+        """Use this profile from now on; with `restart`, its time line starts now.
 
-        Datagrams in flight are not lost. If netem cannot realise the profile, the old profile stays
+        Without `restart`, the new time line has the start of the old time line. Datagrams in flight
+        are not lost. If netem cannot realise the profile, the old profile stays
         in force and the method raises a CloudrcError.
         """
         check(profile)

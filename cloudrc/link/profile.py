@@ -48,7 +48,7 @@ def mean_loss(loss: Loss) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of the conditions at one instant; None leaves a value unchanged."""
+    """A change of the conditions at one time; a value of None means that it does not change."""
 
     at: float  # time since the link came up [s]
     delay: float | None = None  # mean one-way delay [s]
@@ -67,15 +67,15 @@ class Blackout:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """Measured conditions over time: each row holds until the next row; the last row holds forever.
+    """Measured conditions over time: each row applies until the time of the next row.
 
     The delays replace the profile's `delay`; the profile's jitter is added to them. If the trace
-    has losses, they replace the profile's `loss`. In a trace that loops, the last row lasts as long
-    as the other rows on average; then the trace begins again.
+    has losses, they replace the profile's `loss`. The last row applies forever. In a trace that
+    loops, it lasts as long as the other rows on average; then the trace begins again.
 
     Attributes:
         times: Time since the link came up, strictly rising [s], shape (n,), n >= 1. The first row
-            also holds before its time.
+            also applies before its time.
         delays: One-way delay of each row [s], shape (n,).
         losses: Loss of each row in [0, 1], shape (n,), or None.
         loop: Whether the trace begins again after its end.
@@ -106,7 +106,7 @@ class DirectionProfile:
         correlation: Correlation of the jitter of successive packets, in [0, 1].
         loss: Probability of an independent loss, or model of loss in bursts.
         duplicate: Probability in [0, 1] that a packet arrives twice; the copy has its own delay.
-        reorder: Probability in [0, 1] that a packet skips both queue and delay.
+        reorder: Probability in [0, 1] that a packet has no delay, and skips the queue.
         corrupt: Probability in [0, 1] that one bit of the datagram is flipped, in all its copies.
         keep_order: Whether packets arrive in the order of sending (this disables `reorder`).
         rate: Rate of the bottleneck [bit/s]; None without a bottleneck.
@@ -115,8 +115,8 @@ class DirectionProfile:
         changes: Changes of the conditions, strictly rising in `at`.
         trace: Measured delay over time.
         blackouts: Blackouts in any order; they may overlap.
-        table: Values of the distribution "table" [1], drawn with equal probability: mean 0,
-            standard deviation 1, rising, shape (n,). () for other distributions.
+        table: Equally probable values of the distribution "table", as multiples of `jitter` [1]:
+            mean 0, standard deviation 1, rising, shape (n,). () for other distributions.
     """
 
     delay: float = 0.0
@@ -175,7 +175,7 @@ class Timeline:
 
     @property
     def last_ns(self) -> float:
-        """Time of the last change since the link came up [ns]; infinite if the time line loops."""
+        """Time from the start of the link to the last change [ns]; infinite for a loop."""
         return self.pass_ns[-1] if self.period_ns is None else inf
 
     def only(self) -> Conditions | None:

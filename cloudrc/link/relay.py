@@ -47,7 +47,7 @@ BATCH = 32
 SPIN_NS = 60_000
 """Time before a datagram is due at which the relay starts to read the clock in a loop [ns]."""
 STOP_PERIOD = 0.1
-"""Longest time between two calls of `stop` [s]."""
+"""Longest time between two calls of the argument `stop` of `Relay.run` [s]."""
 ANCILLARY_SIZE = 64
 """Size of the buffer for the kernel's time stamp and its count of dropped datagrams [bytes]."""
 AGE_MAX_NS = 50_000_000
@@ -134,8 +134,8 @@ class Stamps:
     def age_ns(self, ancillary: Sequence[tuple[int, int, bytes]], now_ns: int) -> int:
         """Return the time since a datagram arrived [ns]; 0 if the kernel gave no time stamp.
 
-        `now_ns` is the wall clock [ns]. The result is limited to 0 ... AGE_MAX_NS, because users
-        and NTP can set the wall clock.
+        `now_ns` is the wall clock [ns]. The result is limited to 0 ... AGE_MAX_NS, because it is
+        wrong if a user or NTP has just set the wall clock.
         """
         wall_ns = self.wall_ns(ancillary)
         return 0 if wall_ns is None else min(max(0, now_ns - wall_ns), AGE_MAX_NS)
@@ -258,8 +258,8 @@ class Lane:
 class Lanes:
     """Runs several `Lane` objects in one thread.
 
-    The models' time starts at `origin_ns` [ns], monotonic clock. With None, it starts when the
-    first datagram arrives on any lane, as in virtual time.
+    The models' time starts at `origin_ns` [ns], monotonic clock. If `origin_ns` is None, it starts
+    when the first datagram arrives on any lane, as in virtual time.
     """
 
     def __init__(self, lanes: Sequence[Lane], origin_ns: int | None) -> None:
@@ -293,7 +293,7 @@ class Lanes:
     def take_in(self, readable: Collection[socket.socket] | None = None) -> None:
         """Read waiting datagrams from the `readable` sockets, by default from all sockets.
 
-        Call this method before a profile changes: waiting datagrams get the old conditions.
+        Call this method before a profile changes, so that waiting datagrams get the old conditions.
         """
         for lane in self._lanes:
             if readable is None or lane.source in readable:
@@ -318,7 +318,7 @@ class Lanes:
     def recent(self) -> dict[str, int]:
         """Return percentiles of the recent lateness [ns], and `released_early` since the start.
 
-        Call this method once a second: the percentiles cover the time since the tenth call before.
+        Call this method once a second; the percentiles then cover the last 10 s.
         """
         errors = self.errors()
         recent = ReleaseErrors(errors - self._past[0]).in_ns()
@@ -387,11 +387,11 @@ class RelayShaper(Lanes):
     def __init__(
         self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
     ) -> None:
-        """Open the two sockets. The model's origin is on the machine's monotonic clock.
+        """Open the two sockets.
 
         Args:
             listen: Address to which this pod's end of the tunnel sends; port 0: the kernel chooses.
-            direction: Model of the link.
+            direction: Model of the link, whose origin is a time on the monotonic clock.
             peek: Function that reads kind, epoch and counter of a datagram.
             end: Address from which this pod's end of the tunnel sends. None accepts any sender.
 
@@ -421,7 +421,7 @@ class RelayShaper(Lanes):
         return host, port
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Use this profile from now on; its time line starts now (`restart`) or continues."""
+        """Use this profile from now on; `restart` as in `LinkDirection.replace_profile`."""
         self.take_in()  # datagrams that have arrived belong to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
 

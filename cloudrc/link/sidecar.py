@@ -33,7 +33,7 @@ from cloudrc.link.state import (
 from cloudrc.records import Counted
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
-"""Setting `link.mode`: "relay" and "netem" allow no other shaper; "auto" uses netem if possible."""
+"""Setting `link.mode`: the only allowed shaper, or "auto": netem if it works, else the relay."""
 COUNT_PERIOD_NS = 1_000_000_000
 """Time between two updates of the metrics and of the file that reports the lateness [ns]."""
 STEP = 0.05
@@ -99,7 +99,7 @@ def read_told(text: str) -> Told:
 
 
 class Machine(NamedTuple):
-    """Functions and facts of the machine that a sidecar uses.
+    """Functions that a sidecar calls on its machine, and the permissions that it has there.
 
     Attributes:
         relay: Makes a `RelayShaper`.
@@ -152,7 +152,7 @@ class Sidecar:
         route: Path,
         metrics: Metrics | None = None,
     ) -> None:
-        """Prepare; `route` is the path of the route file, whose folder also holds the state file.
+        """Store the arguments; `route` is the path of the route file, beside the state file.
 
         `direction` is "uplink" or "downlink".
         """
@@ -198,7 +198,7 @@ class Sidecar:
         return Told(state.shaper, state.reason, settled(profile) if over else None)
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
-        """Shape with one shaper until `stop`, or until a new profile needs the other shaper."""
+        """Shape with one shaper until `stop` returns True, or a profile needs the other shaper."""
         profile, machine = self.profile, self._machine
         if self._in_force and self._change_of(profile).restart:
             self._origin_ns = machine.clock()
@@ -298,7 +298,7 @@ class Sidecar:
             self._metrics.asked(self._direction, asked["delay"] or 0.0)
 
     def _count(self, shaper: Shaper, now_ns: int) -> None:
-        """Update the metrics, and write how late datagrams left to a file for this pod's end."""
+        """Update the metrics, and the file from which world or cloud reads the lateness."""
         if self._metrics:
             counts = shaper.counts().items()
             self._metrics.see([Counted(now_ns, "link", name, number) for name, number in counts])

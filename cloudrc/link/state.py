@@ -58,13 +58,13 @@ class LinkState:
         reason: Why this shaper was chosen, in words.
         mode: Requested shaper: "auto", "relay" or "netem".
         direction: "uplink" or "downlink".
-        profile: Both directions, as in a profile's file, without defaults.
+        profile: Profiles of both directions, as in the file, without defaults.
         since: When the profile took effect, UTC, to show to users.
         since_ns: When the profile took effect, on the machine's monotonic clock [ns].
         changes: Number of changes since the link came up.
         change: Number of the last change that took effect; "" if unknown.
         cause: Why the profile was changed, in words; "" before the first change.
-        asked: Requested conditions at the start of the time line, as from `summary`.
+        asked: Requested conditions at the start of the time line: the result of `summary`.
         origin_ns: Start of the time line on the monotonic clock [ns]; None if the change did not
             restart the time line.
         refused: Number of the last refused change; "" if no change was refused.

@@ -22,7 +22,7 @@ from cloudrc.link.profile import Trace
 SIZE_MAX = 64 << 20
 """Size limit of a file [bytes]: half a day at 100 packets a second."""
 START_MAX = 600.0
-"""Latest time of a trace's first row [s]; with a later start a flight might use only this row."""
+"""Latest time of a trace's first row [s]: until this time a flight uses only the first row."""
 UNIX_TIME = 1e8
 """If the time of the first row is at least this large, all times are Unix times [s] (1e8 is in
 March 1973). Then the time of the first row is subtracted."""
@@ -36,8 +36,8 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
     """Read a trace from a CSV file of at most `size_max` bytes.
 
     Raises:
-        BadInputError: If the file cannot be read or is no trace; names file, line, value and
-            remedy.
+        BadInputError: If the file cannot be read or is no trace; the text names file, line, value
+            and remedy.
     """
     remedy = "give a CSV file with the columns time_s,delay_ms"
     return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
@@ -69,10 +69,10 @@ def decode(data: bytes) -> list[str]:
 
 
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
-    """Read the distribution of a trace's delays, without lost packets; raise as `read_trace`.
+    """Read the distribution of a trace's delays, without lost packets; errors as in `read_trace`.
 
     Returns:
-        The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,) [1].
+        The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,).
     """
     trace = read_trace(path, size_max)
     losses = trace.losses or (0.0,) * len(trace.delays)
@@ -116,8 +116,8 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
 def write_trace(trace: Trace) -> str:
     """Format a trace as a CSV text that `read_trace` can read.
 
-    If all delays are below 1 ms, the column is `delay_us`. In `delay_ms` the reader would take such
-    values for seconds and reject them.
+    If all delays are below 1 ms, the column is `delay_us`. In a column `delay_ms`, `read_trace`
+    would reject such values, because they could be seconds.
     """
     short = 0.0 < max(trace.delays) < 1e-3
     unit, scale = ("us", 1e6) if short else ("ms", 1e3)

@@ -137,7 +137,7 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     expects="always a safe state; the mission goes on",
 )
 def _swizzle(outcome: Outcome, seed: int) -> None:
-    """Each direction of the link stops before its sender, so that datagrams are lost.
+    """Stop each direction of the link before its sender stops, so that datagrams are lost.
 
     Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
     """

@@ -19,18 +19,18 @@ from cloudrc.tunnel import codec
 from cloudrc.world.endpoint import WorldEndpoint
 
 Make: TypeAlias = Callable[[bytes], Iterable[bytes]]
-"""Function that makes the hostile datagrams which arrive just before an honest datagram."""
+"""Function that makes hostile datagrams from an honest datagram; they arrive just before it."""
 REFUSED = ("tag", "malformed", "version", "direction", "old_epoch", "repeated")
 """Counters of world and cloud for datagrams that they reject."""
 GREETED = ("hello", "unanswered", "accept_ignored")
-"""Counters for captured hello messages; the only possible answer to them is a challenge."""
+"""Counters for captured hello messages, which are answered at most with a challenge."""
 FLOOD = 100  # datagrams of garbage per honest one: 10,000 in a second
 SETTLED = 2.0
 """Time by which a new flight has its session, so that an old hello message cannot open one [s]."""
 
 
 class HostileSender:
-    """Sends hostile datagrams and counts them: all as `sent`, those with an effect as `taken`."""
+    """Sends hostile datagrams. `sent` counts all of them, `taken` the datagrams with an effect."""
 
     def __init__(self) -> None:
         self.sent = self.taken = 0
@@ -62,8 +62,8 @@ def _check_no_effect(
 ) -> None:
     """Fly with and without hostile datagrams; both flights must be equal.
 
-    From `since` [s] on, the first function in `makes` makes the datagrams for world, the second
-    those for cloud. World's counters `refusals` must rise.
+    From `since` [s] on, the functions in `makes` make hostile datagrams: the first for world, the
+    second, if any, for cloud. World's counters `refusals` must rise.
     """
     sender, clean, flight = HostileSender(), Flight(seed=seed).fly_mission(), Flight(seed=seed)
 

@@ -21,7 +21,7 @@ HOLDS = "world guard_transitions_total hold"
     expects="stays in TRACK, no step above the acceleration cap",
 )
 def _short_silence(outcome: Outcome, seed: int) -> None:
-    """A link without jitter has no other gaps between datagrams."""
+    """Interrupt a link without jitter, so that datagrams have no other gaps."""
     at = measures.instant(seed)
     both, steady = silent(at, 0.1), conditions(jitter=0.0)
     cut = silent(at, 0.1, jitter=0.0)

@@ -15,12 +15,12 @@ from cloudrc.link.sidecar import Near, Told
 from cloudrc.link.verify.judge import Row
 
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
-"""A shaper lacks CPU time above any of these limits: 99 % quantile of its release error [s]; share
-of datagrams not read in time; share of CPU periods in which the shaper was throttled."""
+"""Limits of a shaper with enough CPU time: 99 % quantile of its release error [s]; share of
+datagrams not read in time; share of CPU periods in which the shaper was throttled."""
 RAISED = ("mean", "round_trip", "deviation", "loss")
 """Quantities that rise if the shaper lacks CPU time."""
 PASSED = 0.9
-"""If the shaper counts less than this share of the arrived datagrams, the others bypass it."""
+"""If the shaper counts less than this share of the arrived datagrams, some bypass it."""
 
 
 class Evidence(NamedTuple):
@@ -95,7 +95,7 @@ class Findings(NamedTuple):
 
 
 def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
-    """Name the causes for each direction of a link; return none if no measurement is "off"."""
+    """Name the causes for each direction of a link; return [] if no measurement is "off"."""
     found = {way: list(_causes_of(one)) for way, one in findings.items()}
     silent = [way for way, causes in found.items() if causes and causes[0][0] in _UNSHAPED]
     shaped = [way for way in findings if way not in silent]
@@ -131,7 +131,7 @@ measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield the most certain cause; if CPU time is lacking, also the cause that the rows show."""
+    """Yield the most certain cause; if it is a lack of CPU time, also a cause from the rows."""
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
     if off and (read := next(_of_machine(one.evidence, off, lost), None)):
@@ -145,7 +145,7 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
-    """Yield causes that the machine reports, the most certain first; `lost` is the loss [1]."""
+    """Yield causes that the machine reports, the most certain first; `lost` is the share lost."""
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
     sent, unshaped = known.sent or 0, known.shaper == "none"
     passed = sent if known.passed is None else known.passed

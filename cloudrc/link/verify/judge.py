@@ -2,7 +2,7 @@
 
 The random numbers of a relay depend only on seed and counter, so the delay of each datagram through
 a relay can be predicted. The random numbers of netem cannot be predicted. Therefore 200 simulated
-links with other seeds give a band of likely values for each quantity.
+links with different seeds give a band of likely values for each quantity.
 
 The verdict on a quantity is "ok" if the measured value is inside the band, widened by a tolerance,
 and otherwise "off". It is "open" if the measurement is too short to decide, and "told" if a
@@ -33,7 +33,7 @@ SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
 measured and predicted delays; share of datagrams whose loss or arrival was predicted."""
 STILL, SHAPE_FLOOR = 1e-4, 2e-3
 """Standard deviations of the delay [s]. Below STILL, the correlation of delays is not used. Below
-SHAPE_FLOOR, the distribution is not judged, because the machine itself changes its shape."""
+SHAPE_FLOOR, the distribution is not judged, because delays of the machine itself change it."""
 TOLERANCES = {
     "mean": (2e-3, 0.05),
     "round_trip": (2e-3, 0.05),
@@ -42,14 +42,14 @@ TOLERANCES = {
     "rate": (0.0, 0.25),
 }
 """Quantity -> tolerance in the unit of the quantity, and tolerance as a share of the requested
-value. The larger tolerance counts. For the deviation on a relay, half the share is used."""
+value. The larger tolerance applies. For the deviation on a relay, half the share is used."""
 SHARE_TOLERANCE = (0.02, 0.25)
 """Tolerance of loss, reordering and duplication: absolute [1], and as a share of the request."""
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; quantities that are not listed are shares with the unit "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
-"""Smallest number of datagrams for a verdict; largest half width of a band, as a multiple of the
-tolerance, for the verdict "ok"."""
+"""Smallest number of datagrams for a verdict, and largest half width of a band for the verdict
+"ok", as a multiple of the tolerance."""
 
 
 class Flow(NamedTuple):
@@ -84,7 +84,7 @@ class Expected(NamedTuple):
     known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return half a band's width, divided by the tolerance [1]; the limit is `CHANCE_MAX`."""
+        """Return half the width of a quantity's band, as a multiple of its tolerance."""
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
@@ -109,8 +109,8 @@ class Plan:
         profile: Requested conditions.
         flow: Kind, size and direction of the datagrams.
         sent: Time of sending of each datagram, since the link came up [s], shape (n,).
-        train: Number of datagrams in a train, which is sent back to back. Before each train, as
-            many datagrams are sent one by one. 0 if there are no trains.
+        train: Number of datagrams in a train, which is sent back to back. Before each train, the
+            same number of datagrams is sent one by one. 0 if there are no trains.
         pause: Function called every few hundred microseconds, so that other threads can run.
     """
 
@@ -157,7 +157,7 @@ class Plan:
         """Return the values that a correct link would measure with the datagrams of a stream.
 
         If the stream matches the predicted random numbers of a relay, the values are exact.
-        Otherwise they are the bands from simulated links with other seeds.
+        Otherwise they are the bands of simulated links with different seeds.
         """
         drawn = self.draw(measured.sent, epoch, first)
         if self._fits(self._singles(measured), self._singles(drawn)):
@@ -188,10 +188,10 @@ class Plan:
         return round(len(self.links[0].sent) * max(1.0, most**2))
 
     def quantities(self, stream: Stream, pooled: Floats) -> dict[str, float]:
-        """Compute the judged quantities of a stream; an unknown quantity is NaN.
+        """Compute the quantities of a stream that are judged; an unknown quantity is NaN.
 
         "deviation" is the standard deviation from the delay requested at each time [s], so it shows
-        the jitter alone. "distribution" is the Kolmogorov-Smirnov distance to `pooled` [1].
+        the jitter alone. "distribution" is the Kolmogorov-Smirnov distance to `pooled`, in [0, 1].
         """
         singles = self._singles(stream)
         found, shape = numbers(singles), self._shape(singles)
@@ -212,7 +212,7 @@ class Plan:
         return measured
 
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
-        """Return whether the delays match the prediction or, without jitter, the losses do."""
+        """Return whether delays match the prediction; without jitter, whether losses match it."""
         lost = np.isnan(measured.delays), np.isnan(drawn.delays)
         both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)
         pair = [(one.delays - requested)[both] for one in (measured, drawn)]
@@ -266,7 +266,7 @@ def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
 def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     """Return the profile with which the link's model behaves as netem does with `profile`.
 
-    netem hardly correlates delays. If netem draws both a loss and a duplicate for a packet, one
+    netem hardly correlates delays. If netem selects a packet both for loss and for duplication, one
     packet arrives. netem can also lose the copy. Source: Linux, net/sched/sch_netem.c.
     """
     loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate

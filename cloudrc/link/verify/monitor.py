@@ -41,9 +41,10 @@ PERIOD = 0.01
 CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
 """Period of the verdicts [ns]; pause after a change of session or profile [ns]."""
 KEPT, FINAL = 6000, 128
-"""Largest number of datagrams judged; a missing one counts as lost after FINAL newer datagrams."""
+"""Largest number of datagrams judged; number of newer datagrams after which a missing datagram
+counts as lost."""
 ENDS = 2e-3
-"""Largest delay that world and cloud, if they wake on time, add to a round trip [s]."""
+"""Largest delay that world and cloud add to a round trip if they wake on time [s]."""
 FOLLOW_PERIOD = 0.1
 """Period at which the thread reads new records and the link's state file [s]."""
 UNJUDGED = {"distribution"}
@@ -61,7 +62,7 @@ class LinkMonitor:
     """Judges one direction of the link from the records of the program that receives it."""
 
     def __init__(self, *, uplink: bool, flow: Flow) -> None:
-        """Monitor the received `flow`: at cloud the uplink, at world the downlink."""
+        """Monitor the received `flow`: telemetry at cloud (`uplink`), or commands at world."""
         self._uplink, self._flow = uplink, flow
         self._arrivals = deque[Arrival](maxlen=KEPT)
         self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
@@ -75,7 +76,7 @@ class LinkMonitor:
         self._outbox = queue.SimpleQueue[Record]()
 
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
-        """Start the thread; the profiles `asked` hold until the state file reports others."""
+        """Start the thread; the profiles `asked` apply until the state file reports others."""
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
@@ -193,7 +194,7 @@ class LinkMonitor:
         return rows
 
     def _round_trip(self) -> Row:
-        """Judge round trips; world and cloud measure them without overtaken datagrams."""
+        """Judge the mean round trip; datagrams that a later datagram overtook are left out."""
         means = np.sum([[_first_come(link) for link in plan.links] for plan in self._plans], axis=0)
         low, high = np.quantile(means, (TAIL, 1.0 - TAIL)).tolist()
         bands = {"round_trip": (float(means.mean()), low, high + ENDS)}
@@ -201,10 +202,10 @@ class LinkMonitor:
         return expected.judge("round_trip", float(np.mean(self._trips)))
 
     def _excuse(self, row: Row) -> Row:
-        """Change "off" to "open" for a long delay that late wakes of this machine may explain.
+        """Change "off" to "open" if late wakes of this machine may have caused the long delay.
 
-        A loop that is late by t delays the datagrams of the time t by up to t. So the mean square
-        of the added delay grows with the third power of t.
+        If a loop wakes late by t, the datagrams that arrive meanwhile wait for up to t. So the mean
+        square of the added delay grows with the third power of t.
         """
         late = np.array(self._lates or [0.0])
         added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * PERIOD)) ** 0.5
@@ -215,7 +216,7 @@ class LinkMonitor:
 def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
     """Sort arrivals by counter, and mark missing counters between them as lost.
 
-    Also return the first counter, and whether world and cloud share a clock. Without a common
+    Also return the first counter, and whether world and cloud share a clock. Without a shared
     clock, the delays have an unknown constant offset.
     """
     last = max((one.counter for one in arrivals), default=0) - FINAL

@@ -30,7 +30,7 @@ FIRST_PROBE = 1.0
 COUNT = 1500
 """Smallest number of probes, if the user does not specify a duration."""
 LONGEST, AFTER = 120.0, 5.0
-"""Largest duration of a measurement, and its duration after the last change of conditions [s]."""
+"""Longest duration of a measurement; duration after the last change of the conditions [s]."""
 RATE, LINK_SHARE = 200.0, 0.4
 """Largest number of probes per second [1/s], halved for netem; largest share of a limited rate that
 single probes use, in [0, 1]."""
@@ -48,7 +48,7 @@ def plan_probes(
     """Plan probes for `seconds` [s], or with None for as long as a verdict needs.
 
     With None, a profile with a time line is probed along the whole time line. If the profile limits
-    the rate, the probes are large, and half of them are sent in trains, which show the rate.
+    the rate, the probes are large, and half of them are sent in trains to measure the rate.
     `drawn` is True for netem, whose random numbers cannot be predicted.
     """
     timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
@@ -102,7 +102,7 @@ class ProbeEnd:
             self.socket.sendto(self.probes[number], self.route)
 
     def receive(self, far: socket.socket) -> None:
-        """Read one datagram from the other end's socket `far`; record a probe of this end."""
+        """Read a datagram from the other end's socket `far`; record it if this end has sent it."""
         with suppress(OSError, ValueError):  # an earlier probe had no receiver; no probe
             data, ancillary, _, _ = far.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
             at_ns, number = self._stamps.wall_ns(ancillary) or time.time_ns(), peek(data)[2]
