@@ -146,8 +146,8 @@ _TABLE = (
         "A session began under a new epoch, clock of its end", (
         _END, _EPOCH, Field("cause", "string", "", "why, in words"))),
     Topic("/estimated_odometry", "nav_msgs/msg/Odometry", rec.Control, "cloud",
-        "Predicted pose and twist that the controller used; the prediction is for the instant"
-        " basis_stamp_ns + horizon (both in /delay_estimate), cloud's clock",
+        "Predicted pose and twist that the controller used, for the instant basis_stamp_ns +"
+        " horizon (columns of /delay_estimate), cloud's clock",
         _POSE_AND_TWIST[:3]),
     Topic("/setpoint_position", "geometry_msgs/msg/PointStamped", rec.Control, "cloud",
         "Position that the controller tracks, cloud's clock", (
