@@ -1,18 +1,16 @@
 """One direction of the link: draws by counter, queue, order, time line, and their statistics."""
 
-import json
 import random
 from dataclasses import replace
-from importlib.resources import files
 from math import asin, erf, isnan, pi, sqrt
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.schema import Direction, Profile
+from cloudrc.config.load import load_profile
+from cloudrc.config.shipped import names
 from cloudrc.link.draws import (
     BLOCK,
     CHAIN_BLOCKS,
@@ -178,17 +176,17 @@ def stream_of(lost):
     return Stream(np.arange(len(lost)), np.where(lost, np.nan, 0.1), (~lost).astype(int))
 
 
-@pytest.mark.parametrize(("shape", "c"), [("normal", 0.7), ("pareto", 0.5), ("uniform", 0.9)])
-def test_correlated_jitter_keeps_its_distribution(shape, c):
+@pytest.mark.parametrize(
+    ("shape", "c", "expected"),
+    [("normal", 0.7, 0.7), ("uniform", 0.9, 6 / pi * asin(0.45)), ("pareto", 0.5, 0.39)],
+)
+def test_correlated_jitter_keeps_its_distribution(shape, c, expected):
     profile = DirectionProfile(0.045, 0.005, shape)
     apart, alike = (delays(replace(profile, correlation=one), 3 * COUNT) for one in (0.0, c))
-    assert alike.mean() == pytest.approx(0.045, abs=0.0002)
     assert alike.std() == pytest.approx(apart.std(), rel=0.04)
     shares = np.linspace(0.05, 0.95, 19)
     assert np.quantile(alike, shares) == pytest.approx(np.quantile(apart, shares), abs=0.0003)
-    lag_one = np.corrcoef(alike[:-1], alike[1:])[0, 1]
-    expected = {"normal": c, "uniform": 6 / pi * asin(c / 2), "pareto": 0.39}[shape]
-    assert lag_one == pytest.approx(expected, abs=0.03)
+    assert np.corrcoef(alike[:-1], alike[1:])[0, 1] == pytest.approx(expected, abs=0.03)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
@@ -250,12 +248,10 @@ def test_damage_flips_one_bit_anywhere_and_shifts_no_other_draw():
     assert shares.min() > 0.8 * len(hit) / 8
     assert one.counts()["corrupted"] == len(hit)
     assert damaged[:600] == [other.corrupted(1, 3, n, data) for n in reversed(range(600))][::-1]
-    assert damaged[:600] != [other.corrupted(2, 3, n, data) for n in range(600)]
     assert damaged[:600] != [seven.corrupted(1, 3, n, data) for n in range(600)]
     assert {one.corrupted(1, 3, n, b"") for n in range(50)} == {b""}
     assert (len(bit_flips(KEY, 0, 1.0)), bit_flips(KEY, 0, 0.0)) == (256, {})
     assert flow(profile, 600) == flow(LIVELY, 600)
-    assert (link(profile).corrupts, link(LIVELY).corrupts) == (True, False)
 
 
 @given(profile=profiles, seed=st.integers(0, 2**63 - 1))
@@ -356,16 +352,12 @@ def test_a_new_profile_keeps_seed_origin_and_counts():
         assert arrival_ns == round(now * 1e9) + round(delay * 1e9)
 
 
-@pytest.mark.parametrize(
-    ("jitter", "overtaken", "mean", "deviation"),
-    [(0.010, 0.12, 0.0704, 0.0054), (0.025, 0.41, 0.0753, 0.0109), (0.040, 0.54, 0.0829, 0.0150)],
-)
-def test_more_jitter_reorders_more_or_costs_more_delay_in_order(jitter, overtaken, mean, deviation):
-    found = measured(DirectionProfile(0.07, jitter))
-    assert found.overtaken == pytest.approx(overtaken, abs=0.02)
-    assert (found.least, found.most) == pytest.approx((0.07 - jitter, 0.07 + jitter), abs=0.0001)
-    in_order = measured(DirectionProfile(0.07, jitter, keep_order=True))
-    assert (in_order.mean, in_order.deviation) == pytest.approx((mean, deviation), abs=0.0005)
+def test_jitter_reorders_or_costs_delay_in_order():
+    found = measured(DirectionProfile(0.07, 0.040))
+    assert found.overtaken == pytest.approx(0.54, abs=0.02)
+    assert (found.least, found.most) == pytest.approx((0.03, 0.11), abs=0.0001)
+    in_order = measured(DirectionProfile(0.07, 0.040, keep_order=True))
+    assert (in_order.mean, in_order.deviation) == pytest.approx((0.0829, 0.0150), abs=0.0005)
     assert in_order.overtaken == 0.0
 
 
@@ -380,22 +372,9 @@ def test_statistics_of_losses_copies_and_of_nothing():
     assert isnan(measured(DirectionProfile(0.045), 10).correlation)
 
 
-SHIPPED = {
-    file.name.removesuffix(".yaml"): Profile.model_validate_json(
-        json.dumps(yaml.safe_load(file.read_text()))
-    )
-    for file in (files("cloudrc.link") / "profiles").iterdir()
-}
-PAPERS = {"ideal": (0, 0), "paper-p1": (20, 10), "paper-p2": (45, 25), "paper-p3": (70, 40)}
-
-
 def test_the_shipped_profiles_leave_time_for_a_command_to_come_back():
     """Mean round trip plus a period of odometry and of commands is below the command age limit."""
-    assert set(SHIPPED) >= {*PAPERS, "wifi", "lte", "5g", "satellite", "handover", "lossy"}
-    for profile in SHIPPED.values():
+    for profile in map(load_profile, names("profile")):
         assert 10 < len(profile.description) <= 90
         round_trip = profile.uplink.delay_ms + profile.downlink.delay_ms
         assert round_trip + 20 < (profile.command_age_max_ms or 250)
-    for name, (delay, jitter) in PAPERS.items():
-        both = SHIPPED[name].uplink, SHIPPED[name].downlink
-        assert both == (Direction(delay_ms=delay, jitter_ms=jitter),) * 2

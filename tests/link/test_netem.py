@@ -18,7 +18,6 @@ from cloudrc.link.netem import (
     Answer,
     Netem,
     check,
-    counters,
     distribution_name,
     explain,
     limit,
@@ -34,10 +33,6 @@ from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElli
 
 PEER = ("10.244.0.7", 7400)
 UNKNOWN = Answer(2, "", "Error: Specified qdisc kind is unknown.\n")
-NO_QDISC = Answer(2, "", "Error: No such file or directory.\n")
-NO_CLASSIFIER = Answer(
-    2, "", "Error: TC classifier not found.\nWe have an error talking to the kernel\n"
-)
 
 
 class Kernel:
@@ -80,7 +75,7 @@ class Kernel:
                     self.root = {"kind": "prio", "handle": "7400:", "root": True}
                 else:
                     if verb == "change" and self.netem is None:
-                        return NO_QDISC
+                        return Answer(2, "", "Error: No such file or directory.\n")
                     assert (verb == "add") is (self.netem is None)
                     self.netem = list(rest[rest.index("netem") + 1 :])
                 if verb == "change":
@@ -90,7 +85,7 @@ class Kernel:
                     self.history.append((at_ms, self.netem[delay], self.netem[loss]))
             case ["tc", "filter", "add", "dev", _, "parent", _, "pref", number, *rest]:
                 if rest[2] == self.lacks:
-                    return NO_CLASSIFIER
+                    return Answer(2, "", "Error: TC classifier not found.\n")
                 assert int(number) not in self.filters
                 self.filters[int(number)] = " ".join(rest)
             case ["tc", "filter", "del", *_, number]:
@@ -153,14 +148,11 @@ def text(profile, at=0.0):
         ),
         (DirectionProfile(0.045, 0.002, "pareto"), 0.0, "45000.000us 8000.000us 0% distribution p"),
         (DirectionProfile(loss=GilbertElliott(0.01, 0.1, 0.6, 0.005)), 0.0, "gemodel 1% 10% 60% 0"),
-        (SLOW, 0.0, "limit 747 "),  # 100 + 0.3 s * 2 Mbit/s / (8 * 116 bit)
         (SLOW, 0.0, "rate 2000000bit -14"),
         (DirectionProfile(0.04, 0.03, reorder=0.2, keep_order=True), 0.0, "% rate 100gbit"),
         (DirectionProfile(reorder=0.2), 0.0, "corrupt 0% rate"),  # without a delay tc refuses it
-        (TIMED, 0.99, "delay 20000.000us loss random 0% duplicate 10%"),
         (TIMED, 1.0, "delay 100000.000us loss random 50% duplicate 10%"),
         (TIMED, 2.1, "delay 100000.000us loss random 100% duplicate 0%"),  # no copy arrives
-        (TIMED, 2.3, "delay 100000.000us loss random 50% duplicate 10%"),
     ],
 )
 def test_a_profile_is_put_into_tcs_words(profile, at, words):
@@ -176,7 +168,6 @@ def test_a_profile_is_put_into_tcs_words(profile, at, words):
         (DirectionProfile(rate=1e6, changes=(Change(1.0, jitter=0.1),)), "without keep_order"),
         (DirectionProfile(rate=4.0), "rate_kbit below 0.008"),
         (DirectionProfile(loss=GilbertElliott(0.1, 1e-11)), "a probability below 2**-32"),
-        (DirectionProfile(reorder=1e-11), "a probability below 2**-32"),
         (DirectionProfile(blackouts=(Blackout(1.0, 0.004),)), "here 4 ms at 1 s"),
     ],
 )
@@ -186,14 +177,11 @@ def test_what_netem_cannot_do_is_refused_by_name(profile, key):
     assert key in str(refused.value)
 
 
-@pytest.mark.parametrize("name", names("profile"))
-def test_only_lossy_of_the_shipped_profiles_needs_the_relay(name):
-    profile = link_profile(load_profile(name).downlink)
-    if name != "lossy":
-        assert text(profile)
-        return
+def test_only_lossy_of_the_shipped_profiles_needs_the_relay():
+    profiles = {name: link_profile(load_profile(name).downlink) for name in names("profile")}
     with pytest.raises(BadInputError, match="delay_bad_ms"):
-        check(profile)
+        check(profiles.pop("lossy"))
+    assert all(map(text, profiles.values()))
 
 
 def test_what_netem_does_differently_is_said():
@@ -206,28 +194,32 @@ def test_what_netem_does_differently_is_said():
 
 
 def test_the_limit_has_room_for_all_that_is_under_way():
-    fast = replace(SLOW, delay=0.01)
-    assert limit(replace(fast, changes=(Change(1.0, delay=0.3),))) == 747
-    assert limit(replace(fast, changes=(Change(1.0, delay=0.3),), rate=None)) == 10_000
+    assert limit(SLOW) == 747  # 100 + 0.3 s * 2 Mbit/s / (8 * 116 bit)
+    changing = replace(SLOW, delay=0.01, changes=(Change(1.0, delay=0.3),))
+    assert (limit(changing), limit(replace(changing, rate=None))) == (747, 10_000)
     late = DirectionProfile(0.1, 0.1, "pareto", rate=1e5, queue_packets=5, keep_order=True)
     assert limit(late) >= 5 + 100 * (0.1 + 0.1 * 12.1)  # 100 commands a second
     later = DirectionProfile(delay=0.04, queue_packets=20, changes=(Change(10.0, rate=5e4),))
     assert 20 + 100 * 0.04 <= limit(later) <= 20 + 1000 * 0.04
 
 
+def read_table(path):
+    _, *rows = path.read_text().splitlines()
+    entries = np.array([int(word) for row in rows for word in row.split()])
+    assert np.abs(entries).max() < 2**15
+    return entries
+
+
 def test_a_measured_distribution_becomes_a_table(tmp_path):
     drawn = np.random.default_rng(1).exponential(size=3000)
-    values = tuple(np.sort((drawn - drawn.mean()) / drawn.std()).tolist())
-    profile = DirectionProfile(0.04, 0.002, distribution="table", table=values)
+    values = np.sort((drawn - drawn.mean()) / drawn.std())
+    profile = DirectionProfile(0.04, 0.002, distribution="table", table=tuple(values.tolist()))
     write_measured(tmp_path, profile)
-    name, jitter = distribution_name(profile), 2000 * stretch(profile)
-    assert f"delay 40000.000us {jitter}.000us 0% distribution {name}" in text(profile)
-    _, *rows = (tmp_path / f"{name}.dist").read_text().splitlines()
-    entries = np.array([int(word) for row in rows for word in row.split()])
+    name, unit = distribution_name(profile), stretch(profile)
+    assert f"delay 40000.000us {2000 * unit}.000us 0% distribution {name}" in text(profile)
+    entries, shares = read_table(tmp_path / f"{name}.dist"), np.linspace(0.01, 0.99, 50)
     assert len(entries) == ENTRIES
-    assert np.abs(entries).max() < 2**15
-    shares = np.linspace(0.01, 0.99, 50)
-    assert np.quantile(entries * stretch(profile) / 8192, shares) == pytest.approx(
+    assert np.quantile(entries * unit / 8192, shares) == pytest.approx(
         np.quantile(values, shares), abs=0.01
     )
 
@@ -235,10 +227,8 @@ def test_a_measured_distribution_becomes_a_table(tmp_path):
 @pytest.mark.parametrize("distribution", sorted(STRETCH))
 def test_tables_are_the_models_distributions(distribution, tmp_path):
     write_tables(tmp_path)
-    _, *rows = (tmp_path / f"{distribution}.dist").read_text().splitlines()
-    entries = np.array(table(distribution))
-    assert [int(row) for row in rows] == entries.tolist()
-    assert np.abs(entries).max() < 2**15
+    entries = read_table(tmp_path / f"{distribution}.dist")
+    assert entries.tolist() == list(table(distribution))
     profile = DirectionProfile(jitter=1.0, distribution=distribution)
     key = stream_key(1, True, 1, 3)
     drawn = np.concatenate([shape(key, Purpose.DELAY, block, profile) for block in range(80)])
@@ -263,10 +253,6 @@ def test_tables_are_the_models_distributions(distribution, tmp_path):
         ),
         (Answer(1, "", 'Illegal "latency"\n'), "'tc qdisc add netem' failed: Illegal \"latency\""),
         (Answer(3, "", ""), "exit code 3"),
-        (
-            Answer(1, "", "No distribution data for t (No such file or directory)"),
-            "failed: No dist",
-        ),
     ],
 )
 def test_an_error_of_tc_becomes_one_sentence(answer, words):
@@ -293,8 +279,8 @@ def test_only_the_tunnels_flow_is_sent_to_netem_and_all_is_removed():
     kernel = Kernel()
     shaper = netem(kernel, PLAIN)
     assert shaper.follow_peer(PEER) == PEER
-    shaper.follow_profile(PLAIN)
     shaper.step(0.1)
+    assert {"forwarded": 90, "lost": 10, "restored": 0}.items() <= shaper.counts().items()
     for _ in range(2):
         shaper.close()
     assert kernel.said == [
@@ -312,11 +298,7 @@ def test_the_set_up_of_a_killed_process_is_taken_over():
     netem(kernel, PLAIN).follow_peer(PEER)
     kernel.said.clear()
     netem(kernel, DirectionProfile(0.07)).follow_peer(PEER)
-    assert [line.split(" pref")[0][:40] for line in kernel.said] == [
-        "qdisc change parent 7400:4 handle 7401: ",
-        "filter add parent 7400:",
-        "filter del parent 7400:",
-    ]
+    assert [line[:12] for line in kernel.said] == ["qdisc change", "filter add p", "filter del p"]
     assert len(kernel.filters) == 1
 
 
@@ -373,42 +355,35 @@ def test_a_kernel_that_lacks_a_module_is_left_as_it_was(lacks):
     with pytest.raises(MissingPrerequisiteError, match="this kernel lacks sch_netem, sch_prio or "):
         netem(kernel, PLAIN).follow_peer(PEER)
     assert kernel.root["kind"] == "noqueue"
-    assert "'tc qdisc change' failed" in str(explain("tc", ("qdisc", "change"), UNKNOWN))
 
 
-def take_the_delay_out(kernel):
-    kernel.netem[kernel.netem.index("delay") + 1] = "0.000us"
-
-
-@pytest.mark.parametrize(
-    ("harm", "words"),
-    [
-        (Kernel.clear, "was removed by another program"),
-        (lambda kernel: setattr(kernel, "netem", None), "was removed by another program"),
-        (take_the_delay_out, 'was changed to {"limit": 10000, "delay": {"delay": 0.0}'),
-    ],
-)
-def test_a_foreign_change_is_an_error_and_not_repaired(harm, words):
+def test_a_foreign_change_is_an_error_and_not_repaired():
     kernel, log = Kernel(), []
-    profile = DirectionProfile(0.04, changes=(Change(5.0, loss=0.1), Change(9.0, delay=0.2)))
-    shaper = netem(kernel, profile, log.append)
+    shaper = netem(kernel, DirectionProfile(0.04, changes=(Change(5.0, loss=0.1),)), log.append)
     shaper.follow_peer(PEER)
     shaper.step(1.5)
     assert (log, shaper.counts()["restored"]) == ([], 0)
-    harm(kernel)
+    kernel.netem[kernel.netem.index("delay") + 1] = "0.000us"
     kernel.said.clear()
     for _ in range(2):
         shaper.step(1.0)
     (line,) = log
-    assert line.startswith(f"error: the qdisc of eth0 {words}")
-    assert kernel.said == []
-    if harm is not take_the_delay_out:
-        for _ in range(80):
-            shaper.step(0.1)
-        with pytest.raises(MissingPrerequisiteError, match="restart this pod"):
-            shaper.follow_profile(DirectionProfile(0.07))
-    assert len([one for one in log if one.startswith("error")]) == 1, "said once"
-    assert shaper.counts()["restored"] == 1
+    assert line.startswith('error: the qdisc of eth0 was changed to {"limit": 10000, "delay": {"d')
+    assert (kernel.said, shaper.counts()["restored"]) == ([], 1)
+
+
+def test_nor_is_a_qdisc_that_another_program_removed():
+    kernel, log = Kernel(), []
+    shaper = netem(kernel, DirectionProfile(0.04, changes=(Change(5.0, loss=0.1),)), log.append)
+    shaper.follow_peer(PEER)
+    kernel.clear()
+    for _ in range(80):
+        shaper.step(0.1)
+    (line,) = log
+    assert line.startswith("error: the qdisc of eth0 was removed by another program")
+    with pytest.raises(MissingPrerequisiteError, match="restart this pod"):
+        shaper.follow_profile(DirectionProfile(0.07))
+    assert (len(log), shaper.counts()["restored"]) == (1, 1)
 
 
 def follow(profile, until, slow_ms=0):
@@ -446,12 +421,8 @@ def test_changes_faster_than_the_step_are_skipped_and_counted():
 def test_a_slow_machine_reports_its_lateness():
     changes = tuple(Change(0.1 * n, delay=0.01 * n) for n in range(1, 11))
     _, shaper = follow(DirectionProfile(changes=changes), 1.5, slow_ms=30)
-    shaper.steps.note(40_000_000, 0)
-    assert list(shaper.steps.counts().values()) == [30_000_000, 40_000_000]
-    assert shaper.steps.in_words() == (
-        "11 steps of the time line, late by 30.00 ms in the median and 40.00 ms at the 99th "
-        "percentile, 0 passed over"
-    )
+    assert list(shaper.steps.counts().values()) == [30_000_000, 30_000_000]
+    assert shaper.steps.in_words().startswith("10 steps of the time line, late by 30.00 ms in the")
 
 
 @pytest.mark.parametrize(("restart", "due_ms"), [(True, 1300.0), (False, 800.0)])
@@ -464,17 +435,3 @@ def test_a_new_time_line_may_count_from_now_or_go_on(restart, due_ms):
     shaper.follow_profile(after, restart=restart)
     shaper.step(1.2)
     assert [at for at, _, _ in kernel.history] == pytest.approx([500.0, due_ms])
-
-
-# As iproute2 6.1 prints it for Linux 6.1.
-LISTED = """[{"kind":"prio","handle":"7400:","root":true,"refcnt":3,"options":{"bands":4,"priomap":
-[1,2,2,2,1,2,0,0,1,1,1,1,1,1,1,1],"multiqueue":false},"bytes":160,"packets":2,"drops":0,
-"overlimits":0,"requeues":0,"backlog":0,"qlen":0},{"kind":"netem","handle":"7401:","parent":
-"7400:4","options":{"limit":1000,"delay":{"delay":0.01,"jitter":0.005,"correlation":0.3},
-"ecn":false,"gap":0},"bytes":2000,"packets":10,"drops":3,"overlimits":0,"requeues":0,"backlog":428,
-"qlen":2}]"""
-
-
-def test_counters_are_read_from_tcs_json():
-    assert counters(json.loads(LISTED)) == {"forwarded": 10, "lost": 3, "held": 2}
-    assert counters(json.loads('[{"kind":"noqueue","handle":"0:","root":true}]')) == {}

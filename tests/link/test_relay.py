@@ -1,17 +1,18 @@
 """The relay over real sockets on 127.0.0.1: in this process, as a process, and as a pod's link."""
 
-import ctypes
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 import urllib.request
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
+from threading import Event, Thread
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -35,10 +36,8 @@ from cloudrc.link.relay import (
     ReleaseErrors,
     Stamps,
     ask_for_fifo,
-    tighten_slack,
 )
 from cloudrc.tunnel.codec import Kind, encode_header
-from tests.drivers.conftest import FAST
 from tools.bench_link import (
     EPOCH,
     SEED,
@@ -47,16 +46,14 @@ from tools.bench_link import (
     RelayProcess,
     judge,
     measure_profiles,
-    profiles_of,
     run_flow,
-    since_first_ns,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 20.0
 MS, SECOND = 1_000_000, 1_000_000_000
 TRIES = 3
-"""Flights, or floods: other programs may delay one of them."""
+"""Floods: other programs may delay one of them."""
 PLAIN = DirectionProfile()
 
 
@@ -90,9 +87,9 @@ class Bench:
     """A world, a cloud and a relay between them, each with a socket."""
 
     def __init__(self, up, down):
-        self.world, self.cloud, self.world_side, self.cloud_side = (
+        self.ends = self.world, self.cloud, self.world_side, self.cloud_side = [
             bind_loopback() for _ in range(4)
-        )
+        ]
         self.relay = Relay(
             LinkDirection(up, 1, True),
             LinkDirection(down, 1, False),
@@ -102,8 +99,8 @@ class Bench:
             world_peer=self.world.getsockname(),
             cloud_peer=self.cloud.getsockname(),
         )
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self.relay.run, args=(self._stop.is_set,))
+        self._stop = Event()
+        self._thread = Thread(target=self.relay.run, args=(self._stop.is_set,))
         self._thread.start()
 
     def up(self, data):
@@ -117,38 +114,30 @@ class Bench:
         began = time.monotonic()
         self._thread.join(PATIENCE)
         assert time.monotonic() < began + 1.0, "the relay ends soon"
-        for one in (self.world, self.cloud, self.world_side, self.cloud_side):
+        for one in (*self.ends, self.cloud):
             one.close()
 
 
 @pytest.fixture
 def bench():
-    made = []
-
-    def make(up=PLAIN, down=PLAIN):
-        made.append(Bench(up, down))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.close()
+    with ExitStack() as opened:
+        yield lambda up=PLAIN, down=PLAIN: opened.enter_context(closing(Bench(up, down)))
 
 
 def test_a_packet_leaves_when_the_model_says_never_earlier(bench):
-    profile = DirectionProfile(0.020, 0.010)
+    profile = DirectionProfile(0.020, 0.010, corrupt=0.5)
     pair, model = bench(profile), LinkDirection(profile, 1, True)
     errors = []
     for n in range(20):
         sent = time.monotonic_ns()
         pair.up(packet(n))
-        assert pair.cloud.recv(100) == packet(n)
+        assert pair.cloud.recv(100) == model.corrupted(1, 3, n, packet(n))
         (wanted,) = model.send(1, 3, n, 4, 0)
         errors.append(time.monotonic_ns() - sent - wanted)
     assert min(errors) >= 0
     assert sorted(errors)[10] < 50 * MS
     until(lambda: pair.relay.released("uplink").get("released") == 20)
     assert 0 <= pair.relay.counts()["release_error_p99_ns"] < 100 * MS
-    assert pair.relay.released("downlink") == {}
 
 
 def test_every_datagram_is_counted_once(bench, monkeypatch):
@@ -162,14 +151,6 @@ def test_every_datagram_is_counted_once(bench, monkeypatch):
     assert [pair.cloud.recv(100) for _ in range(3)] == [packet(n) for n in range(3)]
     counts = {"received": 10, "malformed": 4, "overflow": 2, "lost": 1, "forwarded": 3}
     until(lambda: pair.relay.outcomes() == {**dict.fromkeys(LINK_OUTCOMES, 0), **counts})
-
-
-def test_a_datagram_is_damaged_as_the_model_says(bench):
-    profile = DirectionProfile(corrupt=1.0)
-    pair = bench(profile)
-    pair.up(packet(5))
-    damaged = LinkDirection(profile, 1, True).corrupted(1, 3, 5, packet(5))
-    assert pair.cloud.recv(100) == damaged != packet(5)
 
 
 def test_a_flood_is_counted_and_over_in_a_second(bench):
@@ -265,8 +246,6 @@ def test_recent_means_the_last_ten_calls():
     with bind_loopback() as source:
         lane = Lane(source, int, LinkDirection(PLAIN, 1, True), peek)
     lanes, said = Lanes([lane], None), []
-    assert lanes.recent() == {"released_early": 0}
-    lanes = Lanes([lane], None)
     for second in range(14):
         lane.errors.observe(9 * MS if second == 2 else 10_000)
         said.append(lanes.recent()["release_error_p999_ns"])
@@ -288,66 +267,25 @@ def test_a_stamp_becomes_an_age_and_drops_are_counted_beyond_32_bits():
     assert stamps.dropped == 2**32 + 3
 
 
-def in_a_thread(act):
-    """Return what `act` returns in a thread, with which its priority and slack end."""
-    found = []
-    thread = threading.Thread(target=lambda: found.append(act()))
-    thread.start()
-    thread.join()
-    return found[0]
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux alone has it")
-def test_a_thread_gets_priority_if_permitted_and_exact_sleeps(monkeypatch):
-    def first():
+def test_a_thread_gets_priority_only_if_permitted(monkeypatch):
+    def is_first():
         return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
 
-    def ask():
-        tighten_slack()
-        slack_ns = ctypes.CDLL(None).prctl(30, 0, 0, 0, 0)  # PR_GET_TIMERSLACK
-        return (not ask_for_fifo()) is first(), in_a_thread(first), slack_ns <= 1
-
-    assert in_a_thread(ask) == (True, False, True), "a child thread is ordinary again"
-
-    def refuse(*_):
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    assert ask_for_fifo() == "Operation not permitted; it takes CAP_SYS_NICE or a limit on rtprio"
+    with ThreadPoolExecutor(1) as pool:  # a thread that ends with its priority
+        said, first = pool.submit(lambda: (ask_for_fifo(), is_first())).result()
+    assert (first, is_first()) == (not said, False)
+    monkeypatch.setattr(os, "sched_setscheduler", Mock(side_effect=PermissionError(1, "Refused")))
+    assert ask_for_fifo() == "Refused; it takes CAP_SYS_NICE or a limit on rtprio"
     monkeypatch.delattr(os, "SCHED_FIFO")
     assert ask_for_fifo() == "this system has no SCHED_FIFO"
 
 
-LIVELY = {
-    "profile": "ideal",
-    "uplink": {"delay_ms": 20, "jitter_ms": 15, "duplicate": 0.2, "loss": 0.2, "reorder": 0.1},
-}
-
-
 @pytest.mark.process
 @pytest.mark.promise("link-follows-the-seed")
-@pytest.mark.parametrize("link", [{"profile": "lossy"}, LIVELY])
-def test_a_relay_run_draws_the_virtual_sequence(tmp_path, link):
-    """Ask a model that never saw a clock: which numbers arrive, how often, how late."""
-    relay = RelayProcess(tmp_path, link)
-    flows = run_flow(relay.ways, 200.0, 1.5, 0.5)
-    relay.stop()
-    for flow, profile in zip(flows, profiles_of(tmp_path, link), strict=True):
-        virtual = LinkDirection(profile, SEED, flow.uplink)
-        kind = Kind.TELEMETRY if flow.uplink else Kind.COMMAND
-        errors = []
-        for n, sent_ns in flow.sent.items():
-            late = sorted(at_ns - sent_ns for at_ns, number in flow.arrived if number == n)
-            drawn = sorted(virtual.send(EPOCH, kind, n, SIZE, 0))
-            errors += [one - delay for one, delay in zip(late, drawn, strict=True)]
-        assert min(errors) >= 0, "early"
-        assert np.median(errors) < 5 * MS
-
-
-@pytest.mark.process
-def test_profiles_with_queue_and_kept_order_are_as_drawn(tmp_path):
-    """`lte` has a rate and keeps order; `make bench-link` measures all profiles for a minute."""
-    for judged in measure_profiles(tmp_path, ["lte"], 2.0).values():
+def test_a_relay_draws_the_virtual_sequence(tmp_path):
+    """`lossy` has bursts, `lte` a rate and kept order; `make bench-link` measures all profiles."""
+    for judged in measure_profiles(tmp_path, ["lossy", "lte"], 2.0).values():
         assert judged.wrongly_lost == judged.wrongly_arrived == 0
         assert judged.errors.min() >= 0.0
         assert np.median(judged.errors) < 5e-3
@@ -355,25 +293,22 @@ def test_profiles_with_queue_and_kept_order_are_as_drawn(tmp_path):
 
 
 def test_lost_invented_and_swapped_datagrams_are_found():
-    """The bench's judge and its times of sending are right."""
+    """The comparison of the test above is not blind."""
     flow, profile = Flow(True), DirectionProfile(0.040, 0.030, loss=0.1)
-    link, start = LinkDirection(profile, SEED, True, SECOND), SECOND
+    link = LinkDirection(profile, SEED, True, SECOND)
     for number in range(500):
-        flow.sent[number] = start + number * 10 * MS
+        flow.sent[number] = SECOND + number * 10 * MS
         sent = link.send(EPOCH, Kind.TELEMETRY, number, SIZE, flow.sent[number])
         flow.arrived += [(at_ns + 20_000, number) for at_ns in sent]
     flow.arrived.sort()
-    honest = judge(flow, profile, start)
+    honest = judge(flow, profile, SECOND)
     assert honest[1:] == (0, 0, 0)
     assert honest.errors == pytest.approx(20e-6)
     lost = next(n for n in range(500) if n not in {number for _, number in flow.arrived})
     del flow.arrived[7]
-    flow.arrived.append((start, lost))
+    flow.arrived.append((SECOND, lost))
     flow.arrived[100], flow.arrived[101] = flow.arrived[101], flow.arrived[100]
-    assert judge(flow, profile, start)[1:] == (1, 1, 1)
-    times = [since_first_ns(n, turn, 2, 10 * MS) for n in range(20) for turn in range(2)]
-    assert times == sorted(times)
-    assert min(min(at % (10 * MS), -at % (10 * MS)) for at in times[1:]) == 10 * MS // 4
+    assert judge(flow, profile, SECOND)[1:] == (1, 1, 1)
 
 
 def flood(target, rate, duration):
@@ -389,45 +324,22 @@ def flood(target, rate, duration):
 
 
 @pytest.mark.process
-def test_5000_strangers_a_second_cost_no_hold(tmp_path):
-    """A local flight of a few seconds, in which strangers flood both sides of its relay."""
-    holds = []
-    for attempt in range(TRIES):
-        folder = tmp_path / str(attempt)
-        words = [*FAST, "run", "hover", "--mode", "local"]
-        words += ["--set", "mission.waypoints.0.dwell_s=4", "--out", str(folder)]
-        run = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        assert run.stdout is not None
-        for line in run.stdout:
-            if "mission started" in line:
-                break
-        floods = [
-            threading.Thread(target=flood, args=(at, 2_500, 3.0)) for at in relay_addresses(run.pid)
-        ]
+def test_5000_strangers_a_second_delay_nothing(tmp_path):
+    """Once they took the turns of both ends' datagrams, which cost four HOLDs a second."""
+    relay, latest = RelayProcess(tmp_path, {"profile": "paper-p1"}), []
+    for _ in range(TRIES):
+        floods = [Thread(target=flood, args=(way.target, 2_500, 2.0)) for way in relay.ways]
         for one in floods:
             one.start()
+        flows = run_flow(relay.ways, 100.0, 2.0, 0.5)
         for one in floods:
             one.join()
-        run.communicate(timeout=90)
-        report = json.loads((folder / "report.json").read_text())
-        holds.append(report["numbers"]["hold_count"]["value"])
-        if holds[-1] == 0:
-            return
-    pytest.fail(f"HOLDs in {TRIES} flights: {holds}")
-
-
-def relay_addresses(parent):
-    """Find the addresses of a local run's relay, world's side and cloud's, in its command line."""
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = path.read_text().split("\0")
-            stat = (path.parent / "stat").read_text()
-        except OSError:
-            continue
-        if "relay" in words and int(stat.rpartition(")")[2].split()[1]) == parent:
-            sides = [word for word in words if "-side=" in word]
-            return [("127.0.0.1", int(side.rpartition(":")[2])) for side in sides]
-    raise AssertionError("no relay")
+        assert [len(flow.arrived) for flow in flows] == [200, 200]
+        latest.append(max(at - flow.sent[n] for flow in flows for at, n in flow.arrived))
+        if latest[-1] < 100 * MS:
+            break
+    relay.stop()
+    assert min(latest) < 100 * MS, "the profile delays by 30 ms at most"
 
 
 class Pod:
@@ -452,7 +364,7 @@ class Pod:
             words = [*command, "--metrics", self.metrics]
             self.process = subprocess.Popen(words, cwd=ROOT, stderr=log)
         self._open = True
-        self._thread = threading.Thread(target=self._receive, daemon=True)
+        self._thread = Thread(target=self._receive, daemon=True)
         self._thread.start()
         until(lambda: self.route.exists() or self.process.poll() is not None)
         assert self.process.poll() is None, self.log.read_text()
@@ -492,15 +404,8 @@ class Pod:
 
 @pytest.fixture
 def pod(tmp_path):
-    pods = []
-
-    def make(*words):
-        pods.append(Pod(tmp_path, *words))
-        return pods[-1]
-
-    yield make
-    for one in pods:
-        one.close()
+    with ExitStack() as opened:
+        yield lambda *words: opened.enter_context(closing(Pod(tmp_path, *words)))
 
 
 def drawn(profile, *, uplink):
