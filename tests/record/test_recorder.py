@@ -63,7 +63,7 @@ def test_what_is_recorded_can_be_read(tmp_path):
     path, records = tmp_path / "world.mcap", world_records(160)
     for target in (path, Path(os.devnull)):  # a device has neither sync nor positions
         recorder = Recorder(target, open_mcap)
-        record_all(recorder, records, 64)
+        record_all(recorder, records, 1000)
         assert (recorder.dropped, recorder.error) == (0, "")
     assert_equal(Recording.read(path), Recording.from_records(records))
 
