@@ -219,14 +219,6 @@ def test_the_bad_state_delays_what_it_does_not_lose():
         assert set(flow(DirectionProfile(duplicate=1.0, loss=certain), 1000)) == {()}
 
 
-def test_a_copy_has_a_delay_of_its_own():
-    fate = flow(DirectionProfile(0.045, 0.025, duplicate=0.2), COUNT)
-    pairs = np.array([copies for copies in fate if len(copies) == 2])
-    assert len(pairs) / COUNT == pytest.approx(0.2, abs=0.01)
-    assert pairs[:, 1].mean() * 1e-9 == pytest.approx(0.045, abs=0.001)
-    assert abs(np.corrcoef(pairs.T)[0, 1]) < 0.05
-
-
 def test_what_overtakes_has_no_delay_and_no_queue():
     fate = flow(DirectionProfile(0.045, 0.005, reorder=0.1), COUNT)
     assert fate.count((0,)) / COUNT == pytest.approx(0.1, abs=0.01)
@@ -350,15 +342,6 @@ def test_a_new_profile_keeps_seed_origin_and_counts():
     for now, delay in ((7.0, 0.02), (11.9, 0.02), (12.1, 0.2)):
         (arrival_ns,) = direction.send(1, 3, 0, 172, round(now * 1e9))
         assert arrival_ns == round(now * 1e9) + round(delay * 1e9)
-
-
-def test_jitter_reorders_or_costs_delay_in_order():
-    found = measured(DirectionProfile(0.07, 0.040))
-    assert found.overtaken == pytest.approx(0.54, abs=0.02)
-    assert (found.least, found.most) == pytest.approx((0.03, 0.11), abs=0.0001)
-    in_order = measured(DirectionProfile(0.07, 0.040, keep_order=True))
-    assert (in_order.mean, in_order.deviation) == pytest.approx((0.0829, 0.0150), abs=0.0005)
-    assert in_order.overtaken == 0.0
 
 
 def test_statistics_of_losses_copies_and_of_nothing():

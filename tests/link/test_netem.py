@@ -13,20 +13,16 @@ from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.draws import Purpose, shape, stream_key
 from cloudrc.link.netem import (
-    ENTRIES,
     STRETCH,
     Answer,
     Netem,
     check,
-    distribution_name,
     explain,
     limit,
     may_shape,
     notes,
     options,
-    stretch,
     table,
-    write_measured,
     write_tables,
 )
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Timeline, Trace
@@ -210,20 +206,6 @@ def read_table(path):
     return entries
 
 
-def test_a_measured_distribution_becomes_a_table(tmp_path):
-    drawn = np.random.default_rng(1).exponential(size=3000)
-    values = np.sort((drawn - drawn.mean()) / drawn.std())
-    profile = DirectionProfile(0.04, 0.002, distribution="table", table=tuple(values.tolist()))
-    write_measured(tmp_path, profile)
-    name, unit = distribution_name(profile), stretch(profile)
-    assert f"delay 40000.000us {2000 * unit}.000us 0% distribution {name}" in text(profile)
-    entries, shares = read_table(tmp_path / f"{name}.dist"), np.linspace(0.01, 0.99, 50)
-    assert len(entries) == ENTRIES
-    assert np.quantile(entries * unit / 8192, shares) == pytest.approx(
-        np.quantile(values, shares), abs=0.01
-    )
-
-
 @pytest.mark.parametrize("distribution", sorted(STRETCH))
 def test_tables_are_the_models_distributions(distribution, tmp_path):
     write_tables(tmp_path)
@@ -300,16 +282,6 @@ def test_the_set_up_of_a_killed_process_is_taken_over():
     netem(kernel, DirectionProfile(0.07)).follow_peer(PEER)
     assert [line[:12] for line in kernel.said] == ["qdisc change", "filter add p", "filter del p"]
     assert len(kernel.filters) == 1
-
-
-def test_a_new_address_gets_its_filter_before_the_old_one_goes():
-    kernel = Kernel()
-    shaper = netem(kernel, PLAIN)
-    for last in (7, 8, 9, 9):
-        shaper.follow_peer((f"10.244.0.{last}", 7400))
-        (match,) = kernel.filters.values()
-        assert f"10.244.0.{last}/32" in match
-    assert [line.split()[1] for line in kernel.said[3:5]] == ["add", "del"]
 
 
 def test_what_is_under_way_has_room_until_it_has_left():
@@ -416,13 +388,6 @@ def test_changes_faster_than_the_step_are_skipped_and_counted():
     applied = shaper.steps.applied
     assert (applied + shaper.steps.passed_over, applied >= 199) == (999, True)
     assert kernel.history[-1][1] == "39990.000us"
-
-
-def test_a_slow_machine_reports_its_lateness():
-    changes = tuple(Change(0.1 * n, delay=0.01 * n) for n in range(1, 11))
-    _, shaper = follow(DirectionProfile(changes=changes), 1.5, slow_ms=30)
-    assert list(shaper.steps.counts().values()) == [30_000_000, 30_000_000]
-    assert shaper.steps.in_words().startswith("10 steps of the time line, late by 30.00 ms in the")
 
 
 @pytest.mark.parametrize(("restart", "due_ms"), [(True, 1300.0), (False, 800.0)])

@@ -17,12 +17,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from cloudrc.cluster.link import APPLY_SCRIPT
-from cloudrc.config.load import load_experiment
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link import relay as module
-from cloudrc.link.follow import Handed, write_handed
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import (
@@ -39,12 +36,8 @@ from cloudrc.link.relay import (
 )
 from cloudrc.tunnel.codec import Kind, encode_header
 from tools.bench_link import (
-    EPOCH,
-    SEED,
     SIZE,
-    Flow,
     RelayProcess,
-    judge,
     measure_profiles,
     run_flow,
 )
@@ -151,24 +144,6 @@ def test_every_datagram_is_counted_once(bench, monkeypatch):
     assert [pair.cloud.recv(100) for _ in range(3)] == [packet(n) for n in range(3)]
     counts = {"received": 10, "malformed": 4, "overflow": 2, "lost": 1, "forwarded": 3}
     until(lambda: pair.relay.outcomes() == {**dict.fromkeys(LINK_OUTCOMES, 0), **counts})
-
-
-def test_a_flood_is_counted_and_over_in_a_second(bench):
-    pair = bench(PLAIN, DirectionProfile(0.02))
-    for n in range(20_000):
-        pair.up(packet(n))
-    time.sleep(1.0)
-    pair.down(packet(1))
-    began = time.monotonic()
-    assert pair.world.recv(100) == packet(1)
-    assert time.monotonic() < began + 0.5
-    pair.up(packet(0))  # with it the kernel tells what it had no room for
-
-    def counted():
-        counts = pair.relay.outcomes()
-        return counts["forwarded"] + counts["unread"]
-
-    until(lambda: counted() == 20_002)
 
 
 def test_strangers_reach_neither_end(bench):
@@ -292,25 +267,6 @@ def test_a_relay_draws_the_virtual_sequence(tmp_path):
         assert judged.swapped <= 0.01 * judged.errors.size
 
 
-def test_lost_invented_and_swapped_datagrams_are_found():
-    """The comparison of the test above is not blind."""
-    flow, profile = Flow(True), DirectionProfile(0.040, 0.030, loss=0.1)
-    link = LinkDirection(profile, SEED, True, SECOND)
-    for number in range(500):
-        flow.sent[number] = SECOND + number * 10 * MS
-        sent = link.send(EPOCH, Kind.TELEMETRY, number, SIZE, flow.sent[number])
-        flow.arrived += [(at_ns + 20_000, number) for at_ns in sent]
-    flow.arrived.sort()
-    honest = judge(flow, profile, SECOND)
-    assert honest[1:] == (0, 0, 0)
-    assert honest.errors == pytest.approx(20e-6)
-    lost = next(n for n in range(500) if n not in {number for _, number in flow.arrived})
-    del flow.arrived[7]
-    flow.arrived.append((SECOND, lost))
-    flow.arrived[100], flow.arrived[101] = flow.arrived[101], flow.arrived[100]
-    assert judge(flow, profile, SECOND)[1:] == (1, 1, 1)
-
-
 def flood(target, rate, duration):
     """Send what looks like telemetry as a stranger, at most `rate` [1/s], for `duration` [s]."""
     data, sent, start = encode_header(Kind.TELEMETRY, 0, 1, 7).ljust(SIZE, b"\0"), 0, time.time()
@@ -345,7 +301,7 @@ def test_5000_strangers_a_second_delay_nothing(tmp_path):
 class Pod:
     """A link container in relay mode, the pod's tunnel end before it and the peer behind it."""
 
-    def __init__(self, folder, profile, direction="uplink"):
+    def __init__(self, folder, profile):
         self.route, self.log = folder / "run" / "route", folder / "log"
         self.profile = folder / "profile.yaml"
         self.route.parent.mkdir()
@@ -356,7 +312,7 @@ class Pod:
         self.arrived = {}
         self.sent_ns = {}
         command = [sys.executable, "-m", "cloudrc", "link", "run", "--config", "paper"]
-        command += ["--profile", str(self.profile), "--direction", direction, "--mode", "relay"]
+        command += ["--profile", str(self.profile), "--direction", "uplink", "--mode", "relay"]
         command += ["--peer", f"localhost:{self.peer.getsockname()[1]}"]
         command += ["--end", f"127.0.0.1:{self.end.getsockname()[1]}"]
         command += ["--listen", f"127.0.0.1:{self.listen[1]}", "--route", str(self.route)]
@@ -405,13 +361,7 @@ class Pod:
 @pytest.fixture
 def pod(tmp_path):
     with ExitStack() as opened:
-        yield lambda *words: opened.enter_context(closing(Pod(tmp_path, *words)))
-
-
-def drawn(profile, *, uplink):
-    """Return the delays [s] that the model draws for the first 20 datagrams of a pod."""
-    model = LinkDirection(profile, load_experiment("paper").seed, uplink)
-    return np.array([model.send(1, Kind.TELEMETRY, n, 166, 0)[0] * 1e-9 for n in range(20)])
+        yield lambda profile: opened.enter_context(closing(Pod(tmp_path, profile)))
 
 
 @pytest.mark.process
@@ -425,28 +375,12 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(pod):
     draft.replace(link.profile)
     link.send(240)
     delays = link.delays(260)
-    assert min(np.array(delays[:20]) - drawn(DirectionProfile(0.3, 0.05), uplink=True)) >= 0.0
+    assert min(delays[:20]) > 0.25
     first = next(n for n, delay in enumerate(delays) if delay < 0.15)
     assert (link.sent_ns[first] - changed_ns) * 1e-9 < 1.0
     assert np.median(delays[-20:]) == pytest.approx(0.020, abs=0.01)
     state = json.loads(link.route.with_name("link.json").read_text())
     assert state["profile"]["description"] == "quick"
-
-
-@pytest.mark.process
-def test_a_change_handed_inside_is_in_force_at_the_commands_end(pod):
-    link = pod("downlink: {delay_ms: 300}\n", "downlink")
-    note = json.dumps({"number": "a1", "cause": "by hand", "restart": True})
-    profile = "{uplink: {delay_ms: 5}, downlink: {delay_ms: 60, jitter_ms: 20}}\n"
-    document = write_handed(Handed(note, {"profile.yaml": profile}))
-    command = ["sh", "-c", APPLY_SCRIPT, "sh", str(link.route.parent), "a1", str(len(document))]
-    done = subprocess.run(command, input=document, check=True, capture_output=True, text=True)
-    told = json.loads(done.stdout)
-    assert (told["change"], told["cause"], told["asked"]["delay"]) == ("a1", "by hand", 0.06)
-    link.send(20)
-    errors = np.array(link.delays(20)) - drawn(DirectionProfile(0.06, 0.02), uplink=False)
-    assert errors.min() >= 0.0
-    assert np.median(errors) < 0.005
 
 
 @pytest.mark.process

@@ -3,20 +3,17 @@
 import json
 import re
 from datetime import UTC, datetime, timedelta
-from errno import ENOSPC
 from itertools import pairwise
 
 import pytest
 
-from cloudrc.cli.link_run import EMPTY_STATUS, LinkStatusSource
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.link import sidecar
 from cloudrc.link.follow import Loaded
-from cloudrc.link.netem import Answer, notes
+from cloudrc.link.netem import Answer
 from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott, Trace
 from cloudrc.link.profile import Change as Step
-from cloudrc.link.sidecar import Machine, Near, Sidecar, Told, look_near, read_told, write_told
-from cloudrc.link.state import Change, publish
+from cloudrc.link.sidecar import Machine, Near, Sidecar, Told, look_near
+from cloudrc.link.state import Change
 
 PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
 REFUSED = BadInputError("netem cannot do delay_ms above 274000 (far); set link.mode=relay")
@@ -221,49 +218,11 @@ def test_a_profile_netem_cannot_do_is_refused_or_relayed(tmp_path):
     assert 1.0e9 <= told["origin_ns"] <= 1.2e9, "the relay begins the time line anew"
 
 
-def test_netems_deviations_are_logged_for_each_profile(tmp_path):
-    first, later = DirectionProfile(corrupt=0.1), DirectionProfile(corrupt=0.2)
-    bench = Bench(tmp_path, "netem", profile=first)
-    bench.at(1.0, lambda: setattr(bench.sidecar, "profile", Loaded(later, {})))
-    bench.run()
-    assert [line for line in bench.log if "corrupt" in line] == notes(first) + notes(later)
-
-
-def test_a_full_disk_ends_nothing_and_delays_the_state(tmp_path, monkeypatch):
-    bench = Bench(tmp_path, "netem")
-    full = {"is": False}
-
-    def write(path, text):
-        if full["is"]:
-            raise OSError(ENOSPC, "No space left on device")
-        publish(path, text)
-
-    monkeypatch.setattr(sidecar, "publish", write)
-    bench.at(1.0, lambda: full.update({"is": True}))
-    bench.at(1.1, lambda: bench.replace(0.5))
-    bench.at(2.5, lambda: bench.replace(9.0, Change("b2", "far")))
-    bench.at(5.0, lambda: full.update({"is": False}))
-    state = bench.run(until=7.0).told()
-    assert (state["changes"], state["refused"]) == (1, "b2")
-    assert state["profile"] == {"description": "0.5 s"}
-
-
 RICH = DirectionProfile(
     0.04, 0.01, "table", loss=GilbertElliott(0.01, 0.2), duplicate=0.02, rate=2e6, table=(-1.0, 1.0)
 )
 OURS = {"kind": "netem", "handle": "7401:", "dev": "eth0", "options": {}}
 THEIRS = {"kind": "netem", "handle": "8001:", "dev": "eth1", "options": {}}
-
-
-def test_a_status_is_written_and_read_again():
-    for status in (
-        Told("netem", "link.mode=auto", RICH, Near("eth0", {"eth0": [OURS]})),
-        Told("relay", "link.mode=relay", None),
-    ):
-        assert read_told(write_told(status)) == status
-    for text in ("{}", "no JSON", '{"shaper": "relay", "why": "", "applied": 3}'):
-        with pytest.raises(ValueError, match="Told"):
-            read_told(text)
 
 
 def test_all_netems_of_a_namespace_are_found():
@@ -293,18 +252,3 @@ def test_a_sidecar_tells_what_is_in_force(tmp_path):
         bench.now_ns = 3_700_000_000_000
         expected = [Told("relay", "link.mode=relay", one) for one in (early, late)]
         assert [*found, bench.sidecar.told()] == expected
-
-
-def test_tools_are_started_at_most_once_a_second(tmp_path):
-    bench, asked, now = Bench(tmp_path, "relay"), [], [0.0]
-
-    def look(host):
-        asked.append(host)
-        return Near("eth0", {})
-
-    source = LinkStatusSource(bench.sidecar, look, lambda: now[0])
-    assert source.text() == EMPTY_STATUS
-    bench.run(1.5)
-    for now[0] in (1.0, 1.5, 1.9, 2.1):
-        assert read_told(source.text()).near == Near("eth0", {})
-    assert asked == [PEER[0]] * 2

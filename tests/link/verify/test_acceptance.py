@@ -134,15 +134,6 @@ def test_the_model_does_what_the_kernel_does(profile):
         assert ours[name] == pytest.approx(value, rel=0.05, abs=0.015), name
 
 
-def test_a_draw_of_the_model_is_predicted_exactly():
-    profile = replace(asked("lossy", "uplink"), duplicate=0.1, corrupt=0.1)
-    plan = plan_probes(profile, Flow(1, True, PROBE, SIZES[Kind.TELEMETRY]))
-    first, again = plan.draw(plan.sent), plan.draw(plan.sent[500:], 1, 500)
-    assert np.array_equal(first.delays[500:], again.delays, equal_nan=True)
-    assert plan.expected(first).known
-    assert not plan.expected(replace(plan, flow=plan.flow._replace(seed=2)).draw(plan.sent)).known
-
-
 STARVED = Evidence("relay", starved="500 datagrams not read in time")
 
 
