@@ -5,9 +5,7 @@ import pytest
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Number
 from cloudrc.metrics.verdict import (
-    EXIT_CODES,
     SLIP_MAX,
-    Ending,
     Observations,
     flight_evidence,
     judge,
@@ -197,31 +195,6 @@ def test_real_time_needs_proof():
 
 
 NAN = float("nan")
-DONE = Ending("done", "mission done")
-LATE = Ending("timed_out", "mission not done within 60 s")
-
-
-@pytest.mark.parametrize(
-    ("seen", "known", "outcome", "found"),
-    [
-        (Observations(touch_speed=0.25), {"contact": True}, "failure", ["contact_too_fast"]),
-        (Observations(touch_speed=9.0), {}, "success", []),  # the board need not be touched
-        # 5 % of 30 s are 1.5 s.
-        (Observations(slip_began_ns=7, slip_ns=1_490_000_007), {}, "success", []),
-        (Observations(slip_began_ns=7, slip_ns=1_510_000_007), {}, "invalid", ["not_real_time"]),
-        (
-            Observations(pipe_touches=1),
-            {"ending": LATE, "reached": 1},
-            "failure",
-            ["timed_out", "waypoint_not_reached", "pipe_touched"],
-        ),
-    ],
-)
-def test_the_same_rules_judge_what_telemetry_shows(seen, known, outcome, found):
-    rules = {"waypoints": 3, "contact_speed_max": 0.25, "contact": False, "reached": 3}
-    verdict = judge(seen.evidence(elapsed=30.0, **{"ending": DONE, **rules, **known}))
-    assert (verdict.outcome, codes(verdict)) == (outcome, found)
-    assert verdict.as_json()["exit_code"] == EXIT_CODES[outcome]
 
 
 def test_only_what_telemetry_shows_during_the_mission_counts():
@@ -232,12 +205,3 @@ def test_only_what_telemetry_shows_during_the_mission_counts():
     assert after.slip_ns - after.slip_began_ns == 4
     assert Observations.begin(4, NAN, 0).see(1, NAN, 0).pipe_touches == 1, "it begins again at 0"
     assert [event for event, _ in after.news(seen, 1.0)] == ["pipe_touched", "board_touched"]
-
-
-def test_slip_while_teleop_is_down_does_not_count():
-    seen = Observations.begin(0, NAN, 5).see(0, NAN, 9)
-    for shown in (1_000, 5_000):
-        seen = seen.after_restart().see(0, NAN, shown)
-        assert seen.slip_ns - seen.slip_began_ns == 4
-    seen = seen.see(0, NAN, 5_003)
-    assert seen.slip_ns - seen.slip_began_ns == 7

@@ -9,7 +9,6 @@ from contextlib import suppress
 from random import Random
 
 import pytest
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message
@@ -22,7 +21,6 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.hash import messages_sha256
 from cloudrc.record.reader import Contents, read_contents, recover
 from cloudrc.record.ros import definition
-from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import MISSING, SHA256, McapWriter
 from tests.record.conftest import assert_equal, rewrite, world_records, write
 
@@ -73,20 +71,6 @@ def whole(tmp_path):
 
 def flipped(at, mask=255):
     return WHOLE[:at] + bytes([WHOLE[at] ^ mask]) + WHOLE[at + 1 :]
-
-
-def test_a_cut_file_is_read_to_its_last_whole_chunk(path):
-    for (_, end), by in itertools.product(CHUNKS, (-1, 0, 500)):
-        path.write_bytes(WHOLE[: end + by])
-        whole = [n for n, (_, last) in enumerate(CHUNKS) if last <= end + by]
-        if not whole:
-            with pytest.raises(BadInputError, match=r"x\.mcap: holds no readable message: cut"):
-                Recording.read(path)
-            continue
-        expected, recording = sum(SIZES[: len(whole)]), Recording.read(path)
-        assert sum(len(recording[topic]) for topic in TOPICS) == expected
-        assert recording.note.startswith(f"cut short: {expected} messages were read, the last at ")
-        assert (recording.complete, recording.lacking) == (False, "")
 
 
 @pytest.mark.parametrize("cut", [0, 1, 8, 30])
@@ -241,14 +225,6 @@ def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, 
     assert peak < 4 * limit << 20
 
 
-def test_a_chunk_in_a_chunk_is_not_unpacked(path):
-    start, end = CHUNKS[0]
-    data, size = WHOLE[start:end] * 2, 2 * (end - start)
-    Chunk("", data, 0, 0, 0, size).write(builder := RecordBuilder())
-    path.write_bytes(WHOLE[:start] + builder.end() + WHOLE[start:end])
-    assert len(read_contents(path).messages) == SIZES[0]
-
-
 def examine(folder, data):
     """Read and recover a file; both say what is wrong, or find all that was recorded."""
     source, new, found = folder / "f.mcap", folder / "new.mcap", list[Contents]()
@@ -300,16 +276,6 @@ def test_a_recovery_says_what_is_kept_and_lost(path):
     assert Recording.read(path).lacking == "something follows its end"
     recovery = recover(path, new)
     assert (recovery.bytes_lost, recovery.share) == (len(WHOLE), pytest.approx(0.5))
-
-
-def test_a_number_without_its_one_definition_is_a_damage(path, tmp_path):
-    source = write(tmp_path / "w.mcap", world_records(5))
-    flat = rewrite(source, path, use_chunking=False).read_bytes()
-    channels = [start for code, start, _ in spans(flat) if code == Opcode.CHANNEL]
-    for at, byte in ((channels[3], b"\x90"), (channels[3] + 9, flat[channels[0] + 9 :][:1])):
-        path.write_bytes(flat[:at] + byte + flat[at + 1 :])
-        assert "damaged" in recover(path, tmp_path / "new.mcap").notes[0]
-        assert Recording.read(path).lacking.startswith("damaged: ")
 
 
 def test_nothing_is_offered_of_what_holds_nothing(path):

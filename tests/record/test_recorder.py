@@ -18,7 +18,7 @@ from cloudrc.record.reader import recover
 from cloudrc.record.recorder import TROUBLE, Recorder
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
-from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records, write
+from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records
 
 
 class Disk(io.BytesIO):
@@ -87,17 +87,6 @@ def test_on_a_full_disk_all_is_kept_or_counted(tmp_path, room):
         assert told or room - path.stat().st_size < 200, "told, if there is room"
     assert kept + recorder.dropped == len(records)
     assert kept < len(records)
-
-
-def test_without_room_for_the_index_all_chunks_are_kept(tmp_path):
-    path, records = tmp_path / "w.mcap", counted(20)
-    disk = Disk(write(path, records).stat().st_size - 100)
-    recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
-    recorder.put(records)
-    recorder.close()
-    path.write_bytes(disk.getvalue())
-    assert "disk full" in recorder.error
-    assert (len(Recording.read(path)["/count"]), recorder.dropped) == (20, 0)
 
 
 def failing(step, error):

@@ -52,22 +52,6 @@ def test_log_times_never_fall_on_a_topic(tmp_path):
     assert Recording.read(path)["/guard"]["stamp_ns"].tolist() == [5, 9, 7, 8, 12]
 
 
-def test_attachments_and_metadata_come_back(tmp_path):
-    path, report = tmp_path / "a.mcap", b'{"verdict": "success"}'
-    with McapWriter(path, clock="cloud", clock_id="boot-1") as writer:
-        writer.write(cloud_records(3))
-        writer.note({"epoch": "1"})
-        writer.note({"epoch": "2"})
-        writer.attach("report.json", report, "application/json")
-        writer.attach("empty", b"")
-    recording = Recording.read(path)
-    assert recording.complete
-    assert recording.attachments == {"report.json": report, "empty": b""}
-    expected = {"clock": "cloud", "clock_id": "boot-1", "epoch": "2"}
-    assert expected.items() <= recording.metadata.items()
-    assert recording.metadata["version"]
-
-
 def test_an_hour_of_recording_takes_no_memory(tmp_path):
     """A chunk every half a second: mcap's own list of chunks takes 12 MB in an hour."""
     path, records = tmp_path / "long.mcap", world_records(1)
