@@ -6,9 +6,8 @@ import struct
 import subprocess
 import threading
 import time
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +15,7 @@ import pytest
 
 from cloudrc.assembly import link_profile
 from cloudrc.cli.link_run import Programs
-from cloudrc.cli.link_verify import inside
+from cloudrc.cli.link_verify import DEVICE, HOSTS, _namespaces, inside
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import MissingPrerequisiteError
@@ -36,10 +35,8 @@ MINUTES = [
 pytestmark = pytest.mark.netem
 
 
-NEAR, FAR = f"crc-near-{os.getpid()}", f"crc-far-{os.getpid()}"
-NEAR_HOST, FAR_HOST = "10.79.0.1", "10.79.0.2"
-DEVICE = "wire"
-FAR_PEER = (FAR_HOST, 7400)
+NEAR, FAR = (f"cloudrc-{way}-{os.getpid()}" for way in HOSTS)
+FAR_PEER = FAR_HOST, _ = HOSTS["downlink"], 7400
 WITHIN = 0.002
 """Tolerance of medians [s]; means would show the stalls of a slow virtual machine."""
 LATE = 0.1
@@ -48,37 +45,8 @@ SIZE = 172
 _SO_TIMESTAMPNS = 35  # include/uapi/asm-generic/socket.h
 
 
-class UnableError(Exception):
-    """This machine cannot make the laboratory."""
-
-
 def sh(*words):
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise UnableError(f"{' '.join(words)}: {done.stderr.strip()}")
-    return done.stdout
-
-
-@contextmanager
-def laboratory():
-    """Make the namespaces and the cable; raise UnableError if that or netem is impossible here."""
-    if os.geteuid() != 0:
-        raise UnableError("the tests of netem need root")
-    try:
-        for name in (NEAR, FAR):
-            sh("ip", "netns", "add", name)
-        sh("ip", "-n", NEAR, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", FAR)
-        for name, host in ((NEAR, NEAR_HOST), (FAR, FAR_HOST)):
-            sh("ip", "-n", name, "addr", "add", f"{host}/24", "dev", DEVICE)
-            for device in ("lo", DEVICE):
-                sh("ip", "-n", name, "link", "set", device, "up")
-        sh("tc", "-n", NEAR, "qdisc", "add", "dev", DEVICE, "root", "netem")
-        sh("tc", "-n", NEAR, "qdisc", "del", "dev", DEVICE, "root")
-        yield
-    finally:
-        for name in (NEAR, FAR):
-            with suppress(UnableError):
-                sh("ip", "netns", "del", name)
+    return subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
 class NearPrograms(Programs):
@@ -89,23 +57,6 @@ class NearPrograms(Programs):
             return super().__call__(words)
 
 
-@lru_cache(maxsize=1)
-def run_near(tables):
-    """Give the programs that all tests share."""
-    return NearPrograms(str(tables))
-
-
-def real_netem(tables, profile, origin_ns=0):
-    return Netem(
-        run_near(tables),
-        profile,
-        origin_ns=origin_ns,
-        clock=time.monotonic_ns,
-        wait=time.sleep,
-        tables=tables,
-    )
-
-
 def qdiscs():
     return sh("tc", "-n", NEAR, "qdisc", "show", "dev", DEVICE)
 
@@ -114,9 +65,7 @@ class Flow:
     """Numbered datagrams from near to a port of far, with the arrival of each copy."""
 
     def __init__(self, port=7400):
-        self.port = port
-        self.sent_ns = []
-        self.arrived = []
+        self.port, self.sent_ns, self.arrived = port, [], []
         with inside(NEAR):
             self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         with inside(FAR):
@@ -182,22 +131,30 @@ def least(error, enough):
 
 
 @pytest.fixture(scope="module")
-def tables(tmp_path_factory):
-    """Make the laboratory; the value is the folder of tc's distributions."""
+def make(tmp_path_factory):
+    """Connect two namespaces; the value makes a netem in the near one."""
     folder = tmp_path_factory.mktemp("tc")
     write_tables(folder)
+    run = NearPrograms(str(folder))
+
+    def made(profile, origin_ns=0):
+        ways = {"clock": time.monotonic_ns, "wait": time.sleep, "tables": folder}
+        return Netem(run, profile, origin_ns=origin_ns, **ways)
+
     try:
-        with laboratory():
-            yield folder
-            run_near(folder).close()
-    except UnableError as error:
+        with _namespaces():
+            for verb in ("add", "del"):
+                sh("tc", "-n", NEAR, "qdisc", verb, "dev", DEVICE, "root", "netem")
+            yield made
+            run.close()
+    except (MissingPrerequisiteError, subprocess.CalledProcessError) as error:
         pytest.exit(f"netem cannot be tested here: {error}", MissingPrerequisiteError.exit_code)
 
 
 @pytest.fixture
-def shaped(tables):
+def shaped(make):
     """Install netem without conditions."""
-    netem = real_netem(tables, DirectionProfile())
+    netem = make(DirectionProfile())
     assert netem.follow_peer(FAR_PEER) == FAR_PEER
     yield netem
     netem.close()
@@ -254,8 +211,7 @@ def test_losses_are_as_many_as_asked_and_counted(shaped, asked, share, burst):
 def test_a_shipped_profile_for_a_minute(shaped, name, way, figure):
     """Mean, loss and order are those that the model draws for the same instants of sending."""
     profile = link_profile(getattr(load_profile(name), way))
-    found = []
-    drawn = []
+    found, drawn = [], []
 
     def off():
         tunnel, stranger = Flow(), Flow(port=7402)
@@ -318,13 +274,13 @@ def test_a_bottleneck_has_its_rate(shaped):
     assert least(off, 0.03) < 0.03
 
 
-def test_it_is_set_up_once_and_removed_without_a_trace(tables):
+def test_it_is_set_up_once_and_removed_without_a_trace(make):
     before = qdiscs()
-    first = real_netem(tables, DirectionProfile(0.02))
-    first.follow_peer(("10.79.0.9", 7400))  # killed here: its qdiscs stay
+    first = make(DirectionProfile(0.02))
+    first.follow_peer(("10.79.7.9", 7400))  # killed here: its qdiscs stay
     left = qdiscs()
-    second = real_netem(tables, DirectionProfile(0.05))
-    for peer in (FAR_PEER, FAR_PEER, ("10.79.0.7", 7400), FAR_PEER):
+    second = make(DirectionProfile(0.05))
+    for peer in (FAR_PEER, FAR_PEER, ("10.79.7.7", 7400), FAR_PEER):
         second.follow_peer(peer)
     assert qdiscs().count("netem") == left.count("netem") == 1
     filters = sh("tc", "-n", NEAR, "filter", "show", "dev", DEVICE, "parent", "7400:")
@@ -335,7 +291,7 @@ def test_it_is_set_up_once_and_removed_without_a_trace(tables):
     assert qdiscs() == before
 
 
-def test_a_time_line_is_followed(tables):
+def test_a_time_line_is_followed(make):
     """60 to 140 ms in waves of 4 s, one row per 20 ms; measured at the instants of sending."""
     times = 0.02 * np.arange(400)
     rows = 0.1 + 0.04 * np.sin(0.5 * np.pi * times)
@@ -345,7 +301,7 @@ def test_a_time_line_is_followed(tables):
     def off():
         origin_ns = time.monotonic_ns() + 5_000_000_000  # by then it is set up
         begun_ns = origin_ns + time.time_ns() - time.monotonic_ns()
-        netem, flow = real_netem(tables, profile, origin_ns), Flow()
+        netem, flow = make(profile, origin_ns), Flow()
         netem.follow_peer(FAR_PEER)
         sender = threading.Thread(target=flow.send, args=(700, 0.02))
         sender.start()
