@@ -16,7 +16,6 @@ from cloudrc.link.draws import (
     CHAIN_BLOCKS,
     Purpose,
     bad_states,
-    bit_flips,
     normals,
     stream_key,
     uniforms,
@@ -74,10 +73,6 @@ def delays(profile, count):
     return np.array([delay * 1e-9 for (delay,) in flow(profile, count)])
 
 
-def measured(profile, count=COUNT):
-    return numbers(sample(link(profile), 3, range(0, count * PERIOD_NS, PERIOD_NS), 191))
-
-
 def ask(direction, counters):
     return {n: direction.send(1, 3, n, SIZE, n * PERIOD_NS) for n in counters}
 
@@ -88,14 +83,6 @@ def test_the_first_draws_of_a_stream_are_these():
     assert uniforms(KEY, Purpose.DELAY, 0)[:3] == pytest.approx(first, abs=1e-12)
     with pytest.raises(ValueError, match="read-only"):
         uniforms(KEY, Purpose.DELAY, 0)[0] = 0.5
-
-
-def test_streams_purposes_and_blocks_do_not_overlap():
-    others = (2, True, 1, 3), (1, False, 1, 3), (1, True, 2, 3), (1, True, 1, 4)
-    keys = [KEY, *(stream_key(*other) for other in others)]
-    drawn = [uniforms(key, p, b) for key in keys for p in Purpose for b in range(10)]
-    values = np.concatenate(drawn)
-    assert np.unique(values).size == values.size
 
 
 @given(block=st.integers(0, 2**56 - 1), purpose=st.sampled_from(Purpose))
@@ -189,16 +176,14 @@ def test_correlated_jitter_keeps_its_distribution(shape, c, expected):
     assert np.corrcoef(alike[:-1], alike[1:])[0, 1] == pytest.approx(expected, abs=0.03)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.6])
-def test_a_table_is_drawn_from_about_its_mean(correlation):
+def test_a_table_is_drawn_from_about_its_mean():
     """A quarter of the packets is late by 1.73 jitters; the others are early by 0.58."""
     table = (-1 / sqrt(3),) * 3 + (sqrt(3),)
-    drawn = delays(DirectionProfile(0.045, 0.005, "table", correlation, table=table), COUNT)
-    assert set(np.round(drawn * 1e9)) == {round(45e6 + 5e6 * value) for value in set(table)}
-    assert drawn.mean() == pytest.approx(0.045, abs=0.0002)
-    assert drawn.std() == pytest.approx(0.005, rel=0.02)
-    lag_one = np.corrcoef(drawn[:-1], drawn[1:])[0, 1]
-    assert (lag_one > 0.3) if correlation else (abs(lag_one) < 0.03)
+    for correlation, least, most in ((0.0, -0.03, 0.03), (0.6, 0.3, 1.0)):
+        drawn = delays(DirectionProfile(0.045, 0.005, "table", correlation, table=table), COUNT)
+        assert set(np.round(drawn * 1e9)) == {round(45e6 + 5e6 * value) for value in set(table)}
+        assert drawn.mean() == pytest.approx(0.045, abs=0.0002)
+        assert least < np.corrcoef(drawn[:-1], drawn[1:])[0, 1] < most
 
 
 def test_200000_packets_have_the_specified_bursts(figure):
@@ -230,7 +215,7 @@ def test_what_overtakes_has_no_delay_and_no_queue():
 
 def test_damage_flips_one_bit_anywhere_and_shifts_no_other_draw():
     profile, data = replace(LIVELY, corrupt=0.2), bytes(SIZE)
-    one, other, seven = link(profile, 7), link(profile, 7), link(profile, 8)
+    one, other = link(profile, 7), link(profile, 7)
     damaged = [one.corrupted(1, 3, n, data) for n in range(COUNT)]
     places = [np.flatnonzero(np.unpackbits(np.frombuffer(d, np.uint8))) for d in damaged]
     hit = [int(place[0]) for place in places if place.size]
@@ -240,9 +225,7 @@ def test_damage_flips_one_bit_anywhere_and_shifts_no_other_draw():
     assert shares.min() > 0.8 * len(hit) / 8
     assert one.counts()["corrupted"] == len(hit)
     assert damaged[:600] == [other.corrupted(1, 3, n, data) for n in reversed(range(600))][::-1]
-    assert damaged[:600] != [seven.corrupted(1, 3, n, data) for n in range(600)]
     assert {one.corrupted(1, 3, n, b"") for n in range(50)} == {b""}
-    assert (len(bit_flips(KEY, 0, 1.0)), bit_flips(KEY, 0, 0.0)) == (256, {})
     assert flow(profile, 600) == flow(LIVELY, 600)
 
 
@@ -321,13 +304,6 @@ def test_a_trace_holds_each_row_until_the_next(loop):
         assert direction.send(1, 3, 0, SIZE, t * SECOND) == at
 
 
-def test_a_trace_without_losses_keeps_loss_and_adds_jitter():
-    fate = flow(DirectionProfile(9.0, 0.005, loss=0.5, trace=Trace((0.0,), (0.030,))), 2000)
-    arrived = [copies[0] for copies in fate if copies]
-    assert 800 < len(arrived) < 1200
-    assert 25 * MS <= min(arrived) < 26 * MS < 34 * MS < max(arrived) <= 35 * MS
-
-
 def test_a_new_profile_keeps_seed_origin_and_counts():
     changes = (Change(5.0, delay=0.2),)
     after = DirectionProfile(0.02, 0.01, distribution="normal", loss=0.1, changes=changes)
@@ -345,14 +321,17 @@ def test_a_new_profile_keeps_seed_origin_and_counts():
 
 
 def test_statistics_of_losses_copies_and_of_nothing():
+    def measured(profile, count):
+        return numbers(sample(link(profile), 3, range(0, count * PERIOD_NS, PERIOD_NS), 191))
+
     stream = stream_of(np.array([0, 1, 1, 0, 1, 0, 0, 1, 1, 1], dtype=bool))
     assert (loss_runs(stream), numbers(stream).loss) == ((2, 1, 3), pytest.approx(0.6))
-    found = measured(DirectionProfile(0.010, 0.020, duplicate=0.1, loss=0.5))
-    assert (found.least, found.duplicated) == (0.0, pytest.approx(0.05, rel=0.1))
+    found = measured(DirectionProfile(0.070, 0.040, duplicate=0.1, loss=0.5), COUNT)
+    assert (found.least, found.most) == pytest.approx((0.03, 0.11), abs=0.0001)
+    assert found.duplicated == pytest.approx(0.05, rel=0.1)
     nothing = measured(DirectionProfile(loss=1.0), 10)
     assert (nothing.loss, nothing.runs) == (1.0, (10,))
     assert all(isnan(value) for value in (nothing.mean, nothing.p99, nothing.correlation))
-    assert isnan(measured(DirectionProfile(0.045), 10).correlation)
 
 
 def test_the_shipped_profiles_leave_time_for_a_command_to_come_back():

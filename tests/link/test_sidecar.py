@@ -10,7 +10,7 @@ import pytest
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.netem import Answer
-from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott, Trace
+from cloudrc.link.profile import Blackout, DirectionProfile, Trace
 from cloudrc.link.profile import Change as Step
 from cloudrc.link.sidecar import Machine, Near, Sidecar, Told, look_near
 from cloudrc.link.state import Change
@@ -21,7 +21,7 @@ NO_NETEM = MissingPrerequisiteError("this kernel has no sch_netem; set link.mode
 
 
 class Shaper:
-    def __init__(self, bench, name, refuses):
+    def __init__(self, bench, name, refuses=None):
         self.name, self._bench, self._refuses = name, bench, refuses
 
     def follow_peer(self, peer):
@@ -57,15 +57,17 @@ class Bench:
         self.counted_ns, self.origins_ns, self.delays = [], [], []
         self.route, self.state = folder / "route", folder / "link.json"
 
-        def make(name, origin_ns, refusal=None):
+        def relay(asked, origin_ns):
             self.origins_ns.append(origin_ns)
-            return Shaper(self, name, refusal)
+            return Shaper(self, "relay")
+
+        def netem(asked, origin_ns):
+            self.origins_ns.append(origin_ns)
+            return Shaper(self, "netem", REFUSED if asked.delay == 9.0 else refuses)
 
         machine = Machine(
-            relay=lambda _, origin_ns: make("relay", origin_ns),
-            netem=lambda asked, origin_ns: make(
-                "netem", origin_ns, REFUSED if asked.delay == 9.0 else refuses
-            ),
+            relay=relay,
+            netem=netem,
             may_shape=may_shape,
             clock=lambda: self.now_ns,
             wait=self.wait,
@@ -128,22 +130,10 @@ def test_auto_takes_netem_where_it_works(tmp_path):
     bench = Bench(tmp_path, "auto").run()
     assert bench.routes == ["10.244.0.7:7400\n"]
     told = bench.told()
-    assert datetime.now(UTC) - datetime.fromisoformat(told.pop("since")) < timedelta(minutes=1)
-    assert told == {
-        "shaper": "netem",
-        "reason": "link.mode=auto",
-        "mode": "auto",
-        "direction": "uplink",
-        "profile": {"description": "nothing"},
-        "since_ns": 0,
-        "changes": 0,
-        "change": "",
-        "cause": "",
-        "asked": {"delay": 0.0, "jitter": 0.0, "loss": 0.0, "rate": None},
-        "origin_ns": 0,
-        "refused": "",
-        "refusal": "",
-    }
+    assert datetime.now(UTC) - datetime.fromisoformat(told["since"]) < timedelta(minutes=1)
+    expected = {"shaper": "netem", "reason": "link.mode=auto", "mode": "auto", "origin_ns": 0}
+    expected |= {"direction": "uplink", "profile": {"description": "nothing"}, "changes": 0}
+    assert expected.items() <= told.items()
 
 
 @pytest.mark.parametrize(
@@ -218,20 +208,12 @@ def test_a_profile_netem_cannot_do_is_refused_or_relayed(tmp_path):
     assert 1.0e9 <= told["origin_ns"] <= 1.2e9, "the relay begins the time line anew"
 
 
-RICH = DirectionProfile(
-    0.04, 0.01, "table", loss=GilbertElliott(0.01, 0.2), duplicate=0.02, rate=2e6, table=(-1.0, 1.0)
-)
-OURS = {"kind": "netem", "handle": "7401:", "dev": "eth0", "options": {}}
-THEIRS = {"kind": "netem", "handle": "8001:", "dev": "eth1", "options": {}}
-
-
 def test_all_netems_of_a_namespace_are_found():
-    qdiscs = [{"kind": "noqueue", "dev": "lo"}, OURS, OURS, THEIRS]
-
-    def run(words):
-        return Answer(0, json.dumps([{"dev": "eth1"}] if words[0] == "ip" else qdiscs), "")
-
-    assert look_near(run, PEER[0]) == Near("eth1", {"eth0": [OURS, OURS], "eth1": [THEIRS]})
+    ours, theirs = ({"kind": "netem", "dev": device} for device in ("eth0", "eth1"))
+    listed = json.dumps([{"kind": "noqueue", "dev": "lo"}, ours, ours, theirs])
+    answers = {"ip": Answer(0, '[{"dev": "eth1"}]', ""), "tc": Answer(0, listed, "")}
+    found = look_near(lambda words: answers[words[0]], PEER[0])
+    assert found == Near("eth1", {"eth0": [ours, ours], "eth1": [theirs]})
     assert look_near(lambda words: Answer(127, "[]", ""), PEER[0]) is None
 
 
@@ -241,7 +223,7 @@ def test_a_sidecar_tells_what_is_in_force(tmp_path):
     timed = DirectionProfile(0.04, changes=changes, blackouts=(Blackout(0.2, 0.1),))
     looping = DirectionProfile(trace=Trace((0.0, 1.0), (0.040, 0.050), loop=True))
     for profile, early, late in (
-        (RICH, RICH, RICH),
+        (DirectionProfile(0.04), DirectionProfile(0.04), DirectionProfile(0.04)),
         (timed, None, DirectionProfile(0.08, 0.01)),
         (looping, None, None),
     ):
