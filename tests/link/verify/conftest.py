@@ -10,10 +10,9 @@ import numpy as np
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
-from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection, Stream
 from cloudrc.link.netem import check, stretch, table
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline
+from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.verify.causes import Findings
 from cloudrc.link.verify.judge import Flow
 from cloudrc.link.verify.monitor import LinkMonitor
@@ -27,46 +26,36 @@ _IN_ORDER = 100e9
 
 
 class VirtualNetem:
-    """Shape one direction as `sch_netem.c` does; used like `LinkDirection`."""
+    """Shape one direction as `sch_netem.c` does, without time lines; used like `LinkDirection`."""
 
     def __init__(self, profile, seed):
         check(profile)
-        self._profile, self._timeline = profile, Timeline(profile)
-        self._chance = random.Random(seed)
+        self._profile, self._chance = profile, random.Random(seed)
         self._rho = round(profile.correlation * (_WORDS - 1))
         self._last_draw = self._chance.getrandbits(32)
-        self._bad = False
-        self._last_ns = 0
-        distribution = profile.distribution
-        self._table = None if distribution == "table" else table(distribution)
+        self._bad, self._last_ns = False, 0
+        self._table = table(profile.distribution)
 
     def send(self, epoch, kind, counter, size, now_ns):
         """Return when the copies of a packet arrive [ns]."""
-        now = self._timeline.at(now_ns)
-        return [at_ns for at_ns in self._enqueue(now, size, now_ns, copies=True) if at_ns >= 0]
+        return [at_ns for at_ns in self._enqueue(size, now_ns, self._profile.duplicate) if at_ns]
 
-    def _enqueue(self, now, size, now_ns, copies):
-        profile, count, found = self._profile, 1, list[int]()
-        if copies and self._chance.random() < profile.duplicate:
-            count += 1
-        if self._loses(now):
-            count -= 1
+    def _enqueue(self, size, now_ns, duplicate):
+        profile = self._profile
+        count = 1 + (self._chance.random() < duplicate) - self._loses()
         if count == 0:
             return []
-        if count > 1:  # the copy goes through all of it once more
-            found += self._enqueue(now, size, now_ns, copies=False)
+        # The copy goes through all of it once more.
+        found = self._enqueue(size, now_ns, 0.0) if count > 1 else []
         damaged = self._chance.random() < profile.corrupt
-        if profile.reorder and not profile.keep_order and self._chance.random() < profile.reorder:
-            return [*found, -1 if damaged else now_ns]
-        at_ns = now_ns + self._delay_ns(now)
-        rate = now.rate or (_IN_ORDER if profile.keep_order else None)
-        if rate is not None:
+        at_ns = now_ns + round((profile.delay + self._jitter()) * 1e9)
+        if rate := profile.rate or (_IN_ORDER if profile.keep_order else None):
             at_ns = max(at_ns, now_ns, self._last_ns) + round((size + _HEADERS) * 8e9 / rate)
             self._last_ns = at_ns
-        return [*found, -1 if damaged else max(now_ns, at_ns)]
+        return [*found, None if damaged else max(now_ns, at_ns)]
 
-    def _loses(self, now):
-        loss = 1.0 if now.blackout else now.loss
+    def _loses(self):
+        loss = self._profile.loss
         if not isinstance(loss, GilbertElliott):
             return self._chance.random() < loss
         share = loss.loss_bad if self._bad else loss.loss_good
@@ -74,31 +63,15 @@ class VirtualNetem:
             self._bad = not self._bad
         return self._chance.random() < share
 
-    def _delay_ns(self, now):
-        if not now.jitter:
-            return now.delay_ns
-        drawn = self._draw()
-        assert self._table is not None
-        sigma = now.jitter * stretch(self._profile) * 1e9
-        return round(now.delay_ns + sigma * self._table[drawn % len(self._table)] / _ONE)
-
-    def _draw(self):
+    def _jitter(self):
         """Draw a number of which only the high bits are correlated."""
         drawn = self._chance.getrandbits(32)
         if self._rho:
             rho = self._rho + 1
             drawn = (drawn * (_WORDS - rho) + self._last_draw * rho) >> 32
             self._last_draw = drawn
-        return drawn
-
-
-def can(profile):
-    """Whether netem can do it at all."""
-    try:
-        check(profile)
-    except BadInputError:
-        return False
-    return True
+        unit = self._profile.jitter * stretch(self._profile) / _ONE
+        return unit * self._table[drawn % len(self._table)]
 
 
 def asked(name, way):

@@ -15,7 +15,6 @@ from cloudrc.tunnel.codec import SIZES, Kind
 from tests.link.verify.conftest import (
     VirtualNetem,
     asked,
-    can,
     meet,
     random_profile,
     rows_of,
@@ -94,15 +93,6 @@ OFF = {
 def test_a_link_beyond_its_tolerance_is_off(name):
     profile, values, quantity = OFF[name]
     assert (quantity, "off") in doubts(rows_of(profile, replace(profile, **values)))
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("name", names("profile"))
-@pytest.mark.parametrize("way", ["uplink", "downlink"])
-def test_an_honest_netem_is_believed(name, way):
-    profile = asked(name, way)
-    if can(profile):
-        assert doubts(rows_of(profile, VirtualNetem(profile, 7))) == []
 
 
 def test_a_netem_that_delays_twice_as_long_is_not():
