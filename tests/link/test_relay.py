@@ -1,14 +1,13 @@
 """The relay over real sockets on 127.0.0.1: in this process, as a process, and as a pod's link."""
 
 import json
-import signal
 import socket
 import subprocess
 import sys
 import time
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Thread, Timer
 
 import numpy as np
 import pytest
@@ -21,17 +20,13 @@ from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import (
     AGE_MAX_NS,
     QUANTILES,
-    Lane,
-    Lanes,
     Relay,
     RelayShaper,
     ReleaseErrors,
     Stamps,
 )
 from cloudrc.tunnel.codec import Kind, encode_header
-from tools.bench_link import (
-    measure_profiles,
-)
+from tools.bench_link import Way, measure_profiles, run_flow
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 20.0
@@ -191,16 +186,6 @@ def test_percentiles_are_those_of_the_sample_to_2_percent(scale):
         assert true <= said <= 1.02 * true + 1.1
 
 
-def test_recent_means_the_last_ten_calls():
-    with bind_loopback() as source:
-        lane = Lane(source, int, LinkDirection(PLAIN, 1, True), peek)
-    lanes, said = Lanes([lane], None), []
-    for second in range(14):
-        lane.errors.observe(9 * MS if second == 2 else 10_000)
-        said.append(lanes.recent()["release_error_p999_ns"])
-    assert [late_ns > 8 * MS for late_ns in said] == [2 <= n < 12 for n in range(14)]
-
-
 def stamp(wall_ns):
     seconds, rest = divmod(wall_ns, SECOND)
     return 1, 35, seconds.to_bytes(8, "little") + rest.to_bytes(8, "little")
@@ -227,80 +212,35 @@ def test_a_relay_draws_the_virtual_sequence(tmp_path):
         assert judged.swapped <= 0.01 * judged.errors.size
 
 
-class Pod:
-    """A link container in relay mode, the pod's tunnel end before it and the peer behind it."""
-
-    def __init__(self, folder, profile):
-        self.route, self.log = folder / "run" / "route", folder / "log"
-        self.profile, self.arrived, self.sent_ns = folder / "profile.yaml", {}, {}
-        self.route.parent.mkdir()
-        self.profile.write_text(profile)
-        self.end, self.peer = bind_loopback(), bind_loopback()
-        command = [sys.executable, "-m", "cloudrc", "link", "run", "--config", "paper"]
-        command += ["--profile", str(self.profile), "--direction", "uplink", "--mode", "relay"]
-        command += ["--peer", f"localhost:{self.peer.getsockname()[1]}"]
-        command += ["--end", f"127.0.0.1:{self.end.getsockname()[1]}"]
-        (port,) = free_ports(1)
-        command += ["--listen", f"127.0.0.1:{port}", "--route", str(self.route)]
-        with self.log.open("w") as log:
-            self.process = subprocess.Popen(command, cwd=ROOT, stderr=log)
-        self._open = True
-        self._thread = Thread(target=self._receive, daemon=True)
-        self._thread.start()
-        until(lambda: self.route.exists() or self.process.poll() is not None)
-        assert self.process.poll() is None, self.log.read_text()
-        assert self.route.read_text() == f"127.0.0.1:{port}\n"
-        self.listen = "127.0.0.1", port
-
-    def send(self, count):
-        for _ in range(count):
-            number = len(self.sent_ns)
-            data = encode_header(Kind.TELEMETRY, 0, 1, number) + bytes(150)
-            self.sent_ns[number] = time.monotonic_ns()
-            self.end.sendto(data, self.listen)
-            time.sleep(0.005)
-
-    def delays(self, count):
-        """Wait until all packets have arrived; return their delays [s]."""
-        until(lambda: len(self.arrived) == count)
-        return [(self.arrived[n] - self.sent_ns[n]) * 1e-9 for n in range(count)]
-
-    def close(self):
-        self._open = False
-        self._thread.join()
-        self.process.kill()
-        self.process.wait()
-        self.end.close()
-        self.peer.close()
-
-    def _receive(self):
-        self.peer.settimeout(0.1)
-        while self._open:
-            with suppress(TimeoutError):
-                data = self.peer.recv(512)
-                self.arrived[int.from_bytes(data[8:16], "little")] = time.monotonic_ns()
-
-
 @pytest.mark.process
 @pytest.mark.promise("link-changes-in-flight")
 def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
-    with closing(Pod(tmp_path, "uplink: {delay_ms: 300, jitter_ms: 50}\n")) as link:
+    profile, draft = tmp_path / "profile.yaml", tmp_path / "draft"
+    profile.write_text("uplink: {delay_ms: 300, jitter_ms: 50}\n")
+    draft.write_text("{description: quick, uplink: {delay_ms: 20}}\n")
+    (folder := tmp_path / "run").mkdir()
+    end, listen, peer = (("127.0.0.1", port) for port in free_ports(3))
+    words = ["link", "run", "--config=paper", f"--profile={profile}", "--direction=uplink"]
+    words += ["--mode=relay", f"--peer=localhost:{peer[1]}", f"--end=127.0.0.1:{end[1]}"]
+    words += [f"--listen=127.0.0.1:{listen[1]}", f"--route={folder / 'route'}"]
+    with subprocess.Popen([sys.executable, "-m", "cloudrc", *words], cwd=ROOT) as process:
+        killer = Timer(PATIENCE, process.kill)  # where this test fails, the process ends, too
+        killer.start()
+        until((folder / "route").exists)
         with bind_loopback() as stranger:
-            stranger.sendto(encode_header(Kind.TELEMETRY, 0, 1, 999) + bytes(150), link.listen)
-        link.send(20)
-        draft = link.profile.with_name("draft")
-        draft.write_text("{description: quick, uplink: {delay_ms: 20}}\n")
-        changed_ns = time.monotonic_ns()
-        draft.replace(link.profile)
-        link.send(240)
-        delays = link.delays(260)
-        assert min(delays[:20]) > 0.25
-        first = next(n for n, delay in enumerate(delays) if delay < 0.15)
-        assert (link.sent_ns[first] - changed_ns) * 1e-9 < 1.0
-        assert np.median(delays[-20:]) == pytest.approx(0.020, abs=0.01)
-        state = json.loads(link.route.with_name("link.json").read_text())
+            stranger.sendto(encode_header(Kind.TELEMETRY, 0, 1, 999) + bytes(150), listen)
+        Timer(0.2, draft.replace, [profile]).start()
+        (flow,) = run_flow([Way(True, listen, peer, end)], 200.0, 1.5, 0.5)
+        delays_ns = {number: at_ns - flow.sent[number] for at_ns, number in flow.arrived}
+        assert len(flow.arrived) == len(delays_ns) == 300
+        assert min(delays_ns[n] for n in range(20)) >= 250 * MS
+        first = next(n for n in range(300) if delays_ns[n] < 150 * MS)
+        assert flow.sent[first] - flow.sent[0] < 1.2 * SECOND
+        assert np.median([delays_ns[n] for n in range(280, 300)]) < 30 * MS
+        state = json.loads((folder / "link.json").read_text())
         assert state["profile"]["description"] == "quick"
-        link.process.send_signal(signal.SIGTERM)
-        assert until(lambda: link.process.poll() is not None) < 0.5
-        assert link.process.returncode == 0, link.log.read_text()
-        assert [path.name for path in link.route.parent.iterdir()] == ["link.json"]
+        process.terminate()
+        assert until(lambda: process.poll() is not None) < 0.5
+        assert process.returncode == 0
+        killer.cancel()
+    assert [path.name for path in folder.iterdir()] == ["link.json"]
