@@ -185,6 +185,13 @@ def test_irtt_knows_both_ways(direction, sent, delays):
     assert packets.notes == ("1 duplicates left out",)
 
 
+def test_irtt_without_a_monotonic_clock_is_read():
+    trips = [trip(0), trip(1)]
+    for one in reversed(trips):  # first only one packet lacks it: the wall clock counts for all
+        del one["timestamps"]["client"]["send"]["monotonic"]
+        assert irtt(trips, "uplink").sent == pytest.approx((0.0, 0.010))
+
+
 STEPPED = [trip(0), trip(1), trip(2)]
 STEPPED[2]["timestamps"]["server"]["receive"]["monotonic"] -= 30_000_000
 CLIENT_STEPPED = [trip(0), trip(1)]

@@ -9,8 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.load import load_profile
-from cloudrc.config.shipped import names
 from cloudrc.link.draws import (
     BLOCK,
     CHAIN_BLOCKS,
@@ -332,11 +330,3 @@ def test_statistics_of_losses_copies_and_of_nothing():
     nothing = measured(DirectionProfile(loss=1.0), 10)
     assert (nothing.loss, nothing.runs) == (1.0, (10,))
     assert all(isnan(value) for value in (nothing.mean, nothing.p99, nothing.correlation))
-
-
-def test_the_shipped_profiles_leave_time_for_a_command_to_come_back():
-    """Mean round trip plus a period of odometry and of commands is below the command age limit."""
-    for profile in map(load_profile, names("profile")):
-        assert 10 < len(profile.description) <= 90
-        round_trip = profile.uplink.delay_ms + profile.downlink.delay_ms
-        assert round_trip + 20 < (profile.command_age_max_ms or 250)

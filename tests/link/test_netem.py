@@ -259,20 +259,6 @@ def test_the_set_up_of_a_killed_process_is_taken_over():
     assert len(kernel.filters) == 1
 
 
-def test_what_is_under_way_has_room_until_it_has_left():
-    kernel, shaper = shaped(DirectionProfile(1.0, rate=1e6, queue_packets=10))
-    kernel.held = 100
-    small = DirectionProfile(0.02, rate=1e6, queue_packets=10)
-    shaper.follow_profile(small)
-    shaper.step(1.5)
-    assert f"limit {limit(small) + 100} " in kernel.said[-1]
-    kernel.held = 3
-    for _ in range(2):
-        shaper.step(1.0)
-    assert f"limit {limit(small)} " in kernel.said[-1]
-    assert shaper.counts()["restored"] == 0, "its own changes are nobody else's"
-
-
 @pytest.mark.parametrize("delay", [300.0, 0.1])
 def test_what_is_refused_leaves_the_old_profile_in_force(delay):
     """`check` refuses the first, and tc the second."""
@@ -344,12 +330,3 @@ def test_changes_faster_than_the_step_are_skipped_and_counted():
     applied = shaper.steps.applied
     assert (applied + shaper.steps.passed_over, applied >= 199) == (999, True)
     assert kernel.history[-1][1] == "39990.000us"
-
-
-@pytest.mark.parametrize(("restart", "due_ms"), [(True, 1300.0), (False, 800.0)])
-def test_a_new_time_line_may_count_from_now_or_go_on(restart, due_ms):
-    kernel, shaper = shaped(DirectionProfile(0.01), 0.5)
-    after = DirectionProfile(0.02, changes=(Change(0.8, delay=0.09),))
-    shaper.follow_profile(after, restart=restart)
-    shaper.step(1.2)
-    assert [at for at, _, _ in kernel.history] == pytest.approx([500.0, due_ms])

@@ -9,10 +9,9 @@ import pytest
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
-from cloudrc.link.netem import Answer
 from cloudrc.link.profile import Blackout, DirectionProfile, Trace
 from cloudrc.link.profile import Change as Step
-from cloudrc.link.sidecar import Machine, Near, Sidecar, Told, look_near
+from cloudrc.link.sidecar import Machine, Sidecar, Told
 from cloudrc.link.state import Change
 
 PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
@@ -206,15 +205,6 @@ def test_a_profile_netem_cannot_do_is_refused_or_relayed(tmp_path):
     assert any("netem cannot do delay_ms" in line for line in auto.log)
     assert (told["shaper"], told["changes"], told["refused"]) == ("relay", 1, "")
     assert 1.0e9 <= told["origin_ns"] <= 1.2e9, "the relay begins the time line anew"
-
-
-def test_all_netems_of_a_namespace_are_found():
-    ours, theirs = ({"kind": "netem", "dev": device} for device in ("eth0", "eth1"))
-    listed = json.dumps([{"kind": "noqueue", "dev": "lo"}, ours, ours, theirs])
-    answers = {"ip": Answer(0, '[{"dev": "eth1"}]', ""), "tc": Answer(0, listed, "")}
-    found = look_near(lambda words: answers[words[0]], PEER[0])
-    assert found == Near("eth1", {"eth0": [ours, ours], "eth1": [theirs]})
-    assert look_near(lambda words: Answer(127, "[]", ""), PEER[0]) is None
 
 
 def test_a_sidecar_tells_what_is_in_force(tmp_path):

@@ -73,16 +73,6 @@ def test_the_true_offset_is_within_the_uncertainty(ahead, delays):
     assert found.uncertainty_ns == (smallest + 1) // 2
 
 
-def test_clocks_that_nothing_relates_begin_together(tmp_path):
-    world, cloud = world_records(2, 7 * SECOND), cloud_records(2, SECOND)
-    cloud = [record for record in cloud if not isinstance(record, rec.Arrival)]
-    mission = merge(*files(tmp_path, world, cloud, ("a", "b")))
-    noted = {"clock_offset_ns": str(6 * SECOND), "clock_offset_method": "first records"}
-    assert noted.items() <= mission.metadata.items()
-    assert "clock_offset_uncertainty_ns" not in mission.metadata
-    assert mission.recording()["/session"]["stamp_ns"].tolist() == [7 * SECOND, 7 * SECOND]
-
-
 def test_the_same_clock_is_left_as_it_is(tmp_path):
     ends = {"world": world_records(20), "cloud": cloud_records(20)}
     for end, records in ends.items():

@@ -21,7 +21,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.hash import messages_sha256
 from cloudrc.record.reader import Contents, read_contents, recover
 from cloudrc.record.ros import definition
-from cloudrc.record.writer import MISSING, SHA256, McapWriter
+from cloudrc.record.writer import SHA256, McapWriter
 from tests.record.conftest import assert_equal, rewrite, world_records, write
 
 RECORDS = world_records(160)
@@ -300,11 +300,3 @@ def test_the_command_says_what_is_kept_and_lost(path, capsys):
     ):
         assert main(["recover", str(path), "-t", str(target)]) == 2
         assert f"{target}: {reason}" in capsys.readouterr().err
-
-
-def test_a_note_of_somebody_else_cannot_steer_a_terminal(path, capsys):
-    with McapWriter(path, clock="world") as writer:
-        writer.write(world_records(5))
-        writer.note({MISSING: "\x1b[2J all"})
-    assert main(["recover", str(path)]) == 1
-    assert "lossy: \\x1b[2J all\n" in capsys.readouterr().out

@@ -79,22 +79,6 @@ def run(code):
     return subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
-def test_a_missing_package_is_named_with_its_remedy():
-    code = f"""
-import sys
-from cloudrc.errors import MissingPrerequisiteError
-for name in {NEEDED}:
-    for loaded in [m for m in sys.modules if m.startswith(("cloudrc.record", *{NEEDED}))]:
-        del sys.modules[loaded]
-    sys.modules[name] = None
-    try: import cloudrc.record.merge
-    except MissingPrerequisiteError as error: print(error.exit_code, error)
-"""
-    for name, text in zip(NEEDED, run(code).splitlines(), strict=True):
-        assert text.startswith(f"3 recording needs the package {name}, which is not installed")
-        assert text.endswith("install it with: pip install 'cloudrc[record]'")
-
-
 def test_flying_needs_none_of_them():
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({NEEDED}))\n"

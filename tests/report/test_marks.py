@@ -9,7 +9,7 @@ import pytest
 from cloudrc.config.schema import Blackout, Change, Direction
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, LinkChanged
-from cloudrc.report.figures.marks import LEGEND, bounds, legend, mark_events, set_in_flight, spans
+from cloudrc.report.figures.marks import LEGEND, bounds, legend, mark_events, set_in_flight
 from cloudrc.report.figures.style import Subject, new_figure
 from tests.metrics.conftest import ONE_PIPE, at, flown
 
@@ -87,18 +87,6 @@ def test_a_time_line_starts_at_its_change_and_ends_at_the_next():
     assert patches(marked(subject)) == [pytest.approx((2.0, 4.0))], "its blackout ends, too"
     said = "set in flight (1: profile timed, at 1.0 s; 2: profile calm, at 4.0 s)."
     assert said in legend(subject)
-
-
-def test_repeated_records_are_no_changes():
-    fast = Direction(delay_ms=9.0)
-    subject = subject_of(
-        changed(-1.0, CALM, "", time_line=math.nan),  # the link started as configured
-        changed(3.0, fast, "by hand"),
-        changed(5.0, fast, "by hand", 1.98),  # a repeated record
-        changed(3.1, fast, "by hand", uplink=False),
-    )
-    assert len(spans(subject, uplink=True)) == 2
-    assert set_in_flight(subject) == [(pytest.approx(3.0), "by hand")]
 
 
 def test_holds_blackouts_and_changes_are_marked():

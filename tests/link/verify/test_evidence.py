@@ -1,32 +1,9 @@
 """What shapers and kernels report of themselves, read back: state, metrics, qdiscs."""
 
-import pytest
-
-from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Near, Told
-from cloudrc.link.verify.causes import Evidence, Findings, find_causes, read_evidence, read_metrics
-from cloudrc.link.verify.judge import Row
+from cloudrc.link.verify.causes import Evidence, read_evidence, read_metrics
 
 NETEM = {"kind": "netem", "handle": "7401:", "packets": 85, "drops": 15}
-DOUBLED = Row("mean", "s", 0.045, 0.09, 0.043, 0.047, "off")
-
-
-@pytest.mark.parametrize(
-    ("shaper", "leaves", "netems", "code"),
-    [
-        ("netem", "eth1", {"eth0": [NETEM]}, "wrong_interface"),
-        ("netem", "eth0", {}, "no_qdisc"),
-        ("netem", "eth0", {"eth0": [NETEM, NETEM]}, "shaped_twice"),
-        ("relay", "eth0", {"lo": [NETEM]}, "shaped_twice"),
-        ("relay", "eth0", {"eth1": [NETEM]}, "doubled_delay"),
-    ],
-)
-def test_qdiscs_on_the_way_of_the_flow_are_the_cause(shaper, leaves, netems, code):
-    told = Told(shaper, "", DirectionProfile(0.045), Near(leaves, netems))
-    (cause,) = find_causes({"uplink": Findings([DOUBLED], read_evidence(told, {}))})
-    assert cause.code == code
-
-
 METRICS = """
 cloudrc_link_release_error_seconds{percentile="99"} 0.0021
 cloudrc_link_datagrams_total{outcome="received"} 500

@@ -128,19 +128,6 @@ def test_cloud_judges_round_trips_without_a_common_clock(slower, verdict):
     assert (trip.asked, trip.verdict) == (pytest.approx(0.120, abs=1e-4), verdict)
 
 
-def test_a_new_profile_is_judged_from_then_on():
-    monitor, slow = hearing(PAPER, PAPER), replace(PAPER, delay=0.120)
-    assert checked(monitor, arrivals(PAPER, 20.0))[1] == []
-    monitor.follow((slow, slow))
-    later = [
-        one._replace(stamp_ns=one.stamp_ns + 20_000_000_000, counter=one.counter + 2000)
-        for one in arrivals(slow, 20.0, seed=2)
-    ]
-    moments, faults = checked(monitor, later)
-    assert faults == []
-    assert moments[-1]["mean"].asked == pytest.approx(0.120, abs=1e-3)
-
-
 def test_a_time_line_that_loops_is_not_judged_after_an_hour_either():
     looping = replace(PAPER, trace=Trace((0.0, 1.0), (0.040, 0.120), loop=True))
     monitor = hearing(looping, looping)
