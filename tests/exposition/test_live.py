@@ -38,11 +38,6 @@ def wake(at_ms, *, slip_ms=0.0, lateness=1e-4):
     return Lateness(round((at_ms - slip_ms) * MS), "world", lateness, 2e-4, round(slip_ms * MS))
 
 
-@pytest.fixture(scope="module")
-def flight():
-    return records(load_experiment("hover", ["link.profile=paper-p2"]))
-
-
 def test_a_bucket_includes_its_upper_bound():
     values = Histogram((0.01, 0.1))
     for each in (0.005, 0.01, 0.0101, 5.0):
@@ -51,19 +46,14 @@ def test_a_bucket_includes_its_upper_bound():
     assert values.total == pytest.approx(5.0251)
 
 
-@pytest.mark.parametrize("role", table.ENDS)
-def test_one_way_delays_include_all_arrivals(flight, role):
-    live, of_end = LiveMetrics(role), flight[role == "cloud"]
-    live.see(of_end)
-    delays = [r.delay for r in of_end if isinstance(r, Arrival)]
-    name = "cloudrc_downlink_delay_seconds" if role == "world" else "cloudrc_uplink_delay_seconds"
-    assert histogram(live, name).cumulative()[-1] == len(delays)
-    assert histogram(live, name).total == pytest.approx(sum(delays))
-    age = histogram(live, "cloudrc_age_of_information_seconds")
-    assert min(delays) < age.total / age.cumulative()[-1] < 2 * max(delays)
-    if role == "world":  # a start from spawn opens a session, but admits no cloud
-        assert value(live, "cloudrc_sessions_opened_total") == 2
-        assert value(live, "cloudrc_clouds_admitted_total") == 1
+def test_a_flight_opens_sessions_and_admits_a_cloud():
+    of_world, _ = records(load_experiment("hover", ["link.profile=paper-p2"]))
+    live, delays = LiveMetrics("world"), [r.delay for r in of_world if isinstance(r, Arrival)]
+    live.see(of_world)
+    assert histogram(live, "cloudrc_downlink_delay_seconds").total == pytest.approx(sum(delays))
+    # A start from spawn opens a session, but admits no cloud.
+    assert value(live, "cloudrc_sessions_opened_total") == 2
+    assert value(live, "cloudrc_clouds_admitted_total") == 1
 
 
 @pytest.mark.promise("unknown-is-absent")

@@ -2,7 +2,7 @@
 
 import random
 from dataclasses import replace
-from math import asin, erf, isnan, pi, sqrt
+from math import erf, isnan, sqrt
 
 import numpy as np
 import pytest
@@ -161,19 +161,6 @@ def stream_of(lost):
     return Stream(np.arange(len(lost)), np.where(lost, np.nan, 0.1), (~lost).astype(int))
 
 
-@pytest.mark.parametrize(
-    ("shape", "c", "expected"),
-    [("normal", 0.7, 0.7), ("uniform", 0.9, 6 / pi * asin(0.45)), ("pareto", 0.5, 0.39)],
-)
-def test_correlated_jitter_keeps_its_distribution(shape, c, expected):
-    profile = DirectionProfile(0.045, 0.005, shape)
-    apart, alike = (delays(replace(profile, correlation=one), 3 * COUNT) for one in (0.0, c))
-    assert alike.std() == pytest.approx(apart.std(), rel=0.04)
-    shares = np.linspace(0.05, 0.95, 19)
-    assert np.quantile(alike, shares) == pytest.approx(np.quantile(apart, shares), abs=0.0003)
-    assert np.corrcoef(alike[:-1], alike[1:])[0, 1] == pytest.approx(expected, abs=0.03)
-
-
 def test_a_table_is_drawn_from_about_its_mean():
     """A quarter of the packets is late by 1.73 jitters; the others are early by 0.58."""
     table = (-1 / sqrt(3),) * 3 + (sqrt(3),)
@@ -257,14 +244,6 @@ def test_order_other_kinds_and_epochs_shift_nothing(profile):
         assert among.send(1, 3, n, SIZE, n * PERIOD_NS) == alone[n]
     others = [ask(link(profile, seed, up), counters) for seed, up in ((2, True), (1, False))]
     assert alone != others[0] != others[1] != alone
-
-
-def test_conditions_that_change_nothing_change_nothing():
-    """The fast and the general path also give the same impairments."""
-    pointless = (Change(1.0, delay=0.045), Change(1000.0, delay=9.0, rate=1e6))
-    for loss in (0.1, LIVELY.loss):
-        steady = DirectionProfile(0.045, 0.06, loss=loss, duplicate=0.1, reorder=0.1)
-        assert flow(steady, 1000) == flow(replace(steady, changes=pointless), 1000)
 
 
 def test_the_bottleneck_serialises_and_drops_from_the_tail():

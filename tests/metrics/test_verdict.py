@@ -120,11 +120,7 @@ def test_a_failure_says_what_when_and_where(log, code, text, time):
         (Arrival, lambda n, a: a, "fresh commands arrived, but no request to start"),
         (Arrival, lambda n, a: a._replace(used=False), "was 0.090 s old or older when"),
         # The start opens a new session: commands of older sessions do not count.
-        (
-            Arrival,
-            lambda n, a: a._replace(used=n < 9, epoch=1 if n < 9 else 2),
-            "guard.command_age_max_ms",
-        ),
+        (Arrival, lambda n, a: a._replace(used=n < 9, epoch=1 + (n > 8)), "command_age_max_ms"),
         (Arrival, lambda n, a: a if a.uplink else None, "no command arrived"),
         (Control, lambda n, c: None, "cloud computed no command"),
     ],

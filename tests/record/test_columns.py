@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc import records as rec
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from tests.record.conftest import any_record, assert_equal, write
@@ -30,13 +29,6 @@ def test_what_does_not_exist_is_answered_with_what_does():
         recording["/odometri"]
     with pytest.raises(KeyError, match="no column 'x' in /guard; it has: stamp_ns, state, cause"):
         recording["/guard"]["x"]
-
-
-def test_rows_of_both_ends_are_in_order_of_time():
-    world = [rec.Counted(t, "world", "sent", t) for t in (0, 10, 20, 20)]
-    cloud = [rec.Counted(t, "cloud", "sent", t) for t in (5, 20, 30)]
-    expected = ["world", "cloud", "world", "world", "world", "cloud", "cloud"]
-    assert Recording.from_records(world, cloud)["/count"]["end"].tolist() == expected
 
 
 @given(st.lists(any_record(), max_size=12))

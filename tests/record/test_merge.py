@@ -92,18 +92,6 @@ def test_the_same_clock_is_left_as_it_is(tmp_path):
     assert merged.attachments == texts | {"report.json": b"{}"}
 
 
-def test_torn_files_are_merged_as_far_as_they_go(tmp_path):
-    world, cloud = files(tmp_path, world_records(150), cloud_records(150), ("x", "x"))
-    cloud.write_bytes(cloud.read_bytes()[: cloud.stat().st_size // 2])
-    mission = merge(world, cloud)
-    assert mission.note.startswith("cloud: cut short: ")
-    mission.write(tmp_path / "m.mcap")
-    recording = Recording.read(tmp_path / "m.mcap")
-    assert (recording.note, recording.complete) == (mission.note, False)
-    assert len(recording["/odometry"]) == 150
-    assert 50 <= len(recording["/pid"]) == len(recording["/cmd_vel"]) < 150
-
-
 @pytest.mark.parametrize(("lost", "rows"), [("world", (0, 9)), ("cloud", (9, 0))])
 def test_one_end_alone_is_better_than_nothing(tmp_path, lost, rows):
     world, cloud = files(tmp_path, world_records(9), cloud_records(9), ("x", "y"))

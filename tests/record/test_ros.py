@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from cloudrc.record.ros import decode, definition, encode, is_known, shifted, type_hash
+from cloudrc.record.ros import decode, definition, encode, is_known, type_hash
 from cloudrc.record.topics import TOPICS, rows
 from tests.record.conftest import any_record
 
@@ -56,13 +56,6 @@ def test_rows_come_back_from_their_bytes(record):
 def test_text_that_is_not_unicode_is_recorded_as_far_as_it_is():
     topic = TOPICS["/fault"]
     assert decode(topic, encode(topic, 0, ("bad_name", "file \udcff")))[1][1] == "file ?"
-
-
-@pytest.mark.parametrize("offset_ns", [0, -1, -3_000_000_001, 10**15])
-def test_a_stamp_is_moved_and_nothing_else(offset_ns):
-    topic, values = TOPICS["/cmd_vel"], ((1.0, 2.0, 3.0), 0.4)
-    data = shifted(encode(topic, 2_000_000_000, values), offset_ns)
-    assert decode(topic, data) == (2_000_000_000 + offset_ns, values)
 
 
 @pytest.mark.parametrize("ros_type", sorted({topic.ros_type for topic in TOPICS.values()}))
