@@ -11,6 +11,7 @@ import pytest
 from cloudrc.config.shipped import names
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import STATE_MAX
+from cloudrc.link.verify.judge import netem_makes
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 from tests.link.verify.conftest import (
@@ -32,7 +33,8 @@ ZERO = (0.0, 0.0, 0.0)
 def test_an_honest_link_is_believed_and_never_faulted(name, netem):
     profile = asked(name, "uplink")
     seconds = 60.0 if netem or name == "handover" else 15.0
-    heard = arrivals(profile, seconds, seed=3 if netem else 1, uplink=True, netem=netem)
+    made, seed = (netem_makes(profile), 3) if netem else (profile, 1)
+    heard = arrivals(made, seconds, seed=seed, uplink=True)
     moments, faults = checked(hearing(profile, PAPER, uplink=True), heard)
     assert faults == []
     assert is_believed(moments[-1]), moments[-1]
