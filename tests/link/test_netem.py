@@ -144,6 +144,7 @@ def text(profile, at=0.0):
         ),
         (DirectionProfile(0.045, 0.002, "pareto"), 0.0, "45000.000us 8000.000us 0% distribution p"),
         (DirectionProfile(loss=GilbertElliott(0.01, 0.1, 0.6, 0.005)), 0.0, "gemodel 1% 10% 60% 0"),
+        (SLOW, 0.0, "limit 747 "),  # 100 + 0.3 s * 2 Mbit/s / (8 * 116 bit)
         (SLOW, 0.0, "rate 2000000bit -14"),
         (DirectionProfile(0.04, 0.03, reorder=0.2, keep_order=True), 0.0, "% rate 100gbit"),
         (DirectionProfile(reorder=0.2), 0.0, "corrupt 0% rate"),  # without a delay tc refuses it
@@ -187,14 +188,6 @@ def test_what_netem_does_differently_is_said():
     assert "seen as loss" in notes(DirectionProfile(corrupt=0.01))[0]
     trace = Trace((0.0, 0.1, 0.101, 0.102), (0.1, 0.2, 0.3, 0.4))
     assert "2 of 4 steps of the time line come sooner" in notes(DirectionProfile(trace=trace))[0]
-
-
-def test_the_limit_has_room_for_all_that_is_under_way():
-    assert limit(SLOW) == 747  # 100 + 0.3 s * 2 Mbit/s / (8 * 116 bit)
-    changing = replace(SLOW, delay=0.01, changes=(Change(1.0, delay=0.3),))
-    assert (limit(changing), limit(replace(changing, rate=None))) == (747, 10_000)
-    late = DirectionProfile(0.1, 0.1, "pareto", rate=1e5, queue_packets=5, keep_order=True)
-    assert limit(late) >= 5 + 100 * (0.1 + 0.1 * 12.1)  # 100 commands a second
 
 
 @pytest.mark.parametrize("distribution", sorted(STRETCH))

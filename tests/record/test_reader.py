@@ -153,14 +153,6 @@ def test_what_other_programs_changed_is_named(whole, path, options, said):
         assert recording.lacking in Recording.read(new).lacking, "a copy hides nothing"
 
 
-def test_a_torn_recording_that_others_ended_is_told(path):
-    with path.open("wb") as stream:
-        writer = McapWriter(stream, clock="world")
-        writer.write(RECORDS)
-        writer._mcap.finish()
-    assert "another program has put an end to it" in Recording.read(path).lacking
-
-
 def write_foreign(path, topic, ros_type, text, data, channels=1, **options):
     """Write messages as another program that names the clock as cloudrc does."""
     with path.open("wb") as stream:

@@ -9,7 +9,7 @@ import pytest
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.record.columns import Recording
-from cloudrc.report.document import Run, clock_offset_document, environment_document
+from cloudrc.report.document import Run, environment_document
 from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import good, paper
 
@@ -46,13 +46,6 @@ def test_failures_say_code_text_time_and_place():
     assert (failure["code"], len(failure["place"])) == ("time_limit_exceeded", 3)
     assert report["operator_verdict"] == {"verdict": "success", "failures": []}
     assert "the operator's verdict is success. This report's counts." in report["notes"][-1]
-
-
-def test_a_clock_offset_has_its_uncertainty():
-    packets = {"clock_offset_method": "packets", "clock_offset_uncertainty_ns": "1500000"}
-    uncertainty = {"value": pytest.approx(0.0015), "unit": "s"}
-    assert clock_offset_document(packets) == {"method": "packets", "uncertainty": uncertainty}
-    assert clock_offset_document({"clock_offset_method": "same clock"}) is None
 
 
 def test_the_environment_names_software_but_no_user_or_host():

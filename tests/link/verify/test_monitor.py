@@ -81,14 +81,6 @@ def test_a_new_session_starts_undecided():
     assert (row.quantity, row.verdict) == ("loss", "open")
 
 
-def test_one_bad_window_is_no_fault():
-    dead = range(300, 700)
-    heard = [one for one in arrivals(PAPER, 40.0) if one.counter not in dead]
-    moments, faults = checked(hearing(PAPER, PAPER), heard)
-    assert faults == []
-    assert is_believed(moments[-1])
-
-
 def test_ends_that_wake_late_are_not_the_links_fault():
     slow = arrivals(replace(PAPER, delay=PAPER.delay + 0.0045))
     assert checked(hearing(PAPER, PAPER), slow)[1], "of punctual ends it is"

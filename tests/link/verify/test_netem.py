@@ -26,28 +26,16 @@ SECONDS = 15.0
 """Time to probe, which a slow machine can [s]."""
 
 
-class Link:
-    """A link that runs, and is probed as often as wanted."""
+def verify(ways, plans):
+    report = make_report("netem", probe_link(ways, plans), dict.fromkeys(HOSTS, ""))
+    print(as_text(report))
+    return report
 
-    def __init__(self, plans, ways):
-        self.plans, self.ways = plans, ways
 
-    def verify(self):
-        found = probe_link(self.ways, self.plans)
-        report = make_report("netem", found, dict.fromkeys(HOSTS, ""))
-        print(as_text(report))
-        return report
-
-    def stop(self):
-        """Stop the link's processes, so that they restore nothing."""
-        for way in self.ways.values():
-            assert way.process is not None
-            way.process.send_signal(signal.SIGSTOP)
-
-    def tc(self, way, *words):
-        """Change the kernel behind the back of the link's process."""
-        command = ["ip", "netns", "exec", self.ways[way].namespace, "tc", *words]
-        subprocess.run(command, check=True, capture_output=True)
+def change(way, command):
+    """Change the kernel behind the back of the link's process."""
+    words = ["ip", "netns", "exec", way.namespace, "tc", *command.split()]
+    subprocess.run(words, check=True, capture_output=True)
 
 
 def planned(*settings):
@@ -57,12 +45,12 @@ def planned(*settings):
 
 
 @contextmanager
-def running(plans):
+def running():
     """Run a link of the profile that is asked for, without what else is planned."""
     applied = Profile.model_validate({way: {"delay_ms": 400.0, "jitter_ms": 80.0} for way in HOSTS})
     try:
         with run_link(find_experiment("ideal", []), "netem", applied) as ways:
-            yield Link(plans, ways)
+            yield ways
     except MissingPrerequisiteError as error:
         pytest.exit(f"netem cannot be tested here: {error}", CloudrcError.exit_code + 2)
 
@@ -72,22 +60,19 @@ def patience(monkeypatch):
     monkeypatch.setattr(link_verify, "START_LIMIT", 300.0)  # emulated processors are slow
 
 
-def causes(report):
-    return [(cause["code"], cause["way"]) for cause in report["causes"]]
-
-
 @pytest.mark.smoke
 def test_an_honest_link_is_believed_but_not_without_its_qdisc():
-    with running(planned()) as link:
+    with running() as ways:
         for _ in range(3):  # emulation is slow
-            if (said := link.verify())["verdict"] == "believed":
+            if (said := verify(ways, planned()))["verdict"] == "believed":
                 break
         assert said["verdict"] == "believed"
         for found in said["directions"].values():
             known = found["evidence"]
             assert (known["shaper"], known["interface"], known["layers"]) == ("netem", DEVICE, 1)
-        link.tc("uplink", "qdisc", "del", "dev", DEVICE, "root")
-        assert causes(link.verify()) == [("no_qdisc", "uplink")]
+        change(ways["uplink"], f"qdisc del dev {DEVICE} root")
+        (cause,) = verify(ways, planned())["causes"]
+        assert (cause["code"], cause["way"]) == ("no_qdisc", "uplink")
 
 
 LEAF = f"qdisc change dev {DEVICE} parent 7400:4 handle 7401: netem limit 10000"
@@ -108,11 +93,11 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_what_is_wrong_in_the_kernel_is_named(fault, figure):
     more, commands = FAULTS[fault]
-    with running(planned(*more)) as link:
-        link.stop()
-        for way in HOSTS:
+    with running() as ways:
+        for way in ways.values():
+            way.process.send_signal(signal.SIGSTOP)  # so that it restores nothing
             for command in commands:
-                link.tc(way, *command.split())
-        found = {code for code, _ in causes(link.verify())}
+                change(way, command)
+        found = {cause["code"] for cause in verify(ways, planned(*more))["causes"]}
     figure("seeded faults in the kernel's netem: not named", int(found != {fault}), "==", 0)
     assert found == {fault}
