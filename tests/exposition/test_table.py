@@ -1,7 +1,5 @@
 """The table of metrics: names by the rules, closed label sets, an entry for every count."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

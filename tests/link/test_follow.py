@@ -89,7 +89,6 @@ def test_a_change_that_comes_both_ways_takes_effect_once(pod, faster):
     ways = [pod.hand, pod.put] if faster == "hand" else [pod.put, pod.hand]
     ways[0](120.0, "a1")
     loaded = pod.profiles.poll()
-    assert loaded is not None
     assert (loaded.direction.delay, loaded.change) == (0.12, Change("a1", "cause a1", False))
     assert pod.poll() is None
     ways[1](120.0, "a1")
@@ -129,10 +128,7 @@ def test_a_trace_is_read_beside_the_handed_profile(pod):
     document = Handed(note("a1"), files)
     assert read_handed(write_handed(document)) == document
     publish(pod.run / HANDED_FILE, write_handed(document))
-    loaded = pod.profiles.poll()
-    assert loaded is not None
-    assert loaded.direction.trace is not None
-    assert loaded.direction.trace.delays == (0.04, 0.06)
+    assert pod.profiles.poll().direction.trace.delays == (0.04, 0.06)
 
 
 @pytest.mark.parametrize(

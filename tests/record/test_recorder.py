@@ -172,7 +172,6 @@ def test_sigkill_loses_at_most_half_a_second(tmp_path, after, sync, figure):
     path, clean = tmp_path / "world.mcap", tmp_path / "clean.mcap"
     command = [sys.executable, "-c", FLIGHT, str(path), str(sync)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         for line in process.stdout:
             last_ns = int(line)
             if last_ns * 1e-9 >= after:

@@ -37,7 +37,6 @@ def subject_of(*changes, uplink=CALM, log=None):
 def band(subject, time, *, uplink=True):
     """Return the bounds of the delay [s] at a time since the start of the flight [s]."""
     found = bounds(subject, np.array([time]), uplink=uplink)
-    assert found is not None
     return float(found[0][0]), float(found[1][0])
 
 

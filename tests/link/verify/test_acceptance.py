@@ -17,7 +17,6 @@ from tests.link.verify.conftest import (
 )
 
 PAPER = asked("paper-p2", "uplink")
-HANDOVER = asked("handover", "uplink")
 LOSING = DirectionProfile(0.045, 0.025, loss=0.05)
 NARROW = DirectionProfile(0.020, 0.002, rate=2e6, queue_packets=200, keep_order=True)
 NOTHING = DirectionProfile()
@@ -75,11 +74,6 @@ OFF = {
     "less jitter": (PAPER, {"jitter": 0.9 * PAPER.jitter}, "deviation"),
     "damaged": (PAPER, {"corrupt": 0.05}, "loss"),
     "other jitter": (PAPER, {"distribution": "normal", "jitter": 0.0144}, "distribution"),
-    "another time line": (
-        HANDOVER,
-        {"changes": tuple(replace(one, delay=0.01 + (one.delay or 0)) for one in HANDOVER.changes)},
-        "mean",
-    ),
     "faster": (NARROW, {"rate": 2.6e6}, "rate"),
 }
 
