@@ -201,7 +201,6 @@ EVENTS = [
     ("resumed", 1, "flying", 1),
     ("reached", 1, "flying", 2),
     ("done", 1, "done", -1),
-    ("goto", -1, "starting", -1),
     ("started", 0, "flying", 0),
     ("leg_timed_out", 0, "failed", -1),
 ]

@@ -25,8 +25,6 @@ MS, SECOND = 1_000_000, 1_000_000_000
 PERIOD_NS, SIZE = 10 * MS, 172
 COUNT = 20_000
 KEY = stream_key(1, True, 1, 3)
-BURSTS = GilbertElliott(0.02, 0.2)
-"""Loss 1/11, in bursts of 5 packets."""
 LIVELY = DirectionProfile(
     0.045,
     0.025,
@@ -172,7 +170,8 @@ def test_a_table_is_drawn_from_about_its_mean():
 
 
 def test_200000_packets_have_the_specified_bursts(figure):
-    lost = np.array([not copies for copies in flow(DirectionProfile(loss=BURSTS), 200_000)])
+    loss = GilbertElliott(0.02, 0.2)  # 1/11, in bursts of 5 packets
+    lost = np.array([not copies for copies in flow(DirectionProfile(loss=loss), 200_000)])
     length = np.mean(loss_runs(stream_of(lost)))
     for name, found, asked in (("loss", lost.mean(), 1 / 11), ("burst", length, 5.0)):
         off = 100 * abs(found / asked - 1)

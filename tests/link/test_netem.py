@@ -27,7 +27,6 @@ from cloudrc.link.netem import (
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Timeline, Trace
 
 PEER = ("10.244.0.7", 7400)
-UNKNOWN = Answer(2, "", "Error: Specified qdisc kind is unknown.\n")
 
 
 class Kernel:
@@ -65,7 +64,7 @@ class Kernel:
             case ["tc", "qdisc", verb, *rest]:
                 kind = "netem" if "netem" in rest else "prio"
                 if kind == self.lacks:
-                    return UNKNOWN
+                    return Answer(2, "", "Error: Specified qdisc kind is unknown.\n")
                 if self.refuses in rest:
                     return Answer(1, "", "Illegal delay")
                 if kind == "prio":
@@ -161,7 +160,10 @@ def test_a_profile_is_put_into_tcs_words(profile, at, words):
     [
         (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 300.0))), "here 300000 ms"),
         (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 0.3), loop=True)), "a trace that begins a"),
-        (DirectionProfile(changes=(Change(1.0, loss=BURSTS),)), "loss.delay_bad_ms"),
+        (
+            DirectionProfile(changes=(Change(1.0, loss=GilbertElliott(0.1, 0.5, delay_bad=0.04)),)),
+            "loss.delay_bad_ms",
+        ),
         (DirectionProfile(rate=1e6, changes=(Change(1.0, jitter=0.1),)), "without keep_order"),
         (DirectionProfile(rate=4.0), "rate_kbit below 0.008"),
         (DirectionProfile(loss=GilbertElliott(0.1, 1e-11)), "a probability below 2**-32"),

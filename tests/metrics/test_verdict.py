@@ -1,5 +1,7 @@
 """Each rule of the verdict: what breaks it, its time and place, and the order of outcomes."""
 
+from math import nan
+
 import pytest
 
 from cloudrc.messages import GuardState
@@ -20,8 +22,6 @@ from cloudrc.records import (
     SessionOpened,
 )
 from tests.metrics.conftest import ONE_PIPE, at, flown, good, touch
-
-ZERO = (0.0, 0.0, 0.0)
 
 
 def measured(flight):
@@ -181,14 +181,11 @@ def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, found):
     assert judged(flight).outcome == "success"
 
 
-NAN = float("nan")
-
-
 def test_only_what_telemetry_shows_during_the_mission_counts():
     seen = Observations.begin(3, 0.9, 5)
     assert seen.see(3, 0.9, 5) == seen
     after = seen.see(5, 0.1, 9).see(5, 0.4, 9)
     assert (after.pipe_touches, after.touch_speed) == (2, 0.1), "the first touch stays"
     assert after.slip_ns - after.slip_began_ns == 4
-    assert Observations.begin(4, NAN, 0).see(1, NAN, 0).pipe_touches == 1, "it begins again at 0"
+    assert Observations.begin(4, nan, 0).see(1, nan, 0).pipe_touches == 1, "it begins again at 0"
     assert [event for event, _ in after.news(seen, 1.0)] == ["pipe_touched", "board_touched"]

@@ -103,9 +103,6 @@ def test_netem_loses_either_a_packet_or_its_copy(loss):
     assert made.duplicate * (1 - 0.7 * lost) == pytest.approx(0.3 * (1 - lost) ** 2)
 
 
-STARVED = Evidence("relay", starved="500 datagrams not read in time")
-
-
 @pytest.mark.parametrize(
     ("real", "causes"),
     [
@@ -115,10 +112,10 @@ STARVED = Evidence("relay", starved="500 datagrams not read in time")
     ],
 )
 def test_a_lack_of_cpu_is_named_beside_other_faults(real, causes):
-    """It is not named where nothing is slower than requested."""
+    known = Evidence("relay", starved="500 datagrams not read in time")
     stall = 0.0 if "keep_order" in real else 0.04
     rows = rows_of(PAPER, replace(PAPER, **real), stall=stall)
-    assert [one.code for one in find_causes({"uplink": Findings(rows, STARVED)})] == causes
+    assert [one.code for one in find_causes({"uplink": Findings(rows, known)})] == causes
 
 
 SLOW = replace(PAPER, delay=0.090)

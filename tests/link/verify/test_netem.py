@@ -22,8 +22,6 @@ from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 
 pytestmark = pytest.mark.netem
 ASKED = ("delay_ms=400", "jitter_ms=80")  # far above what an emulated machine adds
-SECONDS = 15.0
-"""Time to probe, which a slow machine can [s]."""
 
 
 def verify(ways, plans):
@@ -41,7 +39,7 @@ def change(way, command):
 def planned(*settings):
     values = dict(one.split("=") for one in (*ASKED, *settings))
     texts = [f"link.{way}.{key}={value}" for way in HOSTS for key, value in values.items()]
-    return make_plans(find_experiment("ideal", texts), SECONDS, "netem")
+    return make_plans(find_experiment("ideal", texts), 15.0, "netem")  # seconds
 
 
 @contextmanager
