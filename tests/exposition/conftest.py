@@ -1,13 +1,10 @@
 """Helpers: control periods at rest; the time series of a flight, and the alerts that they fire."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
 from math import nan
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -23,7 +20,7 @@ MS = 1_000_000
 
 def period(stamp_ms, basis_ms, **fields):
     """Make a control period at `stamp_ms`, cloud's clock, from odometry of `basis_ms`, world's."""
-    still: dict[str, Any] = dict.fromkeys(Control._fields, ZERO)
+    still = dict.fromkeys(Control._fields, ZERO)
     still |= {"stamp_ns": round(stamp_ms * MS), "basis_stamp_ns": round(basis_ms * MS)}
     still |= {"epoch": 1, "counter": 0, "horizon": 0.0, "rtt": nan, "loop_delay": nan}
     still |= {"orientation_wxyz": UPRIGHT, "waypoint": 0, "yaw_rate": 0.0}
@@ -41,7 +38,7 @@ ROLES = ("world", "cloud", "teleop")
 def series(flight):
     """Return every series of a flight, one value per scrape."""
     times = range(0, int(flight.now) + AFTER, PERIOD)
-    values: dict[str, list[str]] = {}
+    values = {}
     for role in ROLES:
         for n, readings in enumerate(scrapes(flight, role, times)):
             for name, value in samples(role, readings):
@@ -83,7 +80,7 @@ def samples(role, readings):
 def fired(flight, folder):
     """Return the alerts of the chart that a flight fires, evaluated by promtool."""
     expression = 'group by (alertname) (last_over_time(ALERTS{alertstate="firing"}[1d]))'
-    test: dict[str, Any] = {
+    test = {
         "interval": f"{PERIOD}s",
         "input_series": series(flight),
         "promql_expr_test": [{"expr": expression, "eval_time": f"{int(flight.now) + AFTER}s"}],

@@ -1,7 +1,5 @@
 """Each fault fires exactly its alerts of the chart."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -27,24 +27,15 @@ from tests.flights.conftest import records
 
 
 def value(live, name, *label_values):
-    reading = live.read()[name]
-    assert isinstance(reading, dict)
-    return reading[label_values]
+    return live.read()[name][label_values]
 
 
 def histogram(live, name):
-    reading = live.read()[name]
-    assert isinstance(reading, Histogram)
-    return reading
+    return live.read()[name]
 
 
 def wake(at_ms, *, slip_ms=0.0, lateness=1e-4):
     return Lateness(round((at_ms - slip_ms) * MS), "world", lateness, 2e-4, round(slip_ms * MS))
-
-
-@pytest.fixture(scope="module")
-def flight():
-    return records(load_experiment("hover", ["link.profile=paper-p2"]))
 
 
 def test_a_bucket_includes_its_upper_bound():
@@ -53,21 +44,6 @@ def test_a_bucket_includes_its_upper_bound():
         values.observe(each)
     assert values.cumulative() == [2, 3, 4]
     assert values.total == pytest.approx(5.0251)
-
-
-@pytest.mark.parametrize("role", table.ENDS)
-def test_one_way_delays_include_all_arrivals(flight, role):
-    live, of_end = LiveMetrics(role), flight[role == "cloud"]
-    live.see(of_end)
-    delays = [r.delay for r in of_end if isinstance(r, Arrival)]
-    name = "cloudrc_downlink_delay_seconds" if role == "world" else "cloudrc_uplink_delay_seconds"
-    assert histogram(live, name).cumulative()[-1] == len(delays)
-    assert histogram(live, name).total == pytest.approx(sum(delays))
-    age = histogram(live, "cloudrc_age_of_information_seconds")
-    assert min(delays) < age.total / age.cumulative()[-1] < 2 * max(delays)
-    if role == "world":  # a start from spawn opens a session, but admits no cloud
-        assert value(live, "cloudrc_sessions_opened_total") == 2
-        assert value(live, "cloudrc_clouds_admitted_total") == 1
 
 
 @pytest.mark.promise("unknown-is-absent")
@@ -81,10 +57,10 @@ def test_without_a_shared_clock_one_way_delays_are_absent():
     assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] > 100  # needs no shared clock
 
 
-@pytest.mark.parametrize("offset_ns", [0, 7_000_000_000])
-def test_command_age_is_that_of_its_odometry_in_track(offset_ns):
+def test_command_age_is_that_of_its_odometry_in_track():
     """It needs no shared clock; on the ground and in HOLD no command is in use."""
-    of_world, _ = records(load_experiment("hover", ["link.profile=paper-p2"]), offset_ns=offset_ns)
+    experiment = load_experiment("hover", ["link.profile=paper-p2"])
+    of_world, _ = records(experiment, offset_ns=7_000_000_000)
     basis_ns, ages, others = 0, [], 0
     for record in of_world:
         if isinstance(record, CommandApplied):
@@ -99,6 +75,9 @@ def test_command_age_is_that_of_its_odometry_in_track(offset_ns):
     age = histogram(live, "cloudrc_command_age_seconds")
     assert age.cumulative()[-1] == len(ages) > 500
     assert age.total == pytest.approx(sum(ages))
+    # A start from spawn opens a session, but admits no cloud.
+    assert value(live, "cloudrc_sessions_opened_total") == 2
+    assert value(live, "cloudrc_clouds_admitted_total") == 1
 
 
 def test_control_periods_give_delays_errors_and_terms():
@@ -114,31 +93,22 @@ def test_control_periods_give_delays_errors_and_terms():
     assert live.read()["cloudrc_prediction_error_meters"] == {}  # no prediction compared yet
 
 
-def counted(role, **totals):
-    live = LiveMetrics(role)
-    live.see([Counted(0, role, name, total) for name, total in totals.items()])
-    return live
-
-
 @pytest.mark.parametrize(
     ("role", "count", "name", "labels"),
     [
-        ("world", "sent", "cloudrc_datagrams_total", ("uplink", "sent")),
         ("world", "late", "cloudrc_datagrams_total", ("downlink", "late")),
         ("world", "stalls", "cloudrc_world_stalls_total", ()),
-        ("world", "held_seconds", "cloudrc_guard_held_seconds_total", ()),
         ("world", "limited_fence", "cloudrc_guard_limited_total", ("fence",)),
         ("cloud", "controller_failed", "cloudrc_plugin_failures_total", ("controller",)),
-        ("teleop", "api_token", "cloudrc_api_rejected_total", ("token",)),
         ("teleop", "api_order_conflict", "cloudrc_missions_refused_total", ("conflict",)),
         ("link", "lost", "cloudrc_link_datagrams_total", ("lost",)),
         ("link", "released_early", "cloudrc_link_released_early_total", ()),
-        ("link", "restored", "cloudrc_link_restored_total", ()),
-        ("link", "unresolved", "cloudrc_dns_errors_total", ()),
     ],
 )
 def test_a_count_is_in_its_metric(role, count, name, labels):
-    assert value(counted(role, **{count: 7}, unheard_of=9), name, *labels) == 7
+    live = LiveMetrics(role)
+    live.see([Counted(0, role, count, 7), Counted(0, role, "unheard_of", 9)])
+    assert value(live, name, *labels) == 7
     if name in ONE_SHAPER:
         assert name not in LiveMetrics(role).read()
     else:
@@ -178,7 +148,6 @@ def test_the_real_time_factor_covers_the_last_ten_seconds():
 def heard(role, *seen):
     live = LiveMetrics(role)
     live.see(seen)
-    assert live.end is not None
     return live.end.has_peer
 
 
@@ -229,11 +198,9 @@ EVENTS = [
     ("started", 0, "flying", 0),
     ("reached", 0, "flying", 1),
     ("held", 1, "held", 1),
-    ("goto", -1, "held", 1),
     ("resumed", 1, "flying", 1),
     ("reached", 1, "flying", 2),
     ("done", 1, "done", -1),
-    ("goto", -1, "starting", -1),
     ("started", 0, "flying", 0),
     ("leg_timed_out", 0, "failed", -1),
 ]

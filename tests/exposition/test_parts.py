@@ -12,40 +12,28 @@ from hypothesis import strategies as st
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition.live import LiveMetrics
-from cloudrc.exposition.parts import WINDOW, DatagramTally, DelayJudge, PredictionJudge
+from cloudrc.exposition.parts import WINDOW, DatagramTally, PredictionJudge
 from cloudrc.records import CommandApplied, Control
-from tests.exposition.conftest import MS, period
+from tests.exposition.conftest import period
 from tests.flights.conftest import records
 
 
-def taken(counters, epoch=1):
+def taken(counters):
     stream = DatagramTally()
     for counter in counters:
-        stream.take(epoch, counter)
+        stream.take(1, counter)
     return stream
 
 
-@pytest.mark.parametrize(
-    ("counters", "expected", "lost", "reordered"),
-    [
-        ([0, 2, *range(3, WINDOW + 1)], 1, 0, 0),  # only number 0 has left the window
-        ([0, 2, *range(3, WINDOW + 2)], 2, 1, 0),
-        ([0, 2, 1, *range(3, 2 * WINDOW)], WINDOW, 0, 1),
-        ([0, 1, 1, 0, 2], 0, 0, 0),
-        ([0, 1000, *range(1001, 1001 + WINDOW)], 1001, 999, 0),
-    ],
-    ids=["in the window", "left it", "late", "repeated", "a long silence"],
-)
-def test_losses_are_counted(counters, expected, lost, reordered):
-    stream = taken(counters)
-    assert (stream.expected, stream.lost, stream.reordered) == (expected, lost, reordered)
-
-
-def test_a_new_epoch_starts_at_its_first_arrival():
-    stream = taken(range(2 * WINDOW))
+def test_what_has_left_the_window_is_lost_until_an_epoch_begins():
+    stream = taken([0, 2, *range(3, WINDOW + 1)])  # only number 0 has left the window
+    assert (stream.expected, stream.lost) == (1, 0)
+    for counter in (WINDOW + 1, 1000 + WINDOW, *range(1001 + WINDOW, 1001 + 2 * WINDOW)):
+        stream.take(1, counter)
+    assert (stream.expected, stream.lost) == (1001 + WINDOW, 999)
     for counter in range(1000, 1000 + WINDOW):
         stream.take(2, counter)
-    assert (stream.expected, stream.lost) == (WINDOW, 0)
+    assert (stream.expected, stream.lost) == (1001 + WINDOW, 999), "an epoch has its own window"
 
 
 @given(seed=st.integers(0, 10_000), loss=st.floats(0, 0.9), jitter=st.integers(0, 60))
@@ -83,46 +71,20 @@ def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
     assert judge.error == pytest.approx((lead, 0, 0) if judged else (math.nan,) * 3, nan_ok=True)
 
 
-def test_predictions_of_other_sessions_and_older_odometry_do_not_count():
-    judge = PredictionJudge()
-    judge.take(period(0, 0, horizon=0.01, position=(9.0, 9.0, 9.0)))
-    judge.reset()
-    for basis in (0, 10, 5, 20, 15, 30):
-        x = basis * 1e-3
-        judge.take(
-            period(basis, basis, measured=(x, 0, 0), position=(x + 0.01, 0, 0), horizon=0.01)
-        )
-    assert judge.square == pytest.approx(0.0, abs=1e-18)
-    assert judge.judged >= 3
-
-
-@pytest.mark.parametrize(("loop_delay", "error"), [(0.145, -0.02), (0.144, math.nan)])
-def test_a_delay_estimate_is_compared_with_the_true_delay(loop_delay, error):
-    """An echo of an unknown command is ignored."""
-    judge = DelayJudge()
-    judge.sent(period(1000, 500, horizon=0.08))  # a command from odometry of 500 ms
-    # World applies it at 600 ms, 100 ms after the odometry, and echoes it 3 ms later.
-    judge.echoed(period(1150, 603, loop_delay=loop_delay, rtt=loop_delay - 0.003), 1145 * MS)
-    assert judge.error == pytest.approx(error, nan_ok=True)
-
-
-@pytest.mark.parametrize("offset_ns", [0, 5_000_000_000])
-def test_delay_errors_of_a_flight_match_its_ground_truth(offset_ns):
+def test_delay_errors_of_a_flight_match_its_ground_truth():
     experiment = load_experiment("hover", ["link.profile=paper-p2"])
-    world, cloud = records(experiment, offset_ns=offset_ns)
+    world, cloud = records(experiment, offset_ns=5_000_000_000)
     controls = {(c.epoch, c.counter): c for c in cloud if isinstance(c, Control)}
     truth = set()
-    for applied in world:
-        if isinstance(applied, CommandApplied):
-            passed_ns = applied.stamp_ns - applied.basis_stamp_ns
-            control = controls[applied.epoch, applied.counter]
-            truth.add(round((control.horizon - passed_ns * 1e-9) * 1e6))
+    for applied in (r for r in world if isinstance(r, CommandApplied)):
+        passed_ns = applied.stamp_ns - applied.basis_stamp_ns
+        horizon = controls[applied.epoch, applied.counter].horizon
+        truth.add(round((horizon - passed_ns * 1e-9) * 1e6))
     live, seen = LiveMetrics("cloud"), set()
     for record in cloud:
         live.see([record])
         error = live.read().get("cloudrc_delay_estimate_error_seconds")
         if isinstance(record, Control) and error:
-            assert isinstance(error, dict)
             seen.add(round(error[()] * 1e6))
     assert len(seen) > 100
     assert len(seen - truth) <= 0.01 * len(seen), "equal to 1 us, except for rounding"

@@ -33,17 +33,10 @@ def test_a_row_of_a_trace_begins_halfway_between_two_packets():
     ("text", "delays"),
     [
         ("time_s,delay_ms\n10,45\n10.5,60", (0.045, 0.060)),
-        ("time_ms, delay_us\n10000, 45000\n10500, 60000", (0.045, 0.060)),
         ("host,delay_s,sent_us,note\na,0.045,1000000,x\n\nb,0.060,1500000,y", (0.045, 0.060)),
-        (
-            "timestamp_ns,delay_ns\n1700000000000000000,45000000\n1700000000500000000,6e7",
-            (0.045, 0.06),
-        ),
+        ("time_ns,delay_ns\n1700000000000000000,4.5e7\n1700000000500000000,6e7", (0.045, 0.06)),
         ("Time (ms);Delay [µs]\n0;45000,5\n500;6e4", (0.0450005, 0.060)),
-        (
-            'timestamp\t"delay_ms"\n2024-01-20 10:00:00.000\t45\n2024-01-20T10:00:00.500\t60',
-            (0.045, 0.06),
-        ),
+        ('time\t"delay_ms"\n2024-01-20 10:00:00.0\t45\n2024-01-20T10:00:00.5\t60', (0.045, 0.06)),
     ],
 )
 def test_units_and_separators_are_those_of_the_header(text, delays):
@@ -56,11 +49,8 @@ def test_units_and_separators_are_those_of_the_header(text, delays):
 @pytest.mark.parametrize(
     ("header", "row", "note"),
     [
-        ("time_s,delay_ms,loss", "1,,0", ""),
-        ("time_s,delay_ms,loss", "1,30,1", ""),
         ("time_s,delay_ms,loss", "1,0,yes", ""),
         ("time_s,delay_ms", "1,nan", ""),
-        ("time_s,delay_ms", "1,-", ""),
         ("time_s,delay_ms", "1,no answer yet", ""),
         ("time_s,delay_ms", "1,-1", "1 with delay_ms -1 taken as lost"),
         ("time_s,delay_ms", "1,0", "1 with delay_ms 0 taken as lost"),
@@ -93,25 +83,18 @@ def test_round_trips_are_halved_if_asked_only():
     ("text", "says"),
     [
         ("time_s,delay_ms\n0,0.045\n1,0.07", "delay_ms is at most 0.07 ms, which looks like sec"),
-        ("time_s,delay_us\n0,0.5\n1,0.4", "delay_us is at most 0.5 us"),
         ("time_s,delay_s\n0,45\n1,70", "delay_s has a median of 57.5 s, which looks like ms"),
         ("time_s,delay_ms\n1700000000000,45", "time_s is 1700000000000, a finer unit than s"),
         ("time,delay_ms\n0,45", "column time does not say its unit; call it time_s, time_ms"),
-        ("time_s,delay\n0,45", "column delay does not say its unit"),
         ("time_s,latency\n0,45", "no column delay, found time_s,latency; name them time_s"),
-        ("delay_ms\n45", "no column time"),
         ("", "no column time, found nothing"),
         ("time_s,delay_ms,rtt_ms\n0,45,90", "has delay_ms and rtt_ms; keep only one"),
         ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a number"),
         ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a number"),
         ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is '0.5'; give 0 or 1"),
-        (
-            "time_s,delay_ms\n0,45\n1,-3",
-            "a packet arrived 3 ms before it was sent: the two clocks differ; synchronise them, or",
-        ),
+        ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
         ("time_s,rtt_ms\n0,45\n1,-3\n2,-1", "rtt_ms is -3, which is no round trip"),
         ("time_s,delay_ms\n0,1,234.5\n1,41", "line 2: more values than columns"),
-        ("time_s,delay_ms\n0,45\n1", "line 3: delay_ms is nothing"),
         ("time_s,delay_ms", "no packet arrived"),
         ("sent_ms,delay_ms\n" + "1.7212E+12,20\n" * 50, "49 of 50 packets have the same time"),
         ("20.1\n21\n19.5", "numbers without a header"),
@@ -129,17 +112,17 @@ def test_what_cannot_be_used_is_refused(text, says):
 def test_up_to_1_percent_may_be_unusable_and_all_is_counted():
     """Of 200 rows one is torn, one comes late, one is at the time of another; then a pause."""
     rows = [f"{n / 10:g},{40 + n % 5}" for n in range(200)]
-    rows[20], rows[21] = rows[21], rows[20]
-    rows[50] = "5"
-    rows[60] = rows[59]
+    rows[20:22], rows[50], rows[60] = [rows[21], rows[20]], "5", rows[59]
     packets = read("\n".join(["time_s,delay_ms", *rows, "919.9,40"]))
-    assert packets.notes == (
+    pause = (
+        "nothing sent for 900 s after packet 198: a pause, two sessions in one log, or a step of"
+    )
+    assert packets.notes[:3] == (
         "1 out of order, sorted",
         "1 left out, at the time of another one",
         "1 left out, unreadable",
-        "nothing sent for 900 s after packet 198: a pause, two sessions in one log, or a step of "
-        "the clock",
     )
+    assert packets.notes[3:] == (f"{pause} the clock",)
     assert len(packets.sent) == 199
     rows[70] = rows[80] = "7"
     with pytest.raises(BadInputError, match=r"line 52: .* \(3 of 200 rows cannot be used\)"):
@@ -147,22 +130,16 @@ def test_up_to_1_percent_may_be_unusable_and_all_is_counted():
 
 
 def test_packets_are_put_in_the_order_of_sending():
-    log = Log("x", [(2.0, 0.1), (1.0, None)])
-    packets = log.packets()
+    packets = Log("x", [(2.0, 0.1), (1.0, None)]).packets()
     assert (packets.sent, packets.delays) == ((1.0, 2.0), (None, 0.1))
     assert (packets.lost, packets.duration) == (1, 1.0)
-    shuffled = [(float(n % 30 + 30 * (4 - n // 30)), 0.1) for n in range(150)]
-    assert Log("x", shuffled).packets().notes == ("120 out of order, sorted",)
-    with pytest.raises(BadInputError, match="no packet arrived"):
-        Log("x", [(0.0, None)]).packets()
+    assert packets.notes == ("1 out of order, sorted",)
 
 
 @pytest.mark.parametrize(
     ("line", "says"),
     [
         ('{"start":{"version":"iperf 3.16"}}', "output of iperf, which has no delay of each"),
-        ("[ ID] Interval           Transfer     Bitrate         Jitter", "output of iperf"),
-        ("Reply from 192.0.2.1: bytes=32 time=20ms TTL=57", "ping of Windows"),
         ("Antwort von 192.0.2.7: Bytes=32 Zeit<1ms TTL=57", "ping of Windows"),
         ("traceroute to 192.0.2.1, 30 hops max", "traceroute or mtr"),
     ],
@@ -174,18 +151,14 @@ def test_other_tools_are_called_by_their_names(line, says):
 
 def trip(number, lost=False, send=30, receive=20):
     """Make a round trip as irtt 0.9 writes it; delays in [ms], one packet every 10 ms."""
-    wall = 1_700_000_000_000_000_000 + number * 10_000_000
-    send, receive = send * 1_000_000, receive * 1_000_000
-    sent = {"wall": wall, "monotonic": 5_000 + number * 10_000_000}
+    at, send, receive = number * 10_000_000, send * 1_000_000, receive * 1_000_000
+    wall = 1_700_000_000_000_000_000 + at
+    stamps = {"client": {"send": {"wall": wall, "monotonic": 5_000 + at}}}
     if lost:
-        return {"lost": lost, "timestamps": {"client": {"send": sent}}, "delay": {}}
-    there = {"receive": {"wall": wall + send, "monotonic": number * 10_000_000 + send}}
+        return {"lost": lost, "timestamps": stamps}
+    stamps["server"] = {"receive": {"wall": wall + send, "monotonic": at + send}}
     delay = {"send": send, "receive": receive, "rtt": send + receive}
-    return {
-        "lost": "false",
-        "timestamps": {"client": {"send": sent}, "server": there},
-        "delay": delay,
-    }
+    return {"lost": "false", "timestamps": stamps, "delay": delay}
 
 
 def irtt(trips, direction=None, **stats):
@@ -206,8 +179,7 @@ TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(
 )
 def test_irtt_knows_both_ways(direction, sent, delays):
     """Packets lost on the uplink were never on the downlink, and vice versa."""
-    trips = [{key: value for key, value in one.items() if value != {}} for one in TRIPS]
-    packets = irtt(trips, direction, packets_sent=5, packets_received=3, duplicates=1)
+    packets = irtt(TRIPS, direction, packets_sent=5, packets_received=3, duplicates=1)
     assert packets.sent == pytest.approx(sent)
     assert packets.delays == pytest.approx(delays)
     assert packets.notes == ("1 duplicates left out",)
@@ -237,12 +209,7 @@ del NO_STAMPS[0]["delay"]["send"]
         (STEPPED, {}, "the clock of irtt's server made a step of 30 ms"),
         (CLIENT_STEPPED, {}, "the clock of irtt's client made a step of 9 ms"),
         (NO_STAMPS, {}, r"server sent no stamps.*--halve-rtt"),
-        (
-            TRIPS,
-            {"packets_sent": 6},
-            "counts are 6 sent and 2 received, but it has 5 packets and 2",
-        ),
-        (TRIPS, {"packets_received": 5}, "counts are 5 sent and 5 received"),
+        (TRIPS, {"packets_sent": 6}, "counts are 6 sent and 2 received, but it has 5 packets and "),
         ([], {}, "no packet arrived"),
     ],
 )
@@ -251,13 +218,7 @@ def test_irtt_that_contradicts_itself_is_refused(trips, stats, says, direction):
         irtt(trips, direction, **stats)
 
 
-ENDLESS = {"lost": "false", "timestamps": {"client": {"send": {"wall": float("inf")}}}}
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["{", "{}", '{"round_trips": [{}]}', "[" * 100_000, json.dumps({"round_trips": [ENDLESS]})],
-)
+@pytest.mark.parametrize("text", ["{", "{}", '{"round_trips": [{}]}', "[" * 100_000])
 def test_other_json_is_refused(text):
     with pytest.raises(BadInputError, match="not a log of irtt"):
         read_irtt(text, "x", "uplink", halve=False)
@@ -281,11 +242,11 @@ def ping(*lines):
 
 PING = (
     HEAD,
-    "[100.040000] 64 bytes from 192.0.2.1: icmp_seq=1 ttl=57 time=40.0 ms",
-    "[100.230000] 64 bytes from host.example (192.0.2.1): icmp_seq=2 ttl=57 time=30 ms",
+    reply(1, 100.04, "40.0"),
+    reply(2, 100.23, "30").replace("192.0.2.1", "host.example (192.0.2.1)"),
     "[100.410000] no answer yet for icmp_seq=3",
-    "[100.700000] 64 bytes from 192.0.2.1: icmp_seq=4 ttl=57 time=100 ms",
-    "[100.710000] 64 bytes from 192.0.2.1: icmp_seq=4 ttl=57 time=110 ms (DUP!)",
+    reply(4, 100.7, "100"),
+    reply(4, 100.71, "110", " (DUP!)"),
     "[100.900000] no answer yet for icmp_seq=5",
 )
 END = (
@@ -320,7 +281,6 @@ STAMPED = "[1700000000.5] "
 @pytest.mark.parametrize(
     ("lines", "delays"),
     [
-        ([f"{STAMPED}64 Bytes von 192.0.2.7: icmp_seq=1 ttl=53 Zeit=20 ms"], (10,)),
         ([f"{STAMPED}64 octets de 192.0.2.7 : icmp_seq=1 ttl=53 temps=20,1 ms"], (10.05,)),
         ([f"{STAMPED}64 字节, 来自 192.0.2.7: icmp_seq=1 ttl=53 时间=20.1 毫秒"], (10.05,)),
         ([f"{STAMPED}64 bytes from ::1, icmp_seq=0 hlim=64 time=2 ms", summary(2, 1)], (1, None)),
@@ -331,7 +291,6 @@ STAMPED = "[1700000000.5] "
                 "Request timeout for icmp_seq 1",
                 "00:00:01.123456 64 bytes from 192.0.2.7: icmp_seq=2 ttl=53 time=20.5 ms",
                 "3 packets transmitted, 2 packets received, 33.3% packet loss",
-                "round-trip min/avg/max/stddev = 20.5/20.5/20.5/0.0 ms",
             ],
             (10.25, None, 10.25),
         ),
@@ -339,7 +298,6 @@ STAMPED = "[1700000000.5] "
             [
                 f"{STAMPED}192.0.2.7 : [0], 64 bytes, 20.1 ms (20.1 avg, 0% loss)",
                 "[1700000001.5] 192.0.2.7 : [1], timed out (20.1 avg, 50% loss)",
-                "192.0.2.7 : xmt/rcv/%loss = 2/1/50%, min/avg/max = 20.1/20.1/20.1",
             ],
             (10.05, None),
         ),
@@ -381,15 +339,10 @@ FIVE = [reply(number, number / 5) for number in range(1, 6)]
         ([HEAD], "has no replies"),
         (["[1.0] 64 bytes from h: icmp_seq=1 ttl=57 tid=1 xx"], "cannot? ?be read|LC_ALL=C"),
         ([*FIVE, summary(5, 4)], "summary counts 5 sent and 4 received, but it has 5 replies"),
-        ([*FIVE, summary(4, 5)], "summary counts 4 sent"),
         ([*FIVE[:2], summary(5, 5)], "summary counts 5 sent and 5 received, but it has 2 replies"),
         ([*FIVE, "rtt min/avg/max/mdev = 9/30/90/1 ms"], "gives a mean of 30 ms, but .* 20 ms"),
         ([HEAD, *FIVE, HEAD], "more than one session of ping .2 beginnings"),
         ([*FIVE, reply(1, 900.0)], "more than one session of ping .number 1 comes twice"),
-        (
-            [*FIVE[:2], reply(3, 900.0), *(reply(n, n / 5) for n in range(4, 20))],
-            "after row 3 the times go back by 899.2 s",
-        ),
         (
             [reply(n, 50.0 + n - 10.0 * (n > 5)) for n in range(1, 12)],
             "after row 5 the times go back by 9 s: a step of the clock",
@@ -402,18 +355,7 @@ def test_a_ping_that_cannot_be_used_is_refused(lines, says):
         ping(*lines)
 
 
-def test_a_step_of_the_clock_or_a_pause_is_named():
+def test_a_pause_is_named():
     packets = ping(*FIVE, *(reply(number, 3600 + number / 5) for number in range(6, 9)))
     assert packets.notes[0].startswith("nothing sent for 3600 s after packet 5: a pause, ")
     assert len(packets.sent) == 8
-    packets = ping(*(reply(n, n + 10.0 * (n > 5)) for n in range(1, 12)))
-    assert packets.notes[0].startswith("nothing sent for 11 s after packet 5: a pause, ")
-    dated = [
-        f"2024-01-{day} 1{number}:00:00.5 {reply(number, 0.0)[11:]}"
-        for number, day in enumerate((10, 11, 12, 13, 18))
-    ]
-    assert (
-        ping(*dated).notes[0].startswith("nothing sent for 4.356e+05 s after packet 4: a pause, ")
-    )
-    back = ping(*FIVE, reply(6, 0.3))
-    assert back.notes == ("1 out of order, sorted",)

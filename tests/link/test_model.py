@@ -1,24 +1,19 @@
 """One direction of the link: draws by counter, queue, order, time line, and their statistics."""
 
-import json
 import random
 from dataclasses import replace
-from importlib.resources import files
-from math import asin, erf, isnan, pi, sqrt
+from math import erf, isnan, sqrt
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.schema import Direction, Profile
 from cloudrc.link.draws import (
     BLOCK,
     CHAIN_BLOCKS,
     Purpose,
     bad_states,
-    bit_flips,
     normals,
     stream_key,
     uniforms,
@@ -30,8 +25,6 @@ MS, SECOND = 1_000_000, 1_000_000_000
 PERIOD_NS, SIZE = 10 * MS, 172
 COUNT = 20_000
 KEY = stream_key(1, True, 1, 3)
-BURSTS = GilbertElliott(0.02, 0.2)
-"""Loss 1/11, in bursts of 5 packets."""
 LIVELY = DirectionProfile(
     0.045,
     0.025,
@@ -76,10 +69,6 @@ def delays(profile, count):
     return np.array([delay * 1e-9 for (delay,) in flow(profile, count)])
 
 
-def measured(profile, count=COUNT):
-    return numbers(sample(link(profile), 3, range(0, count * PERIOD_NS, PERIOD_NS), 191))
-
-
 def ask(direction, counters):
     return {n: direction.send(1, 3, n, SIZE, n * PERIOD_NS) for n in counters}
 
@@ -90,14 +79,6 @@ def test_the_first_draws_of_a_stream_are_these():
     assert uniforms(KEY, Purpose.DELAY, 0)[:3] == pytest.approx(first, abs=1e-12)
     with pytest.raises(ValueError, match="read-only"):
         uniforms(KEY, Purpose.DELAY, 0)[0] = 0.5
-
-
-def test_streams_purposes_and_blocks_do_not_overlap():
-    others = (2, True, 1, 3), (1, False, 1, 3), (1, True, 2, 3), (1, True, 1, 4)
-    keys = [KEY, *(stream_key(*other) for other in others)]
-    drawn = [uniforms(key, p, b) for key in keys for p in Purpose for b in range(10)]
-    values = np.concatenate(drawn)
-    assert np.unique(values).size == values.size
 
 
 @given(block=st.integers(0, 2**56 - 1), purpose=st.sampled_from(Purpose))
@@ -178,33 +159,19 @@ def stream_of(lost):
     return Stream(np.arange(len(lost)), np.where(lost, np.nan, 0.1), (~lost).astype(int))
 
 
-@pytest.mark.parametrize(("shape", "c"), [("normal", 0.7), ("pareto", 0.5), ("uniform", 0.9)])
-def test_correlated_jitter_keeps_its_distribution(shape, c):
-    profile = DirectionProfile(0.045, 0.005, shape)
-    apart, alike = (delays(replace(profile, correlation=one), 3 * COUNT) for one in (0.0, c))
-    assert alike.mean() == pytest.approx(0.045, abs=0.0002)
-    assert alike.std() == pytest.approx(apart.std(), rel=0.04)
-    shares = np.linspace(0.05, 0.95, 19)
-    assert np.quantile(alike, shares) == pytest.approx(np.quantile(apart, shares), abs=0.0003)
-    lag_one = np.corrcoef(alike[:-1], alike[1:])[0, 1]
-    expected = {"normal": c, "uniform": 6 / pi * asin(c / 2), "pareto": 0.39}[shape]
-    assert lag_one == pytest.approx(expected, abs=0.03)
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.6])
-def test_a_table_is_drawn_from_about_its_mean(correlation):
+def test_a_table_is_drawn_from_about_its_mean():
     """A quarter of the packets is late by 1.73 jitters; the others are early by 0.58."""
     table = (-1 / sqrt(3),) * 3 + (sqrt(3),)
-    drawn = delays(DirectionProfile(0.045, 0.005, "table", correlation, table=table), COUNT)
-    assert set(np.round(drawn * 1e9)) == {round(45e6 + 5e6 * value) for value in set(table)}
-    assert drawn.mean() == pytest.approx(0.045, abs=0.0002)
-    assert drawn.std() == pytest.approx(0.005, rel=0.02)
-    lag_one = np.corrcoef(drawn[:-1], drawn[1:])[0, 1]
-    assert (lag_one > 0.3) if correlation else (abs(lag_one) < 0.03)
+    for correlation, least, most in ((0.0, -0.03, 0.03), (0.6, 0.3, 1.0)):
+        drawn = delays(DirectionProfile(0.045, 0.005, "table", correlation, table=table), COUNT)
+        assert set(np.round(drawn * 1e9)) == {round(45e6 + 5e6 * value) for value in set(table)}
+        assert drawn.mean() == pytest.approx(0.045, abs=0.0002)
+        assert least < np.corrcoef(drawn[:-1], drawn[1:])[0, 1] < most
 
 
 def test_200000_packets_have_the_specified_bursts(figure):
-    lost = np.array([not copies for copies in flow(DirectionProfile(loss=BURSTS), 200_000)])
+    loss = GilbertElliott(0.02, 0.2)  # 1/11, in bursts of 5 packets
+    lost = np.array([not copies for copies in flow(DirectionProfile(loss=loss), 200_000)])
     length = np.mean(loss_runs(stream_of(lost)))
     for name, found, asked in (("loss", lost.mean(), 1 / 11), ("burst", length, 5.0)):
         off = 100 * abs(found / asked - 1)
@@ -221,14 +188,6 @@ def test_the_bad_state_delays_what_it_does_not_lose():
         assert set(flow(DirectionProfile(duplicate=1.0, loss=certain), 1000)) == {()}
 
 
-def test_a_copy_has_a_delay_of_its_own():
-    fate = flow(DirectionProfile(0.045, 0.025, duplicate=0.2), COUNT)
-    pairs = np.array([copies for copies in fate if len(copies) == 2])
-    assert len(pairs) / COUNT == pytest.approx(0.2, abs=0.01)
-    assert pairs[:, 1].mean() * 1e-9 == pytest.approx(0.045, abs=0.001)
-    assert abs(np.corrcoef(pairs.T)[0, 1]) < 0.05
-
-
 def test_what_overtakes_has_no_delay_and_no_queue():
     fate = flow(DirectionProfile(0.045, 0.005, reorder=0.1), COUNT)
     assert fate.count((0,)) / COUNT == pytest.approx(0.1, abs=0.01)
@@ -240,7 +199,7 @@ def test_what_overtakes_has_no_delay_and_no_queue():
 
 def test_damage_flips_one_bit_anywhere_and_shifts_no_other_draw():
     profile, data = replace(LIVELY, corrupt=0.2), bytes(SIZE)
-    one, other, seven = link(profile, 7), link(profile, 7), link(profile, 8)
+    one, other = link(profile, 7), link(profile, 7)
     damaged = [one.corrupted(1, 3, n, data) for n in range(COUNT)]
     places = [np.flatnonzero(np.unpackbits(np.frombuffer(d, np.uint8))) for d in damaged]
     hit = [int(place[0]) for place in places if place.size]
@@ -250,12 +209,8 @@ def test_damage_flips_one_bit_anywhere_and_shifts_no_other_draw():
     assert shares.min() > 0.8 * len(hit) / 8
     assert one.counts()["corrupted"] == len(hit)
     assert damaged[:600] == [other.corrupted(1, 3, n, data) for n in reversed(range(600))][::-1]
-    assert damaged[:600] != [other.corrupted(2, 3, n, data) for n in range(600)]
-    assert damaged[:600] != [seven.corrupted(1, 3, n, data) for n in range(600)]
     assert {one.corrupted(1, 3, n, b"") for n in range(50)} == {b""}
-    assert (len(bit_flips(KEY, 0, 1.0)), bit_flips(KEY, 0, 0.0)) == (256, {})
     assert flow(profile, 600) == flow(LIVELY, 600)
-    assert (link(profile).corrupts, link(LIVELY).corrupts) == (True, False)
 
 
 @given(profile=profiles, seed=st.integers(0, 2**63 - 1))
@@ -288,14 +243,6 @@ def test_order_other_kinds_and_epochs_shift_nothing(profile):
         assert among.send(1, 3, n, SIZE, n * PERIOD_NS) == alone[n]
     others = [ask(link(profile, seed, up), counters) for seed, up in ((2, True), (1, False))]
     assert alone != others[0] != others[1] != alone
-
-
-def test_conditions_that_change_nothing_change_nothing():
-    """The fast and the general path also give the same impairments."""
-    pointless = (Change(1.0, delay=0.045), Change(1000.0, delay=9.0, rate=1e6))
-    for loss in (0.1, LIVELY.loss):
-        steady = DirectionProfile(0.045, 0.06, loss=loss, duplicate=0.1, reorder=0.1)
-        assert flow(steady, 1000) == flow(replace(steady, changes=pointless), 1000)
 
 
 def test_the_bottleneck_serialises_and_drops_from_the_tail():
@@ -333,13 +280,6 @@ def test_a_trace_holds_each_row_until_the_next(loop):
         assert direction.send(1, 3, 0, SIZE, t * SECOND) == at
 
 
-def test_a_trace_without_losses_keeps_loss_and_adds_jitter():
-    fate = flow(DirectionProfile(9.0, 0.005, loss=0.5, trace=Trace((0.0,), (0.030,))), 2000)
-    arrived = [copies[0] for copies in fate if copies]
-    assert 800 < len(arrived) < 1200
-    assert 25 * MS <= min(arrived) < 26 * MS < 34 * MS < max(arrived) <= 35 * MS
-
-
 def test_a_new_profile_keeps_seed_origin_and_counts():
     changes = (Change(5.0, delay=0.2),)
     after = DirectionProfile(0.02, 0.01, distribution="normal", loss=0.1, changes=changes)
@@ -356,46 +296,15 @@ def test_a_new_profile_keeps_seed_origin_and_counts():
         assert arrival_ns == round(now * 1e9) + round(delay * 1e9)
 
 
-@pytest.mark.parametrize(
-    ("jitter", "overtaken", "mean", "deviation"),
-    [(0.010, 0.12, 0.0704, 0.0054), (0.025, 0.41, 0.0753, 0.0109), (0.040, 0.54, 0.0829, 0.0150)],
-)
-def test_more_jitter_reorders_more_or_costs_more_delay_in_order(jitter, overtaken, mean, deviation):
-    found = measured(DirectionProfile(0.07, jitter))
-    assert found.overtaken == pytest.approx(overtaken, abs=0.02)
-    assert (found.least, found.most) == pytest.approx((0.07 - jitter, 0.07 + jitter), abs=0.0001)
-    in_order = measured(DirectionProfile(0.07, jitter, keep_order=True))
-    assert (in_order.mean, in_order.deviation) == pytest.approx((mean, deviation), abs=0.0005)
-    assert in_order.overtaken == 0.0
-
-
 def test_statistics_of_losses_copies_and_of_nothing():
+    def measured(profile, count):
+        return numbers(sample(link(profile), 3, range(0, count * PERIOD_NS, PERIOD_NS), 191))
+
     stream = stream_of(np.array([0, 1, 1, 0, 1, 0, 0, 1, 1, 1], dtype=bool))
     assert (loss_runs(stream), numbers(stream).loss) == ((2, 1, 3), pytest.approx(0.6))
-    found = measured(DirectionProfile(0.010, 0.020, duplicate=0.1, loss=0.5))
-    assert (found.least, found.duplicated) == (0.0, pytest.approx(0.05, rel=0.1))
+    found = measured(DirectionProfile(0.070, 0.040, duplicate=0.1, loss=0.5), COUNT)
+    assert (found.least, found.most) == pytest.approx((0.03, 0.11), abs=0.0001)
+    assert found.duplicated == pytest.approx(0.05, rel=0.1)
     nothing = measured(DirectionProfile(loss=1.0), 10)
     assert (nothing.loss, nothing.runs) == (1.0, (10,))
     assert all(isnan(value) for value in (nothing.mean, nothing.p99, nothing.correlation))
-    assert isnan(measured(DirectionProfile(0.045), 10).correlation)
-
-
-SHIPPED = {
-    file.name.removesuffix(".yaml"): Profile.model_validate_json(
-        json.dumps(yaml.safe_load(file.read_text()))
-    )
-    for file in (files("cloudrc.link") / "profiles").iterdir()
-}
-PAPERS = {"ideal": (0, 0), "paper-p1": (20, 10), "paper-p2": (45, 25), "paper-p3": (70, 40)}
-
-
-def test_the_shipped_profiles_leave_time_for_a_command_to_come_back():
-    """Mean round trip plus a period of odometry and of commands is below the command age limit."""
-    assert set(SHIPPED) >= {*PAPERS, "wifi", "lte", "5g", "satellite", "handover", "lossy"}
-    for profile in SHIPPED.values():
-        assert 10 < len(profile.description) <= 90
-        round_trip = profile.uplink.delay_ms + profile.downlink.delay_ms
-        assert round_trip + 20 < (profile.command_age_max_ms or 250)
-    for name, (delay, jitter) in PAPERS.items():
-        both = SHIPPED[name].uplink, SHIPPED[name].downlink
-        assert both == (Direction(delay_ms=delay, jitter_ms=jitter),) * 2

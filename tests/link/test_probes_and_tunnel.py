@@ -1,7 +1,5 @@
 """A probe of the link is no datagram of the tunnel, whoever sends it: refused and counted."""
 
-from cloudrc.cli.link_verify import make_plans
-from cloudrc.config.load import load_experiment
 from cloudrc.link.verify.probe import PROBE
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Direction, Kind
@@ -27,9 +25,3 @@ def test_no_end_takes_a_probe_for_a_datagram_or_answers_it():
     target.check()  # nothing accepted, nothing answered, no session touched
     for end, count in zip((target.world, target.cloud), before, strict=True):
         assert end._counts["malformed"] - count == len(sent)
-
-
-def test_probes_are_as_long_as_what_flies_there():
-    asked = make_plans(load_experiment("paper"), 5.0, "relay")
-    for way, kind in {"uplink": Kind.TELEMETRY, "downlink": Kind.COMMAND}.items():
-        assert asked[way].flow.size == codec.SIZES[kind]

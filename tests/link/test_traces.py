@@ -12,18 +12,12 @@ HEAD = "time_s,delay_ms"
 @pytest.mark.parametrize(
     ("data", "times", "delays", "losses"),
     [
-        (
-            b"time_s, delay_ms, loss\n0, 45, 0\n0.5, 60, 0.25\n\n2,0,1\n",
-            (0, 0.5, 2),
-            (45, 60, 0),
-            1,
-        ),
+        (b"time_s, delay_ms, loss\n0, 45, 0\n.5, 60, .2\n\n2,0,1\n", (0, 0.5, 2), (45, 60, 0), 1),
         (b"delay_us,time_s\n45000,0\n", (0,), (45,), 0),
         (b'\xef\xbb\xbf"time_s","delay_ms"\r\n0,45\r\n', (0,), (45,), 0),
         ("time_s;delay_ms\n0;45,5\n".encode("utf-16"), (0,), (45.5,), 0),
         (b"# measured\ntime_s,delay_ms\n1705744800.5,45\n1705744801.5,46\n", (0, 1), (45, 46), 0),
         (b"time_s,delay_ms\n0,0\n1,0\n", (0, 1), (0, 0), 0),
-        (b"time_s,delay_ms,loss\n" + b"0,0,0\n1,90,0\n"[:6] + b"9,90,0\n", (0, 9), (0, 90), 1),
     ],
 )
 def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
@@ -39,24 +33,15 @@ def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
     ("text", "says"),
     [
         ("", "line 1: the columns are missing; the header is time_s,delay_ms or"),
-        ("time_s\n0", "line 1: the columns are time_s; the header is"),
-        *(
-            (f"{HEAD},{more}\n0,1,0", "the columns are")
-            for more in ("lost", "delay_ms", "delay_us")
-        ),
+        (f"{HEAD},delay_us\n0,1,0", "the columns are"),
         (f"{HEAD},loss,loss\n0,1,0,0", "the columns are"),
         (HEAD, "no rows"),
         (f"{HEAD}\n1,45\n0.5,45", "line 3: time_s 0.5 does not come after 1; sort"),
         (f"{HEAD}\n1,45\n1,45", "line 3: time_s 1 does not come after 1"),
         (f"{HEAD}\n-1,45", "line 2: time_s is -1; give a number that is finite"),
-        (
-            f"{HEAD}\n0,-1",
-            "line 2: delay_ms is -1; give a number that is finite and not negative; a",
-        ),
-        (f"{HEAD}\n0,nan", "line 2: delay_ms is nan"),
+        (f"{HEAD}\n0,-1", "line 2: delay_ms is -1; give a number that is finite and not neg"),
         (f"{HEAD}\n0,fast", "line 2: delay_ms is 'fast'; give a number"),
         (f"{HEAD}\n0,", "line 2: delay_ms is nothing; give a number"),
-        (f"{HEAD}\n0", "line 2: delay_ms is nothing; give a number"),
         (f"{HEAD}\n0,1,234.5", "line 2: more values than columns; give 2"),
         (f"{HEAD}\n0,0.045\n1,0.07", "delay_ms is at most 0.07, which looks like sec"),
         (f"{HEAD},loss\n0,45,1.2", "line 2: loss is 1.2; give a number from 0 to 1"),
@@ -95,11 +80,6 @@ def test_a_table_is_the_arrived_delays_with_mean_0_deviation_1(tmp_path):
     path = tmp_path / "trace.csv"
     path.write_text(f"{HEAD},loss\n0,60,0\n1,40,0.5\n2,900,1\n3,40,0\n4,60,0\n")
     assert read_table(path) == pytest.approx((-1.0, -1.0, 1.0, 1.0))
-
-
-@pytest.mark.parametrize("rows", ["0,45,0", "0,45,0\n1,45,0", "0,45,1\n1,50,1"])
-def test_a_table_without_a_spread_is_refused(tmp_path, rows):
-    path = tmp_path / "trace.csv"
-    path.write_text(f"{HEAD},loss\n{rows}\n")
+    path.write_text(f"{HEAD},loss\n0,45,0\n1,45,0\n2,50,1\n")
     with pytest.raises(BadInputError, match="at least two different delays"):
         read_table(path)

@@ -4,8 +4,6 @@ The robot flies at 1 m/s along x from the origin at a height of 1 m, with 25 tel
 commands per second. The mission lasts from 10 s to 20 s on the shared clock of both ends.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cache
 

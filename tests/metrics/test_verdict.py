@@ -1,13 +1,13 @@
 """Each rule of the verdict: what breaks it, its time and place, and the order of outcomes."""
 
+from math import nan
+
 import pytest
 
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Number
 from cloudrc.metrics.verdict import (
-    EXIT_CODES,
     SLIP_MAX,
-    Ending,
     Observations,
     flight_evidence,
     judge,
@@ -16,16 +16,12 @@ from cloudrc.metrics.verdict import (
 from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,
     Arrival,
-    Contact,
     Control,
     GuardChange,
-    Lateness,
     MissionEvent,
     SessionOpened,
 )
-from tests.metrics.conftest import ONE_PIPE, SECOND, at, flown, good, touch
-
-ZERO = (0.0, 0.0, 0.0)
+from tests.metrics.conftest import ONE_PIPE, at, flown, good, touch
 
 
 def measured(flight):
@@ -63,7 +59,8 @@ def without_end(log):
 
 
 def met(speed):
-    return world(Contact(at(8), "board", ZERO, ZERO, (speed, 0.0, 0.0), True), log=flown)
+    touched = touch(8)._replace(tip_velocity=(speed, 0.0, 0.0))
+    return world(touched, log=flown)
 
 
 @pytest.mark.parametrize(
@@ -98,22 +95,13 @@ def test_rules(log, limits, outcome, found):
     ("log", "code", "text", "time"),
     [
         (world(touch(4, "pipe_1"), touch(3, "pipe_1")), "pipe_touched", "pipe_1 (2 times)", 3.0),
-        *(
-            (
-                # A touch-down repeats LAND.
-                world(GuardChange(at(5), state, "why"), GuardChange(at(6), state, "down")),
-                "guard_intervened",
-                f"{state.name}: why",
-                5.0,
-            )
-            for state in (GuardState.LAND, GuardState.ESTOP, GuardState.GROUND)
+        (  # A touch-down repeats LAND.
+            world(*(GuardChange(at(n), GuardState.LAND, f"why {n}") for n in (5, 6))),
+            "guard_intervened",
+            "LAND: why 5",
+            5.0,
         ),
-        (
-            world(*(SessionOpened(at(6), end, 3, "why") for end in ("world", "cloud"))),
-            "world_restarted",
-            "why",
-            6.0,
-        ),
+        (world(SessionOpened(at(6), "world", 3, "why")), "world_restarted", "why", 6.0),
         (ended("timed_out"), "timed_out", "why", 10.0),
     ],
 )
@@ -131,11 +119,7 @@ def test_a_failure_says_what_when_and_where(log, code, text, time):
         (Arrival, lambda n, a: a, "fresh commands arrived, but no request to start"),
         (Arrival, lambda n, a: a._replace(used=False), "was 0.090 s old or older when"),
         # The start opens a new session: commands of older sessions do not count.
-        (
-            Arrival,
-            lambda n, a: a._replace(used=n < 9, epoch=1 if n < 9 else 2),
-            "guard.command_age_max_ms",
-        ),
+        (Arrival, lambda n, a: a._replace(used=n < 9, epoch=1 + (n > 8)), "command_age_max_ms"),
         (Arrival, lambda n, a: a if a.uplink else None, "no command arrived"),
         (Control, lambda n, c: None, "cloud computed no command"),
     ],
@@ -168,7 +152,6 @@ def test_an_interrupted_run_lists_only_certain_failures():
         (world(touch(3, "pipe_1")), ["pipe_touched"], ["pipe_touched"]),
         # What telemetry had not shown when the mission ended
         (world(touch(9.99, "pipe_1")), ["pipe_touched"], []),
-        (world(GuardChange(at(9.99), GuardState.LAND, "")), ["guard_intervened"], []),
         (world(touch(9.99), log=flown), [], ["board_not_touched"]),
     ],
 )
@@ -181,68 +164,21 @@ def test_the_operator_knows_what_had_arrived(log, report, operator):
 
 
 @pytest.mark.parametrize(
-    ("slip", "factor", "outcome"),
+    ("slip", "factor", "found"),
     [
-        (SLIP_MAX, REAL_TIME_FACTOR_MIN, "success"),
-        (SLIP_MAX + 1e-6, 0.99, "invalid"),
-        (0.1, REAL_TIME_FACTOR_MIN - 1e-6, "invalid"),
+        (SLIP_MAX, REAL_TIME_FACTOR_MIN, []),
+        (SLIP_MAX + 1e-6, 0.99, ["not_real_time"]),
+        (0.1, REAL_TIME_FACTOR_MIN - 1e-6, ["not_real_time"]),
     ],
 )
-def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, outcome):
+def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, found):
     values = {"waypoints_reached": 1.0, "world_slip": slip, "real_time_factor": factor}
     numbers = {name: Number(value, "", "") for name, value in values.items()}
     flight = good().flight(ONE_PIPE, contact=True)
     verdict = judge(flight_evidence(flight, numbers, real_time=True, interrupted=False))
-    assert verdict.outcome == outcome
-    assert codes(verdict) == ([] if outcome == "success" else ["not_real_time"])
+    assert (verdict.outcome, codes(verdict)) == ("invalid" if found else "success", found)
     # Virtual time does not depend on the machine.
-    verdict = judge(flight_evidence(flight, numbers, real_time=False, interrupted=False))
-    assert verdict.outcome == "success"
-
-
-def test_real_time_needs_proof():
-    log = good()
-    unproven = judged(log.flight(ONE_PIPE, contact=True), real_time=True)
-    assert (unproven.outcome, codes(unproven)) == ("invalid", ["not_real_time"])
-    log.world += [Lateness(at(n), "world", 0.0, 0.0, n * SECOND // 10) for n in range(11)]
-    (failure,) = judged(log.flight(ONE_PIPE, contact=True), real_time=True).failures
-    assert "0.909" in failure.text  # 10 s took 11
-
-
-NAN = float("nan")
-DONE = Ending("done", "mission done")
-LATE = Ending("timed_out", "mission not done within 60 s")
-
-
-@pytest.mark.parametrize(
-    ("seen", "known", "outcome", "found"),
-    [
-        (Observations(touch_speed=0.12), {"contact": True}, "success", []),
-        (Observations(touch_speed=0.25), {"contact": True}, "failure", ["contact_too_fast"]),
-        (Observations(touch_speed=9.0), {}, "success", []),  # the board need not be touched
-        # 5 % of 30 s are 1.5 s.
-        (Observations(slip_began_ns=7, slip_ns=1_490_000_007), {}, "success", []),
-        (Observations(slip_began_ns=7, slip_ns=1_510_000_007), {}, "invalid", ["not_real_time"]),
-        (
-            Observations(pipe_touches=1),
-            {"ending": LATE, "reached": 1},
-            "failure",
-            ["timed_out", "waypoint_not_reached", "pipe_touched"],
-        ),
-    ],
-)
-def test_the_same_rules_judge_what_telemetry_shows(seen, known, outcome, found):
-    rules = {"waypoints": 3, "contact_speed_max": 0.25, "contact": False, "reached": 3}
-    verdict = judge(seen.evidence(elapsed=30.0, **{"ending": DONE, **rules, **known}))
-    assert (verdict.outcome, codes(verdict)) == (outcome, found)
-    assert verdict.as_json()["exit_code"] == EXIT_CODES[outcome]
-
-
-def test_telemetry_names_neither_pipe_nor_waypoint():
-    rules = {"waypoints": 3, "contact_speed_max": 0.25, "contact": False, "reached": 1}
-    verdict = judge(Observations(pipe_touches=1).evidence(DONE, 30.0, **rules))
-    texts = [failure.text for failure in verdict.failures]
-    assert texts == ["1 of 3 waypoints reached", "the robot touched a pipe"]
+    assert judged(flight).outcome == "success"
 
 
 def test_only_what_telemetry_shows_during_the_mission_counts():
@@ -251,14 +187,5 @@ def test_only_what_telemetry_shows_during_the_mission_counts():
     after = seen.see(5, 0.1, 9).see(5, 0.4, 9)
     assert (after.pipe_touches, after.touch_speed) == (2, 0.1), "the first touch stays"
     assert after.slip_ns - after.slip_began_ns == 4
-    assert Observations.begin(4, NAN, 0).see(1, NAN, 0).pipe_touches == 1, "it begins again at 0"
+    assert Observations.begin(4, nan, 0).see(1, nan, 0).pipe_touches == 1, "it begins again at 0"
     assert [event for event, _ in after.news(seen, 1.0)] == ["pipe_touched", "board_touched"]
-
-
-def test_slip_while_teleop_is_down_does_not_count():
-    seen = Observations.begin(0, NAN, 5).see(0, NAN, 9)
-    for shown in (1_000, 5_000):
-        seen = seen.after_restart().see(0, NAN, shown)
-        assert seen.slip_ns - seen.slip_began_ns == 4
-    seen = seen.see(0, NAN, 5_003)
-    assert seen.slip_ns - seen.slip_began_ns == 7

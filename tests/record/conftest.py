@@ -177,8 +177,7 @@ class Shelf:
     def flush(self):
         pass
 
-    def sync(self):
-        pass
+    sync = flush
 
     def abandon(self, reason):
         self.closed = True

@@ -9,7 +9,6 @@ from contextlib import suppress
 from random import Random
 
 import pytest
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message
@@ -22,22 +21,21 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.hash import messages_sha256
 from cloudrc.record.reader import Contents, read_contents, recover
 from cloudrc.record.ros import definition
-from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import MISSING, SHA256, McapWriter
+from cloudrc.record.writer import SHA256, McapWriter
 from tests.record.conftest import assert_equal, rewrite, world_records, write
 
 RECORDS = world_records(160)
 
 
-def make_whole():
+def recorded(records):
     stream = io.BytesIO()
     with McapWriter(stream, clock="world") as writer:
-        writer.write(RECORDS)
+        writer.write(records)
         writer.attach("config.yaml", b"seed: 1\n" * 50)
     return stream.getvalue()
 
 
-WHOLE, EXPECTED = make_whole(), Recording.from_records(RECORDS)
+WHOLE, EXPECTED = recorded(RECORDS), Recording.from_records(RECORDS)
 HASH = [one.metadata for one in make_reader(io.BytesIO(WHOLE)).iter_metadata()][-1][SHA256]
 
 
@@ -75,33 +73,6 @@ def flipped(at, mask=255):
     return WHOLE[:at] + bytes([WHOLE[at] ^ mask]) + WHOLE[at + 1 :]
 
 
-def test_a_cut_file_is_read_to_its_last_whole_chunk(path):
-    for (_, end), by in itertools.product(CHUNKS, (-1, 0, 500)):
-        path.write_bytes(WHOLE[: end + by])
-        whole = [n for n, (_, last) in enumerate(CHUNKS) if last <= end + by]
-        if not whole:
-            with pytest.raises(BadInputError, match=r"x\.mcap: holds no readable message: cut"):
-                Recording.read(path)
-            continue
-        expected, recording = sum(SIZES[: len(whole)]), Recording.read(path)
-        assert sum(len(recording[topic]) for topic in TOPICS) == expected
-        assert recording.note.startswith(f"cut short: {expected} messages were read, the last at ")
-        assert (recording.complete, recording.lacking) == (False, "")
-
-
-def copied(path):
-    """Return all that a recovery keeps."""
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        messages = [
-            (schema.name, schema.data, channel.topic, channel.metadata, message.log_time,
-             message.publish_time, message.sequence, message.data)
-            for schema, channel, message in reader.iter_messages()
-        ]  # fmt: skip
-    contents = read_contents(path)
-    return [messages, contents.metadata, contents.attachments]
-
-
 @pytest.mark.parametrize("cut", [0, 1, 8, 30])
 def test_a_lost_index_loses_nothing(path, cut):
     path.write_bytes(WHOLE[: len(WHOLE) - cut])
@@ -110,14 +81,15 @@ def test_a_lost_index_loses_nothing(path, cut):
     assert [remark[:16] for remark in recording.remarks] == ["had a torn index"] * (cut > 0)
     recovery = recover(path, new := path.with_name("new.mcap"))
     assert (recovery.complete, recovery.index_is_new) == (True, cut > 0)
-    path.write_bytes(WHOLE)
-    assert copied(new) == copied(path)
+    copy = read_contents(new)
+    assert messages_sha256(copy.messages) == HASH
+    assert copy.attachments == recording.attachments
+    assert recording.metadata.items() <= copy.metadata.items()
 
 
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "is empty"),
         (bytes(100), "is empty"),
         (b"\x89MCAP0\r\n\x01" + b"\xff" * 40, "holds no readable message: cut short"),
         (b"#ROSBAG V2.0\n", "is a ROS 1 bag, not an MCAP file"),
@@ -181,14 +153,6 @@ def test_what_other_programs_changed_is_named(whole, path, options, said):
         assert recording.lacking in Recording.read(new).lacking, "a copy hides nothing"
 
 
-def test_a_torn_recording_that_others_ended_is_told(path):
-    with path.open("wb") as stream:
-        writer = McapWriter(stream, clock="world")
-        writer.write(RECORDS)
-        writer._mcap.finish()
-    assert "another program has put an end to it" in Recording.read(path).lacking
-
-
 def write_foreign(path, topic, ros_type, text, data, channels=1, **options):
     """Write messages as another program that names the clock as cloudrc does."""
     with path.open("wb") as stream:
@@ -196,8 +160,8 @@ def write_foreign(path, topic, ros_type, text, data, channels=1, **options):
         writer.start(profile="ros2")
         writer.add_metadata("cloudrc", {"clock": "world"})
         schema = writer.register_schema(ros_type, "ros2msg", text.encode())
-        numbers = [writer.register_channel(topic, "cdr", schema, {"robot": str(n)})
-                   for n in range(channels)]  # fmt: skip
+        robots = [{"robot": str(n)} for n in range(channels)]
+        numbers = [writer.register_channel(topic, "cdr", schema, robot) for robot in robots]
         for each, number in itertools.product(data, numbers):
             writer.add_message(number, 1, each, 1)
         writer.finish()
@@ -219,8 +183,7 @@ ARRIVAL = definition(OURS)
     ],
 )
 def test_foreign_topics_are_told_apart(path, topic, name, text, channels, said):
-    data = [b"\0\1\0\0\7"]
-    write_foreign(path, topic, name, text, data, channels)
+    write_foreign(path, topic, name, text, [b"\0\1\0\0\7"], channels)
     recording = Recording.read(path)
     assert said in recording.lacking
     assert bool(said) == bool(recording.note)
@@ -230,17 +193,17 @@ def test_foreign_topics_are_told_apart(path, topic, name, text, channels, said):
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
 @pytest.mark.parametrize(("size", "count"), [(0, 40_000), (1 << 20, 20)])
-@pytest.mark.parametrize("stated", [None, 1000])
-def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, stated):
+@pytest.mark.parametrize("lies", [False, True])
+def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, lies):
     """A few kilobytes unpack to far more: in large messages, or in very many."""
     monkeypatch.setattr("cloudrc.record.reader.UNPACKED_MAX", limit := 4)
     options = {"chunk_size": 1 << 27, "compression": compression, "index_types": IndexType.NONE}
     data = (bytes(size) for _ in range(count))
     write_foreign(path, "/odometry", "nav_msgs/msg/Odometry", "", data, **options)
-    if stated is not None:  # the chunk lies about its size
+    if lies:  # about the size of the chunk
         data = bytearray(path.read_bytes())
         start = data.index(compression.name.lower().encode()) - 16
-        data[start : start + 8] = stated.to_bytes(8, "little")
+        data[start : start + 8] = (1000).to_bytes(8, "little")
         path.write_bytes(data)
     tracemalloc.start()
     try:
@@ -249,22 +212,9 @@ def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, 
         told = str(error)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert told.count("\n") == 0
-    assert ("unpacks to more than 4 times its size" in told) == (stated is None)
+    assert "\n" not in told
+    assert ("unpacks to more than 4 times its size" in told) != lies
     assert peak < 4 * limit << 20
-
-
-def test_a_chunk_in_a_chunk_is_not_unpacked(path):
-    start, end = CHUNKS[0]
-    inner = {
-        "compression": "",
-        "data": WHOLE[start:end] * 2,
-        "uncompressed_size": 2 * (end - start),
-    }
-    outer = Chunk(**inner, message_start_time=0, message_end_time=0, uncompressed_crc=0)
-    outer.write(builder := RecordBuilder())
-    path.write_bytes(WHOLE[:start] + builder.end() + WHOLE[start:end])
-    assert len(read_contents(path).messages) == SIZES[0]
 
 
 def examine(folder, data):
@@ -320,16 +270,6 @@ def test_a_recovery_says_what_is_kept_and_lost(path):
     assert (recovery.bytes_lost, recovery.share) == (len(WHOLE), pytest.approx(0.5))
 
 
-def test_a_number_without_its_one_definition_is_a_damage(path, tmp_path):
-    source = write(tmp_path / "w.mcap", world_records(5))
-    flat = rewrite(source, path, use_chunking=False).read_bytes()
-    channels = [start for code, start, _ in spans(flat) if code == Opcode.CHANNEL]
-    for at, byte in ((channels[3], b"\x90"), (channels[3] + 9, flat[channels[0] + 9 :][:1])):
-        path.write_bytes(flat[:at] + byte + flat[at + 1 :])
-        assert "damaged" in recover(path, tmp_path / "new.mcap").notes[0]
-        assert Recording.read(path).lacking.startswith("damaged: ")
-
-
 def test_nothing_is_offered_of_what_holds_nothing(path):
     with pytest.raises(BadInputError, match="holds no readable message: none is in it; nothing"):
         recover(write(path, []), new := path.with_name("new.mcap"))
@@ -337,7 +277,7 @@ def test_nothing_is_offered_of_what_holds_nothing(path):
 
 
 def test_the_command_says_what_is_kept_and_lost(path, capsys):
-    new, folder = path.with_name("new.mcap"), path.parent
+    new = path.with_name("new.mcap")
     path.write_bytes(WHOLE)
     assert main(["recover", str(path)]) == 0
     assert "kept 100.0%" in capsys.readouterr().out
@@ -348,13 +288,7 @@ def test_the_command_says_what_is_kept_and_lost(path, capsys):
     assert 0 < account["bytes_lost"] <= 100
     for target, reason in (
         (new, "already there; name another file with --to"),
-        (folder / "none" / "n.mcap", "No such file or directory; name another"),
+        (new / "none", "Not a directory; name another"),
     ):
         assert main(["recover", str(path), "-t", str(target)]) == 2
         assert f"{target}: {reason}" in capsys.readouterr().err
-    with McapWriter(path, clock="world") as writer:  # whose note cannot steer a terminal
-        writer.write(world_records(5))
-        writer.note({MISSING: "\x1b[2J all"})
-    new.unlink()
-    assert main(["recover", str(path), "--to", str(new)]) == 1
-    assert "lossy: \\x1b[2J all\n" in capsys.readouterr().out

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -17,7 +18,7 @@ from cloudrc.record.reader import recover
 from cloudrc.record.recorder import TROUBLE, Recorder
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
-from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records, write
+from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records
 
 
 class Disk(io.BytesIO):
@@ -59,26 +60,23 @@ def test_the_oldest_are_dropped_and_counted():
 
 
 def test_what_is_recorded_can_be_read(tmp_path):
-    path, records = tmp_path / "world.mcap", world_records(30)
-    for target in (path, Path(os.devnull)):  # a device has no sync
+    path, records = tmp_path / "world.mcap", world_records(160)
+    for target in (path, Path(os.devnull)):  # a device has neither sync nor positions
         recorder = Recorder(target, open_mcap)
-        record_all(recorder, records, 64)
+        record_all(recorder, records, 1000)
         assert (recorder.dropped, recorder.error) == (0, "")
     assert_equal(Recording.read(path), Recording.from_records(records))
 
 
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
-@pytest.mark.parametrize("room", [0, 100, 1500, *range(20_000, 60_800, 2_720)])
+@pytest.mark.parametrize("room", [0, 100, 1500, *range(20_000, 60_800, 8_160)])
 def test_on_a_full_disk_all_is_kept_or_counted(tmp_path, room):
     path, records = tmp_path / "w.mcap", counted(3000)
     disk = Disk(room)
     recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
     record_all(recorder, records, 30)
     path.write_bytes(disk.getvalue())
-    assert recorder.error == (
-        f"{path}: recording stopped: disk full; make room or choose another folder;"
-        " the flight goes on"
-    )
+    assert recorder.error.startswith(f"{path}: recording stopped: disk full; make room or choose")
     kept = 0
     with suppress(BadInputError):
         recording = Recording.read(path)
@@ -91,25 +89,10 @@ def test_on_a_full_disk_all_is_kept_or_counted(tmp_path, room):
     assert kept < len(records)
 
 
-def test_without_room_for_the_index_all_chunks_are_kept(tmp_path):
-    path, records = tmp_path / "w.mcap", counted(20)
-    disk = Disk(write(path, records).stat().st_size - 100)
-    recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
-    recorder.put(records)
-    recorder.close()
-    path.write_bytes(disk.getvalue())
-    assert "disk full" in recorder.error
-    assert (len(Recording.read(path)["/count"]), recorder.dropped) == (20, 0)
-
-
-def failing(step, code):
+def failing(step, error):
     """Make a sink whose `step` fails."""
-
-    def refuse(*_):
-        raise OSError(code, "Input/output error")
-
     shelf = Shelf()
-    setattr(shelf, step, refuse)
+    setattr(shelf, step, Mock(side_effect=error))
     return shelf
 
 
@@ -117,22 +100,16 @@ def failing(step, code):
 @pytest.mark.parametrize("step", ["flush", "sync", "close"])
 @pytest.mark.parametrize(("code", "words"), [*TROUBLE.items(), (errno.EIO, "Input/output error")])
 def test_disk_errors_are_told_and_never_raised(step, code, words):
-    shelf = failing(step, code)
+    shelf = failing(step, OSError(code, "Input/output error"))
     recorder = Recorder(Path("w.mcap"), lambda path: shelf)
     recorder.put(counted(3))
     recorder.drain()
     recorder.flush()
     recorder.put(counted(2))
     recorder.close()
+    assert not recorder.sync()
     assert f"w.mcap: recording stopped: {words};" in recorder.error
     assert recorder.dropped == (0 if step == "close" else 2)
-
-
-def test_a_folder_that_is_not_there_stops_the_recording_only(tmp_path):
-    recorder = Recorder(tmp_path / "absent" / "world.mcap", open_mcap)
-    record_all(recorder, counted(10), 7)
-    assert recorder.dropped == 10
-    assert "world.mcap: recording stopped: No such file or directory" in recorder.error
 
 
 def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path):
@@ -144,41 +121,19 @@ def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path):
     assert len(Recording.read(path)["/count"]) == 4
 
 
-def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path):
-    path = tmp_path / "world.mcap"
-    recorder = Recorder(path, open_mcap, size_max=20_000)
-    record_all(recorder, world_records(3000), 200)
-    assert "recording stopped: the file has reached its size limit" in recorder.error
-    assert recorder.dropped > 0
-    assert 20_000 <= path.stat().st_size < 100_000
-    said = "recording stopped: the file has reached its size limit"
-    assert Recording.read(path).note == said
-    path.write_bytes(path.read_bytes()[:-50])
-    assert said in recover(path, tmp_path / "new.mcap").notes[0]
-
-
-@pytest.mark.parametrize("works", [True, False])
-def test_a_sync_by_another_thread_reports_its_error_later(tmp_path, works):
-    path, shelf = tmp_path / "w.mcap", Shelf() if works else failing("sync", errno.EIO)
+@pytest.mark.parametrize("error", [None, OSError(errno.EIO, "broken"), ValueError("closed file")])
+def test_a_sync_by_another_thread_reports_its_error_later(tmp_path, error):
+    path, shelf = tmp_path / "w.mcap", failing("sync", error)
     recorder = Recorder(path, lambda path: shelf)
     recorder.put(counted(1))
     recorder.drain()
     assert not recorder.sync(), "what is in no file is never safe"
     path.touch()
-    assert recorder.sync() is works
+    assert recorder.sync() is (error is None)
     assert not shelf.closed
     recorder.flush(sync=False)
-    assert (shelf.closed, recorder.error == "") == (not works, works)
-
-
-def test_a_sync_of_a_closed_file_is_nothing(tmp_path):
-    recorder = Recorder(tmp_path / "w.mcap", open_mcap)
-    recorder.put(counted(1))
-    recorder.drain()
-    assert recorder._sink is not None
-    recorder._sink.close()
-    assert not recorder.sync()
-    assert recorder.error == ""
+    failed = isinstance(error, OSError)  # the other one means that the file was closed meanwhile
+    assert (shelf.closed, recorder.error != "") == (failed, failed)
 
 
 FLIGHT = """
@@ -211,15 +166,12 @@ INSTANTS = [pytest.param(0.6 + 0.031 * n, 0.0, marks=pytest.mark.full) for n in 
 
 @pytest.mark.promise("a-kill-loses-half-a-second")
 @pytest.mark.process
-@pytest.mark.parametrize(
-    ("after", "sync"), [(0.9, 0.0), (1.3, 0.0), (2.1, 0.4), (2.1, 60.0), *INSTANTS]
-)
+@pytest.mark.parametrize(("after", "sync"), [(0.9, 0.0), (2.1, 0.4), (2.1, 60.0), *INSTANTS])
 def test_sigkill_loses_at_most_half_a_second(tmp_path, after, sync, figure):
     """Even if the disk is slow: `sync` is how long it takes [s]."""
     path, clean = tmp_path / "world.mcap", tmp_path / "clean.mcap"
     command = [sys.executable, "-c", FLIGHT, str(path), str(sync)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         for line in process.stdout:
             last_ns = int(line)
             if last_ns * 1e-9 >= after:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from cloudrc.record.ros import decode, definition, encode, is_known, shifted, type_hash
+from cloudrc.record.ros import decode, definition, encode, is_known, type_hash
 from cloudrc.record.topics import TOPICS, rows
 from tests.record.conftest import any_record
 
@@ -36,6 +36,8 @@ def test_rows_are_converted_to_the_conventions_of_ros():
     assert xyz(twist.angular) == (0.1, 0.2, 0.3)
     predicted = standard("/estimated_odometry", 0, values[:3]).twist.twist
     assert math.isnan(predicted.angular.z), "it is not predicted"
+    fault = TOPICS["/fault"]
+    assert decode(fault, encode(fault, 0, ("bad_name", "file \udcff")))[1][1] == "file ?"
     twist = standard("/cmd_vel", 1, ((1.0, 2.0, 3.0), 0.4)).twist
     assert (xyz(twist.linear), xyz(twist.angular)) == ((1.0, 2.0, 3.0), (0.0, 0.0, 0.4))
 
@@ -51,18 +53,6 @@ def test_rows_come_back_from_their_bytes(record):
                 np.testing.assert_allclose(back, value, rtol=1e-12, atol=1e-8)
             else:
                 np.testing.assert_equal(back, value)
-
-
-def test_text_that_is_not_unicode_is_recorded_as_far_as_it_is():
-    topic = TOPICS["/fault"]
-    assert decode(topic, encode(topic, 0, ("bad_name", "file \udcff")))[1][1] == "file ?"
-
-
-@pytest.mark.parametrize("offset_ns", [0, -1, -3_000_000_001, 10**15])
-def test_a_stamp_is_moved_and_nothing_else(offset_ns):
-    topic, values = TOPICS["/cmd_vel"], ((1.0, 2.0, 3.0), 0.4)
-    data = shifted(encode(topic, 2_000_000_000, values), offset_ns)
-    assert decode(topic, data) == (2_000_000_000 + offset_ns, values)
 
 
 @pytest.mark.parametrize("ros_type", sorted({topic.ros_type for topic in TOPICS.values()}))
@@ -81,9 +71,7 @@ def test_a_definition_stands_on_its_own(ros_type):
     [
         ("# [s]", "# seconds:", True),
         ("float64 delay", "float32 delay", False),
-        ("int64 epoch  # epoch of its session\n", "", False),
         ("int64 epoch", "int64 (", False),
-        ("int64 epoch", "#" * 70_000 + "\nint64 epoch", False),
     ],
 )
 def test_another_layout_is_noticed(old, new, known):

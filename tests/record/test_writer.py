@@ -5,15 +5,13 @@ import sys
 import tracemalloc
 from collections import defaultdict
 
-import pytest
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex
 from mcap_ros2.decoder import DecoderFactory
 
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import CHUNK_NS, McapWriter, _ChunkIndexes
+from cloudrc.record.writer import CHUNK_NS, McapWriter
 from cloudrc.records import GuardChange
 from tests.record.conftest import MS, SECOND, cloud_records, world_records, write
 
@@ -35,8 +33,6 @@ def test_other_programs_read_every_topic(tmp_path):
     assert stamps.keys() == set(TOPICS) - {"/lateness", "/link", "/link_check"}
     for topic, found in stamps.items():
         assert found == recording[topic]["stamp_ns"].tolist()
-    assert summary is not None
-    assert summary.statistics is not None
     assert summary.statistics.message_count == sum(map(len, stamps.values()))
     assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
     assert len(summary.chunk_indexes) >= 6
@@ -52,22 +48,6 @@ def test_log_times_never_fall_on_a_topic(tmp_path):
         times = [message.log_time for _, _, message in make_reader(stream).iter_messages()]
     assert times == [5, 9, 9, 9, 12]
     assert Recording.read(path)["/guard"]["stamp_ns"].tolist() == [5, 9, 7, 8, 12]
-
-
-def test_attachments_and_metadata_come_back(tmp_path):
-    path, report = tmp_path / "a.mcap", b'{"verdict": "success"}'
-    with McapWriter(path, clock="cloud", clock_id="boot-1") as writer:
-        writer.write(cloud_records(3))
-        writer.note({"epoch": "1"})
-        writer.note({"epoch": "2"})
-        writer.attach("report.json", report, "application/json")
-        writer.attach("empty", b"")
-    recording = Recording.read(path)
-    assert recording.complete
-    assert recording.attachments == {"report.json": report, "empty": b""}
-    expected = {"clock": "cloud", "clock_id": "boot-1", "epoch": "2"}
-    assert expected.items() <= recording.metadata.items()
-    assert recording.metadata["version"]
 
 
 def test_an_hour_of_recording_takes_no_memory(tmp_path):
@@ -93,26 +73,8 @@ def test_an_hour_of_recording_takes_no_memory(tmp_path):
 
 
 def run(code):
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
-
-
-@pytest.mark.parametrize("module", ["reader", "merge"])
-def test_a_missing_package_is_named_with_its_remedy(module):
-    code = f"""
-import sys
-from cloudrc.errors import MissingPrerequisiteError
-for name in {NEEDED}:
-    for loaded in [m for m in sys.modules if m.startswith(("cloudrc.record", *{NEEDED}))]:
-        del sys.modules[loaded]
-    sys.modules[name] = None
-    try: import cloudrc.record.{module}
-    except MissingPrerequisiteError as error: print(error.exit_code, error)
-"""
-    for name, text in zip(NEEDED, run(code).splitlines(), strict=True):
-        assert text.startswith(f"3 recording needs the package {name}, which is not installed")
-        assert text.endswith("install it with: pip install 'cloudrc[record]'")
+    words = [sys.executable, "-c", code]
+    return subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
 def test_flying_needs_none_of_them():
@@ -125,21 +87,3 @@ def test_flying_needs_none_of_them():
         "print(len(columns.Recording.from_records([])['/pid']))"
     )
     assert run(code).split() == ["False", "0"]
-
-
-def test_the_chunks_of_a_device_are_listed_too():
-    """A process without --record writes to /dev/null, where every position is 0."""
-    index = ChunkIndex(
-        chunk_length=100,
-        chunk_start_offset=0,
-        compression="zstd",
-        compressed_size=50,
-        message_end_time=2,
-        message_index_length=30,
-        message_index_offsets={1: 0, 2: 150},
-        message_start_time=1,
-        uncompressed_size=80,
-    )
-    chunks = _ChunkIndexes()
-    chunks.append(index)
-    assert list(chunks) == [index]

@@ -1,6 +1,5 @@
 """report.json and environment.json: their names, absent values, and what they never contain."""
 
-import builtins
 import getpass
 import json
 import platform
@@ -10,7 +9,7 @@ import pytest
 
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.record.columns import Recording
-from cloudrc.report.document import Run, clock_offset_document, environment_document, write_json
+from cloudrc.report.document import Run, environment_document
 from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import good, paper
 
@@ -30,11 +29,11 @@ def document(run=RUN, **criteria):
 def test_names_and_values():
     report = document()
     assert set(report) == NAMES
-    assert (report["schemaVersion"], report["verdict"], report["failures"]) == (1, "success", [])
-    assert (report["experiment"], report["mode"], report["seed"]) == ("paper", "virtual", 1)
-    assert (report["shaper"], report["complete"], report["notes"]) == ("virtual", True, [])
+    expected = {"schemaVersion": 1, "verdict": "success", "experiment": "paper", "seed": 1}
+    expected |= {"mode": "virtual", "shaper": "virtual", "failures": []}
+    assert expected.items() <= report.items()
+    assert (report["complete"], report["notes"]) == (True, [])
     assert all(set(number) == {"value", "unit"} for number in report["numbers"].values())
-    assert json.dumps(report) == json.dumps(document())
     # What is unknown is absent.
     assert "real_time_factor" not in report["numbers"]
     assert set(document(Run("virtual", "virtual"))) == NAMES - {"records_sha256"}
@@ -49,25 +48,6 @@ def test_failures_say_code_text_time_and_place():
     assert "the operator's verdict is success. This report's counts." in report["notes"][-1]
 
 
-@pytest.mark.parametrize(
-    ("metadata", "expected"),
-    [
-        (
-            {"clock_offset_method": "packets", "clock_offset_uncertainty_ns": "1500000"},
-            {"method": "packets", "uncertainty": {"value": pytest.approx(0.0015), "unit": "s"}},
-        ),
-        ({"clock_offset_method": "same clock"}, None),
-    ],
-)
-def test_a_clock_offset_has_its_uncertainty(metadata, expected):
-    assert clock_offset_document(metadata) == expected
-
-
-def test_numbers_that_are_not_finite_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="JSON compliant"):
-        write_json(tmp_path / "report.json", {"value": float("nan")})
-
-
 def test_the_environment_names_software_but_no_user_or_host():
     environment = environment_document()
     assert environment["packages"]["numpy"]
@@ -77,16 +57,9 @@ def test_the_environment_names_software_but_no_user_or_host():
 
 
 def test_without_matplotlib_the_numbers_are_written(tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def refuse(name, *args):
-        if name.partition(".")[0] == "matplotlib":
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-        return real(name, *args)
-
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     for name in [n for n in sys.modules if n.startswith("cloudrc.report.figures")]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr(builtins, "__import__", refuse)
     with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[report\]"):
         write_report(tmp_path, Recording.from_records(*good().ends()), paper()[0], RUN)
     assert json.loads((tmp_path / "report.json").read_text())["schemaVersion"] == 1

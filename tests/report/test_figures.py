@@ -4,10 +4,9 @@ import matplotlib
 import pytest
 
 from cloudrc.config.schema import Direction
-from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, draw_all
 from cloudrc.report.figures.style import RC, Subject
-from tests.metrics.conftest import ONE_PIPE, START, at, flown
+from tests.metrics.conftest import ONE_PIPE, START, flown
 
 CALM = Direction(delay_ms=50.0)
 
@@ -27,18 +26,6 @@ def test_a_flight_without_data_is_drawn(name, end_ns):
     with matplotlib.rc_context(RC):
         draw(subject).draw_without_rendering()
     assert caption(subject)
-
-
-def test_waypoints_are_the_first_setpoints_of_each():
-    log = flown()
-
-    def fly_to(n, control):
-        waypoint = -1 if control.stamp_ns < at(1) else 0 if control.stamp_ns < at(4) else 1
-        return control._replace(waypoint=waypoint, setpoint=(float(n), 2.0, 3.0))
-
-    log.change(Control, fly_to)
-    # 25 periods a second; the log starts one second before the mission.
-    assert subject_of(log).waypoints == {0: (50.0, 2.0, 3.0), 1: (125.0, 2.0, 3.0)}
 
 
 def test_figures_ignore_the_users_matplotlib_settings(monkeypatch):

@@ -4,14 +4,11 @@ import json
 import re
 import shutil
 from pathlib import Path
-from random import Random
 
 import pytest
-from mcap.writer import CompressionType
 
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump
-from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.reader import recover
 from cloudrc.record.writer import McapWriter
@@ -53,36 +50,12 @@ def test_a_run_gives_the_same_report_again(run):
     assert write_report(run, *read_run(run), page=False) == first
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"compression": CompressionType.LZ4},
-        {"shuffle": lambda messages: Random(1).shuffle(messages)},
-        {"use_chunking": False, "use_statistics": False},
-    ],
-    ids=["lz4", "shuffled", "bare"],
-)
-def test_another_layout_gives_the_same_report(run, options):
-    first, recording = report(run), run / "mission.mcap"
-    rewrite(recording, run / "n.mcap", **options).replace(recording)
-    again = write_report(run, *read_run(run), page=False)
-    sorted_ = "The recording was not in order of time: "
-    assert again["notes"] == [] or again["notes"][0].startswith(sorted_)
-    assert again | {"notes": []} == first
-
-
 def filtered(**options):
     return lambda source, target: rewrite(source, target, **options)
 
 
 def cut(source, target):
     target.write_bytes(source.read_bytes()[: source.stat().st_size // 2])
-
-
-def damaged(source, target):
-    data = bytearray(source.read_bytes())
-    data[data.index(b"zstd") + 1000] ^= 255
-    target.write_bytes(data)
 
 
 def recovered_and_filtered(source, target):
@@ -112,12 +85,9 @@ OTHER = b"seed: 2\nmission: pipes\n"
             filtered(keep=lambda c, m: c.topic in ("/odometry", "/cmd_vel")),
             "it holds 0 of 401 on /telemetry, .* and 12 more",
         ),
-        (filtered(keep=lambda c, m: m.log_time < at(5)), "it holds"),
         (filtered(rename=lambda topic: f"/r1{topic}"), "does not record: /r1/cmd_vel, "),
-        (filtered(metadata=False), "the metadata of cloudrc, which names the clock, is not there"),
         (cut, "cut short: .* but report.json is of the whole recording"),
         (recovered_and_filtered, "messages were removed or added: it holds 0 of [0-9]+ on /tele"),
-        (damaged, "damaged: a checksum is wrong"),
         (recorded(more=40), "on /ground_truth that are not later than the row before"),
         (recorded(config=OTHER), "is the recording of an experiment with other values for: "),
         (lambda source, target: target.write_bytes(b"PK"), "is not an MCAP file"),
@@ -176,10 +146,3 @@ def test_the_ends_are_merged_if_nobody_has(run):
         what(run / "mission.mcap")
         assert write_report(run, *read_run(run), page=False)["numbers"] == first
         assert Recording.read(run / "mission.mcap").complete
-
-
-@pytest.mark.parametrize("name", ["config.yaml", "mission.mcap"])
-def test_a_folder_without_a_run_is_refused(run, name):
-    (run / name).unlink()
-    with pytest.raises(BadInputError, match=f"has no {name}"):
-        read_run(run)

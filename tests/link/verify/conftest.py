@@ -1,104 +1,19 @@
-"""Links in virtual time: probes and flights over the model, or over netem as the kernel draws.
+"""Links in virtual time: probes and flights over the model, or what netem makes of it."""
 
-Source: Linux, net/sched/sch_netem.c: get_crandom, tabledist, loss_gilb_ell, netem_enqueue.
-"""
-
-import random
 from dataclasses import replace
 
 import numpy as np
 
 from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
-from cloudrc.errors import BadInputError
-from cloudrc.link.model import LinkDirection, Stream
-from cloudrc.link.netem import check, stretch, table
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.profile import DirectionProfile, GilbertElliott
 from cloudrc.link.verify.causes import Findings
-from cloudrc.link.verify.judge import Flow
+from cloudrc.link.verify.judge import Flow, netem_makes
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from cloudrc.records import Arrival, Fault, LinkChecked
 from cloudrc.tunnel.codec import SIZES, Kind
-
-_WORDS, _ONE = 1 << 32, 8192
-_HEADERS = 28
-_IN_ORDER = 100e9
-
-
-class VirtualNetem:
-    """Shape one direction as `sch_netem.c` does; used like `LinkDirection`."""
-
-    def __init__(self, profile, seed):
-        check(profile)
-        self._profile, self._timeline = profile, Timeline(profile)
-        self._chance = random.Random(seed)
-        self._rho = round(profile.correlation * (_WORDS - 1))
-        self._last_draw = self._chance.getrandbits(32)
-        self._bad = False
-        self._last_ns = 0
-        distribution = profile.distribution
-        self._table = None if distribution == "table" else table(distribution)
-
-    def send(self, epoch, kind, counter, size, now_ns):
-        """Return when the copies of a packet arrive [ns]."""
-        now = self._timeline.at(now_ns)
-        return [at_ns for at_ns in self._enqueue(now, size, now_ns, copies=True) if at_ns >= 0]
-
-    def _enqueue(self, now, size, now_ns, copies):
-        profile, count, found = self._profile, 1, list[int]()
-        if copies and self._chance.random() < profile.duplicate:
-            count += 1
-        if self._loses(now):
-            count -= 1
-        if count == 0:
-            return []
-        if count > 1:  # the copy goes through all of it once more
-            found += self._enqueue(now, size, now_ns, copies=False)
-        damaged = self._chance.random() < profile.corrupt
-        if profile.reorder and not profile.keep_order and self._chance.random() < profile.reorder:
-            return [*found, -1 if damaged else now_ns]
-        at_ns = now_ns + self._delay_ns(now)
-        rate = now.rate or (_IN_ORDER if profile.keep_order else None)
-        if rate is not None:
-            at_ns = max(at_ns, now_ns, self._last_ns) + round((size + _HEADERS) * 8e9 / rate)
-            self._last_ns = at_ns
-        return [*found, -1 if damaged else max(now_ns, at_ns)]
-
-    def _loses(self, now):
-        loss = 1.0 if now.blackout else now.loss
-        if not isinstance(loss, GilbertElliott):
-            return self._chance.random() < loss
-        share = loss.loss_bad if self._bad else loss.loss_good
-        if self._chance.random() < (loss.bad_end if self._bad else loss.bad_start):
-            self._bad = not self._bad
-        return self._chance.random() < share
-
-    def _delay_ns(self, now):
-        if not now.jitter:
-            return now.delay_ns
-        drawn = self._draw()
-        assert self._table is not None
-        sigma = now.jitter * stretch(self._profile) * 1e9
-        return round(now.delay_ns + sigma * self._table[drawn % len(self._table)] / _ONE)
-
-    def _draw(self):
-        """Draw a number of which only the high bits are correlated."""
-        drawn = self._chance.getrandbits(32)
-        if self._rho:
-            rho = self._rho + 1
-            drawn = (drawn * (_WORDS - rho) + self._last_draw * rho) >> 32
-            self._last_draw = drawn
-        return drawn
-
-
-def can(profile):
-    """Whether netem can do it at all."""
-    try:
-        check(profile)
-    except BadInputError:
-        return False
-    return True
 
 
 def asked(name, way):
@@ -112,28 +27,20 @@ OVERHEAD = 8e-5
 """Delay that a good relay and the network stack add [s]."""
 
 
-def rows_of(profile, real, *, stall=0.0, seconds=None):
-    """Probe a link; a relay without CPU delays 30 % of the probes by up to `stall` [s]."""
-    netem = isinstance(real, VirtualNetem)
-    plan = plan_probes(
-        profile, Flow(SEED, True, PROBE, SIZES[Kind.TELEMETRY]), seconds, drawn=netem
-    )
-    stream = meet(plan, real)
+def rows_of(profile, real, *, stall=0.0, seconds=None, netem=False):
+    """Probe a link; a relay without CPU delays 30 % of the probes by up to `stall` [s].
+
+    A relay draws by the experiment's seed, the kernel (`netem`) by none that is known.
+    """
+    flow = Flow(SEED, True, PROBE, SIZES[Kind.TELEMETRY])
+    plan = plan_probes(profile, flow, seconds, drawn=netem)
+    link = replace(plan, profile=real)
+    if netem:
+        link = replace(link, profile=netem_makes(real), flow=flow._replace(seed=2))
+    stream = link.draw(plan.sent)
     rng = np.random.default_rng(SEED)
     late = stall * rng.random(len(stream.sent)) * (rng.random(len(stream.sent)) < 0.3)
-    stream = replace(stream, delays=stream.delays + OVERHEAD + late)
-    return plan.judge(stream)
-
-
-def meet(plan, real):
-    """Return what a link does to the datagrams of a plan."""
-    if not isinstance(real, VirtualNetem):
-        return replace(plan, profile=real).draw(plan.sent)
-    sent_ns = np.rint(plan.sent * 1e9).astype(np.int64).tolist()
-    fates = [real.send(1, PROBE, n, plan.flow.size, at_ns) for n, at_ns in enumerate(sent_ns)]
-    pairs = zip(fates, sent_ns, strict=True)
-    delays = [(min(fate) - at_ns) * 1e-9 if fate else np.nan for fate, at_ns in pairs]
-    return Stream(plan.sent, np.array(delays), np.array([len(fate) for fate in fates]))
+    return plan.judge(replace(stream, delays=stream.delays + OVERHEAD + late))
 
 
 def verify(profile, up, down, known):
@@ -142,19 +49,17 @@ def verify(profile, up, down, known):
     return {way: Findings(rows_of(profile, one), known) for way, one in ways.items()}
 
 
-def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False, netem=False):
+def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False):
     """Return what cloud (`uplink`) or world notes of a flight of some seconds.
 
     The ends add `overhead` [s]; NaN: they share no clock. The experiment's seed is 1.
     """
-    model = LinkDirection(profile, seed, uplink=uplink)
-    link = VirtualNetem(profile, seed) if netem else model
-    kind, size, found = KINDS[uplink], SIZES[KINDS[uplink]], []
+    link, found = LinkDirection(profile, seed, uplink=uplink), []
+    kind, whole = KINDS[uplink], bytes(SIZES[KINDS[uplink]])
     for n in range(round(seconds * 100)):
         sent_ns = n * PERIOD_NS
-        fate = link.send(1, kind, n, size, sent_ns)
-        whole = bytes(size)
-        if link is model and model.corrupts and model.corrupted(1, kind, n, whole) != whole:
+        fate = link.send(1, kind, n, len(whole), sent_ns)
+        if link.corrupts and link.corrupted(1, kind, n, whole) != whole:
             continue
         for at_ns in fate:
             delay = (at_ns - sent_ns) * 1e-9 + overhead

@@ -1,31 +1,22 @@
 """Which links are believed, which are not and why: whole links in virtual time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from cloudrc.config.shipped import names
-from cloudrc.link.netem import check
-from cloudrc.link.profile import DirectionProfile, GilbertElliott
+from cloudrc.link.profile import DirectionProfile, GilbertElliott, mean_loss
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
-from cloudrc.link.verify.judge import Flow, look_twice, netem_makes, verdict_of
-from cloudrc.link.verify.probe import PROBE, plan_probes
-from cloudrc.tunnel.codec import SIZES, Kind
+from cloudrc.link.verify.judge import look_twice, netem_makes, verdict_of
 from tests.link.verify.conftest import (
-    VirtualNetem,
     asked,
-    can,
-    meet,
     random_profile,
     rows_of,
     verify,
 )
 
 PAPER = asked("paper-p2", "uplink")
-HANDOVER = asked("handover", "uplink")
 LOSING = DirectionProfile(0.045, 0.025, loss=0.05)
 NARROW = DirectionProfile(0.020, 0.002, rate=2e6, queue_packets=200, keep_order=True)
 NOTHING = DirectionProfile()
@@ -51,7 +42,7 @@ def netem(**facts):
 
 
 # Requested, found on the uplink, found on the downlink, reported by the machine.
-FAULTS: dict[str, tuple[DirectionProfile, DirectionProfile, DirectionProfile, Evidence]] = {
+FAULTS = {
     "no_qdisc": (PAPER, NOTHING, NOTHING, Evidence("none", interface="eth0")),
     "wrong_interface": (PAPER, NOTHING, NOTHING, Evidence("none", elsewhere=("eth1",))),
     "doubled_delay": (PAPER, *[replace(PAPER, delay=0.090)] * 2, netem()),
@@ -80,22 +71,9 @@ def test_a_seeded_fault_is_named(fault, figure):
 
 OFF = {
     "slower": (PAPER, {"delay": 1.06 * PAPER.delay}, "mean"),
-    "quicker": (PAPER, {"delay": 0.94 * PAPER.delay}, "mean"),
-    "more jitter": (PAPER, {"jitter": 1.1 * PAPER.jitter}, "deviation"),
     "less jitter": (PAPER, {"jitter": 0.9 * PAPER.jitter}, "deviation"),
-    "lossy": (PAPER, {"loss": 0.03}, "loss"),
     "damaged": (PAPER, {"corrupt": 0.05}, "loss"),
     "other jitter": (PAPER, {"distribution": "normal", "jitter": 0.0144}, "distribution"),
-    "more bursts": (
-        asked("lossy", "uplink"),
-        {"loss": GilbertElliott(0.02, 0.1, 0.6, 0.005, 0.04)},
-        "deviation",
-    ),
-    "another time line": (
-        HANDOVER,
-        {"changes": tuple(replace(one, delay=0.01 + (one.delay or 0)) for one in HANDOVER.changes)},
-        "mean",
-    ),
     "faster": (NARROW, {"rate": 2.6e6}, "rate"),
 }
 
@@ -106,73 +84,23 @@ def test_a_link_beyond_its_tolerance_is_off(name):
     assert (quantity, "off") in doubts(rows_of(profile, replace(profile, **values)))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[] if name == "paper-p2" else pytest.mark.full)
-        for name in names("profile")
-    ],
-)
-def test_an_honest_netem_is_believed(name):
-    for way in ("uplink", "downlink"):
-        profile = asked(name, way)
-        if can(profile):
-            assert doubts(rows_of(profile, VirtualNetem(profile, 7))) == []
-
-
-@pytest.mark.parametrize(
-    "loss", [0.2, GilbertElliott(0.02, 0.2, 0.9, 0.1)], ids=["independent", "in bursts"]
-)
-def test_an_honest_netem_loses_either_a_packet_or_its_copy(loss):
-    profile = DirectionProfile(0.045, loss=loss, duplicate=0.3)
-    rows = rows_of(profile, VirtualNetem(profile, 7), seconds=120.0)
-    assert doubts(rows) == []
-    for row in rows:
-        if row.name in ("loss", "duplicated"):
-            assert row.asked == pytest.approx(row.measured, abs=0.03)
-
-
-@pytest.mark.parametrize(
-    ("values", "quantity"),
-    [({"delay": 0.09}, "mean"), ({"jitter": 0.026}, "deviation"), ({"loss": 0.05}, "loss")],
-)
-def test_a_wrong_netem_is_off(values, quantity):
+def test_netem_is_believed_unless_it_delays_twice_as_long():
     profile = DirectionProfile(0.08, 0.02, correlation=0.9)
-    rows = rows_of(profile, VirtualNetem(replace(profile, **values), 7))
-    assert (quantity, "off") in doubts(rows)
+    assert doubts(rows_of(profile, profile, netem=True)) == []
+    assert ("mean", "off") in doubts(rows_of(profile, replace(profile, delay=0.16), netem=True))
 
 
-@pytest.mark.parametrize(
-    "profile",
-    [
-        DirectionProfile(0.08, 0.02, correlation=0.9),
-        DirectionProfile(0.08, 0.02, "pareto", 0.5, keep_order=True),
-        DirectionProfile(0.045, 0.0, loss=0.1, corrupt=0.1),
-        DirectionProfile(0.045, 0.0, loss=0.2, duplicate=0.3),
-    ],
-)
-def test_the_model_does_what_the_kernel_does(profile):
-    check(profile)
-    plan = plan_probes(profile, Flow(1, True, PROBE, SIZES[Kind.TELEMETRY]), 300.0)
-    made = replace(plan, profile=netem_makes(profile))
-    ours, theirs = (
-        plan.quantities(one, np.zeros(0))
-        for one in (made.draw(plan.sent), meet(plan, VirtualNetem(profile, 7)))
-    )
-    for name, value in theirs.items():
-        assert ours[name] == pytest.approx(value, rel=0.05, abs=0.015), name
+@pytest.mark.parametrize("loss", [0.2, GilbertElliott(0.1, 0.4, 0.8, 0.05)])
+def test_netem_loses_either_a_packet_or_its_copy(loss):
+    """Beside a duplicate a loss leaves one packet; a copy can be lost, too.
 
-
-def test_a_draw_of_the_model_is_predicted_exactly():
-    profile = replace(asked("lossy", "uplink"), duplicate=0.1, corrupt=0.1)
-    plan = plan_probes(profile, Flow(1, True, PROBE, SIZES[Kind.TELEMETRY]))
-    first, again = plan.draw(plan.sent), plan.draw(plan.sent[500:], 1, 500)
-    assert np.array_equal(first.delays[500:], again.delays, equal_nan=True)
-    assert plan.expected(first).known
-    assert not plan.expected(replace(plan, flow=plan.flow._replace(seed=2)).draw(plan.sent)).known
-
-
-STARVED = Evidence("relay", starved="500 datagrams not read in time")
+    Source: Linux, net/sched/sch_netem.c: netem_enqueue; get_crandom for the correlation.
+    """
+    lost = mean_loss(loss)
+    made = netem_makes(DirectionProfile(0.08, 0.02, correlation=0.9, loss=loss, duplicate=0.3))
+    assert (lost, made.correlation) == (pytest.approx(0.2), 0.0)
+    assert mean_loss(made.loss) == pytest.approx(0.7 * lost)
+    assert made.duplicate * (1 - 0.7 * lost) == pytest.approx(0.3 * (1 - lost) ** 2)
 
 
 @pytest.mark.parametrize(
@@ -184,10 +112,10 @@ STARVED = Evidence("relay", starved="500 datagrams not read in time")
     ],
 )
 def test_a_lack_of_cpu_is_named_beside_other_faults(real, causes):
-    """It is not named where nothing is slower than requested."""
+    known = Evidence("relay", starved="500 datagrams not read in time")
     stall = 0.0 if "keep_order" in real else 0.04
     rows = rows_of(PAPER, replace(PAPER, **real), stall=stall)
-    assert [one.code for one in find_causes({"uplink": Findings(rows, STARVED)})] == causes
+    assert [one.code for one in find_causes({"uplink": Findings(rows, known)})] == causes
 
 
 SLOW = replace(PAPER, delay=0.090)
@@ -196,10 +124,8 @@ SLOW = replace(PAPER, delay=0.090)
 @pytest.mark.parametrize(
     ("up", "down", "known", "causes"),
     [
-        (PAPER, PAPER, netem(), []),
         (PAPER, replace(PAPER, loss=0.2), netem(), [("more_loss", "downlink")]),
         (SLOW, SLOW, netem(), [("doubled_delay", "both")]),
-        (SLOW, PAPER, netem(), [("doubled_delay", "uplink")]),
         (NOTHING, PAPER, netem(restored=1), [("no_qdisc", "uplink")]),
         (*[replace(PAPER, loss=1.0)] * 2, Evidence(), [("nothing_arrives", "both")]),
     ],

@@ -1,39 +1,9 @@
 """What shapers and kernels report of themselves, read back: state, metrics, qdiscs."""
 
-import pytest
-
-from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Near, Told
-from cloudrc.link.verify.causes import Evidence, Findings, find_causes, read_evidence, read_metrics
-from cloudrc.link.verify.judge import Row
+from cloudrc.link.verify.causes import Evidence, read_evidence, read_metrics
 
 NETEM = {"kind": "netem", "handle": "7401:", "packets": 85, "drops": 15}
-DOUBLED = Row("mean", "s", 0.045, 0.09, 0.043, 0.047, "off")
-
-
-@pytest.mark.parametrize(
-    ("shaper", "leaves", "netems", "code"),
-    [
-        ("netem", "eth1", {"eth0": [NETEM]}, "wrong_interface"),
-        ("netem", "eth0", {}, "no_qdisc"),
-        ("netem", "eth0", {"eth0": [NETEM, NETEM]}, "shaped_twice"),
-        ("relay", "eth0", {"eth0": [NETEM]}, "shaped_twice"),
-        ("relay", "eth0", {"lo": [NETEM]}, "shaped_twice"),
-        ("relay", "eth0", {"eth1": [NETEM]}, "doubled_delay"),
-        ("netem", "eth0", {"eth0": [NETEM], "lo": [NETEM]}, "doubled_delay"),
-    ],
-)
-def test_qdiscs_on_the_way_of_the_flow_are_the_cause(shaper, leaves, netems, code):
-    told = Told(shaper, "", DirectionProfile(0.045), Near(leaves, netems))
-    (cause,) = find_causes({"uplink": Findings([DOUBLED], read_evidence(told, {}))})
-    assert cause.code == code
-
-
-def test_without_tools_nothing_is_claimed():
-    told = Told("relay", "link.mode=relay", None)
-    assert read_evidence(told, {}, 5) == Evidence("relay", "link.mode=relay", sent=5)
-
-
 METRICS = """
 cloudrc_link_release_error_seconds{percentile="99"} 0.0021
 cloudrc_link_datagrams_total{outcome="received"} 500
@@ -45,7 +15,7 @@ cloudrc_link_restored_total 2
 
 
 def test_metrics_report_lateness_counts_and_stops():
-    told, found = Told("relay", "", None), read_metrics(METRICS)
+    told, found = Told("relay", "link.mode=relay", None), read_metrics(METRICS)
     known = read_evidence(told, found, 600)
     assert (known.passed, known.sent, known.restored) == (503, 600, 2)
     assert known.starved == (
@@ -53,8 +23,7 @@ def test_metrics_report_lateness_counts_and_stops():
         " periods"
     )
     assert read_evidence(told, found).passed is None, "since its start"
-
-
-def test_netem_is_counted_by_the_kernel():
-    told = Told("netem", "", None, Near("eth0", {"eth0": [NETEM]}))
-    assert read_evidence(told, {}, 100).passed == 100
+    nothing = Evidence("relay", "link.mode=relay", sent=5)
+    assert read_evidence(told, {}, 5) == nothing, "without tools nothing is claimed"
+    netem = Told("netem", "", None, Near("eth0", {"eth0": [NETEM]}))
+    assert read_evidence(netem, {}, 100).passed == 100, "counted by the kernel"

@@ -1,25 +1,23 @@
 """The monitor in flight: by the tunnel's own datagrams, drawn here without any flight."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import replace
-from math import isnan, nan
-from typing import Any
+from math import nan
+from unittest.mock import Mock
 
 import pytest
 
 from cloudrc.config.shipped import names
-from cloudrc.link.profile import DirectionProfile, Trace
+from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import STATE_MAX
+from cloudrc.link.verify.judge import netem_makes
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 from tests.link.verify.conftest import (
     PERIOD_NS,
     arrivals,
     asked,
-    can,
     checked,
     hearing,
     is_believed,
@@ -29,19 +27,14 @@ PAPER, P1 = asked("paper-p2", "downlink"), asked("paper-p1", "downlink")
 ZERO = (0.0, 0.0, 0.0)
 
 
-RELAYS = [pytest.param(name, False, id=f"{name}-relay") for name in names("profile")]
-NETEMS = [
-    pytest.param(name, True, id=f"{name}-netem", marks=[] if name == "lte" else pytest.mark.full)
-    for name in names("profile")
-    if can(asked(name, "uplink"))
-]
-
-
-@pytest.mark.parametrize(("name", "netem"), RELAYS + NETEMS)
+@pytest.mark.parametrize(
+    ("name", "netem"), [*((name, False) for name in names("profile")), ("lte", True)]
+)
 def test_an_honest_link_is_believed_and_never_faulted(name, netem):
     profile = asked(name, "uplink")
     seconds = 60.0 if netem or name == "handover" else 15.0
-    heard = arrivals(profile, seconds, seed=3 if netem else 1, uplink=True, netem=netem)
+    made, seed = (netem_makes(profile), 3) if netem else (profile, 1)
+    heard = arrivals(made, seconds, seed=seed, uplink=True)
     moments, faults = checked(hearing(profile, PAPER, uplink=True), heard)
     assert faults == []
     assert is_believed(moments[-1]), moments[-1]
@@ -59,18 +52,22 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("overhead", [5e-4, nan], ids=["one clock", "two clocks"])
 @pytest.mark.parametrize("quantity", FAULTS)
-def test_a_wrong_link_is_a_fault_after_a_second_look(quantity, overhead):
-    moments, faults = checked(hearing(PAPER, PAPER), arrivals(FAULTS[quantity], overhead=overhead))
-    if isnan(overhead) and quantity in ("mean", "deviation"):
-        assert quantity not in moments[-1], "nobody knows one-way delays"
-        return
+def test_a_wrong_link_is_a_fault_after_a_second_look(quantity):
+    moments, faults = checked(hearing(PAPER, PAPER), arrivals(FAULTS[quantity]))
     verdicts = [one[quantity].verdict for one in moments if quantity in one]
     assert verdicts[0] == "open", "not said before it was looked at again"
     assert verdicts[-1] == "off"
     assert [fault.code for fault in faults] == ["link"], "told once"
     assert faults[0].text.startswith("the downlink is not what was asked for: ")
+
+
+def test_without_a_common_clock_one_way_delays_are_not_judged():
+    heard = arrivals(replace(FAULTS["mean"], loss=0.1), overhead=nan)
+    moments, faults = checked(hearing(PAPER, PAPER), heard)
+    assert moments[-1]["loss"].verdict == "off"
+    assert not {"mean", "deviation"} & moments[-1].keys()
+    assert len(faults) == 1
 
 
 def test_a_new_session_starts_undecided():
@@ -84,47 +81,15 @@ def test_a_new_session_starts_undecided():
     assert (row.quantity, row.verdict) == ("loss", "open")
 
 
-def test_one_bad_window_is_no_fault():
-    dead = range(300, 700)
-    heard = [one for one in arrivals(PAPER, 40.0) if one.counter not in dead]
-    moments, faults = checked(hearing(PAPER, PAPER), heard)
-    assert faults == []
-    assert is_believed(moments[-1])
-
-
 def test_ends_that_wake_late_are_not_the_links_fault():
     slow = arrivals(replace(PAPER, delay=PAPER.delay + 0.0045))
     assert checked(hearing(PAPER, PAPER), slow)[1], "of punctual ends it is"
-    heard: list[Record] = []
+    heard = []
     for arrival in slow:
         heard += [arrival, Lateness(arrival.stamp_ns, "world", 0.002, 0.0002, 0)]
     moments, faults = checked(hearing(PAPER, PAPER), heard)
     assert faults == []
     assert moments[-1]["mean"].verdict == "open"
-
-
-def test_one_long_stall_of_an_end_is_not_the_links_fault():
-    heard: list[Record] = []
-    begin_ns, end_ns = 20_000_000_000, 20_500_000_000
-    for arrival in arrivals(P1, 32.0):
-        late_ns = end_ns - arrival.stamp_ns if begin_ns < arrival.stamp_ns < end_ns else 0
-        stamp_ns = arrival.stamp_ns + late_ns
-        heard.append(arrival._replace(stamp_ns=stamp_ns, delay=arrival.delay + late_ns * 1e-9))
-        if not late_ns:
-            late = 0.5 if 0 < stamp_ns - end_ns < 11_000_000 else 1e-4
-            heard.append(Lateness(stamp_ns, "world", late, 1e-4, 0))
-    assert checked(hearing(P1, P1), heard)[1] == []
-
-
-def test_order_survives_that_an_end_reads_several_datagrams_at_once():
-    period_ns = 15_000_000
-    heard = [
-        one._replace(stamp_ns=late_ns, delay=one.delay + (late_ns - one.stamp_ns) * 1e-9)
-        for one in arrivals(PAPER, 20.0)
-        for late_ns in [-(-one.stamp_ns // period_ns) * period_ns]
-    ]
-    moments, _ = checked(hearing(PAPER, PAPER), heard)
-    assert moments[-1]["reordered"].verdict == "ok"
 
 
 def control(stamp_ns, rtt):
@@ -137,7 +102,7 @@ def control(stamp_ns, rtt):
 @pytest.mark.parametrize(("slower", "verdict"), [(0.001, "ok"), (0.030, "off")])
 def test_cloud_judges_round_trips_without_a_common_clock(slower, verdict):
     up, down = DirectionProfile(0.040), DirectionProfile(0.080)
-    heard: list[Record] = []
+    heard = []
     for arrival in arrivals(up, overhead=nan, uplink=True):
         heard += [arrival, control(arrival.stamp_ns, 0.120 + slower + arrival.counter * 1e-9)]
     moments, _ = checked(hearing(up, down, uplink=True), heard)
@@ -145,41 +110,18 @@ def test_cloud_judges_round_trips_without_a_common_clock(slower, verdict):
     assert (trip.asked, trip.verdict) == (pytest.approx(0.120, abs=1e-4), verdict)
 
 
-def test_a_new_profile_is_judged_from_then_on():
-    monitor, slow = hearing(PAPER, PAPER), replace(PAPER, delay=0.120)
-    assert checked(monitor, arrivals(PAPER, 20.0))[1] == []
-    monitor.follow((slow, slow))
-    later = [
-        one._replace(stamp_ns=one.stamp_ns + 20_000_000_000, counter=one.counter + 2000)
-        for one in arrivals(slow, 20.0, seed=2)
-    ]
-    moments, faults = checked(monitor, later)
-    assert faults == []
-    assert moments[-1]["mean"].asked == pytest.approx(0.120, abs=1e-3)
-
-
-def test_a_time_line_that_loops_is_not_judged_after_an_hour_either():
-    looping = replace(PAPER, trace=Trace((0.0, 1.0), (0.040, 0.120), loop=True))
-    monitor = hearing(looping, looping)
-    hour = [one._replace(stamp_ns=one.stamp_ns + 3_700_000_000_000) for one in arrivals(PAPER)]
-    moments, faults = checked(monitor, [*arrivals(PAPER, 1.0), *hour])
-    assert faults == []
-    assert moments
-    assert set(moments[-1]) == {"time_line"}
-    assert moments[-1]["time_line"].measured == 1.0, "so that nobody waits for a verdict"
-
-
-@pytest.mark.parametrize("gap", [20_000, 10**6, 10**18])
-def test_a_counter_that_jumps_costs_no_memory(gap):
+def test_a_counter_that_jumps_costs_no_memory():
     heard = [
-        Arrival(n * PERIOD_NS, False, 1, n + gap * (n >= 1500), 0.070, True) for n in range(3000)
+        Arrival(n * PERIOD_NS, False, 1, n + 10**18 * (n >= 1500), 0.070, True) for n in range(3000)
     ]
     moments, _ = checked(hearing(*[DirectionProfile(0.070)] * 2), heard)
     assert is_believed(moments[-1]), "only what came after the jump counts"
 
 
-def run(monitor, records):
+def threaded(records):
     """Pass records to a monitor with a thread; return what it says first."""
+    monitor = hearing(PAPER, PAPER)
+    monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
     told, deadline = list[Record](), time.monotonic() + 20.0
     for one in records:
         told += monitor.after([one], one.stamp_ns)
@@ -190,7 +132,7 @@ def run(monitor, records):
 
 
 def state(profile):
-    found: dict[str, Any] = dict.fromkeys(("reason", "mode", "direction", "since"), "")
+    found = dict.fromkeys(("reason", "mode", "direction", "since"), "")
     return json.dumps(found | {"shaper": "relay", "since_ns": 0, "profile": profile})
 
 
@@ -213,22 +155,10 @@ def test_the_state_file_is_followed_past_nonsense(tmp_path):
     assert checked(monitor, arrivals(FAULTS["mean"], 20.0)) == ([], []), "nothing is known"
 
 
-def test_a_failure_is_told_once_and_the_monitor_goes_on(monkeypatch):
-    def fails(self):
-        raise MemoryError("no\nroom")
-
-    monkeypatch.setattr(LinkMonitor, "_rows", fails)
-    monitor = hearing(PAPER, PAPER)
-    monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
-    told = run(monitor, arrivals(PAPER, 20.0))
-    text = "the monitor of the link failed (MemoryError: no room); it goes on"
-    assert [(one.code, one.text) for one in told if isinstance(one, Fault)] == [
-        ("link_check", text)
-    ]
-
-
-def test_the_thread_judges_like_the_loop():
-    monitor = hearing(PAPER, PAPER)
-    monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
-    told = run(monitor, arrivals(PAPER, 12.0))
+def test_the_thread_judges_like_the_loop_and_survives_a_failure(monkeypatch):
+    told = threaded(arrivals(PAPER, 12.0))
     assert {one.verdict for one in told if isinstance(one, LinkChecked)} == {"ok"}
+    monkeypatch.setattr(LinkMonitor, "_rows", Mock(side_effect=MemoryError("no\nroom")))
+    text = "the monitor of the link failed (MemoryError: no room); it goes on"
+    faults = [one for one in threaded(arrivals(PAPER, 20.0)) if isinstance(one, Fault)]
+    assert [(one.code, one.text) for one in faults] == [("link_check", text)]
