@@ -121,7 +121,7 @@ def serve_api(
     criteria = experiment.criteria
     plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
     order = partial(
-        read_order, scene=scene, time_limit=criteria.time_limit_s, contact=criteria.contact,
+        read_order, scene=scene, time_limit=criteria.time_limit_s, contact=bool(criteria.contact),
         plan=plan,
     )  # fmt: skip
     goto = partial(read_goto, scene=scene)
@@ -246,7 +246,7 @@ def _start(
     if any(each.order.plan == plan for each in service.book.open()):
         return True  # a previous process started this mission: it resumes
     try:
-        order = Order(plan, experiment.name, contact=criteria.contact)
+        order = Order(plan, experiment.name, contact=bool(criteria.contact))
         service.create(order, time.monotonic_ns())
     except ConflictError as error:
         if not options.api:

@@ -43,6 +43,7 @@ from cloudrc.config.schema import (
     PlugIn,
     Profile,
     Speed,
+    World,
 )
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
@@ -136,7 +137,7 @@ def load_experiment(
         _remove_profile_values(document)
     outer = {path: value for path, value in changes.items() if path not in inner}
     overrides.apply_overrides(document, outer)
-    for key in ("world", "guard", "link", "cloud", "report"):
+    for key in ("world", "guard", "link", "cloud", "criteria", "report"):
         _default(document, (key,), {})
     found: list[Problem] = []
     with _collect(found, ("mission",)):
@@ -148,6 +149,7 @@ def load_experiment(
         _default(document, ("cloud", key), getattr(Cloud(), key))
     found += overrides.resolve_plugins(document, build=build)
     found += _resolve_traces(document, ("link",)) + _resolve_files(document)
+    _default_contact(document)
     experiment = _validate(document, ResolvedExperiment, name, found)
     wrong = check_mission(experiment.mission, load_scene(experiment.world.scene))
     below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
@@ -313,6 +315,15 @@ def _resolve_files(document: Document) -> list[Problem]:
             source = document.source(("report", "metrics", str(index)))
             names[index] = str(source.absolute(name))
     return found
+
+
+def _default_contact(document: Document) -> None:
+    """Require contact if the scene has a board and the mission is not one of random steps."""
+    scene, mission = document.get("world", "scene"), document.get("mission")
+    with suppress(BadInputError, TypeError):  # the validation reports an invalid scene
+        has_board = load_scene(World().scene if scene is None else scene).board is not None
+        has_steps = isinstance(mission, dict) and bool(mission.get("steps"))
+        _default(document, ("criteria", "contact"), has_board and not has_steps)
 
 
 CHANGEABLE_KEYS = Change.model_fields.keys() - {"at_s"}

@@ -341,8 +341,9 @@ class Cloud(Section):
 class Criteria(Section):
     """What a flight needs to count as a success."""
 
-    contact: bool = True
-    """Whether the tip of the arm must touch the board"""
+    contact: bool | None = None
+    """Whether the tip of the arm must touch the board; null: only in a scene that has a board, and
+    not with random steps"""
     contact_speed_max_mps: Positive = 0.25
     """Largest speed of the tip when it touches the board [m/s]; with a higher speed the flight
     fails"""

@@ -116,7 +116,7 @@ class Flight:
     def make_order(self) -> Order:
         """Make an order for the experiment's mission."""
         plan = assembly.build_plan(self.experiment)
-        return Order(plan, contact=self.experiment.criteria.contact)
+        return Order(plan, contact=bool(self.experiment.criteria.contact))
 
     def order_if_possible(self, now_ns: int) -> None:
         """Order the experiment's mission at `now_ns` [ns, virtual time]; a refusal is ignored."""

@@ -103,7 +103,7 @@ def judge(evidence: Evidence) -> Verdict:
     violations, limit = evidence.violations, evidence.contact_speed_max
     if evidence.contact and evidence.touch is not None and evidence.touch[0] >= limit:
         speed, moment = evidence.touch
-        text = f"the tip met the board at {speed:.2f} m/s, not below {limit:g} m/s"
+        text = f"the tip met the board at {speed:.2f} m/s, not below criteria.contact_speed_max_mps {limit:g}"
         violations = (Failure("contact_too_fast", text, *moment), *violations)
     if evidence.ending.code in ("interrupted", "cancelled"):  # unmet goals are no failure
         return Verdict("interrupted", (Failure(*evidence.ending, *evidence.end), *violations))
@@ -125,9 +125,11 @@ def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
         text = f"{evidence.reached} of {evidence.waypoints} waypoints reached{evidence.judged_by}"
         yield Failure("waypoint_not_reached", text, *end)
     if evidence.contact and evidence.touch is None:
-        yield Failure("board_not_touched", "the arm never touched the board")
+        yield Failure(
+            "board_not_touched", "the arm never touched the board, which criteria.contact requires"
+        )
     if end.time is not None and end.time > evidence.time_limit:
-        text = f"the mission took {end.time:.1f} s, more than {evidence.time_limit:g} s"
+        text = f"the mission took {end.time:.1f} s, more than criteria.time_limit_s {evidence.time_limit:g}"
         yield Failure("time_limit_exceeded", text, *end)
 
 
@@ -162,7 +164,7 @@ def flight_evidence(
         waypoints=flight.waypoints,
         reached=0 if reached is None else round(reached.value),
         judged_by="" if flight.mission.steps else " by the true position",
-        contact=criteria.contact,
+        contact=bool(criteria.contact),
         contact_speed_max=criteria.contact_speed_max_mps,
         ending=_ending(flight, interrupted),
         end=UNKNOWN if end_ns is None else _moment(flight, end_ns),

@@ -12,7 +12,7 @@ from statistics import median
 import numpy as np
 import pytest
 
-from cloudrc.config.schema import Criteria
+from cloudrc.config.schema import Criteria, Mission
 from cloudrc.faults.scenarios.intruder import REFUSED
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import Flight
@@ -76,7 +76,7 @@ def fly(folder, *, flooded):
     ended_ns = time.monotonic_ns()
     run.communicate(timeout=90)
     recording = Recording.read(folder / "mission.mcap")
-    flight = Flight(recording, Criteria(), 1, load_scene("empty"))
+    flight = Flight(recording, Criteria(), Mission(), load_scene("empty"))
     woken = wakes(flight, "world")
     meanwhile = (woken["stamp_ns"] >= began_ns) & (woken["stamp_ns"] < ended_ns)
     assert meanwhile.sum() >= 0.95 * 100 * SECONDS
