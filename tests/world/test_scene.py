@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from math import pi, sin, tan
+from math import pi, tan
 from xml.etree import ElementTree
 
 import numpy as np
@@ -42,34 +42,11 @@ def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
 
 
-def test_mass_centre_and_inertia_are_the_sum_of_the_parts(pipes):
-    def rod(radius, length):  # across and along its axis, 10 g
-        return 0.01 * (3 * radius**2 + length**2) / 12, 0.01 * radius**2 / 2
-
-    across, along = rod(0.01, 0.4)
-    flat, spin = rod(0.128, 0.005)
-    parts = [
-        (1.0, (0, 0, 0), (0.01, 0.01, 0.02)),
-        (0.01, (0, 0, 0.12), (1.825e-5, 1.825e-5, 1.25e-5)),
-        (0.01, (0.2, 0, 0.17), (along, across, across)),
-        *(
-            (0.01, (x, y, 0.05), (flat, flat, spin))
-            for x, y in [(0.21, 0), (0, 0.21), (-0.21, 0), (0, -0.21)]
-        ),
-    ]
-    mass = sum(m for m, _, _ in parts)
-    centre = sum(m * np.array(r) for m, r, _ in parts) / mass
-    inertia = np.zeros((3, 3))
-    for m, r, diagonal in parts:
-        d = np.array(r) - centre
-        inertia += np.diag(diagonal) + m * (d @ d * np.eye(3) - np.outer(d, d))
-
-    assert pipes.body_mass[BASE] == pytest.approx(mass) == pytest.approx(1.06)
-    assert pipes.body_ipos[BASE] == pytest.approx(centre, abs=1e-9)
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, pipes.body_iquat[BASE])
-    axes = rotation.reshape(3, 3)
-    assert axes @ np.diag(pipes.body_inertia[BASE]) @ axes.T == pytest.approx(inertia, abs=1e-9)
+def test_the_pelican_has_the_mass_centre_and_inertia_of_its_parts(pipes):
+    """By hand: a base, an arm of two rods, four rotors. Their principal axes are turned."""
+    assert pipes.body_mass[BASE] == pytest.approx(1.06)
+    assert pipes.body_ipos[BASE] == pytest.approx((2e-3 / 1.06, 0, 4.9e-3 / 1.06), abs=1e-9)
+    assert pipes.body_inertia[BASE] == pytest.approx((0.0226439, 0.0121043, 0.0115651), abs=1e-7)
 
 
 def test_readers_without_mujoco_see_what_is_compiled(pipes):
@@ -85,36 +62,22 @@ def test_readers_without_mujoco_see_what_is_compiled(pipes):
     assert (board.pos + board.size)[1:].tolist() == pytest.approx([y_max, z_max])
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("pipe_1", (-1, 0, 0.8, 0, -1, 0)),
-        ("pipe_2", (0.96, -4.61, 0.8, sin(0.8), -sin(pi / 2 - 0.8), 0)),
-        ("pipe_3", (5.66, -6.42, 0.8, sin(1.57), -sin(pi / 2 - 1.57), 0)),
-    ],
-)
-def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
+@pytest.mark.parametrize("name", ["pipe_1", "pipe_2", "pipe_3"])
+def test_staves_are_tangent_to_the_pipe(pipes, name):
     numbers = facts("pipes")[name]
-    assert numbers == pytest.approx((*expected, 5.0, 0.662, 0.700), abs=1e-9)
     centre, axis = np.array(numbers[:3]), np.array(numbers[3:6])
     data = mujoco.MjData(pipes)
     mujoco.mj_kinematics(pipes, data)
     staves = [i for i in range(pipes.ngeom) if pipes.geom(i).name.startswith(f"{name}/")]
     assert len(staves) == 32
-    directions = []
     for stave in staves:
         out = data.geom_xpos[stave] - centre
         frame = data.geom_xmat[stave].reshape(3, 3)
-        thickness, width, length = pipes.geom_size[stave]
         assert out @ axis == pytest.approx(0, abs=1e-9)
         assert abs(frame[:, 2] @ axis) == pytest.approx(1)
-        assert frame[:, 0] @ out == pytest.approx(np.linalg.norm(out))
-        assert np.linalg.norm(out) - thickness == pytest.approx(0.662)
-        assert np.linalg.norm(out) + thickness == pytest.approx(0.700)
-        assert width == pytest.approx(0.700 * tan(pi / 32), abs=1e-4)
-        assert length == 2.5
-        directions.append(out / np.linalg.norm(out))
-    assert np.sum(directions, axis=0) == pytest.approx([0, 0, 0], abs=1e-9)
+        assert frame[:, 0] @ out == pytest.approx(0.681)  # the middle of the wall
+        assert pipes.geom_size[stave] == pytest.approx((0.019, 0.7 * tan(pi / 32), 2.5), abs=1e-4)
+    assert sum(data.geom_xpos[staves] - centre) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
 def touched_at(scene):
@@ -130,7 +93,7 @@ def touched_at(scene):
         ((0.0, 0.0, 0.1), set()),
         # The rear rotor's rim reaches x = -.338; pipe 1's outside is at -1 + .7 = -.3.
         ((0.0, 0.0, 0.75), {"pipe_1"}),
-        *(((0.2, 0.0, height), set()) for height in (0.3, 0.5, 0.75, 1.0)),
+        ((0.2, 0.0, 0.75), set()),
         ((8.134, -6.42, 0.7), set()),  # the tip meets the board with the base at 8.135
         ((8.136, -6.42, 0.7), {"board"}),
     ],
@@ -151,7 +114,6 @@ GOOD = (FOLDER / "robots" / "pelican.xml").read_text()
 @pytest.mark.parametrize(
     ("robot", "message"),
     [
-        (GOOD.replace("</mujoco>", ""), "does not compile"),
         (GOOD.replace('size=".05 .05 .10"', 'size=".05 nan .10"'), "does not compile"),
         (GOOD.replace('name="rotor_left" site', 'name="rotor_5" site'), "needs the actuators"),
         (GOOD.replace('touch name="tip"', 'touch name="hand"'), "needs a sensor named tip"),
@@ -175,15 +137,10 @@ def test_a_robot_that_cannot_fly_is_refused(tmp_path, monkeypatch, robot, messag
         ('mass="1.0"', 'mass="1.265"', r"mass .kg. is 1.325, not 1.05 \+- 0.1"),
         (".01 .01 .02", ".02 .01 .02", "inertia about x .kg m.2. is 0.0215"),
         ('inertial pos="0 0 0"', 'inertial pos="0 .03 0"', "centre of mass, y .m. is 0.028"),
-        ("<freejoint", "<joint type='free' damping='.1'", "damping of the base is 0.1, not 0"),
-        ('pos=".21 0 .05"', 'pos=".15 .15 .05"', "rotor_front place, x .m. is 0.15, not 0.21"),
         ('"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "rotor_left gear"),
-        ('gear="0 0 1 0 0 .016"', 'gear="0 0 1 0 0 .02"', "torque about z .m. is 0.02, not 0.016"),
         ('gear="0 0 1 0 0 -.016"', 'gear="0 0 1 0 0 .016"', "is 0.016, not -0.016"),
-        ('gear="0 0 1 0 0 .016"', 'gear="0 0 2 0 0 .016"', "thrust along z is 2, not 1"),
         ('ctrllimited="false"', 'ctrlrange="0 13"', "ctrlrange, end .N. is 13, not at least 33.7"),
         ('ctrllimited="false"', 'forcerange="1 40"', "forcerange, begin .N. is 1, not 0 or less"),
-        ('ctrllimited="false"', 'gainprm="2"', "rotor_front gain is 2, not 1"),
         ('ctrllimited="false"', 'dyntype="filter" dynprm="1"', "nothing else|dyntype is 2, not 0"),
         ('size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip, x .m. is 0.3, not 0.4"),
     ],
@@ -228,37 +185,20 @@ def test_an_unknown_name_lists_the_available_ones():
             compile_model(robot, scene)
 
 
-FLIGHT = """
-from cloudrc.world.simulator import Simulator
-simulator = Simulator("pelican", "pipes")
-for _ in range(100):
-    simulator.step((600.0,) * 4)
-assert simulator.readings.position[2] > 0.1
-"""
+FLIES = "from cloudrc.world.simulator import Simulator; Simulator('pelican', 'pipes')"
 
 
-def test_it_flies_without_the_requested_gl(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", FLIGHT],
-        env={**os.environ, "MUJOCO_GL": "egl", "PYTHONPATH": os.pathsep.join(sys.path)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("wanted", [None, "disable", "egl"])
-def test_the_variable_is_restored(monkeypatch, wanted):
-    if wanted is None:
-        monkeypatch.delenv("MUJOCO_GL", raising=False)
-    else:
+@pytest.mark.parametrize("wanted", [None, "egl"])
+def test_it_is_imported_without_gl(monkeypatch, wanted):
+    """The variable is restored for a child process that renders."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    if wanted is not None:
         monkeypatch.setenv("MUJOCO_GL", wanted)
     import_mujoco()
     assert os.environ.get("MUJOCO_GL") == wanted
+    command = [sys.executable, "-c", FLIES]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_without_the_package_the_extra_is_named(monkeypatch):
