@@ -37,17 +37,13 @@ def test_an_end_opens_what_the_other_one_sends(secret):
     cloud.seal(Kind.COMMAND, BODY)
     data, hello = cloud.seal(Kind.COMMAND, BODY), cloud.greet(Kind.HELLO, HELLO)
     assert world.open(data) == (Kind.COMMAND, 1, 1, BODY)
-    assert len(data) == codec.SIZES[Kind.COMMAND]
     assert refuses(cloud, data, "direction")
     assert world.open(hello) == (Kind.HELLO, NO_EPOCH, 0, HELLO)
-    assert refuses(world, hello[:-1] + bytes([hello[-1] ^ 1]))
     assert refuses(world, cloud.greet(Kind.HELLO, HELLO, NEW))
+    if secret:
+        assert refuses(world, pair(secret=None)[1].seal(Kind.COMMAND, BODY)), "it is not sealed"
     world.begin(2)
     assert refuses(world, data, "old_epoch")
-
-
-def test_a_sealed_end_opens_no_unsealed_datagram():
-    assert refuses(pair()[0], pair(secret=None)[1].seal(Kind.COMMAND, BODY))
 
 
 def test_a_malformed_datagram_costs_no_cryptography(monkeypatch):
@@ -89,24 +85,20 @@ def test_keys_depend_on_key_epoch_and_both_nonces(key, epoch, nonces):
 
 
 def test_each_direction_has_its_own_key():
-    world, cloud = pair()
+    world, _ = pair()
     data = bytearray(world.seal(Kind.ALIVE, b""))
     data[1] = Direction.DOWNLINK
     assert refuses(world, bytes(data))
-    assert cloud.seal(Kind.ALIVE, b"")[16:] != world.seal(Kind.ALIVE, b"")[16:]
 
 
 def test_each_kind_has_its_own_counter_in_each_epoch():
     """So no nonce is used twice in an epoch."""
     _, cloud = pair()
     kinds = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
-    told = {
-        codec.peek(cloud.seal(kind, bytes(codec.BODY_SIZES[kind])))
-        for kind in kinds
-        for _ in range(50)
-    }
-    assert told == {(kind, 1, counter) for kind in kinds for counter in range(50)}
-    assert cloud.next_counter(Kind.COMMAND) == 50
+    sealed = [cloud.seal(kind, bytes(codec.BODY_SIZES[kind])) for kind in kinds for _ in range(9)]
+    told = {(kind, 1, counter) for kind in kinds for counter in range(9)}
+    assert set(map(codec.peek, sealed)) == told
+    assert cloud.next_counter(Kind.COMMAND) == 9
     cloud.begin(2)
     assert cloud.next_counter(Kind.COMMAND) == 0
 

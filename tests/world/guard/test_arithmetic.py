@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cloudrc.messages import ZERO
 from cloudrc.world.guard import limits as rules
-from cloudrc.world.guard.hold import brake_rate, brake_start
+from cloudrc.world.guard.hold import brake_start
 from tests.world.guard.conftest import LIMITS
 
 BIG, TINY = 1.7976931348623157e308, 5e-324
@@ -31,33 +31,13 @@ def is_far(velocity, position):
     return rules.is_far_from_fence(tuple(velocity), tuple(position), LOW, HIGH)
 
 
-def test_stopping_distance_is_that_of_the_stop_rule():
-    assert rules.stopping_distance(6.0, 0.45) == pytest.approx(8.7)
-
-
-@pytest.mark.parametrize("reach", [TINY, 1e-9, 0.01, 0.5, 1.0, 7.0, 1000.0, 1e6])
 @pytest.mark.parametrize("caution", [rules.FENCE_REACTION, rules.REACTION])
-def test_approach_speed_solves_the_stop_rule(reach, caution):
-    v = rules.approach_speed(reach, caution)
-    assert v * (caution + v / 6) == pytest.approx(reach, rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("reach", "speed"),
-    [(-0.1, -0.1), (-0.5, -0.5), (-3.0, -0.5), (0.0, 0.0), (nan, 0.0), (1e6 + 1, inf)],
-)
-def test_approach_speed_beyond_a_face_and_far_from_it(reach, speed):
-    assert rules.approach_speed(reach) == speed
-
-
-def test_nearer_is_never_faster():
-    speeds = [rules.approach_speed(k * 0.001 - 2.0) for k in range(12_000)]
-    assert speeds == sorted(speeds)
-
-
-@pytest.mark.parametrize("value", SPECIAL_BAD)
-def test_clamp_stays_in_its_interval(value):
-    assert -2.0 <= rules.clamp(value, -2.0, 3.0) <= 3.0
+def test_approach_speed_solves_the_stop_rule(caution):
+    for reach in (TINY, 0.01, 1.0, 7.0, 1e6):
+        v = rules.approach_speed(reach, caution)
+        assert v * (caution + v / 6) == pytest.approx(reach, rel=1e-12)
+    for reach, speed in ((-0.1, -0.1), (-3.0, -0.5), (0.0, 0.0), (nan, 0.0), (1e6 + 1, inf)):
+        assert rules.approach_speed(reach, caution) == speed
 
 
 @pytest.mark.parametrize("length_max", [0.5, 6.0])
@@ -116,17 +96,6 @@ def test_far_from_the_fence_limit_to_fence_changes_nothing(velocity, position, s
         assert fenced(velocity, near) == pytest.approx(velocity, abs=1e-12)
 
 
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("bad", SPECIAL_BAD)
-def test_any_reading_gives_a_finite_reference(bad, axis):
-    position = [1.0, 1.0, 1.0]
-    assert is_far(ZERO, position)
-    position[axis] = bad
-    assert isfinite(bad) or not is_far(ZERO, position)
-    for velocity in ((6.0, 6.0, 6.0), (-6.0, -6.0, -6.0), ZERO):
-        assert all(abs(v) <= 6.0 for v in fenced(velocity, tuple(position)))
-
-
 @pytest.mark.parametrize(("axis", "sign"), [(a, s) for a in range(3) for s in (-1, 1)])
 def test_far_from_the_fence_ends_where_the_robot_must_slow_down(axis, sign):
     position, velocity = [1.0, 1.0, 1.3], [0.0, 0.0, 0.0]
@@ -144,29 +113,15 @@ def test_far_from_the_fence_ends_where_the_robot_must_slow_down(axis, sign):
     [
         # Beyond the margin the robot comes back.
         (ZERO, (9.1, 0, 1), (-0.1, 0, 0)),
-        (ZERO, (-2.9, 0, 1), (0.1, 0, 0)),
         (ZERO, (0, 5.4, 1), (0, -0.1, 0)),
         (ZERO, (0, 0, 2.45), (0, 0, -0.15)),
         # A robot on the floor is not told to climb.
         (ZERO, (0, 0, 0.1), ZERO),
-        ((0, 0, -1), (0, 0, 0.1), ZERO),
-        ((0, 0, 0.9), (0, 0, 0.1), (0, 0, 0.9)),
         # Near the floor the sideways speed is limited.
         ((3, 4, 0), (0, -2, 0.2), (0.6, 0.8, 0)),
         ((3, 4, 0), (0, -2, 0.25), (3, 4, 0)),
         # A wall does not slow a robot that flies past it.
         ((0, 6, 0), (-2.5, -5, 2.2), (0, 6, 0)),
-        ((0, -6, 0), (-2.5, 3, 2.2), (0, -6, 0)),
-        # The paper's flight asks for this, and presses on the board.
-        *(
-            (velocity, position, velocity)
-            for velocity, position in (
-                ((-0.05, -4.83, -0.06), (-0.93, 3.4, 0.74)),
-                ((0.59, 0.0, 0.0), (7.5, -6.42, 0.7)),
-                ((0.08, 0.0, 0.0), (8.135, -6.42, 0.7)),
-                ((2.0, -2.0, 0.0), (0.9, -4.6, 0.7)),
-            )
-        ),
     ],
 )
 def test_limit_to_fence_by_hand_worked_numbers(velocity, position, limited):
@@ -180,37 +135,23 @@ def test_the_floor_is_approached_as_the_stop_rule_says_and_is_no_face_in_land():
     assert fenced(down, (0.0, 0.0, 0.1), (LOW[0], LOW[1], -inf)) == down
 
 
-@pytest.mark.parametrize(
-    ("wanted", "before", "climb", "lowest"),
-    [
+def test_limit_sink_limits_how_fast_the_reference_sinks():
+    for wanted, before, climb, lowest in (
         (-3.0, 0.0, -0.2, -0.2 - rules.SINK_LEAD_MAX),
         (-0.6, 0.0, -0.2, -0.6),
-        (-0.2 - rules.SINK_LEAD_MAX, 0.0, -0.2, -0.2 - rules.SINK_LEAD_MAX),
         (-1.0, 0.5, 3.0, 0.5),  # it does not rise again while the robot still climbs
-    ],
-)
-def test_limit_sink_limits_how_fast_the_reference_sinks(wanted, before, climb, lowest):
-    reference = (1.0, 0.0, wanted)
-    kept = rules.limit_sink(reference, (1.0, 0.0, before), climb, speed_max=6.0)
-    assert kept == (1.0, 0.0, lowest)
-    assert (kept is reference) == (wanted == lowest)
-
-
-@pytest.mark.parametrize("climb", SPECIAL_BAD)
-def test_limit_sink_of_any_reading_stays_below_the_cap(climb):
-    kept = rules.limit_sink((5.9, 0.0, -1.0), (0.0, 0.0, 5.9), climb, speed_max=6.0)
-    assert hypot(*kept) <= 6.0 * (1 + 1e-15)
+    ):
+        reference = (1.0, 0.0, wanted)
+        kept = rules.limit_sink(reference, (1.0, 0.0, before), climb, speed_max=6.0)
+        assert kept == (1.0, 0.0, lowest)
+    capped = rules.limit_sink((5.9, 0.0, -1.0), (0.0, 0.0, 5.9), BIG, speed_max=6.0)
+    assert hypot(*capped) == pytest.approx(6.0)
 
 
 @given(SPEEDS, VECTORS)
 @settings(max_examples=500, deadline=None)
 def test_brake_start_is_no_faster_than_the_reference(reference, velocity):
     assert hypot(*brake_start(reference, velocity)) <= hypot(*reference)
-
-
-@pytest.mark.parametrize(("speed", "rate"), [(0.0, 1.0), (0.5, 2.0), (5.0, 5.5), (inf, 5.5)])
-def test_braking_is_hard_first_and_gentle_in_the_end(speed, rate):
-    assert brake_rate(speed) == rate
 
 
 @given(SPEEDS, SPEEDS, st.floats(1e-3, 0.1))
@@ -224,21 +165,6 @@ def test_limit_growth_speeds_up_by_at_most_a_step(before, after, step):
         assert got * wanted >= 0.0
     if hypot(*(rules.growth(a, b) for a, b in zip(before, after, strict=True))) <= step:
         assert kept == pytest.approx(after, abs=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "step", "kept"),
-    [
-        ((5.0, -5.0, 5.0), (1.0, -1.0, 0.0), 0.024, (1.0, -1.0, 0.0)),
-        (ZERO, (-0.25, 0.0, 0.0), 0.25, (-0.25, 0.0, 0.0)),
-        ((3.0, 0.0, 0.0), (1.0, 1.0, 0.0), 0.5, (1.0, 0.5, 0.0)),
-        ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.25, (-0.25, 0.0, 0.0)),
-    ],
-)
-def test_limit_growth_does_not_limit_slowing_down(before, after, step, kept):
-    limited = rules.limit_growth(before, after, step)
-    assert limited == kept
-    assert (limited is after) == (kept == after)
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,11 @@ import pytest
 from cloudrc.geometry import fence
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.hold import LAND_SPEED
-from cloudrc.world.simulator import Simulator
 from tests.world.guard.conftest import (
     HERE,
     LIMITS,
     MS,
     SECOND,
-    Flight,
     bring_down,
     feed,
     landing,
@@ -71,29 +69,16 @@ def test_a_slow_landing_can_be_acknowledged_in_the_air():
     assert guard.state is HOLD
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.4])
-def test_a_landing_near_the_fence_touches_down(share):
+def test_a_landing_near_the_fence_touches_down():
     x, y, _ = fence.HIGH
     guard = landing()
-    assert None in run(guard, 2 * SECOND, 4 * SECOND, (x - share, y - share, 0.1))
+    assert None in run(guard, 2 * SECOND, 4 * SECOND, (x, y - 0.4, 0.1))
     assert guard.take_changes()[-1].cause == DOWN
 
 
-@pytest.mark.parametrize("speed_max", [0.01, 0.05, 0.19, 0.2, 0.25, 6.0])
+@pytest.mark.parametrize("speed_max", [0.01, 0.2, 6.0])
 def test_slow_sinking_under_a_low_cap_is_no_touch_down(speed_max):
     guard = landing(replace(LIMITS, speed_max=speed_max))
     sinks = (0.0, 0.0, -0.5 * min(LAND_SPEED, 0.5 * speed_max))
     assert None not in run(guard, 2 * SECOND, 5 * SECOND, velocity=sinks)
     assert None in run(guard, 5 * SECOND, 6 * SECOND)
-
-
-def test_with_the_lowest_cap_it_lands_on_the_floor():
-    flight = Flight(Simulator("pelican", "empty"), replace(LIMITS, speed_max=0.1))
-    flight.fly(6.0, (0.0, 0.0, 0.1))
-    assert flight.readings.position[2] > 0.4
-    bring_down(flight.guard, flight.now_ns)
-    for _ in range(400):
-        flight.fly(0.1)
-        assert flight.readings.velocity[2] > -0.1
-    assert flight.guard.take_changes()[-1].cause == DOWN
-    assert flight.readings.position[2] < 0.15

@@ -6,7 +6,6 @@ import pytest
 
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.limits import RECHECK_NS
-from cloudrc.world.guard.state import OVERTURNED_COSINE
 from cloudrc.world.readings import Readings
 from tests.world.guard.conftest import (
     DT,
@@ -32,15 +31,11 @@ def felt(tilt_deg=0.0):
 
 
 @pytest.mark.parametrize("make", [tracking, holding, landing])
-@pytest.mark.parametrize("tilt_deg", [78.0, 79.0, -120.0, 180.0])
+@pytest.mark.parametrize("tilt_deg", [79.0, -120.0])
 def test_a_robot_that_turns_over_stops_its_rotors(make, tilt_deg):
-    assert cos(radians(78.5)) == pytest.approx(OVERTURNED_COSINE, abs=0.001)
     guard, now_ns = make(), 10 * MS if make is tracking else 2 * SECOND
-    flown = guard.step(now_ns, felt(tilt_deg), DT)
-    if tilt_deg == 78.0:
-        assert (flown is None, guard.state is ESTOP) == (False, False)
-        return
-    assert flown is None
+    assert guard.step(now_ns - TICK, felt(78.0), DT) is not None, "almost"
+    assert guard.step(now_ns, felt(tilt_deg), DT) is None
     assert guard.take_changes()[-1] == (now_ns, ESTOP, Cause.OVERTURNED.words)
     assert (guard.armed, guard.latched, guard.reference) == (False, True, ZERO)
     assert guard.accept_command(command(basis_ns=now_ns), now_ns) is None
@@ -72,9 +67,8 @@ def test_a_robot_with_stopped_rotors_may_lie_on_its_back():
 def test_a_steady_flight_notices_it_within_12_ms(flown_ticks):
     guard = armed()
     for now_ns in range(0, (flown_ticks + 7) * TICK, TICK):
-        over = now_ns >= flown_ticks * TICK
         guard.accept_command(command((0.0, 0.0, 0.5), now_ns), now_ns)
-        guard.step(now_ns, felt(120.0 if over else 0.0), DT)
-    changes = guard.take_changes()
-    assert [change.state for change in changes] == [TRACK, ESTOP]
-    assert changes[1].stamp_ns - flown_ticks * TICK <= RECHECK_NS + TICK
+        guard.step(now_ns, felt(120.0 * (now_ns >= flown_ticks * TICK)), DT)
+    tracks, hit = guard.take_changes()
+    assert (tracks.state, hit.state) == (TRACK, ESTOP)
+    assert hit.stamp_ns - flown_ticks * TICK <= RECHECK_NS + TICK

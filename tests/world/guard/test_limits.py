@@ -10,7 +10,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.limits import FENCE_MARGIN, Limits
-from tests.world.guard.conftest import LIMITS, MS, SECOND, TICK, armed, run, tracking
+from tests.world.guard.conftest import LIMITS, MS, SECOND, TICK, armed, command, run, tracking
 
 NUMBERS = [field.name for field in fields(Limits) if not field.name.startswith("fence")]
 
@@ -22,7 +22,7 @@ def limits(**values):
 @pytest.mark.promise("commands-within-caps")
 @pytest.mark.parametrize("name", NUMBERS)
 def test_a_limit_cannot_be_switched_off_or_changed(name):
-    for value in (0, 0.0, -1, inf, -inf, nan):
+    for value in (0, -1, inf, nan):
         with pytest.raises(ValueError, match=f"guard: {name} is"):
             limits(**{name: value})
     with pytest.raises(FrozenInstanceError):
@@ -30,9 +30,9 @@ def test_a_limit_cannot_be_switched_off_or_changed(name):
 
 
 def test_a_command_may_not_be_older_than_ten_seconds():
+    limits(command_age_max_ns=10 * SECOND, speed_max=0.5)
     with pytest.raises(ValueError, match="above 10 s"):
-        limits(command_age_max_ns=10_000_000_001, speed_max=0.5)
-    limits(command_age_max_ns=10_000_000_000, speed_max=0.5)
+        limits(command_age_max_ns=10 * SECOND + 1, speed_max=0.5)
 
 
 @pytest.mark.parametrize(("age_ms", "fastest"), [(250, 6.0), (400, 5.645805), (800, 4.823043)])
@@ -43,22 +43,24 @@ def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
         limits(command_age_max_ns=age_ms * 1_000_000, speed_max=fastest + 1e-3)
 
 
-@pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (10, 10), (11, 11)])
+@pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (11, 11)])
 def test_on_the_ground_it_waits_for_a_mission_for_10_s_at_least(hold_s, waited_s):
     """The longest hold may be too short for a first command to arrive."""
     guard = armed(limits(hold_max_ns=round(hold_s * SECOND)))
+    guard.accept_command(command(basis_ns=-300 * MS), SECOND)  # a stale command does not count
     run(guard, 0, waited_s * SECOND + TICK)
     assert guard.state is GuardState.GROUND
-    run(guard, waited_s * SECOND + TICK, waited_s * SECOND + 2 * TICK)
-    assert guard.state is GuardState.LAND
+    assert run(guard, waited_s * SECOND + TICK, waited_s * SECOND + 2 * TICK) == [None]
+    assert (guard.state, guard.armed) == (GuardState.LAND, False)
     assert guard.take_changes()[-1].cause == f"held for {waited_s} s without the cloud"
+    guard.acknowledge(62 * SECOND)
+    assert guard.state is GuardState.GROUND, "without a touch-down"
 
 
-@pytest.mark.parametrize("hold_s", [2, 11])
-def test_in_flight_a_hold_lasts_no_longer_than_its_limit(hold_s):
-    guard = tracking(limits=limits(hold_max_ns=hold_s * SECOND))
-    run(guard, 0, 12 * SECOND)
-    land = (hold_s * SECOND + 254 * MS, GuardState.LAND, f"held for {hold_s} s without the cloud")
+def test_in_flight_a_hold_lasts_no_longer_than_its_limit():
+    guard = tracking(limits=limits(hold_max_ns=2 * SECOND))
+    run(guard, 0, 3 * SECOND)
+    land = (2254 * MS, GuardState.LAND, "held for 2 s without the cloud")
     assert land in guard.take_changes()
 
 
@@ -67,16 +69,13 @@ THIN = FLOOR_MARGIN + FENCE_MARGIN
 
 @pytest.mark.parametrize("axis", range(3))
 def test_a_fence_has_room_between_its_margins(axis):
-    for high in (-inf, inf, nan, -1.0, 0.0, THIN, THIN + 0.01):
-        corner = [9.0] * 3
+    corner = [9.0] * 3
+    corner[axis] = THIN + 0.01
+    Limits((0.0, 0.0, 0.0), tuple(corner))
+    for high in (-inf, inf, nan, 0.0, THIN):
         corner[axis] = high
-        if high == THIN + 0.01:
+        with pytest.raises(ValueError, match="leaves no room"):
             Limits((0.0, 0.0, 0.0), tuple(corner))
-        else:
-            with pytest.raises(ValueError, match="leaves no room"):
-                Limits((0.0, 0.0, 0.0), tuple(corner))
-    with pytest.raises(ValueError, match="zip"):
-        Limits((0.0,) * (2 * axis), (5.0, 5.0, 5.0))
 
 
 def test_the_inner_corners_have_the_margins_taken_off():
