@@ -78,13 +78,6 @@ def test_yaw_turns_the_short_way_round():
     assert output.yaw_rate == pytest.approx(2.0 * 20 * pi / 180)
 
 
-def test_a_limit_does_not_turn_nan_into_full_speed():
-    controller = pid.build(velocity_max=ONES, gain_i=ONES)
-    velocity = fly(controller, x(float("nan"))).velocity
-    assert velocity[0] != velocity[0]
-    assert fly(controller).velocity == ZERO
-
-
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [

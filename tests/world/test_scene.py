@@ -140,7 +140,6 @@ def test_a_robot_that_cannot_fly_is_refused(tmp_path, monkeypatch, robot, messag
         ('"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "rotor_left gear"),
         ('gear="0 0 1 0 0 -.016"', 'gear="0 0 1 0 0 .016"', "is 0.016, not -0.016"),
         ('ctrllimited="false"', 'ctrlrange="0 13"', "ctrlrange, end .N. is 13, not at least 33.7"),
-        ('ctrllimited="false"', 'forcerange="1 40"', "forcerange, begin .N. is 1, not 0 or less"),
         ('ctrllimited="false"', 'dyntype="filter" dynprm="1"', "nothing else|dyntype is 2, not 0"),
         ('size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip, x .m. is 0.3, not 0.4"),
     ],

@@ -187,19 +187,6 @@ def test_the_velocity_of_the_tip_includes_the_rotation(scene_at):
     assert touch.tip_velocity[2] < touch.velocity[2] - 0.3
 
 
-@pytest.mark.parametrize(
-    ("spawn", "reference", "body", "tip"),
-    [
-        ((-1.0, 0.0, 0.7), (-0.5, 0.0, 0.0), "pipe_1", False),
-        ((5.66, -6.42, 0.7), (0.0, 0.5, 0.0), "pipe_3", False),
-    ],
-)
-def test_a_contact_names_the_touched_pipe(scene_at, spawn, reference, body, tip):
-    simulator = Simulator("pelican", scene_at(*spawn))
-    touch = fly(simulator, LowLevel(), reference, 2.0)[0]
-    assert (touch.body, touch.tip) == (body, tip)
-
-
 def test_the_floor_is_a_new_contact_only_after_a_flight():
     simulator, low_level = Simulator("pelican", "empty"), LowLevel()
     for _ in range(200):
