@@ -52,9 +52,12 @@ def test_a_landing_acknowledged_in_a_climb_holds_once_it_sinks():
         run(guard, now_ns, now_ns + 10 * MS, velocity=(0.0, 0.0, climb))
         assert guard.state is LAND
     run(guard, now_ns + 10 * MS, now_ns + 12 * MS, velocity=(0.0, 0.0, -0.26))
-    assert guard.state is HOLD
-    guard.start_mission(3 * SECOND)
-    now_ns = feed(guard, 3 * SECOND, 20)
+    change = (now_ns + 10 * MS, HOLD, "acknowledged before touch-down")
+    assert guard.take_changes()[-1] == change
+    feed(guard, 3 * SECOND, 100)
+    assert guard.state is HOLD, "it waits for a new start"
+    guard.start_mission(5 * SECOND)
+    now_ns = feed(guard, 5 * SECOND, 20)
     bring_down(guard, now_ns)
     run(guard, now_ns, now_ns + SECOND, velocity=SINKS)
     assert guard.state is LAND, "the acknowledgement does not count for the next landing"

@@ -7,12 +7,11 @@ from math import dist, hypot, inf, nan, nextafter
 import pytest
 
 from cloudrc.messages import ZERO, Cause, GuardState
-from cloudrc.world.guard.hold import HOLD_SPEED_MAX, LAND_SPEED, STILL_SPEED
+from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
 from cloudrc.world.guard.limits import COMMAND_MAX
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import (
     DT,
-    HERE,
     LIMITS,
     MS,
     SECOND,
@@ -180,15 +179,10 @@ def test_hold_brakes_at_once_and_then_holds_the_position():
     run(guard, 0, 252 * MS, velocity=(1.5, 0.0, 0.0))
     first, *rest = run(guard, 252 * MS, 900 * MS, velocity=(1.5, 0.0, 0.0))
     assert hypot(*first) < 1.0  # below the speed of the robot, which follows late
-    assert rest[-1] == ZERO
-    assert guard.brakes
-    run(guard, 900 * MS, 902 * MS, velocity=(0.75, 0.0, 0.0))
-    run(guard, 902 * MS, 904 * MS)
+    assert (rest[-1], guard.brakes) == (ZERO, True)
+    run(guard, 900 * MS, 902 * MS)
     assert not guard.brakes
-    assert run(guard, 904 * MS, 906 * MS, (1.02, 2.0, 1.3))[0][0] < 0.0
-    far = run(guard, 906 * MS, 2 * SECOND, (3.0, 2.0, 1.3))[-1]
-    assert far == pytest.approx((-HOLD_SPEED_MAX, 0.0, 0.0))
-    assert run(guard, 2 * SECOND, 3 * SECOND, HERE, (0.0, 0.2, 0.0))[-1][1] < -0.2, "it is damped"
+    assert run(guard, 902 * MS, 906 * MS, (1.02, 2.0, 1.3))[-1][0] < 0.0
 
 
 def test_the_next_hold_has_a_new_hold_point():
@@ -413,9 +407,6 @@ def test_after_touch_down_it_may_slide_off_an_obstacle():
     guard.start_mission(6 * SECOND)
     feed(guard, 6 * SECOND, 1, position=(1.0, 2.0, 0.3))
     assert guard.state is GROUND
-    run(guard, 7 * SECOND, 8 * SECOND, LOW)
-    feed(guard, 8 * SECOND, 1, position=LOW)
-    assert guard.state is TRACK
 
 
 @pytest.mark.parametrize(
@@ -426,15 +417,6 @@ def test_after_touch_down_it_may_slide_off_an_obstacle():
 def test_a_robot_that_moves_has_not_touched_down(climb, down_ms):
     stood = run(landing(), 2 * SECOND, 4 * SECOND, (1.0, 2.0, 1.0), (0.0, 0.0, climb))
     assert (stood.index(None) * TICK == down_ms * MS) if down_ms else (None not in stood)
-
-
-def test_a_short_stop_of_a_descent_is_no_touch_down():
-    guard = landing()
-    run(guard, 2 * SECOND, 4 * SECOND, velocity=SINKS)
-    for k in range(10):
-        start_ns = 4 * SECOND + k * 400 * MS
-        assert None not in run(guard, start_ns, start_ns + 390 * MS)
-        assert None not in run(guard, start_ns + 390 * MS, start_ns + 400 * MS, HERE, (0, 0, -0.3))
 
 
 def test_land_from_track_descends_where_the_robot_is():
@@ -480,17 +462,6 @@ def test_an_acknowledgement_names_the_condition_of_a_take_off(velocity, cause):
     guard.acknowledge(2 * SECOND)
     assert told(guard) == (2 * SECOND, GROUND, cause.words)
     assert guard.cause is cause
-
-
-def test_a_landing_that_is_acknowledged_in_the_air_holds():
-    guard = landing()
-    run(guard, 2 * SECOND, 3 * SECOND, velocity=SINKS)
-    guard.acknowledge(3 * SECOND)
-    run(guard, 3 * SECOND, 3 * SECOND + TICK, velocity=SINKS)
-    assert told(guard) == (3 * SECOND, HOLD, "acknowledged before touch-down")
-    assert run(guard, 3 * SECOND + TICK, 5 * SECOND)[-1] == ZERO
-    feed(guard, 5 * SECOND, 100)
-    assert guard.state is HOLD
 
 
 @pytest.mark.parametrize("make", [lambda: Guard(LIMITS), armed, tracking, holding])

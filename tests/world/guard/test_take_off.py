@@ -17,7 +17,6 @@ from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.robot import Robot
 from tests.world.guard.conftest import (
-    HERE,
     LIMITS,
     MS,
     SECOND,
@@ -168,11 +167,6 @@ def test_a_mission_that_ends_on_the_ground_ends_in_ground():
     assert run(guard, 10 * MS, 20 * MS, STANDS) == [None] * 5
     assert states(guard) == [HOLD, GROUND]
     assert not guard.armed
-    feed(guard, 2 * SECOND, 100, position=STANDS)
-    assert guard.state is GROUND
-    guard.start_mission(4 * SECOND)
-    feed(guard, 4 * SECOND, 1, position=STANDS)
-    assert guard.state is TRACK
 
 
 # Above the ground
@@ -204,18 +198,6 @@ def test_after_flying_the_rotors_do_not_stop_where_it_stood():
     feed(guard, 3 * SECOND, 20, ZERO, position=STANDS)
     run(guard, 4 * SECOND, 6 * SECOND, STANDS)
     assert states(guard) == [TRACK, HOLD]
-
-
-def test_after_a_stop_the_next_take_off_is_a_new_one():
-    guard = taking_off(1.0)
-    guard.stop(10 * MS)
-    guard.acknowledge(1 * SECOND)
-    guard.start_mission(1 * SECOND)
-    run(guard, 1 * SECOND, 2 * SECOND, HERE)
-    feed(guard, 2 * SECOND, 1, position=HERE)
-    guard.take_changes()
-    run(guard, 3 * SECOND, 4 * SECOND, HERE)
-    assert states(guard) == [HOLD, GROUND]
 
 
 def test_a_take_off_within_one_tick_knows_its_ground():
