@@ -63,14 +63,6 @@ def test_clearance_on_the_axis_is_that_of_the_plant():
         assert clearance(PIPES, pipe.centre, facing) == pytest.approx([0.320], abs=1e-3)
 
 
-def test_the_spawn_trap():
-    """Straight above the spawn the rear rotor is in the wall of pipe 1; x = .2 is clear."""
-    at = np.array([(0.0, 0.0, height) for height in np.arange(0.1, 1.6, 0.01)])
-    for aside, nearest in ((0.0, -0.019), (0.2, 0.162)):
-        found = clearance(PIPES, at + np.array((aside, 0, 0)), np.tile(LEVEL, (len(at), 1)))
-        assert found.min() == pytest.approx(nearest, abs=2e-3)
-
-
 def test_clearance_is_infinite_in_an_empty_scene():
     assert clearance(Scene("empty"), [(0, 0, 1), (1, 0, 1)], [LEVEL] * 2).tolist() == [math.inf] * 2
     assert clearance(PIPES, np.empty((0, 3)), np.empty((0, 4))).shape == (0,)

@@ -84,13 +84,6 @@ def test_keys_depend_on_key_epoch_and_both_nonces(key, epoch, nonces):
     assert refuses(world, cloud.seal(Kind.COMMAND, BODY))
 
 
-def test_each_direction_has_its_own_key():
-    world, _ = pair()
-    data = bytearray(world.seal(Kind.ALIVE, b""))
-    data[1] = Direction.DOWNLINK
-    assert refuses(world, bytes(data))
-
-
 def test_each_kind_has_its_own_counter_in_each_epoch():
     """So no nonce is used twice in an epoch."""
     _, cloud = pair()
@@ -101,17 +94,6 @@ def test_each_kind_has_its_own_counter_in_each_epoch():
     assert cloud.next_counter(Kind.COMMAND) == 9
     cloud.begin(2)
     assert cloud.next_counter(Kind.COMMAND) == 0
-
-
-@pytest.mark.parametrize(
-    ("kind", "told"),
-    [(Kind.HELLO, (0, 1)), (Kind.CHALLENGE, (0, 1)), (Kind.BUSY, (0, 1)), (Kind.ACCEPT, (5, 0))],
-)
-def test_only_an_acceptance_belongs_to_an_epoch(kind, told):
-    _, session = pair()
-    session.greet(kind, b"")
-    session.begin(5)
-    assert codec.peek(session.greet(kind, b"")) == (kind, *told)
 
 
 def test_while_two_keys_are_accepted_greetings_may_have_either():

@@ -65,6 +65,22 @@ def test_acknowledged_in_its_fall_it_waits_until_it_lies(flight):
     assert flight.readings.position[2] > 0.8
 
 
+@pytest.mark.parametrize("velocity", [(0.0, 0.0, 1.0), (1.5, 0.5, 2.0), (6.0, 0.0, 0.3)])
+def test_a_take_off_aborted_at_any_time_does_not_scrape(simulator, velocity):
+    ends = set()
+    for centiseconds in (1, 3, 4, 5, 6, 7, 8, 10, 14, 20, 25, 40):
+        flight = Flight(simulator).fly(0.02).fly(centiseconds / 100, velocity)
+        simulator.take_contacts()
+        flight.guard.end_mission(flight.now_ns)
+        while flight.guard.state is not GuardState.GROUND and flight.now_ns < 6 * SECOND:
+            flight.fly(0.01)
+        assert flight.guard.state is GuardState.GROUND or simulator.take_contacts() == []
+        assert flight.readings.position[2] > 0.29 or flight.guard.state is GuardState.GROUND
+        assert flight.speed < 0.2
+        ends.add(flight.guard.state)
+    assert ends == {GuardState.GROUND, GuardState.HOLD}
+
+
 # Hostile clouds: the robot flies at most at 6 m/s, and its base stays inside the fence.
 
 FACES = [(9.0, 0.0, 0.0), (-9.0, 0.0, 0.0), (0.0, 9.0, 0.0), (0.0, -9.0, 0.0), (0.0, 0.0, 9.0)]

@@ -1,14 +1,14 @@
-"""Braking and position hold, with numbers."""
+"""Braking, position hold and take-off, with numbers."""
 
-from math import hypot
+from math import hypot, nan
 
 import pytest
 
 from cloudrc.messages import ZERO
 from cloudrc.world.guard import hold as rules
-from cloudrc.world.guard.hold import PositionHold, brake_start
+from cloudrc.world.guard.hold import PositionHold, TakeOff, brake_start
 from cloudrc.world.guard.limits import BRAKE
-from tests.world.guard.conftest import DT, HERE, sensed
+from tests.world.guard.conftest import DT, HERE, LIMITS, sensed
 
 LOW, HIGH = (-2.8, -8.3, 0.0), (9.0, 5.3, 2.3)
 ENOUGH = 1.0
@@ -123,3 +123,78 @@ def test_the_integral_works_against_a_steady_distance(offset, seconds, sink, lea
 def test_the_hold_point_is_inside_the_margins(position, back):
     reference = holding_at(position=position).follow(ZERO, sensed(position), 0.0, ENOUGH)
     assert reference == pytest.approx(back)
+
+
+# Take-off
+
+STANDS = (0.0, 0.0, 0.1)
+FENCE = (LIMITS.fence_low, LIMITS.fence_high)
+
+
+@pytest.mark.parametrize(
+    ("height", "over"), [(0.0199, False), (0.02, True), (-0.02, True), (nan, True)]
+)
+def test_a_take_off_is_over_at_the_lift_off_height(height, over):
+    take_off = TakeOff(*FENCE)
+    for at in (3.0, 0.0):  # the last place on the ground counts
+        take_off.look(sensed((0.0, 0.0, at)), flies=False)
+    take_off.look(sensed((9.0, 0.0, height)), flies=True)
+    assert take_off.over == over
+    assert take_off.may_end(sensed()) == (not over)
+    take_off.forget()
+    assert not take_off.over
+    never_seen = TakeOff(*FENCE)
+    never_seen.look(sensed(STANDS), flies=True)
+    assert never_seen.over
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(
+    ("speed", "may"), [(0.99 * rules.GROUND_SPEED_MAX, True), (rules.GROUND_SPEED_MAX, False)]
+)
+def test_at_speed_the_rotors_do_not_stop(axis, speed, may):
+    velocity = [0.0, 0.0, 0.0]
+    velocity[axis] = speed
+    assert TakeOff(*FENCE).may_end(sensed(STANDS, tuple(velocity))) == may
+
+
+def stopped():
+    take_off = TakeOff(*FENCE)
+    take_off.forget(stopped=True)
+    return take_off
+
+
+def lie(take_off, ticks, position=STANDS, velocity=ZERO):
+    """Let the robot lie for some ticks; tell whether it may take off then."""
+    for _ in range(ticks):
+        take_off.look(sensed(position, velocity), flies=False)
+    return take_off.allowed
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("speed", [rules.STILL_SPEED, nan])
+def test_stopped_it_may_take_off_once_it_has_been_at_rest(axis, speed):
+    take_off, velocity = stopped(), [0.0, 0.0, 0.0]
+    velocity[axis] = speed
+    assert not lie(take_off, rules.STILL_TICKS - 1)
+    take_off.forget()  # acknowledged
+    assert not lie(take_off, 1, velocity=tuple(velocity)), "it slides off an obstacle"
+    assert not lie(take_off, rules.STILL_TICKS - 1)
+    velocity[axis] = 0.99 * rules.STILL_SPEED
+    assert lie(take_off, 1, velocity=tuple(velocity))
+    take_off.look(sensed(STANDS), flies=True)
+    take_off.forget()
+    assert take_off.allowed
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("face", [0, 1])
+def test_outside_the_fence_a_take_off_is_not_allowed(axis, face):
+    """Nor so near a wall that it would scrape out of the fence."""
+    position = list(STANDS)
+    edge = FENCE[face][axis] - (0.5 if axis < 2 else 0.0) * (2 * face - 1)
+    position[axis] = edge
+    assert lie(stopped(), rules.STILL_TICKS, tuple(position))
+    for outside in (edge + (2 * face - 1) * 1e-6, nan):
+        position[axis] = outside
+        assert not lie(stopped(), 2 * rules.STILL_TICKS, tuple(position))
