@@ -247,24 +247,6 @@ class Run:
         return solver.check() != z3.unsat
 
 
-class AtLeast:
-    """Any float from `bound` > 0 on, infinity included; z3 takes half a minute for their product.
-
-    A correctly rounded sum or product of such floats is monotonic: the result is at least that of
-    the bounds, and never NaN. A factor that is zero, negative or NaN fails the assertion.
-    """
-
-    def __init__(self, bound):
-        assert bound > 0.0
-        self.bound = bound
-
-    def __add__(self, other):
-        return AtLeast(self.bound + other.bound)
-
-    def __mul__(self, other):
-        return AtLeast(self.bound * (other.bound if isinstance(other, AtLeast) else other))
-
-
 def root(x, top=LARGEST):
     """Return the square root of a finite x >= 0: a finite float >= 0.
 
