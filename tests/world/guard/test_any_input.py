@@ -20,22 +20,24 @@ CHANGE_MAX = 0.8
 """Largest change of a velocity between two readings [m/s]."""
 STEP_MAX = 0.04
 """The robot moves by less than this in a tick [m]."""
-CASES_AT_ONCE = 4
-CASE = st.tuples(
-    st.one_of(SPEEDS, TAKEN),
-    st.one_of(VECTORS, TAKEN, SPEEDS, SPEEDS),
-    st.one_of(ANY, st.floats(-COMMAND_MAX, COMMAND_MAX)),
-    st.one_of(st.just(None), PLACES, PLACES, VECTORS),
-    st.one_of(SPEEDS, VECTORS),
-    st.tuples(*[st.floats(-CHANGE_MAX, CHANGE_MAX)] * 3),
-    st.integers(-2, 300),
-    st.sampled_from([TICK, TICK, 300 * MS]),
+
+
+@pytest.mark.promise("commands-within-caps")
+@given(
+    first=st.one_of(SPEEDS, TAKEN),
+    then=st.one_of(VECTORS, TAKEN, SPEEDS, SPEEDS),
+    yaw_rate=st.one_of(ANY, st.floats(-COMMAND_MAX, COMMAND_MAX)),
+    place=st.one_of(st.just(None), PLACES, PLACES, VECTORS),
+    velocity=st.one_of(SPEEDS, VECTORS),
+    change=st.tuples(*[st.floats(-CHANGE_MAX, CHANGE_MAX)] * 3),
+    age_ms=st.integers(-2, 300),
+    after_ns=st.sampled_from([TICK, TICK, 300 * MS]),
 )
-CASES = st.lists(CASE, min_size=CASES_AT_ONCE, max_size=CASES_AT_ONCE)
-
-
-def check_case(first, then, yaw_rate, place, velocity, change, age_ms, after_ns):
-    """Fly one command, then another one or silence; return the last state."""
+@settings(max_examples=1000, deadline=None)
+def test_any_input_is_flown_inside_the_caps(
+    first, then, yaw_rate, place, velocity, change, age_ms, after_ns
+):
+    """Fly one command, then another one or silence."""
     guard = armed()
     position = (1.0, 1.0, 1.0) if place is None else place
     guard.accept_command(command(first), 0)
@@ -54,7 +56,6 @@ def check_case(first, then, yaw_rate, place, velocity, change, age_ms, after_ns)
         step_max = 12.0 * DT * (1 + 1e-9)
         assert hypot(*(growth(a, b) for a, b in zip(before, after, strict=True))) <= step_max
         assert dist(before, after) <= step_max or guard.counts["limited_fence"] > limited
-    return guard.state
 
 
 def check_flown(guard, reference, position):
@@ -67,11 +68,3 @@ def check_flown(guard, reference, position):
         room = high - at if v > 0 else at - low
         if guard.state is not GuardState.LAND and v != 0.0 and isfinite(at):
             assert 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-9
-
-
-@pytest.mark.promise("commands-within-caps")
-@given(CASES)
-@settings(max_examples=1_000 // CASES_AT_ONCE, deadline=None)
-def test_any_input_is_flown_inside_the_caps(cases):
-    for case in cases:
-        check_case(*case)
