@@ -131,12 +131,9 @@ def test_an_incumbent_that_asks_gets_its_epoch_again(step):
     """Until it has asked in vain: world cannot hear it, so a new epoch loses nothing."""
     step.receive_hello()
     for counter in range(2 * REPEATS_MAX):
-        step.now_ns += SECOND_NS // 5
-        step.door.accept_once(Kind.ALIVE, counter, step.now_ns)
+        step.now_ns += 250 * MS  # the last instant at which it counts as heard
         assert step.answer()[:2] == (Kind.ACCEPT, 1)
-    step.now_ns += 250 * MS  # the last instant at which it counts as heard
-    assert [step.answer()[1] for _ in range(2 * REPEATS_MAX)] == [1] * 2 * REPEATS_MAX
-    step.door.hear(step.now_ns)
+        step.door.accept_once(Kind.ALIVE, counter, step.now_ns)
     opened = []
     for _ in range(2 * REPEATS_MAX):
         step.now_ns += SECOND_NS // 2
@@ -183,19 +180,14 @@ def test_an_incumbent_with_the_newest_key_gets_a_new_epoch(step):
     assert step.world.epoch_key == NEW
 
 
-@pytest.mark.parametrize("heard", [(), (2,)])
-def test_a_cloud_without_the_key_of_its_epoch_gets_a_new_one(step, heard):
+def test_a_cloud_without_the_key_of_its_epoch_gets_a_new_one(step):
     """Cloud's key file was restored to an older version, world's was not."""
     step.world.ring.keys = KeySet(NEW, KEY)
     assert step.receive_hello().opened
-    told = []
-    for n in range(REPEATS_MAX + len(heard) * 2 + 2):
-        if n in heard:
-            step.door.hear(step.now_ns)
-        answer = step.receive_hello(key=KEY)
-        told.append((answer.opened, signed_by(KEY, answer)))
-    repeated = REPEATS_MAX + 2 * len(heard)
-    assert told == [(False, False)] * repeated + [(True, True), (False, True)]
+    answers = [step.receive_hello(key=KEY) for _ in range(REPEATS_MAX + 2)]
+    opened = [False] * REPEATS_MAX + [True, False]
+    assert [answer.opened for answer in answers] == opened
+    assert [signed_by(KEY, answer) for answer in answers] == [False] * REPEATS_MAX + [True, True]
 
 
 @pytest.mark.promise("old-keys-end")

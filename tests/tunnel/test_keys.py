@@ -49,7 +49,6 @@ def test_a_key_file_is_read_as_it_was_written():
     ("text", "said"),
     [
         ("", "^expected the line 'current' and optionally 'previous', each once$"),
-        (f"previous {HEX}", "expected the line"),
         (f"current {HEX}\ncurrent {HEX}", "expected the line"),
         (HEX, "^neither 32 bytes nor lines of 'name value'$"),
         ("\xff" * 40, "neither 32 bytes nor lines"),

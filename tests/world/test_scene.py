@@ -37,8 +37,6 @@ def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch
     model = compile_model(robot, scene)
     assert model.opt.timestep == 0.002
     assert model.opt.gravity.tolist() == [0.0, 0.0, -9.8066]
-    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
 
 
@@ -102,12 +100,6 @@ def test_what_the_robot_touches(scene_at, place, touched):
     assert touched_at(scene_at(*place)) == touched
 
 
-def test_a_contact_has_the_stiffness_and_friction_of_the_scene(scene_at):
-    contact = Simulator("pelican", scene_at(8.136, -6.42, 0.7))._data.contact
-    assert contact.solref[0].tolist() == [0.005, 1.0]
-    assert contact.friction[0, 0] == 0.6
-
-
 GOOD = (FOLDER / "robots" / "pelican.xml").read_text()
 
 
@@ -116,7 +108,6 @@ GOOD = (FOLDER / "robots" / "pelican.xml").read_text()
     [
         (GOOD.replace('size=".05 .05 .10"', 'size=".05 nan .10"'), "does not compile"),
         (GOOD.replace('name="rotor_left" site', 'name="rotor_5" site'), "needs the actuators"),
-        (GOOD.replace('touch name="tip"', 'touch name="hand"'), "needs a sensor named tip"),
         (GOOD.replace('<freejoint name="base"/>', ""), "freejoint"),
     ],
 )
@@ -136,9 +127,7 @@ def test_a_robot_that_cannot_fly_is_refused(tmp_path, monkeypatch, robot, messag
     [
         ('mass="1.0"', 'mass="1.265"', r"mass .kg. is 1.325, not 1.05 \+- 0.1"),
         (".01 .01 .02", ".02 .01 .02", "inertia about x .kg m.2. is 0.0215"),
-        ('inertial pos="0 0 0"', 'inertial pos="0 .03 0"', "centre of mass, y .m. is 0.028"),
         ('"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "rotor_left gear"),
-        ('gear="0 0 1 0 0 -.016"', 'gear="0 0 1 0 0 .016"', "is 0.016, not -0.016"),
         ('ctrllimited="false"', 'ctrlrange="0 13"', "ctrlrange, end .N. is 13, not at least 33.7"),
         ('ctrllimited="false"', 'dyntype="filter" dynprm="1"', "nothing else|dyntype is 2, not 0"),
         ('size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip, x .m. is 0.3, not 0.4"),
@@ -159,7 +148,6 @@ SCENE = (FOLDER / "scenes" / "empty.xml").read_text()
     ("scene", "message"),
     [
         (SCENE.replace('name="spawn"', 'name="start"'), "needs a frame named spawn"),
-        (SCENE.replace('timestep=".002"', 'timestep=".01"'), "timestep is 0.01, not 0.002"),
         (SCENE.replace('<body name="floor">', '<body><freejoint/><geom size="1"/></body>'
                        '<body name="floor">'), "nothing else may move"),
         (SCENE.replace('<body name="floor">', "<body>"), "needs a body named floor"),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.limits import COMMAND_MAX, growth
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed
-from tests.world.guard.test_arithmetic import ANY, PLACES, SPEEDS, VECTORS
+from tests.world.guard.test_limits import ANY, PLACES, SPEEDS, VECTORS
 
 TAKEN = st.tuples(*[st.floats(-COMMAND_MAX, COMMAND_MAX)] * 3)
 """Values that a command may have without being rejected."""
