@@ -7,7 +7,6 @@ import pytest
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import Estimator
-from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.drivers.process import from_line, to_line
@@ -125,9 +124,12 @@ LONG = ValueError("no caf\udce9 " + "x" * 100_000)
 ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
 OUT_OF_SHAPE = returns((0.1,), ANY._replace(velocity=(0.1, 0.2)), position=(1.0, 2.0))
 NOT_FINITE = returns(nan, ANY._replace(velocity=(0.0, nan, 0.0)), position=(inf, 0.0, 0.0))
+NO_NUMBERS = returns("abc", ANY._replace(integral=(None,) * 3), velocity="abc")
 
 
-@pytest.mark.parametrize("bad", [*map(raises, (*ERRORS, LONG)), OUT_OF_SHAPE, NOT_FINITE])
+@pytest.mark.parametrize(
+    "bad", [*map(raises, (*ERRORS, LONG)), OUT_OF_SHAPE, NOT_FINITE, NO_NUMBERS]
+)
 @pytest.mark.parametrize("kind", ["estimator", "predictor", "controller"])
 def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     a_loop = loop(**{kind: bad if kind == "estimator" else bad()})
@@ -142,14 +144,6 @@ def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     assert "\n" not in fault.text
     assert len(fault.text.encode()) < 2200
     assert fault.text.endswith(f"fix cloud.{kind} or choose another")
-
-
-@pytest.mark.parametrize("wrong", [(0.1, 0.2), "abc", None, (None,) * 3])
-@pytest.mark.parametrize("field", ["velocity", "proportional", "integral", "derivative"])
-def test_an_output_that_is_not_three_numbers_is_not_flown(field, wrong):
-    a_loop = loop(controller=returns(output=ANY._replace(**{field: wrong}))(), heard_ms=1090)
-    assert command(a_loop, 1094)[0].velocity == ZERO
-    assert a_loop.counts["controller_failed"] == 1
 
 
 def test_arrays_and_generators_become_plain_numbers():
@@ -177,13 +171,13 @@ def test_a_failing_reset_is_reported_with_the_next_telemetry():
             if self.begun > 1:
                 raise RuntimeError("not again")
 
-    class Mean(Once, RunningMean):
-        def __init__(self):
-            self.reset()
-            super().__init__()
+        __init__ = reset
 
-    sample, steady = (type("", (Once, kind), {})() for kind in (LastSample, Integrating))
-    a_loop = loop(Mean, sample, steady)
+    mean, sample, steady = (
+        type("", (Once, kind), {"asked": 0}) for kind in (Estimator, LastSample, Integrating)
+    )
+    sample.begun = steady.begun = -1
+    a_loop = loop(mean, sample(), steady())
     a_loop.start_mission()
     a_loop.reset()
     assert a_loop.take_faults() == []

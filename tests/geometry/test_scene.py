@@ -5,7 +5,6 @@ import math
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.geometry import fence
 from cloudrc.geometry.scene import Board, Scene, load_scene
 
 
@@ -48,7 +47,6 @@ def test_a_scene_of_ones_own_is_read(tmp_path):
     ("numbers", "reason"),
     [
         ('<numeric name="board" data="1 2 x 4 5"/>', "board: data must be 5 numbers"),
-        ('<numeric name="pipe_1" data="0 0 0 0 0 0 5 .6 .7"/>', "pipe_1: needs an axis"),
         ('<numeric name="pipe_1" data="0 0 0 1 0 0 5 .7 .6"/>', "0 < inner < outer"),
         ('<numeric name="floor" data="nan"/>', "floor: data must be 1 numbers"),
         ("<numeric", "not readable as XML"),
@@ -64,9 +62,3 @@ def test_a_bad_spawn_and_a_missing_scene_are_refused(tmp_path):
         load_scene(scene_file(tmp_path, "", '<frame name="spawn" pos="1 2"/>'))
     with pytest.raises(BadInputError, match="No such file"):
         load_scene("nowhere")
-
-
-def test_the_fence_is_a_closed_box():
-    assert fence.inside((9.2, 5.5, 2.5))
-    assert fence.inside((-3, -8.5, 0))
-    assert not fence.inside((0, 0, -1e-9))

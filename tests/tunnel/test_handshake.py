@@ -9,7 +9,6 @@ from cloudrc.tunnel.handshake import (
     CLOUDS_MAX,
     COOKIE_NS,
     EPOCH_MAX,
-    GRACE_NS,
     NO_COOKIE,
     REPEATS_MAX,
     HelloAnswer,
@@ -34,20 +33,13 @@ def test_a_hello_gets_a_cookie_and_with_the_cookie_a_session(step, now_ns):
     before = dict(vars(step.door)) | {"_challenged_ns": now_ns}
     cookie = step.cookie()
     assert dict(vars(step.door)) == before, "without a cookie it changes nothing"
+    step.now_ns += CHALLENGE_NS
+    assert step.answer(cookie=cookie[:-1] + b"?")[0] == Kind.CHALLENGE, "a wrong one is as none"
     answer = step.receive_hello(cookie=cookie)
     assert (answer.outcome, answer.opened, step.world.epoch) == ("hello", True, 1)
     kind, epoch, _, body = step.cloud.open(answer.datagrams[0])
     assert (kind, epoch) == (Kind.ACCEPT, 1)
     assert codec.decode_accept(body) == Accept(NONCE, WORLD, CLOCK)
-
-
-def test_a_wrong_cookie_is_as_good_as_none(step):
-    right = step.cookie()
-    others = Doorstep(nonce=b"v" * 16), Doorstep(key=NEW)
-    for cookie in (right[:-1] + bytes([right[-1] ^ 1]), *(other.cookie() for other in others)):
-        step.now_ns += CHALLENGE_NS
-        assert step.answer(cookie=cookie)[0] == Kind.CHALLENGE
-    assert step.world.epoch == 0
 
 
 @pytest.mark.parametrize(("slots", "opened"), [(0, True), (1, True), (2, False)])
@@ -59,7 +51,7 @@ def test_a_cookie_lasts_its_slot_and_the_next(step, slots, opened):
 
 def test_challenges_are_at_most_100_ms_apart(step):
     for _ in range(50):
-        assert step.receive_hello(cookie=NO_COOKIE).datagrams
+        assert step.receive_hello(cookie=NO_COOKIE).outcome == "hello"
         step.now_ns += CHALLENGE_NS - 1
         assert step.receive_hello(cookie=NO_COOKIE) == ("unanswered", [], False)
         assert step.receive_hello().datagrams, "a hello with a cookie is answered"
@@ -100,20 +92,6 @@ def test_another_cloud_is_refused_while_the_incumbent_is_fresh(step):
     assert step.world.epoch == 2
 
 
-def test_a_new_epoch_gives_its_cloud_time_to_be_heard(step):
-    step.receive_hello()
-    step.now_ns += GRACE_NS
-    assert step.receive_hello(OTHER).outcome == "busy"
-    step.door.accept_once(Kind.OPERATOR, 0, step.now_ns - GRACE_NS)
-    assert codec.peek(step.door.begin_next_epoch(step.now_ns))[:2] == (Kind.ACCEPT, 2)
-    step.door.accept_once(Kind.OPERATOR, 0, step.now_ns - GRACE_NS)  # counters restart
-    step.door.begin_next_epoch(step.now_ns)
-    step.now_ns += GRACE_NS
-    assert step.receive_hello(OTHER).outcome == "busy"
-    step.now_ns += 1
-    assert step.receive_hello(OTHER).opened
-
-
 def test_operator_and_alive_are_let_in_once(step):
     step.receive_hello()
     for kind in (Kind.OPERATOR, Kind.ALIVE):
@@ -124,6 +102,8 @@ def test_operator_and_alive_are_let_in_once(step):
     with pytest.raises(DecodeError, match=r"^malformed$"):
         step.door.accept_once(Kind.TELEMETRY, 0, step.now_ns)
     step.now_ns += 300 * MS
+    assert codec.peek(step.door.begin_next_epoch(step.now_ns))[:2] == (Kind.ACCEPT, 2)
+    step.door.accept_once(Kind.ALIVE, 5, step.now_ns - 300 * MS)  # counters restart
     assert step.receive_hello(OTHER).opened, "a repeat is no sign of life"
 
 

@@ -46,16 +46,6 @@ def test_an_end_opens_what_the_other_one_sends(secret):
     assert refuses(world, data, "old_epoch")
 
 
-def test_a_malformed_datagram_costs_no_cryptography(monkeypatch):
-    world, cloud = pair()
-    data = cloud.seal(Kind.COMMAND, BODY)
-    monkeypatch.setattr(world, "_opening", None)
-    monkeypatch.setattr(world, "_open_greeting", None)
-    sizes = set(range(codec.DATAGRAM_MAX + 2)) - {len(data)}
-    assert all(refuses(world, data[:size].ljust(size, b"x"), "malformed") for size in sizes)
-    assert refuses(world, bytes([data[0] ^ 1]) + data[1:], "version")
-
-
 def test_without_a_session_only_greetings_are_opened():
     cloud = Session(Direction.DOWNLINK, KeyRing(KeySet(OLD)))
     world, _ = pair(NO_EPOCH)

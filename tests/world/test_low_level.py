@@ -22,13 +22,9 @@ def turned(orientation, rate=ZERO):
 AT_REST = turned(UPRIGHT)
 
 
-def test_hover_carries_the_assumed_mass_with_508_rad_per_s():
+def test_proportional_and_integral_force_carry_the_mass_and_oppose_the_error():
     # 10.3005 / 4 = 2.575125 N; / 9.9865e-6 = 257860.6; root 507.80.
-    assert LowLevel().force(ZERO, ZERO) == pytest.approx((0, 0, WEIGHT))
     assert LowLevel().update(AT_REST, ZERO) == pytest.approx((507.80,) * 4, abs=0.005)
-
-
-def test_proportional_and_integral_force_oppose_the_error():
     # e = v - v_ref = (.1, -.1, .1): P = 4, 4, 10 times; the integral after 2 ms is .0002.
     force = LowLevel().force((0.1, 0.1, 0.3), (0.0, 0.2, 0.2))
     assert force == pytest.approx((-0.4002, 0.4002, WEIGHT - 1.0005))

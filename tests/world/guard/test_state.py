@@ -148,17 +148,6 @@ def test_hold_begins_with_the_first_tick_after_the_age_limit():
     assert told(guard) == (2200 * MS, HOLD, "new session")
 
 
-def test_hold_brakes_at_once_and_then_holds_the_position():
-    guard = tracking((1.5, 0.0, 0.0))
-    run(guard, 0, 252 * MS, velocity=(1.5, 0.0, 0.0))
-    first, *rest = run(guard, 252 * MS, 900 * MS, velocity=(1.5, 0.0, 0.0))
-    assert hypot(*first) < 1.0  # below the speed of the robot, which follows late
-    assert (rest[-1], guard.brakes) == (ZERO, True)
-    run(guard, 900 * MS, 902 * MS)
-    assert not guard.brakes
-    assert run(guard, 902 * MS, 906 * MS, (1.02, 2.0, 1.3))[-1][0] < 0.0
-
-
 def test_the_next_hold_has_a_new_hold_point():
     guard = holding()
     now_ns = feed(guard, 2 * SECOND, 20, (0.0, 0.0, 0.0))
@@ -535,14 +524,6 @@ def test_a_hold_on_the_ground_stops_the_rotors_not_the_mission():
     assert guard.reference == ZERO
     feed(guard, 2 * SECOND, 1, (0.0, 0.0, 1.0), position=STANDS)
     assert states(guard) == [TRACK]
-
-
-def test_a_mission_that_ends_on_the_ground_ends_in_ground():
-    guard = taking_off()
-    guard.end_mission(10 * MS)
-    assert run(guard, 10 * MS, 20 * MS, STANDS) == [None] * 5
-    assert states(guard) == [HOLD, GROUND]
-    assert not guard.armed
 
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")
