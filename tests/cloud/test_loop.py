@@ -161,23 +161,9 @@ def test_arrays_and_generators_become_plain_numbers():
 
 
 def test_a_failing_reset_is_reported_with_the_next_telemetry():
-    class Once:
-        """Begins once, and again raises."""
-
-        begun = 0
-
-        def reset(self):
-            type(self).begun += 1
-            if self.begun > 1:
-                raise RuntimeError("not again")
-
-        __init__ = reset
-
-    mean, sample, steady = (
-        type("", (Once, kind), {"asked": 0}) for kind in (Estimator, LastSample, Integrating)
-    )
-    sample.begun = steady.begun = -1
-    a_loop = loop(mean, sample(), steady())
+    estimators, sample, steady = [Estimator()], LastSample(), Integrating()
+    a_loop = loop(estimators.pop, sample, steady)  # there is no second estimator
+    sample.reset = steady.reset = lambda: 1 / 0
     a_loop.start_mission()
     a_loop.reset()
     assert a_loop.take_faults() == []

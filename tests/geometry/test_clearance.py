@@ -71,9 +71,6 @@ def test_clearance_is_infinite_in_an_empty_scene():
 def test_points_are_those_of_the_plant_and_turn_with_the_robot():
     points = key_points()
     assert (points.positions.shape, len(robot_points().radii)) == ((225, 3), 341)
-    assert points.positions.max(axis=0) == pytest.approx((0.4, 0.338, 0.18))
-    assert points.positions[:, 2].min() == -0.1
-    assert sorted(set(points.radii)) == [0, 0.01]
     # A third of a turn about (1, 1, 1) takes x to y, y to z, z to x.
     placed = place_points(points, np.zeros((1, 3)), np.array([[0.5, 0.5, 0.5, 0.5]]))[0]
     assert placed == pytest.approx(points.positions[:, [2, 0, 1]])
