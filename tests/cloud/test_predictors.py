@@ -8,17 +8,11 @@ from cloudrc.cloud.predictors import (
     commanded_velocity,
     constant_acceleration,
     constant_velocity,
-    last_sample,
 )
 from cloudrc.messages import UPRIGHT, Command, Odometry
 
 HALF = sqrt(0.5)
 SAMPLE = Odometry(1_000_000_000, (1.0, 2.0, 3.0), UPRIGHT, (0.5, -1.0, 2.0), (0.0, 0.0, pi / 2))
-
-
-def test_last_sample_moves_nothing_but_the_stamp():
-    moved = SAMPLE._replace(stamp_ns=1_100_000_000)
-    assert last_sample.build().predict(SAMPLE, 0.1) == moved
 
 
 def test_constant_velocity_is_equation_3():

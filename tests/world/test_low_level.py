@@ -46,14 +46,6 @@ def test_the_integral_force_in_x_and_y_is_limited():
     assert low_level.force(ZERO, ZERO) == pytest.approx((0.3, -0.3, WEIGHT + 2.5 * 0.40))
 
 
-def test_reset_forgets_integral_and_last_error():
-    low_level = LowLevel()
-    fresh = low_level.update(AT_REST, (0.3, 0.2, 0.1))
-    assert low_level.update(AT_REST, (0.5, 0.5, 0.5)) != fresh
-    low_level.reset()
-    assert low_level.update(AT_REST, (0.3, 0.2, 0.1)) == fresh
-
-
 def test_a_forward_force_pitches_the_nose_down_and_rates_are_damped():
     # Wanted tilt atan(3/4) about +y, so e_R = -sin = -.6; thrust is the force's part along z.
     assert attitude((3.0, 0.0, 4.0), AT_REST) == pytest.approx((4.0, 0, 0.6, 0))

@@ -148,18 +148,6 @@ def test_the_tip_touches_the_board_and_again_after_0_1_s_without(at_the_board):
     assert (again.body, again.tip) == ("board", True)
 
 
-def test_the_velocity_of_the_tip_includes_the_rotation(scene_at):
-    # With two rotors it tips over its nose, and the tip falls faster than the base.
-    simulator = Simulator("pelican", scene_at(0, 0, 0.6, "empty"))
-    touches = []
-    while not touches:
-        simulator.step((0.0, 350.0, 500.0, 350.0))
-        touches = simulator.take_contacts()
-    touch = touches[0]
-    assert (touch.body, touch.tip) == ("floor", True)
-    assert touch.tip_velocity[2] < touch.velocity[2] - 0.3
-
-
 def test_the_floor_is_a_new_contact_only_after_a_flight():
     simulator, low_level = Simulator("pelican", "empty"), LowLevel()
     for _ in range(200):
