@@ -7,10 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.load import load_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import Mission, Steps, Waypoint
-from cloudrc.geometry import fence
 from cloudrc.geometry.clearance import clearance
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
@@ -20,7 +18,6 @@ from cloudrc.geometry.placement import (
     outside_fence,
 )
 from cloudrc.geometry.scene import load_scene
-from cloudrc.world.guard.limits import Limits
 
 PIPES = load_scene("pipes")
 
@@ -116,8 +113,6 @@ def test_a_straight_way_leads_to_the_offered_point():
 def test_a_waypoint_that_the_guard_keeps_the_robot_from_is_refused(position, tolerance, outside):
     said = refusals(position, start="here", scene="empty", tolerance_m=tolerance)
     assert ("x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]" in said) is outside
-    corners = Limits(fence_low=fence.LOW, fence_high=fence.HIGH).inner_corners()
-    assert corners == (fence.INNER_LOW, fence.INNER_HIGH)
 
 
 @pytest.mark.parametrize(
@@ -134,19 +129,6 @@ def test_a_waypoint_that_the_guard_keeps_the_robot_from_is_refused(position, tol
 def test_a_mission_with_a_wall_on_its_way_is_refused(positions, start, reason):
     said = refusals(*positions, start=start)
     assert reason in said if reason else said == ""
-
-
-def test_every_bad_waypoint_is_named_up_to_a_number():
-    problems = refusals(*[(-1.0, 0.0, 0.7), (-0.6, 0.0, 0.7)] * 30).splitlines()
-    assert len(problems) == 21
-    assert problems[0].startswith("waypoints.1.position_m: [-0.6, 0, 0.7]: the robot would")
-    assert problems[-1].startswith("waypoints: 10 more waypoints")
-
-
-@pytest.mark.parametrize("experiment", ["paper", "steps", "hover"])
-def test_shipped_missions_can_be_flown(experiment):
-    loaded = load_experiment(experiment)
-    assert check_mission(loaded.mission, load_scene(loaded.world.scene)) == []
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.config import document
 from cloudrc.config.load import load_profile, read_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.files import atomic_file, write_atomically
-from cloudrc.link import traces
 from cloudrc.link.state import publish
 from cloudrc.link.traces import read_trace
 from cloudrc.record.merge import merge
@@ -53,15 +51,6 @@ def test_one_named_by_a_configuration_is_refused(tmp_path, named):
         (tmp_path / "config.yaml").write_text(f'{where}"{named}"' + "}" * where.count("{"))
         with pytest.raises(BadInputError, match=r"^[^\n]*config\.yaml:1: [^\n]*$"):
             read_experiment(tmp_path / "config.yaml")
-
-
-@pytest.mark.parametrize(("module", "read"), [(document, read_experiment), (traces, read_trace)])
-def test_no_file_is_read_beyond_its_size_limit(tmp_path, module, read):
-    path = tmp_path / "long.yaml"
-    with path.open("wb") as file:
-        file.truncate(module.SIZE_MAX + 1)
-    with pytest.raises(BadInputError, match=f": longer than {module.SIZE_MAX} bytes; "):
-        read(path)
 
 
 def test_aliases_in_aliases_do_not_multiply_values_without_end(tmp_path):

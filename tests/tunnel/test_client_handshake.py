@@ -1,8 +1,8 @@
-"""Cloud's side of the handshake, and the log of why there is no session."""
+"""Cloud's side of the handshake, the log of why there is no session, and what an end sends."""
 
 import pytest
 
-from cloudrc.records import Fault
+from cloudrc.records import Fault, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Accept, Hello, Kind
 from cloudrc.tunnel.handshake import (
@@ -138,3 +138,16 @@ def test_a_text_is_logged_once_in_a_session():
     for kind in Kind:
         said = [Fault(7, "key", KEY_TEXT)] if kind <= Kind.BUSY else []
         assert HandshakeLog().about("tag", codec.encode_header(kind, 1, 1, 1), 7) == said
+
+
+def test_an_end_gives_its_datagrams_and_records_once():
+    bare = Bare(ring())
+    world = bare.world
+    bare.send(bare.cloud("a").hello())
+    assert (world.sealed, world.epoch) == (True, 1)
+    assert any(isinstance(record, SessionOpened) for record in world.take_records())
+    assert world.take_records() == []
+    world.handle_deadline(world.next_deadline_ns())
+    assert codec.peek(world.take_datagrams()[-1])[:2] == (Kind.TELEMETRY, 1)
+    assert world.take_datagrams() == []
+    assert world.counts["sent"] == 3, "a challenge, an acceptance, telemetry"

@@ -57,21 +57,17 @@ def test_without_a_session_only_greetings_are_opened():
         cloud.begin(1)
 
 
-@pytest.mark.parametrize(
-    ("key", "epoch", "nonces"),
-    [
-        (NEW, 1, NONCES),
-        (OLD, 2, NONCES),
-        (OLD, 1, b"x" * 16 + NONCES[16:]),
-        (OLD, 1, NONCES[:16] + b"x" * 16),
-    ],
-)
-def test_keys_depend_on_key_epoch_and_both_nonces(key, epoch, nonces):
+def test_keys_depend_on_key_epoch_and_both_nonces():
     world, _ = pair()
-    cloud = Session(Direction.DOWNLINK, KeyRing(KeySet(key)))
-    cloud.begin(epoch, nonces)
-    cloud.epoch = 1  # as a forger would write it
-    assert refuses(world, cloud.seal(Kind.COMMAND, BODY))
+    other = b"x" * 16
+    for key, epoch, nonces in (
+        *((NEW, 1, NONCES), (OLD, 2, NONCES)),
+        *((OLD, 1, other + NONCES[16:]), (OLD, 1, NONCES[:16] + other)),
+    ):
+        cloud = Session(Direction.DOWNLINK, KeyRing(KeySet(key)))
+        cloud.begin(epoch, nonces)
+        cloud.epoch = 1  # as a forger would write it
+        assert refuses(world, cloud.seal(Kind.COMMAND, BODY))
 
 
 def test_each_kind_has_its_own_counter_in_each_epoch():
