@@ -28,13 +28,6 @@ def test_first_horizons(estimator, delays, expected):
     assert horizons(estimator, *delays) == pytest.approx(expected)
 
 
-def test_running_mean_500_forgets_with_a_share_of_1_in_500():
-    estimator = running_mean_500.build()
-    horizons(estimator, *[0.020] * 1000)
-    # 70 - 50 (499/500)^100 ms
-    assert horizons(estimator, *[0.070] * 100)[-1] == pytest.approx(0.029072, abs=1e-6)
-
-
 @pytest.mark.parametrize("offset", [0.0, -86_400.0])
 def test_split_adds_the_age_and_cancels_the_clock_offset(offset):
     estimator = split.build(gain=0.25)

@@ -42,10 +42,5 @@ def test_a_scene_of_ones_own_is_read(tmp_path):
 def test_bad_numbers_are_named(tmp_path, numbers, reason):
     with pytest.raises(BadInputError, match=r"scene mine\.xml: .*" + reason):
         load_scene(scene_file(tmp_path, numbers))
-
-
-def test_a_bad_spawn_and_a_missing_scene_are_refused(tmp_path):
     with pytest.raises(BadInputError, match="spawn: data must be 3 numbers: '1 2'"):
         load_scene(scene_file(tmp_path, "", '<frame name="spawn" pos="1 2"/>'))
-    with pytest.raises(BadInputError, match="No such file"):
-        load_scene("nowhere")

@@ -39,19 +39,6 @@ def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
 
 
-def test_readers_without_mujoco_see_what_is_compiled(pipes):
-    told = facts("pipes")
-    assert list(told) == ["pipe_1", "pipe_2", "pipe_3", "board"]
-    for name, numbers in told.items():
-        assert pipes.numeric(name).data.tolist() == numbers
-    x, y_min, y_max, z_min, z_max = told["board"]
-    assert (x, y_min, y_max, z_min, z_max) == (8.535, -6.82, -6.02, 0.025, 1.225)
-    geoms = [pipes.geom(number) for number in range(pipes.ngeom)]
-    (board,) = [geom for geom in geoms if geom.name.startswith("board/")]
-    assert (board.pos - board.size).tolist() == pytest.approx([x, y_min, z_min])
-    assert (board.pos + board.size)[1:].tolist() == pytest.approx([y_max, z_max])
-
-
 @pytest.mark.parametrize("name", ["pipe_1", "pipe_2", "pipe_3"])
 def test_staves_are_tangent_to_the_pipe(pipes, name):
     numbers = facts("pipes")[name]
@@ -70,13 +57,6 @@ def test_staves_are_tangent_to_the_pipe(pipes, name):
     assert sum(data.geom_xpos[staves] - centre) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
-def touched_at(scene):
-    """Return the bodies that the robot touches at its spawn, without the floor."""
-    simulator = Simulator("pelican", scene)
-    simulator.step(STOPPED)
-    return {touch.body for touch in simulator.take_contacts()}
-
-
 @pytest.mark.parametrize(
     ("place", "touched"),
     [
@@ -89,7 +69,9 @@ def touched_at(scene):
     ],
 )
 def test_what_the_robot_touches(scene_at, place, touched):
-    assert touched_at(scene_at(*place)) == touched
+    simulator = Simulator("pelican", scene_at(*place))
+    simulator.step(STOPPED)
+    assert {touch.body for touch in simulator.take_contacts()} == touched
 
 
 SHIPPED = {"robots": "pelican", "scenes": "empty"}

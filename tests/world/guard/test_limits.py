@@ -2,7 +2,7 @@
 
 from dataclasses import FrozenInstanceError, fields
 from itertools import product
-from math import hypot, inf, isfinite, nan, nextafter, sqrt
+from math import hypot, inf, isfinite, nan
 
 import pytest
 from hypothesis import given, settings
@@ -123,14 +123,6 @@ def test_limit_length_keeps_a_vector_of_the_allowed_length():
     allowed, longer = (1.0, 0.0, 0.0), (1.0, 2.0**-26, 0.0)
     assert rules.limit_length(allowed, 1.0) is allowed
     assert rules.limit_length(longer, 1.0) == longer  # rounding makes its length 1.0 again
-
-
-def test_the_cap_holds_to_the_last_bit():
-    """Use speeds whose square is rounded down."""
-    for k in range(2000):
-        v = nextafter(6.0, 0.0) / sqrt(1 + k * k * 1e-6)
-        w = rules.limit_length((v, v * k * 1e-3, 0.0), 6.0 * rules.ROUNDING_FACTOR)
-        assert hypot(*w) <= 6.0
 
 
 @pytest.mark.parametrize("step", [1e-9, 0.024, 3.0])
