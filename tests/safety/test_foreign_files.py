@@ -6,6 +6,7 @@ import signal
 import stat
 from contextlib import suppress
 from itertools import pairwise
+from math import nan
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,14 @@ def test_an_old_report_is_used_completely_or_not_at_all(run):
         assert read_run(run)[2] == anew, before[:99]
     (run / "report.json").write_text(json.dumps(good))
     assert read_run(run)[2].notes == ("seen",)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_undrawable_data_gives_one_line_of_error(run):
+    log = flown(lambda seconds: (nan, nan, nan))
+    write_mission(run / "mission.mcap", log.ends()[0], ())
+    with pytest.raises(BadInputError, match=r"^[^\n]*cannot be drawn \(ValueError: [^\n]*$"):
+        write_report(run, *read_run(run))
 
 
 # Links.
