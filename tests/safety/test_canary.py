@@ -13,7 +13,6 @@ from cloudrc.drivers.realtime import free_ports
 from tests.drivers.conftest import KEY, TOKEN, Release
 
 SECRET_FILES = ("operator", "key")
-"""The files that contain the token and the key."""
 CANARIES = [
     form
     for secret in (KEY, TOKEN.encode())

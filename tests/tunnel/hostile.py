@@ -22,7 +22,6 @@ from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.session import pair
 from tests.flights.conftest import MS, Bare, BareCloud, bare_cloud, ring
 
-LONGEST = 2048
 STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
 """Steps of time [ns]; cloud asks for a session after 0.5 s of silence."""
 TOLD_MAX = 256
@@ -139,14 +138,14 @@ class Target:
         way, which, rest = program[0] % 4, program[1] | program[2] << 8, program[3:]
         frame = self.frames[which % len(self.frames)]
         if way == 0:
-            return rest[:LONGEST]
+            return rest[:2048]
         if way == 1:
             spoiled = bytearray(frame)
             for at, change in zip(rest[::2], rest[1::2], strict=False):
                 spoiled[at % len(spoiled)] ^= change
             return bytes(spoiled)
         if way == 2:
-            length = (rest[0] | which & 0x700) % LONGEST
+            length = (rest[0] | which & 0x700) % 2048
             return (frame + rest * (1 + length // len(rest)))[:length]
         kind = DOWNLINK[which % 3] if which & 1 else Kind.TELEMETRY
         size = codec.BODY_SIZES[kind]

@@ -33,9 +33,7 @@ def facts(scene):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    model = compile_model(robot, scene)
-    assert model.opt.timestep == 0.002
-    assert model.opt.gravity.tolist() == [0.0, 0.0, -9.8066]
+    assert compile_model(robot, scene).opt.timestep == 0.002
     assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
 
 
@@ -112,8 +110,6 @@ def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, ol
 def test_an_unknown_name_lists_the_available_ones():
     with pytest.raises(BadInputError, match=r"no robot named 'pelikan'; available: pelican"):
         compile_model("pelikan", "pipes")
-    with pytest.raises(BadInputError, match=r"no scene named '/nowhere/scene.xml'"):
-        compile_model("pelican", "/nowhere/scene.xml")
 
 
 FLIES = "from cloudrc.world.simulator import Simulator; Simulator('pelican', 'pipes')"

@@ -117,6 +117,7 @@ def test_the_integral_works_against_a_steady_distance(offset, seconds, sink, lea
         hold.follow(ZERO, moved(offset), sink, 0.1)
     assert hold.follow(ZERO, moved(ZERO), sink, ENOUGH) == pytest.approx(lean)
     hold.forget()
+    assert not hold.brakes
     hold.follow((0.0, 0.0, -sink), sensed(HERE, (0.0, 0.0, -sink)), sink, ENOUGH)
     fresh = hold.follow(ZERO, moved(ZERO), sink, ENOUGH)
     assert fresh == (0.0, 0.0, -sink), "a new hold point begins without it"

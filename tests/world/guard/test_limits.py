@@ -69,6 +69,8 @@ def test_a_fence_has_room_between_its_margins(axis):
         corner[axis] = high
         with pytest.raises(ValueError, match="leaves no room"):
             Limits((0.0, 0.0, 0.0), tuple(corner))
+    with pytest.raises(ValueError, match="zip"):
+        Limits((0.0, 0.0), (5.0, 5.0, 5.0))
 
 
 def test_the_inner_corners_have_the_margins_taken_off():
@@ -127,8 +129,8 @@ def test_limit_length_keeps_a_vector_of_the_allowed_length():
 
 @pytest.mark.parametrize("step", [1e-9, 0.024, 3.0])
 def test_step_towards_moves_by_at_most_a_step(step):
-    far = rules.step_towards(ZERO, (3.0, 0.0, 4.0), step)
-    assert far == pytest.approx((0.6 * step, 0.0, 0.8 * step))
+    far = rules.step_towards((1.0, 1.0, 1.0), (4.0, 1.0, 5.0), step)
+    assert far == pytest.approx((1 + 0.6 * step, 1, 1 + 0.8 * step), rel=1e-12)
     for share in (0.5, 1.0):
         end = (share * step, 0.0, 0.0)
         assert rules.step_towards(ZERO, end, step) is end
@@ -196,11 +198,13 @@ def test_limit_sink_limits_how_fast_the_reference_sinks():
     for wanted, before, climb, lowest in (
         (-3.0, 0.0, -0.2, -0.2 - rules.SINK_LEAD_MAX),
         (-0.6, 0.0, -0.2, -0.6),
+        (-0.2 - rules.SINK_LEAD_MAX, 0.0, -0.2, -0.2 - rules.SINK_LEAD_MAX),
         (-1.0, 0.5, 3.0, 0.5),  # it does not rise again while the robot still climbs
     ):
         reference = (1.0, 0.0, wanted)
         kept = rules.limit_sink(reference, (1.0, 0.0, before), climb, speed_max=6.0)
         assert kept == (1.0, 0.0, lowest)
+        assert (kept is reference) == (wanted == lowest)
     capped = rules.limit_sink((5.9, 0.0, -1.0), (0.0, 0.0, 5.9), BIG, speed_max=6.0)
     assert hypot(*capped) == pytest.approx(6.0)
 
@@ -214,7 +218,8 @@ def test_brake_start_is_no_faster_than_the_reference(reference, velocity):
 @given(SPEEDS, SPEEDS, st.floats(1e-3, 0.1))
 @MANY
 def test_limit_growth_speeds_up_by_at_most_a_step(before, after, step):
-    kept = rules.limit_growth(before, after, step)
+    kept, exact = rules.limit_growth(before, after, step), (-step, 0.0, 0.0)
+    assert rules.limit_growth(ZERO, exact, step) is exact
     grown = [rules.growth(a, b) for a, b in zip(before, kept, strict=True)]
     assert hypot(*grown) <= step * (1 + 1e-12) + 1e-15
     for wanted, got in zip(after, kept, strict=True):
