@@ -7,7 +7,7 @@ import pytest
 
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Cause, GuardState
-from cloudrc.world.guard.hold import LAND_SPEED, LIFT_OFF_HEIGHT, STILL_SPEED
+from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
 from cloudrc.world.guard.limits import COMMAND_MAX, RECHECK_NS
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
@@ -59,6 +59,7 @@ def test_fresh_commands_alone_never_arm():
     guard.accept_command(command(basis_ns=12 * MS), 12 * MS)
     assert told(guard) == (12 * MS, TRACK, "fresh command")
     guard.start_mission(20 * MS)
+    guard.acknowledge(20 * MS)
     run(guard, 20 * MS, 30 * MS)
     assert guard.state is TRACK, "a second start within a mission forgets nothing"
 
@@ -109,7 +110,7 @@ def test_a_command_is_fresh_while_its_basis_is(age_ns, answer):
 def test_speed_and_yaw_rate_are_capped(asked, allowed):
     guard = armed()
     for _ in range(2):
-        assert guard.accept_command(command((asked, 0.0, 0.0), yaw_rate=asked), 0) is None
+        assert guard.accept_command(command((asked,) * 3, yaw_rate=asked), 0) is None
     assert guard.yaw_rate == allowed
     assert guard.counts["limited_yaw_rate"] == 2 * (asked != allowed)
     assert guard.counts["limited_speed"] == 2 * (abs(asked) > 6.0)
@@ -144,7 +145,7 @@ def test_hold_begins_with_the_first_tick_after_the_age_limit():
     assert guard.state is TRACK
     run(guard, 252 * MS, 254 * MS)
     assert told(guard) == (252 * MS, HOLD, "command age 0.252 s above 0.250 s")
-    assert guard.cause is Cause.SILENCE
+    assert (guard.cause, guard.brakes) == (Cause.SILENCE, False)
     feed(guard, 2 * SECOND, 20)
     assert told(guard) == (2090 * MS, TRACK, "10 fresh commands within 0.090 s")
     assert guard.cause is Cause.COMMANDS
@@ -454,23 +455,19 @@ def test_a_steady_flight_notices_it_within_12_ms(flown_ticks):
 STANDS = (0.0, 0.0, 0.1)
 
 
-def above(height):
-    return (*STANDS[:2], STANDS[2] + height)
-
-
 def taking_off(height=0.0):
     """Return a guard in TRACK that has seen its ground; it has this height since the next tick."""
     guard = armed()
     assert run(guard, 0, TICK, STANDS) == [None]
     guard.accept_command(command((0.0, 0.0, 1.0)), 0)
-    run(guard, TICK, 10 * MS, above(height))
+    run(guard, TICK, 10 * MS, (0.0, 0.0, 0.1 + height))
     assert states(guard) == [TRACK]
     return guard
 
 
 def test_a_hold_on_the_ground_stops_the_rotors_not_the_mission():
-    guard = taking_off(0.9 * LIFT_OFF_HEIGHT)
-    flown = run(guard, 250 * MS, 260 * MS, above(0.9 * LIFT_OFF_HEIGHT))
+    guard = taking_off(height=0.018)
+    flown = run(guard, 250 * MS, 260 * MS, (0.0, 0.0, 0.118))
     assert flown[0] is not None
     assert set(flown[1:]) == {None}
     silent, not_yet = "command age 0.252 s above 0.250 s", "not off the ground yet, rotors stopped"
@@ -483,11 +480,10 @@ def test_a_hold_on_the_ground_stops_the_rotors_not_the_mission():
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")
 def test_above_the_ground_a_hold_climbs_clear_of_it():
-    guard = taking_off(1.1 * LIFT_OFF_HEIGHT)
-    flown = run(guard, 10 * MS, 3 * SECOND, above(1.1 * LIFT_OFF_HEIGHT))
+    guard = taking_off(height=0.022)
+    flown = run(guard, 10 * MS, 3 * SECOND, (0.0, 0.0, 0.122))
     assert states(guard) == [HOLD]
-    assert flown[-1][:2] == (0.0, 0.0)
-    assert flown[-1][2] == pytest.approx(0.8 * (FLOOR_MARGIN - STANDS[2] - 1.1 * LIFT_OFF_HEIGHT))
+    assert flown[-1] == pytest.approx((0.0, 0.0, 0.8 * (FLOOR_MARGIN - 0.122)))
 
 
 @pytest.mark.promise("no-rotor-stop-in-the-air")
