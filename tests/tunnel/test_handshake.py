@@ -112,7 +112,7 @@ def test_an_incumbent_that_asks_gets_its_epoch_again(step):
     step.receive_hello()
     step.door.hear(step.now_ns)
     step.now_ns += 250 * MS  # the last instant at which it counts as heard
-    assert [step.answer()[:2] for _ in range(2 * REPEATS_MAX)] == [(Kind.ACCEPT, 1)] * 6
+    assert {step.answer()[:2] for _ in range(2 * REPEATS_MAX)} == {(Kind.ACCEPT, 1)}
     step.door.hear(step.now_ns)
     opened = []
     for _ in range(2 * REPEATS_MAX):
