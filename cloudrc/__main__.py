@@ -1,4 +1,4 @@
-"""`python -m cloudrc`: the same as the command `cloudrc`."""
+"""Run the command `cloudrc` as `python -m cloudrc`."""
 
 from cloudrc.cli.main import main
 

@@ -1,6 +1,6 @@
 """Build world, cloud and link from an experiment, and convert its values to SI units.
 
-World and cloud do not import each other, and drivers know only the contract of an endpoint.
+World and cloud do not import each other. Drivers use them only through `cloudrc.endpoint.Endpoint`.
 """
 
 from __future__ import annotations
@@ -33,23 +33,24 @@ if TYPE_CHECKING:
 
 MS_TO_NS = 1_000_000
 CRUISE_SPEED = 1.0
-"""Expected speed on a leg, if the guard allows this speed [m/s]."""
+"""Expected speed between two waypoints, if the guard allows this speed [m/s]."""
 SETTLE_TIME = 4.0
-"""Expected extra time for the beginning and the end of a leg [s]."""
+"""Expected extra time at the beginning and end of the way to a waypoint [s]."""
 LEG_FACTOR = 3.0
-"""Limit of a leg, divided by its expected time. Source: docs/reference/faults.md, "F28"."""
+"""Time limit of the way to a waypoint, divided by its expected time [1].
+Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
-"""Mission number of a cloud that flies only one mission."""
+"""Mission number in a cloud that flies only one mission."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)
-"""Length of the longest straight way inside the fence [m]."""
+"""Length of the longest straight line inside the fence [m]."""
 
 
 def build_world(
     experiment: ResolvedExperiment, identity: Identity, clock: Callable[[], int] = lambda: 0
 ) -> WorldEndpoint:
-    """Build world's end: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
+    """Build world: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 
-    The monotonic clock [ns] is read last, because compiling a scene takes a while.
+    `clock` is the monotonic clock [ns]. It is read last, because compiling a scene takes a while.
     """
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.guard.limits import Limits
@@ -92,13 +93,13 @@ def build_cloud(
     *,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
 ) -> CloudEndpoint:
-    """Build cloud's end: plug-ins, teleoperation, and cloud's end of the tunnel.
+    """Build cloud: plug-ins, teleoperation, and cloud's end of the tunnel.
 
     Args:
         experiment: The experiment.
-        identity: The identity of this end.
-        clock: Monotonic clock of this end [ns].
-        teleop: The source of setpoints; None for one in this process, which starts at once.
+        identity: Names cloud's clock and process in the tunnel, and holds the keys.
+        clock: Cloud's monotonic clock [ns].
+        teleop: Source of setpoints; None: a new one, which flies the mission at once.
         make_loop: Makes the control loop from the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud
@@ -123,7 +124,7 @@ def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDire
 
 
 def build_plan(experiment: ResolvedExperiment) -> Plan:
-    """Turn the experiment's mission into legs."""
+    """Convert the experiment's mission to a plan for teleop."""
     limit, speed_max = experiment.criteria.time_limit_s, experiment.guard.speed_max_mps
     return mission_plan(experiment.mission, limit, experiment.seed, speed_max=speed_max)
 
@@ -131,15 +132,15 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
 def mission_plan(
     mission: schema.Mission, time_limit: float, seed: int = 0, *, speed_max: float = inf
 ) -> Plan:
-    """Turn a checked mission with a time limit [s] into legs.
+    """Convert a valid mission with a time limit [s] to a plan for teleop.
 
-    `seed` is the seed of random steps, `speed_max` is the guard's cap [m/s].
+    `seed` is the seed of random setpoints, `speed_max` the guard's speed limit [m/s].
     """
     if mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
     else:
         starts = (None, *mission.waypoints)
-        ways = zip(starts, mission.waypoints, strict=False)  # no leg starts at the last waypoint
+        ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
         legs = tuple(_leg(start, waypoint, speed_max) for start, waypoint in ways)
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
@@ -147,7 +148,7 @@ def mission_plan(
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
     """Convert one direction of a link profile to SI units, and read its trace and its table.
 
-    Raise a BadInputError for a file that cannot be read or is longer than `file_max` bytes.
+    Raise a BadInputError if a file cannot be read or is longer than `file_max` bytes.
     """
     trace = read_trace(Path(direction.trace), file_max) if direction.trace else None
     table = direction.distribution == "table" and direction.table
@@ -173,7 +174,7 @@ def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> Direc
 def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: float) -> Leg:
     limit = waypoint.time_limit_s
     if limit is None:
-        # The start of the first leg is unknown: assume the longest way.
+        # Where the robot starts is unknown: assume the longest way.
         way = FENCE_SPAN if start is None else dist(start.position_m, waypoint.position_m)
         expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
         limit = round(LEG_FACTOR * expected, 1)
@@ -182,7 +183,7 @@ def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: fl
 
 
 def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:
-    """Make random setpoints. Each lasts for one period, whether the robot arrives or not."""
+    """Make random setpoints. Each lasts one period, even if the robot does not arrive."""
     rng = np.random.Generator(np.random.PCG64([seed, _stream("steps")]))
     offsets = rng.uniform(-1.0, 1.0, (steps.count, 3)) * steps.range_m + steps.centre_m
     limit = 10 * steps.period_s
@@ -214,5 +215,5 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def _stream(name: str) -> int:
-    """Return the number of a random stream; draws of one stream do not change the others."""
+    """Return the number of a random stream; streams are independent of each other."""
     return int.from_bytes(name.encode(), "little")

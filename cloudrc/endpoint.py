@@ -1,7 +1,7 @@
-"""The contract of both ends of the tunnel: state machines without I/O.
+"""Define the interface of world and cloud to their driver: state machines without I/O.
 
-An endpoint has no socket, no clock and no thread. A driver calls the endpoint, and only the driver
-knows whether time is virtual or real:
+World and cloud are endpoints, the two ends of the tunnel. An endpoint has no socket, no clock and
+no thread. A driver calls its methods, and only the driver knows whether time is virtual or real:
 
     for data in arrived:
         endpoint.receive_datagram(data, now_ns)
@@ -10,8 +10,8 @@ knows whether time is virtual or real:
     send(endpoint.take_datagrams())
     keep(endpoint.take_records())
 
-`now_ns` never falls. All datagrams that a driver reads in one wake get the same `now_ns`: so an
-endpoint knows what waited in the socket while its process was stalled.
+`now_ns` never decreases. All datagrams that a driver reads at once get the same `now_ns`. So an
+endpoint can detect datagrams that waited in the socket while its process was stalled.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from cloudrc.records import Record
 
 
 class Endpoint(Protocol):
-    """One end of the tunnel. All times are integer nanoseconds on the clock of this end."""
+    """World or cloud, as its driver sees it. All times are integer nanoseconds on its own clock."""
 
     @property
     def sealed(self) -> bool:
-        """Whether the endpoint's datagrams are authenticated; only these may reach a socket."""
+        """Whether datagrams are authenticated; only authenticated datagrams may go to a socket."""
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Handle one datagram. Count and drop an invalid datagram, without an exception."""
+        """Process one datagram; count and drop an invalid datagram, without an exception."""
 
     def next_deadline_ns(self) -> int:
-        """Return the time of the next call of `handle_deadline` [ns]."""
+        """Return the time at which `handle_deadline` must be called next [ns]."""
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Do the work that is due at `now_ns` [ns]; the call may be late."""
+        """Do the work that is due at `now_ns` [ns]; the driver may call this late."""
 
     def take_datagrams(self) -> list[bytes]:
-        """Return the datagrams to send, made since the last call, oldest first."""
+        """Return the datagrams to send since the last call, oldest first."""
 
     def take_records(self) -> list[Record]:
-        """Return the records made since the last call, oldest first."""
+        """Return the new records since the last call, oldest first."""

@@ -1,9 +1,12 @@
-"""Errors that a user can fix: one line that says what is wrong, where, and what to do next."""
+"""Errors that a user can fix: one line that says what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
+import traceback
+from pathlib import Path
+
 TEXT_MAX = 2000
-"""Longest part of a foreign text that is shown [characters]."""
+"""Largest part of another program's text that is shown [characters]."""
 
 
 class CloudrcError(Exception):
@@ -13,7 +16,7 @@ class CloudrcError(Exception):
 
 
 class BadInputError(CloudrcError):
-    """A file, key, option or value is not usable."""
+    """A file, key, option or value cannot be used."""
 
     exit_code = 2
 
@@ -25,7 +28,7 @@ class MissingPrerequisiteError(CloudrcError):
 
 
 class InvalidRunError(CloudrcError):
-    """The run is invalid: it did not keep real time, or a process died."""
+    """The run is invalid: it did not keep real time, or one of its processes failed."""
 
     exit_code = 6
 
@@ -37,13 +40,13 @@ class TimedOutError(CloudrcError):
 
 
 class InterruptedRunError(CloudrcError):
-    """The user interrupted the run before the run had any result to report."""
+    """The user interrupted the run before there was a result to report."""
 
     exit_code = 130
 
 
 def to_one_line(text: str) -> str:
-    """Turn a foreign text into one printable line, with lone surrogates escaped."""
+    """Convert text from outside to one printable line; lone surrogates are escaped."""
     line = " ".join(text[:TEXT_MAX].split())
     return line.encode("utf-8", "backslashreplace").decode("utf-8")
 
@@ -55,5 +58,13 @@ def describe_error(error: BaseException) -> str:
         return to_one_line(f"{name}: {error}")
     except KeyboardInterrupt:
         raise
-    except BaseException:  # the exception's __str__ is foreign code, too
+    except BaseException:  # the exception's __str__ may raise, too
         return to_one_line(name)
+
+
+def locate_error(error: BaseException) -> str:
+    """Return where an exception was raised, as "FILE:LINE in FUNCTION" without folders."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames:
+        return ""
+    return f"{Path(frames[-1].filename).name}:{frames[-1].lineno} in {frames[-1].name}"

@@ -1,6 +1,6 @@
-"""Read and write files that other processes also write.
+"""Read and write files that other processes write or read at the same time.
 
-Reading never waits. Writing replaces a file in one step.
+Reading never blocks. Writing replaces the file in one step.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import IO
 
 SIZE_MAX = 1 << 20
-"""Largest file that is read by default [bytes]: the size limit of a ConfigMap."""
+"""Default size limit of a file that is read [bytes]: the size limit of a ConfigMap."""
 
 
 class TooLongError(ValueError):
-    """A file is larger than the reader's limit."""
+    """A file is larger than the size limit for reading."""
 
 
 def version(path: Path | str) -> tuple[int, int, int] | None:
-    """Identify the content of a file by one system call; None if the file does not exist."""
+    """Return a value that changes with a file's content (one system call); None if missing."""
     try:
         status = os.stat(path)
     except OSError:
@@ -31,11 +31,11 @@ def version(path: Path | str) -> tuple[int, int, int] | None:
 
 
 def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
-    """Read a whole file of at most `size_max` bytes, without waiting for another process.
+    """Read a whole file of at most `size_max` bytes; never block, even if the file is a pipe.
 
     Raises:
         OSError: If the file cannot be read.
-        ValueError: If `path` is not a regular file; a TooLongError if the file is larger.
+        ValueError: If `path` is no regular file; as TooLongError, if the file is too large.
     """
     with BufferedReader(open_file(path)) as file:
         status = os.fstat(file.fileno())
@@ -48,9 +48,9 @@ def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
 
 
 def open_file(path: Path) -> FileIO:
-    """Open a file that another process has written, without a buffer and without waiting.
+    """Open a file for reading, unbuffered; never block, even if the file is a pipe.
 
-    Raise an OSError, or a ValueError if `path` is not a regular file but, for example, a pipe.
+    Raise an OSError if it cannot be opened, or a ValueError if it is no regular file.
     """
     file = FileIO(path, opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -60,10 +60,10 @@ def open_file(path: Path) -> FileIO:
 
 
 def readable_by_others(path: Path) -> bool:
-    """Check whether other users can read a file of this user; a missing file is not readable.
+    """Check whether other users can read this user's file; False for a missing file.
 
-    A file of another owner may be open to the group: Kubernetes gives a Secret's files to root and
-    lets the pod's group read them.
+    If another user owns the file, its group may read it: Kubernetes gives the files of a Secret to
+    root, and lets the pod's group read them.
     """
     try:
         status = path.stat()
@@ -75,11 +75,11 @@ def readable_by_others(path: Path) -> bool:
 
 @contextmanager
 def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
-    """Write a file under a temporary name, and rename the complete file to `path`.
+    """Write a file under a temporary name, then rename it to `path`; readers see no partial file.
 
-    `mode` are the permissions from its creation, minus the umask. Other users may write to the
-    folder: a symbolic link at `path` is replaced, and nobody can guess the temporary name. If the
-    file cannot be written, raise an OSError; an existing file then stays unchanged.
+    `mode` is the file's permissions, minus the umask. Other users may write to the folder, so a
+    symbolic link at `path` is replaced, and the temporary name is random. If writing fails, the
+    existing file stays unchanged, and an OSError is raised.
     """
     new = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
     alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
@@ -94,6 +94,6 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
 
 
 def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
-    """Write a whole file through `atomic_file`."""
+    """Write `data` to a file as with `atomic_file`."""
     with atomic_file(path, mode) as file:
         file.write(data)

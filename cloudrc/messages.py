@@ -1,9 +1,9 @@
 """The messages between world, cloud and teleoperation.
 
-Messages are named tuples in SI units: making one takes a quarter of the time of a frozen dataclass.
+Messages are named tuples in SI units; to make a frozen dataclass takes four times as long.
 
-- Stamps: integer nanoseconds on the monotonic clock of the named end. Only stamps of the same clock
-  may be subtracted.
+- Stamps: integer nanoseconds on the monotonic clock of world or cloud, as stated. Only stamps of
+  the same clock may be subtracted.
 - Frames: REP-103 (x forward, y left, z up). A vector is in the world frame unless its name ends in
   ``_body``.
 - Quaternions: ``wxyz``, as in MuJoCo.
@@ -21,31 +21,32 @@ Quaternion: TypeAlias = tuple[float, float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 NEVER_NS = -1
-"""The stamp of an event that has not happened [ns]."""
+"""Stamp that stands for "never" [ns]."""
 
 
 class GuardState(IntEnum):
     """State of the guard."""
 
     GROUND = 0
-    """The rotors are stopped. Only the operator's start of a mission ends this state."""
+    """The rotors are stopped. Only the start of a mission by the operator ends this state."""
     TRACK = 1
-    """The robot flies fresh commands from the cloud."""
+    """The robot follows fresh commands from the cloud."""
     HOLD = 2
-    """No command is fresh: the robot brakes, then holds its position with onboard sensors alone."""
+    """No command is fresh: the robot brakes, then holds its position with onboard sensors only."""
     LAND = 3
-    """The robot descends slowly and stops its rotors at touch-down. Latched until acknowledged."""
+    """The robot descends slowly and stops its rotors at touch-down. LAND lasts until
+acknowledged."""
     ESTOP = 4
-    """The rotors were stopped at once. Latched until acknowledged."""
+    """The rotors were stopped at once. ESTOP lasts until the operator acknowledges."""
 
 
 class Cause(IntEnum):
-    """Why the guard is in its state: a number in messages, and `words` for people."""
+    """Why the guard is in its state: a number in messages, and `words` for users."""
 
     words: str
 
     def __new__(cls, number: int, words: str) -> Cause:
-        """Make a member of the enum from its number and its words."""
+        """Make a cause from its number and its words."""
         cause = int.__new__(cls, number)
         cause._value_, cause.words = number, words
         return cause
@@ -68,12 +69,12 @@ class Cause(IntEnum):
 
 
 class Start(IntEnum):
-    """Where a mission starts from."""
+    """Place where a mission starts."""
 
     SPAWN = 0
-    """The world is reset to its spawn under a new epoch."""
+    """World resets the robot to its spawn point and begins a new session (epoch)."""
     HERE = 1
-    """The robot starts from where it is."""
+    """The robot starts from its present place."""
 
 
 class Request(IntEnum):
@@ -82,17 +83,17 @@ class Request(IntEnum):
     START = 0
     """Arm the robot and begin the mission."""
     END = 1
-    """End the mission: the robot holds its position by itself until the next mission starts."""
+    """End the mission: the robot holds its position until the next mission starts."""
     ESTOP = 2
-    """Stop the rotors at once, in any state; latched until acknowledged."""
+    """Stop the rotors at once, in any state. The state ESTOP lasts until acknowledged."""
     ACKNOWLEDGE = 3
-    """End the state LAND or ESTOP after the operator has seen its cause; no rotor starts."""
+    """End the state LAND or ESTOP after the operator has seen its cause. This starts no rotor."""
     PROGRESS = 4
-    """Store the mission's progress on board, for a cloud that restarts. Its number is 0."""
+    """Store the mission's progress on board, for a cloud that restarts. The request number is 0."""
 
 
 class Odometry(NamedTuple):
-    """Pose and twist of the robot's base at one time.
+    """Measured or true pose and twist of the robot's base at one time.
 
     Attributes:
         stamp_ns: Time of the measurement [ns], world's clock.
@@ -117,7 +118,8 @@ class Telemetry(NamedTuple):
         odometry: Measured pose and twist, with sensor noise if configured.
         tip_force: Force on the touch sensor at the arm's tip [N].
         echo_stamp_ns: Stamp of the newest applied command [ns], cloud's clock; `NEVER_NS` if none.
-        echo_hold_ns: Time since world first applied that command [ns].
+            Cloud computes the round trip from this value.
+        echo_hold_ns: Time since world first applied the newest applied command [ns].
         slip_ns: Lag of world's clock behind its machine's monotonic clock [ns].
         mission: Number of the last operator request that world carried out; 0 if none.
         guard: State of the guard.
@@ -125,7 +127,7 @@ class Telemetry(NamedTuple):
         touch_speed: Speed of the tip at its first contact with the board in this mission [m/s]; NaN
             before the first contact.
         mission_id: Mission that was started last, as in `OperatorRequest`; 0 if none.
-        reached: Number of waypoints of that mission reached, as far as world knows, or
+        reached: Number of waypoints reached in this mission, as far as world knows, or
             `MISSION_OVER`.
         cause: Why the guard is in its state; after touch-down in LAND, why the robot landed.
     """
@@ -150,11 +152,10 @@ class Command(NamedTuple):
 
     Attributes:
         stamp_ns: Time of the computation [ns], cloud's clock.
-        basis_stamp_ns: Stamp of the odometry from which the command was computed [ns], world's
-            clock.
+        basis_stamp_ns: Stamp of the odometry that the command is based on [ns], world's clock.
         basis_hold_ns: Time from the arrival of that odometry at cloud to the computation [ns].
-        velocity: Wanted velocity [m/s], world frame, shape (3,).
-        yaw_rate: Wanted yaw rate [rad/s].
+        velocity: Commanded velocity [m/s], world frame, shape (3,).
+        yaw_rate: Commanded yaw rate [rad/s].
     """
 
     stamp_ns: int
@@ -169,15 +170,14 @@ MISSION_OVER = 0xFFFF
 
 
 class OperatorRequest(NamedTuple):
-    """A request of the operator to the robot, repeated until telemetry shows its number.
+    """Request of the operator to the robot; cloud repeats it until telemetry shows its number.
 
     Attributes:
-        number: A number above those of all requests that the robot has carried out.
+        number: Request number, higher than those of all requests that the robot has carried out.
         request: Kind of the request.
-        start: Where the mission starts from; used with `Request.START` only.
+        start: Where the mission starts; only for `Request.START`.
         mission_id: Number of the mission, below 2^63.
-        reached: Number of waypoints reached in the mission; `MISSION_OVER` if the mission ended
-            early.
+        reached: Number of waypoints reached in the mission; `MISSION_OVER` if it ended early.
         basis_stamp_ns: Stamp of cloud's newest odometry when cloud forwarded the request [ns],
             world's clock; `NEVER_NS` before the first odometry.
         epoch: Session that teleop saw when it made the request; 0 for none. Only cloud uses it.
@@ -193,11 +193,11 @@ class OperatorRequest(NamedTuple):
 
 
 class Setpoint(NamedTuple):
-    """Setpoint that teleop gives to the controller.
+    """Target that teleop gives to the controller.
 
     Attributes:
-        position: Wanted position [m], world frame, shape (3,).
-        yaw: Wanted heading [rad].
+        position: Target position [m], world frame, shape (3,).
+        yaw: Target heading [rad].
         waypoint: Index of the waypoint in the mission; -1 for none.
         epoch: Session for which teleop made the setpoint; 0 for none.
     """

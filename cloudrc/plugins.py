@@ -1,7 +1,7 @@
-"""Find plug-ins by kind and configuration name, and build them.
+"""Find plug-ins by kind and name, and build them.
 
-A plug-in is one file with a function `build(**parameters)`. The file name is the plug-in's
-configuration name. A metric has no `build`; see `cloudrc.metrics`. Three places are searched:
+A plug-in is one file with a function `build(**parameters)`. Its name in a configuration is the file
+name. A metric has no `build`; see `cloudrc.metrics`. Plug-ins are searched in three places:
 
 1. the package of the kind in cloudrc, without files whose name begins with an underscore;
 2. installed packages with an entry point in the group `cloudrc.<kind>`;
@@ -30,12 +30,11 @@ PACKAGES = {
     "controllers": "cloudrc.cloud.controllers",
     "metrics": "",
 }
-"""Kind of plug-in -> package of the shipped plug-ins. Shipped metrics are rows of tables, without a
-package."""
+"""Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" for metrics."""
 
 
 def names(kind: str) -> list[str]:
-    """List the configuration names of a kind, sorted, without importing a plug-in."""
+    """List the names of all plug-ins of a kind, sorted, without importing them."""
     return sorted({*_shipped(kind), *_installed(kind)})
 
 
@@ -49,7 +48,7 @@ def describe(kind: str, name: str) -> str:
 
 
 def signature(kind: str, name: str) -> inspect.Signature:
-    """Return the parameters of a plug-in's `build`, with evaluated annotations."""
+    """Return the parameters of a plug-in's `build`; their annotations are types, not strings."""
     build = _build(kind, name)
     try:
         return inspect.signature(build, eval_str=True)
@@ -59,19 +58,19 @@ def signature(kind: str, name: str) -> inspect.Signature:
 
 
 def load(kind: str, name: str, **parameters: Any) -> Any:
-    """Build a plug-in by the `parameters` of its `build`; see `find`.
+    """Find a plug-in and build it with these parameters.
 
     Raise a BadInputError if the plug-in does not exist, or if its `build` fails.
     """
     build = _build(kind, name)
     try:
         return build(**parameters)
-    except Exception as error:  # foreign code may raise anything; the user gets one line
+    except Exception as error:  # a plug-in may raise anything; the user gets one line
         raise BadInputError(f"{_one(kind)} {name!r} cannot be built: {_reason(error)}") from error
 
 
 def find(kind: str, name: str) -> Any:
-    """Import a plug-in of a kind of `PACKAGES`, by its configuration name or the path of a file.
+    """Import a plug-in by its kind (a key of `PACKAGES`) and by its name or path.
 
     Return the plug-in's module, or the object of its entry point.
     """
@@ -92,18 +91,18 @@ def find(kind: str, name: str) -> Any:
 
 
 def is_path(name: str) -> bool:
-    """Tell whether a configuration name is the path of a file."""
+    """Return whether the name of a plug-in is the path of a file."""
     return name.endswith(".py") or "/" in name or "\\" in name
 
 
 def unknown_name_text(what: str, name: str, available: list[str]) -> str:
-    """Return the error text for an unknown name, with all known names and the nearest name."""
+    """Return an error text for an unknown name: all known names, and the most similar name."""
     there = ", ".join(available) or "none"
     return f"no {what} named {name!r}; available: {there}{suggest_name(name, available)}"
 
 
 def suggest_name(name: str, available: list[str]) -> str:
-    """Return the suggestion that ends an error text: the nearest name. "" if no name is near."""
+    """Return an error text's end that suggests the most similar name; "" if no name is similar."""
     near = difflib.get_close_matches(name, available, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -134,7 +133,7 @@ def _installed(kind: str) -> dict[str, EntryPoint]:
 def _load_file(kind: str, path: Path) -> ModuleType:
     if not path.is_file():
         raise BadInputError(f"{_one(kind)} {str(path)!r}: there is no such file")
-    # The module name has the whole path, because two files may have the same name.
+    # The module name contains the whole path, because two files may have the same name.
     module_name = f"cloudrc_plugin:{path.resolve()}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:

@@ -1,9 +1,9 @@
 """The records of a run, which world, cloud and the drivers make during a flight.
 
-A record is a named tuple. Its first field is `stamp_ns`, when it was made [ns], on the clock of the
-end that made it. `epoch` and `counter` are those of a datagram's header. The docstring of each
-record begins with its maker: an end, or the driver that runs the end. `record/` turns records into
-MCAP topics, columns and a hash; `metrics/` turns them into numbers.
+A record is a named tuple. `stamp_ns` is the time at which the record was made [ns], on the clock of
+world or cloud, whichever made it. `epoch` and `counter` identify a datagram, as in its header. Each
+docstring begins with the maker: world, cloud, or the driver, which runs one of them. `record/`
+converts records to MCAP topics, columns and a hash; `metrics/` computes numbers.
 """
 
 from __future__ import annotations
@@ -14,23 +14,22 @@ from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
 
 
 class LinkChanged(NamedTuple):
-    """Driver, in real time only: the conditions of the link towards this end. Topic /link.
+    """Driver, in real time only: requested conditions of one link direction. Topic /link.
 
     World records the uplink, cloud the downlink: at the start, after every change, and when a
-    session or a mission begins. Values are those requested at the start of the profile's time line.
+    session or a mission begins. The values are those at the start of the profile's time line.
 
     Attributes:
         uplink: True for the uplink, False for the downlink.
         shaper: "relay" or "netem".
-        cause: Why the link changed, in words; "" at the start.
-        age: How long these conditions have been in force [s].
-        time_line: Time since the time line began [s]; NaN if the change did not restart the time
-            line.
+        cause: Why the conditions changed, in words; "" at the start.
+        age: Time since these conditions took effect [s].
+        time_line: Time since the time line began [s]; NaN if the change did not restart it.
         delay: Requested one-way delay [s].
         jitter: Requested jitter, as in the profile [s].
         loss: Requested long-run loss, in [0, 1].
         rate: Requested rate [bit/s]; NaN without a bottleneck.
-        conditions: All requested values, as in a profile's file, as JSON.
+        conditions: All requested values as JSON, with the keys of a profile's file.
     """
 
     stamp_ns: int
@@ -47,20 +46,20 @@ class LinkChanged(NamedTuple):
 
 
 class LinkChecked(NamedTuple):
-    """Driver, in real time only: one judged quantity of the link. Topic /link_check.
+    """Driver, in real time only: verdict on one quantity of the link. Topic /link_check.
 
-    Cloud judges the uplink, world the downlink, by the tunnel's datagrams of the last 60 s.
+    Cloud judges the uplink, world the downlink, by the datagrams received in the last 60 s.
 
     Attributes:
         uplink: True for the uplink, False for the downlink.
         quantity: Judged: "mean", "deviation", "round_trip", "loss", "reordered", "duplicated".
-            Not judged: "time_line", "rate", "correlation".
+            Others are not judged: "time_line", "rate", "correlation".
         asked: Expected value: delays [s], shares in [0, 1].
         measured: Measured value, likewise.
         low: Lowest accepted value, likewise.
         high: Highest accepted value, likewise.
-        verdict: "ok", "off", "open" (too few datagrams, a second look, or ends that woke too late)
-            or "told" (for information).
+        verdict: "ok", "off", "open" (too few datagrams, to be confirmed, or explained by late wakes
+            of the ends) or "told" (not judged).
         datagrams: Number of datagrams behind the measurement.
     """
 
@@ -90,31 +89,34 @@ class TelemetrySent(NamedTuple):
 
 
 class GroundTruth(NamedTuple):
-    """World: the true state, at every odometry. Topics /ground_truth and /reference.
+    """World: the true state, once per odometry. Topics /ground_truth and /reference.
 
     Attributes:
         odometry: True pose and twist.
         tip_force: Force on the touch sensor [N].
-        reference: Velocity that the guard lets the low-level controller follow [m/s], shape (3,).
+        tip_force_peak: Largest force since the previous record, of every physics step [N].
+        tip_impulse: Integral of the force over time since the previous record [N s].
+        reference: Velocity that the guard gives to the low-level controller [m/s], shape (3,).
     """
 
     stamp_ns: int
     odometry: Odometry
     tip_force: float
+    tip_force_peak: float
+    tip_impulse: float
     reference: Vector
 
 
 class Arrival(NamedTuple):
-    """Either end: a telemetry or command datagram arrived, late ones included.
+    """World or cloud: a datagram with a command or telemetry arrived, even if late.
 
-    Once more datagrams were repeated than sent, repeated datagrams are only counted.
-    Topics /uplink_delay (made by cloud) and /downlink_delay (made by world).
+    If more datagrams were repeated than sent, further repeated datagrams are only counted. Topics
+    /uplink_delay (made by cloud) and /downlink_delay (made by world).
 
     Attributes:
         uplink: True for telemetry at cloud, False for commands at world.
-        delay: One-way delay [s]; NaN if the two ends cannot prove that they share a clock.
-        used: True if the datagram became the newest; False if it was late, stale, repeated or
-            rejected.
+        delay: One-way delay [s]; NaN if world and cloud cannot prove that they share a clock.
+        used: True if the datagram became the newest; False if late, stale, repeated or rejected.
     """
 
     stamp_ns: int
@@ -131,9 +133,8 @@ class CommandApplied(NamedTuple):
     Epoch and counter identify the `Control` record of the command.
 
     Attributes:
-        basis_stamp_ns: Stamp of the odometry from which the command was computed [ns], world's
-            clock.
-        velocity: Commanded velocity, before the caps [m/s], shape (3,).
+        basis_stamp_ns: Stamp of the odometry that the command is based on [ns], world's clock.
+        velocity: Commanded velocity before the guard limits it [m/s], shape (3,).
     """
 
     stamp_ns: int
@@ -148,7 +149,7 @@ class GuardChange(NamedTuple):
 
     Attributes:
         state: The new state.
-        cause: Why the state changed: "command age 0.252 s above 0.250 s".
+        cause: Why the state changed, such as "command age 0.252 s above 0.250 s".
     """
 
     stamp_ns: int
@@ -160,10 +161,10 @@ class Contact(NamedTuple):
     """World: the robot began to touch something. Topic /contact.
 
     Attributes:
-        body: Name of the touched body of the scene: pipe_1, board, floor.
-        position: Position of the base just before [m], world frame, shape (3,).
-        velocity: Velocity of the base just before [m/s], world frame, shape (3,).
-        tip_velocity: Velocity of the arm's tip just before [m/s], world frame, shape (3,).
+        body: Name of the touched body of the scene, such as pipe_1, board, floor.
+        position: Position of the base just before the contact [m], world frame, shape (3,).
+        velocity: Velocity of the base just before the contact [m/s], world frame, shape (3,).
+        tip_velocity: Velocity of the arm's tip just before it [m/s], world frame, shape (3,).
         tip: True if the arm's tip touched the body, False if another part of the robot did.
     """
 
@@ -176,7 +177,7 @@ class Contact(NamedTuple):
 
 
 class SessionOpened(NamedTuple):
-    """Either end: a session began under a new epoch. Topic /session.
+    """World or cloud: a session began under a new epoch, its number. Topic /session.
 
     Attributes:
         end: "world" or "cloud".
@@ -197,9 +198,9 @@ class Control(NamedTuple):
 
     Attributes:
         basis_stamp_ns: Stamp of the odometry used [ns], world's clock.
-        horizon: Prediction horizon [s]: the delay estimate, clamped.
+        horizon: Prediction horizon [s]: the estimated delay, clamped.
         rtt: Last round trip, without the hold time on world [s]; NaN before the first echo.
-        loop_delay: Last `now - echo_stamp`, the paper's tau_n, with the hold time [s]; or NaN.
+        loop_delay: Last `now - echo_stamp`, with the hold time [s]; the paper's tau_n; or NaN.
         measured: Position in the odometry used [m], shape (3,).
         position: Predicted position for `basis_stamp_ns + horizon` [m], shape (3,).
         orientation_wxyz: Predicted orientation, unit quaternion, shape (4,).
@@ -234,24 +235,23 @@ class Control(NamedTuple):
 
 
 UNDER_WAY = ("started", "reached", "held", "resumed", "goto", "paused")
-"""Events after which a mission continues; every other event ends the mission. "paused": the process
-that flies the mission ends, and the next process continues the mission."""
+"""Events after which a mission continues; every other event ends it. After "paused", the process
+that flies the mission ends and the next process continues the mission."""
 
 
 FAILURES = (
     *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
     *("taken_over", "end_lost"),
 )
-"""Events that end a mission as failed."""
+"""Events that end a mission as a failure."""
 
 
 class MissionEvent(NamedTuple):
     """Cloud: an event of the mission. Topic /mission.
 
     Attributes:
-        event: One of `UNDER_WAY`, or the outcome of the mission: "done", "cancelled", or one of
-            `FAILURES`.
-        waypoint: Index of the waypoint of the event; -1 if none.
+        event: One of `UNDER_WAY`, or the outcome: "done", "cancelled" or one of `FAILURES`.
+        waypoint: Index of the waypoint that the event is about; -1 if none.
         text: The event in words.
     """
 
@@ -262,21 +262,23 @@ class MissionEvent(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """Either end: a problem that did not stop the flight. Topic /fault.
+    """World or cloud: a problem that did not stop the flight. Topic /fault.
 
     Attributes:
         code: One word, such as "predictor_failed", "recorder", "link_check", or "late" (cloud
             missed periods, or world is slower than real time).
         text: What is wrong, where, and what to do.
+        traceback: The traceback of a plug-in's first failure; "" for another fault.
     """
 
     stamp_ns: int
     code: str
     text: str
+    traceback: str = ""
 
 
 class Counted(NamedTuple):
-    """Either end: the value of a counter, once a second. Topic /count.
+    """World or cloud: the value of a counter, once a second. Topic /count.
 
     Attributes:
         end: "world", "cloud" or "link".
@@ -295,9 +297,9 @@ class Lateness(NamedTuple):
 
     Attributes:
         end: "world" or "cloud".
-        lateness: Time from the deadline to its handling [s].
+        lateness: Time from the deadline to the start of its handling [s].
         busy: Duration of the handling [s].
-        slip_ns: Lag of world's clock behind the machine's clock [ns]; 0 for cloud.
+        slip_ns: Lag of world's clock behind its machine's clock [ns]; 0 for cloud.
     """
 
     stamp_ns: int

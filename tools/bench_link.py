@@ -1,9 +1,9 @@
-"""`make bench-link`: compare the relay with what its model draws, and with a program in C.
+"""`make bench-link`: compare the relay with its model, and with a program in C.
 
 Numbered datagrams go through a relay. The kernel stamps each datagram when it leaves and when it
-arrives (wall clock), so late wakes of Python do not matter. Close other programs first, because
-they delay the relay. The program in C runs in turns with the relay and shows how late the machine
-wakes. Exit codes: 0 all limits were kept, 1 a limit was missed, 3 no C compiler.
+arrives (wall clock), so late wakes of Python have no effect. Close other programs first, because
+they delay the relay. The program in C runs in turns with the relay, and shows how late any program
+wakes on this machine. Exit codes: 0 all limits were kept, 1 a limit was exceeded, 3 no C compiler.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ SIZE = 172
 """Length of a datagram, about that of telemetry [bytes]."""
 EPOCH, SEED = 1, 1
 TIE_NS = 5_000
-"""Difference of two due instants below which their order is chance [ns]."""
+"""Difference between the due times of two datagrams below which their order does not count [ns]."""
 # Source: Linux, include/uapi/asm-generic/socket.h, linux/net_tstamp.h, linux/errqueue.h.
 _SO_TIMESTAMPNS, _SO_TIMESTAMPING, _IP_RECVERR = 35, 37, 11
 _TX_SOFTWARE, _SOFTWARE, _ID, _STAMP_ONLY = 1 << 1, 1 << 4, 1 << 7, 1 << 11
 
 
 class Way(NamedTuple):
-    """One direction of a link: datagrams go from `source` to `target` and arrive at `sink`."""
+    """One direction of a link: datagrams leave at `source`, go to `target` and arrive at `sink`."""
 
     uplink: bool
     target: Address
@@ -66,7 +66,7 @@ class Way(NamedTuple):
 
 @dataclass
 class Flow:
-    """Instants of sending by number, and of arrival with the number, in order [ns, wall clock]."""
+    """Times of sending and arrival by number of the datagram [ns, wall clock]."""
 
     uplink: bool
     sent: dict[int, int] = field(default_factory=dict)
@@ -76,7 +76,7 @@ class Flow:
 class Judged(NamedTuple):
     """Comparison of a flow with the model.
 
-    `errors` are measured minus drawn delays of the datagrams that arrived, with copies [s].
+    `errors` are measured minus modelled delays of the datagrams that arrived, including copies [s].
     """
 
     errors: Array
@@ -86,7 +86,7 @@ class Judged(NamedTuple):
 
 
 class Line(NamedTuple):
-    """One limit: what is measured, the limit, the result, and whether the limit is kept."""
+    """One result: what is measured, its limit, its value, and whether the limit is kept."""
 
     what: str
     asked: str
@@ -98,7 +98,7 @@ class RelayProcess:
     """A running `cloudrc relay`; its `ways` are uplink and downlink."""
 
     def __init__(self, folder: Path, link: dict[str, object], *, fifo: bool = False) -> None:
-        """Start a relay on a link, the section `link` of an experiment, and wait for it."""
+        """Start a relay for `link`, the section of an experiment, and wait until it runs."""
         config = _write(folder, link)
         world_side, cloud_side, world, cloud = (("127.0.0.1", port) for port in free_ports(4))
         addresses = {
@@ -143,9 +143,9 @@ def main() -> int:
 
 
 def releases(folder: Path, rounds: int, duration: float) -> list[Line]:
-    """Measure in turns the relay's release errors at 1 kHz and how late the program in C wakes.
+    """Measure in turns how late the relay sends at 1 kHz, and how late the C program wakes.
 
-    Both use SCHED_FIFO if this user may. A measurement takes `duration` [s].
+    Both use SCHED_FIFO if this user is allowed to. Each measurement takes `duration` [s].
 
     Raises:
         MissingPrerequisiteError: If there is no C compiler.
@@ -168,7 +168,7 @@ def releases(folder: Path, rounds: int, duration: float) -> list[Line]:
         errors.append(judge(flow, DirectionProfile(DELAY), min(flow.sent.values())).errors)
 
     def quantile(values: list[Array], share: float) -> float:
-        """Return the median of the rounds' quantiles [us]."""
+        """Return the median of the quantiles of all rounds [us]."""
         return 1e6 * float(np.median([np.quantile(one, share) for one in values]))
 
     p50, p99, wake = quantile(errors, 0.5), quantile(errors, 0.99), quantile(wakes, 0.99)
@@ -182,7 +182,7 @@ def releases(folder: Path, rounds: int, duration: float) -> list[Line]:
 
 
 def profiles(folder: Path, seconds: float) -> list[Line]:
-    """Judge all shipped profiles, both ways at 100 Hz, all at the same time, for `seconds` [s]."""
+    """Compare all shipped profiles with the model at the same time, for `seconds` [s]."""
     judged = measure_profiles(folder, names("profile"), seconds)
     every = np.concatenate([one.errors for one in judged.values()])
     wrong = sum(one.wrongly_lost + one.wrongly_arrived for one in judged.values())
@@ -203,14 +203,14 @@ def profiles(folder: Path, seconds: float) -> list[Line]:
 
 
 def measure_profiles(folder: Path, chosen: Iterable[str], duration: float) -> dict[str, Judged]:
-    """Send through several profiles at the same time, both ways at 100 Hz, for `duration` [s].
+    """Send through several profiles at once, both ways at 100 Hz, for `duration` [s].
 
     Returns:
         Name and direction of a profile -> comparison with the model.
     """
     fifo, links = fifo_allowed(), {name: dict[str, object](profile=name) for name in chosen}
     relays = {name: RelayProcess(folder, link, fifo=fifo) for name, link in links.items()}
-    # Once all senders are up: to start one takes 0.6 s of processor time from the others.
+    # When all senders run: the start of one takes 0.6 s of CPU time from the others.
     begin = time.monotonic() + 0.6 * (len(links) + 1)
     tasks = [(relay.ways, duration, begin) for relay in relays.values()]
     with ProcessPoolExecutor(len(tasks), mp_context=get_context("spawn")) as pool:
@@ -226,13 +226,13 @@ def measure_profiles(folder: Path, chosen: Iterable[str], duration: float) -> di
 
 
 def profiles_of(folder: Path, link: dict[str, object]) -> tuple[DirectionProfile, DirectionProfile]:
-    """Read the profiles of a link: uplink, downlink."""
+    """Read the uplink and downlink profiles of a link."""
     experiment = load_experiment(str(_write(folder, link)))
     return link_profile(experiment.uplink), link_profile(experiment.downlink)
 
 
 def fifo_allowed() -> bool:
-    """Check whether this user may run programs under SCHED_FIFO."""
+    """Check whether this user may use SCHED_FIFO."""
     if shutil.which("chrt") is None:
         return False
     done = subprocess.run(["chrt", "-f", "10", "true"], capture_output=True, check=False)
@@ -242,9 +242,9 @@ def fifo_allowed() -> bool:
 def run_flow(
     ways: Sequence[Way], rate: float, duration: float, tail: float, begin: float = 0.0
 ) -> list[Flow]:
-    """Send on one or two ways in turns at `rate` [1/s] each for `duration` [s], and receive.
+    """Send in one or two directions in turns, each at `rate` [1/s] for `duration` [s], and receive.
 
-    Receiving ends `tail` [s] later. Sending begins at `begin` [s], monotonic clock, or soon.
+    Receiving ends `tail` [s] after sending. Sending begins at `begin` [s], monotonic clock.
     """
     flows = [Flow(way.uplink) for way in ways]
     addresses = {address for way in ways for address in (way.source, way.sink)}
@@ -274,9 +274,9 @@ def run_flow(
 def since_first_ns(number: int, turn: int, turns: int, period_ns: int) -> int:
     """Return when to send a datagram, as time since the first datagram [ns].
 
-    The first datagram starts the link's time. All others stay clear of whole periods since then: if
-    a trace changes just as a datagram leaves, the relay, which receives the datagram a microsecond
-    later, may rightly draw its delay from the next row.
+    The first datagram starts the link's time. All others are sent some time away from whole
+    periods, at which a trace may change. Otherwise the relay, which receives a datagram a
+    microsecond later, might correctly use the trace's next row.
     """
     if number == turn == 0:
         return 0
@@ -284,7 +284,7 @@ def since_first_ns(number: int, turn: int, turns: int, period_ns: int) -> int:
 
 
 def judge(flow: Flow, profile: DirectionProfile, origin_ns: int) -> Judged:
-    """Compare a flow with the model; the relay saw its first datagram at `origin_ns` [ns]."""
+    """Compare a flow with the model; the first datagram reached the relay at `origin_ns` [ns]."""
     model = LinkDirection(profile, SEED, flow.uplink, origin_ns)
     due: dict[int, list[int]] = {}
     for number in sorted(flow.sent):
@@ -308,7 +308,6 @@ def _send(task: tuple[list[Way], float, float]) -> list[Flow]:
 
 
 def _write(folder: Path, link: dict[str, object]) -> Path:
-    """Write an experiment file with a link."""
     path = folder / f"{link.get('profile', 'link')}-{len(list(folder.iterdir()))}.yaml"
     world = {"mission": "hover", "world": {"scene": "empty"}}
     path.write_text(json.dumps({"seed": SEED, **world, "link": link}))
@@ -331,7 +330,6 @@ def _open(address: Address) -> socket.socket:
 
 
 def _drain(sink: socket.socket, source: socket.socket, flow: Flow) -> None:
-    """Read all datagrams that arrived, and the kernel's stamps of those that were sent."""
     with suppress(BlockingIOError):
         while True:
             data, ancillary, _, _ = sink.recvmsg(SIZE, 512)

@@ -1,7 +1,7 @@
-"""Define every value of the chart, with its unit and default.
+"""Define every value of the chart with its unit, default and description.
 
-`docs.py` writes values.yaml, values.schema.json and the README's tables from these models.
-Keys are camelCase in the chart; below `experiment` they are those of an experiment file.
+`docs.py` writes values.yaml, values.schema.json and the README's tables from these models. The
+chart's keys are in camelCase; below `experiment` they are those of an experiment file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Texts = dict[str, str]
 
 
 class Values(BaseModel):
-    """A part of the values, with camelCase keys and no unknown keys."""
+    """A part of the values; keys are in camelCase, and unknown keys are rejected."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -44,12 +44,12 @@ class Quantities(Values):
 
 
 class Resources(Values):
-    """Requests and limits of one container; if they are equal everywhere, the pod is Guaranteed."""
+    """Requests and limits of one container; if all are equal, the pod's QoS class is Guaranteed."""
 
     requests: Quantities = Quantities()
-    """Amounts that the scheduler reserves"""
+    """Amounts that the scheduler reserves on the node"""
     limits: Quantities = Quantities()
-    """Largest amounts; above them CPU is throttled, and memory ends the container"""
+    """Largest amounts; above them, CPU is throttled, or memory use ends the container"""
 
 
 def resources(cpu: str, memory: str, cpu_limit: str, memory_limit: str) -> Any:
@@ -73,36 +73,36 @@ class ImageOf(Values):
     repository: str
     """Name of the image in the registry"""
     digest: Annotated[str, Field(pattern=r"^$|^sha256:[0-9a-f]{64}$")] = ""
-    """Digest of the image, sha256:...; if set, the tag is ignored"""
+    """Digest of the image, sha256:...; if it is set, the tag is ignored"""
 
 
 class Image(Values):
     """The images of the pods."""
 
     registry: str = ""
-    """Registry of both images, without a slash at the end"""
+    """Registry of both images, without a slash at its end"""
     tag: Annotated[str, Field(pattern=r"^$|^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")] = ""
-    """Tag of both images; empty: the chart's appVersion"""
+    """Tag of both images. Empty: the chart's appVersion"""
     pull_policy: Literal["Always", "IfNotPresent", "Never"] = "IfNotPresent"
     """When Kubernetes pulls the images"""
     pull_secrets: tuple[str, ...] = ()
-    """Names of Secrets with the registry's credentials"""
+    """Names of Secrets with credentials for the registry"""
     world: ImageOf = ImageOf(repository="cloudrc/world")
     """Image of the world pod"""
     cloud: ImageOf = ImageOf(repository="cloudrc/cloud")
-    """Image of the cloud pod and of missions"""
+    """Image of the cloud pod and of mission Jobs"""
 
 
 class LinkContainer(Values):
-    """The emulated network: a container in each pod that shapes what the pod sends."""
+    """The emulated network: a container in each pod that delays and drops what the pod sends."""
 
     mode: Literal["auto", "netem", "relay"] = "auto"
     """What emulates the network. netem: the kernel, needs NET_ADMIN. relay: a process without
-    privileges. auto: relay if the namespace enforces Pod Security baseline or restricted, or is
-    unknown at install; otherwise netem if the kernel has it, else relay"""
+    privileges. auto: relay if the namespace enforces Pod Security baseline or restricted, if that
+    is unknown at install, or if the kernel has no netem; otherwise netem"""
     profile: str | Profile | None = None
-    """Either the name of a shipped profile, or a mapping with the keys of a file in link/profiles.
-    A change takes effect in flight and restarts nothing. null: the experiment's link"""
+    """Either the name of a shipped profile, or a mapping with the keys of a link profile. A change
+    takes effect in flight, without a restart. null: the experiment's link"""
     traces: Texts = Field(
         {},
         json_schema_extra={
@@ -113,46 +113,46 @@ class LinkContainer(Values):
             }
         },
     )
-    """The CSV files for the keys `trace` and `table` of link.profile or the experiment: file name
-    -> text of the file"""
+    """CSV files, file name -> text, to which the keys `trace` and `table` of link.profile or of the
+    experiment refer"""
     resources: Resources = resources("20m", "40Mi", "1", "96Mi")
 
 
 class Placement(Values):
-    """Nodes, annotations and labels of a pod."""
+    """Node selection, annotations and labels of a pod."""
 
     node_selector: Texts = {}
-    """Labels that the pod's node must have"""
+    """Labels that the pod's node must have, as in Kubernetes"""
     tolerations: tuple[dict[str, Any], ...] = ()
     """Tolerations of the pod, as in Kubernetes"""
     affinity: dict[str, Any] = {}
     """Affinity of the pod, as in Kubernetes"""
     pod_annotations: Texts = {}
-    """Further annotations of the pod"""
+    """Additional annotations of the pod"""
     pod_labels: Texts = Field(
         {}, json_schema_extra={"propertyNames": {"not": {"pattern": r"^app\.kubernetes\.io/"}}}
     )
-    """Further labels of the pod; app.kubernetes.io/* is refused"""
+    """Additional labels of the pod; app.kubernetes.io/* is rejected"""
 
 
 class WorldPod(Placement):
     """The pod of the robot."""
 
     epochs: Texts = {}
-    """No longer used; values of earlier versions are accepted"""
+    """No longer used; accepted so that values of earlier versions stay valid"""
     resources: Resources = resources("60m", "96Mi", "1", "256Mi")
     recording_size_limit: Quantity = "1Gi"
-    """Size limit of the volume for recordings [bytes]. The volume also keeps the recording from
-    before a restart; at 90 % of the limit for both together, the recording ends"""
+    """Size limit of the volume for recordings [bytes]. After a restart, the volume also holds the
+    recording from before. Recording ends when both together reach 90 % of the limit"""
 
 
 class BackgroundLoad(Values):
-    """A container that burns CPU beside the controller, for a cloud under load."""
+    """A container that uses CPU time beside the controller, to test a cloud under load."""
 
     enabled: bool = False
-    """Whether the pod has a container that only uses CPU time"""
+    """Whether the pod has a further container, which only uses CPU time"""
     workers: Annotated[int, Field(ge=1, le=64)] = 1
-    """Number of busy loops [count]; each uses up to one core, within the CPU limit"""
+    """Number of busy loops [count]; each loop uses up to one core, within the CPU limit"""
     resources: Resources = resources("10m", "8Mi", "1", "16Mi")
 
 
@@ -161,25 +161,25 @@ class CloudPod(Placement):
 
     resources: Resources = resources("60m", "64Mi", "1", "192Mi")
     recording_size_limit: Quantity = "1Gi"
-    """Size limit of the volume for recordings [bytes]. The volume also keeps the recording from
-    before a restart; at 90 % of the limit for both together, the recording ends"""
+    """Size limit of the volume for recordings [bytes]. After a restart, the volume also holds the
+    recording from before. Recording ends when both together reach 90 % of the limit"""
     background_load: BackgroundLoad = BackgroundLoad()
-    """CPU load in the cloud pod"""
+    """Artificial CPU load in the cloud pod"""
 
 
 class Journal(Values):
-    """The volume that keeps missions when the pod is replaced."""
+    """The volume that stores missions, so that they survive a replacement of the pod."""
 
     existing_claim: Name = ""
-    """Name of an existing PersistentVolumeClaim; empty: the chart makes a claim"""
+    """Name of an existing PersistentVolumeClaim. Empty: the chart creates a claim"""
     storage_class_name: str = ""
-    """Storage class of the volume; empty: the cluster's default"""
+    """Storage class of the volume. Empty: the cluster's default"""
     size: Quantity = "64Mi"
     """Size of the volume [bytes]"""
 
 
 class Service(Values):
-    """The Service of the API."""
+    """The Service of teleop's HTTP API."""
 
     type: Literal["ClusterIP", "NodePort", "LoadBalancer"] = "ClusterIP"
     """Type of the Service"""
@@ -190,29 +190,29 @@ class Service(Values):
 
 
 class Tokens(Values):
-    """The tokens of the API."""
+    """The tokens for teleop's HTTP API."""
 
     existing_secret: Name = ""
-    """Name of an existing Secret. Its key `operator` has the token to command, its optional key
-    `reader` has the token to read. Empty: the chart makes a Secret with both"""
+    """Name of an existing Secret. Its key `operator` has the token for commands, its optional key
+    `reader` the token for reading only. Empty: the chart creates a Secret with both"""
 
 
 class Teleop(Values):
-    """Missions, operator's commands and HTTP API, in the cloud pod."""
+    """Missions, the operator's commands and the HTTP API, in the cloud pod."""
 
     resources: Resources = resources("30m", "72Mi", "1", "192Mi")
     journal: Journal = Journal()
-    """Volume that keeps missions"""
+    """Volume that stores missions"""
     tokens: Tokens = Tokens()
-    """Tokens of the API"""
+    """Tokens for the API"""
     service: Service = Service()
     """Service of the API"""
     allow_from: tuple[Peer, ...] = ()
-    """NetworkPolicy peers that may call the API; this release's missions always may"""
+    """NetworkPolicy peers that may call the API; mission Jobs of this release may always call it"""
 
 
 class MissionJob(Values):
-    """A mission that flies as a Job when the release is installed."""
+    """A Job that flies a mission when the release is installed."""
 
     enabled: bool = False
     """Whether to fly the mission"""
@@ -220,33 +220,30 @@ class MissionJob(Values):
     """Either the name of a shipped mission, or a mapping with the keys of a mission. null: the
     experiment's mission"""
     queue: bool = False
-    """true: the mission waits while another mission flies; false: it is refused"""
+    """true: the mission waits until the present mission has ended. false: it is then rejected"""
     active_deadline_seconds: Seconds = 600
-    """Time limit of the Job, waiting included [s]; beyond it the Job fails"""
+    """Time limit of the Job, including waiting [s]; after this time the Job fails"""
     ttl_seconds_after_finished: Seconds = 86_400
-    """Time for which the finished Job is kept [s]; an upgrade after this time flies the mission
-    again"""
+    """Time for which the finished Job is kept [s]. A later upgrade flies the mission again"""
     pod_annotations: Texts = {}
-    """Further annotations of the pods of missions and of helm test. With the sidecar of a mesh, a
-    Job never ends; to leave out Istio's sidecar: sidecar.istio.io/inject: "false"
-    """
+    """Additional annotations of the pods of missions and of helm test. In a mesh with sidecars a
+    Job never ends; sidecar.istio.io/inject: "false" excludes Istio's sidecar"""
     resources: Resources = resources("10m", "48Mi", "500m", "128Mi")
 
 
 class Monitor(Values):
-    """An object of the Prometheus operator, made only if the cluster knows its kind."""
+    """An object for the Prometheus operator, created only if the cluster knows its kind."""
 
     enabled: bool = False
-    """Whether the chart makes this object"""
+    """Whether the chart creates this object"""
     force: bool = False
-    """Whether the chart makes the object even if the cluster does not know its kind (helm
-    template)"""
+    """Whether the chart creates the object even if its kind is unknown, as with helm template"""
     labels: Texts = {}
-    """Labels by which your Prometheus selects it"""
+    """Labels by which your Prometheus selects the object"""
 
 
 class PodMonitor(Monitor):
-    """Scraping by the Prometheus operator."""
+    """PodMonitor, with which the Prometheus operator scrapes the pods."""
 
     interval: Annotated[str, Field(pattern=r"^[0-9]+(ms|s|m)$")] = "5s"
     """Time between two scrapes, with its unit [ms, s or m]"""
@@ -258,7 +255,7 @@ class Metrics(Values):
     annotations: bool = True
     """Whether the pods have the annotations prometheus.io/scrape, port and path"""
     allow_from: tuple[Peer, ...] = ()
-    """NetworkPolicy peers that may scrape; empty: only helm test"""
+    """NetworkPolicy peers that may scrape the pods. Empty: only helm test"""
     pod_monitor: PodMonitor = PodMonitor()
     """PodMonitor of the Prometheus operator"""
     prometheus_rule: Monitor = Monitor()
@@ -266,45 +263,44 @@ class Metrics(Values):
 
 
 class NetworkPolicy(Values):
-    """NetworkPolicies: the pods exchange tunnel, DNS, API and metrics, nothing else."""
+    """NetworkPolicies, which allow only the tunnel, DNS, the API and metrics."""
 
     enabled: bool = True
-    """Whether the chart makes the NetworkPolicies"""
+    """Whether the chart creates the NetworkPolicies"""
     dns: tuple[Peer, ...] = (
         {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "kube-system"}}},
     )
-    """NetworkPolicy peers that resolve names (port 53); for a node-local cache use an ipBlock"""
+    """NetworkPolicy peers that resolve names (port 53); for a node-local cache, use an ipBlock"""
 
 
 class Secret(Values):
     """The tunnel's pre-shared key."""
 
     existing_secret: Name = ""
-    """Name of an existing Secret. Its entry `key` holds the text of the key file. Empty: the chart
-    makes a Secret"""
+    """Name of an existing Secret. Its key `key` has the text of the key file. Empty: the chart
+    creates a Secret"""
 
 
 class ServiceAccount(Values):
-    """The pods' service accounts, without tokens."""
+    """The pods' service accounts, which have no tokens."""
 
     create: bool = True
-    """Whether the chart makes an account for each pod"""
+    """Whether the chart creates an account for each pod"""
     name: Name = ""
-    """Service account of both pods if the chart makes none; empty: the account `default`"""
+    """Service account of both pods if the chart creates none. Empty: the account `default`"""
     annotations: Texts = {}
-    """Annotations of the accounts that the chart makes"""
+    """Annotations of the accounts that the chart creates"""
 
 
 class ChartValues(Values):
     """All values of the chart."""
 
     fullname_override: ObjectName = ""
-    """First part of the names of all objects; empty: RELEASE-cloudrc"""
+    """First part of the names of all objects. Empty: RELEASE-cloudrc"""
     image: Image = Image()
     """Images of the pods"""
     experiment: Experiment = Experiment()
-    """The experiment, with the keys of a file for 'cloudrc run'. Missing keys have the values of
-    the paper"""
+    """The experiment, with the keys of a file for 'cloudrc run'; missing keys: as in the paper"""
     link: LinkContainer = LinkContainer()
     """The emulated network between the pods"""
     world: WorldPod = WorldPod()
@@ -314,11 +310,11 @@ class ChartValues(Values):
     teleop: Teleop = Teleop()
     """Missions and API, in the cloud pod"""
     mission: MissionJob = MissionJob()
-    """Mission that flies as a Job at install"""
+    """Mission that a Job flies at install"""
     metrics: Metrics = Metrics()
     """Access to the metrics"""
     network_policy: NetworkPolicy = NetworkPolicy()
-    """Limits on the pods' traffic"""
+    """Limits on the pods' network traffic"""
     secret: Secret = Secret()
     """Pre-shared key of the tunnel"""
     service_account: ServiceAccount = ServiceAccount()
@@ -326,8 +322,8 @@ class ChartValues(Values):
     ip_family_policy: Literal["SingleStack", "PreferDualStack", "RequireDualStack"] | None = (
         "PreferDualStack"
     )
-    """Address families of the Services. The pods listen on both; the tunnel needs IPv4. null: the
-    cluster's default"""
+    """Address families of the Services. The pods listen on IPv4 and IPv6; the tunnel needs IPv4.
+    null: the cluster's default"""
     pod_security_context: dict[str, Any] | None = {
         "runAsNonRoot": True,
         "runAsUser": 10_001,
@@ -335,16 +331,15 @@ class ChartValues(Values):
         "fsGroup": 10_001,
         "seccompProfile": {"type": "RuntimeDefault"},
     }
-    """Security context of all pods, as in Kubernetes. null: no security context, for OpenShift,
-    which gives each namespace its own user ids"""
+    """Security context of all pods, as in Kubernetes. null: no security context, for OpenShift"""
     container_security_context: dict[str, Any] | None = {
         "allowPrivilegeEscalation": False,
         "readOnlyRootFilesystem": True,
         "capabilities": {"drop": ["ALL"]},
     }
-    """Security context of all containers, except the link container with netem, which has its own.
-    null: no security context"""
+    """Security context of all containers. The link container has its own if it uses netem. null: no
+    security context"""
     termination_grace_period_seconds: Seconds = 10
-    """Time in which the pods must end [s], else they are killed; they need 2 s"""
+    """Time that the pods get to end [s], after which they are killed; they need 2 s"""
     global_: dict[str, Any] | None = Field(None, alias="global")
     """Values that Helm passes to subcharts; this chart ignores them"""

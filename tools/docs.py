@@ -1,10 +1,12 @@
-"""Write every generated file: `make docs` runs it, a test compares each file with it.
+"""Write all generated files. `make docs` runs this module; a test compares the files.
 
-The tables of docs/experiment.md come from the models of `cloudrc/config/schema.py` and the
-signatures of the shipped plug-ins, those of docs/topics.md from `cloudrc/record/topics.py`, those
-of docs/metrics.md from `cloudrc/exposition/table.py`; the text around the tables is written by
-hand. The chart's values, schema and table come from `tools/chart_values.py`; shipped profiles and
-missions are copied, because a chart can read only its own files.
+The tables of docs/experiment.md come from the models in `cloudrc/config/schema.py` and from the
+signatures of the shipped plug-ins. The tables of docs/topics.md come from
+`cloudrc/record/topics.py`, those of docs/metrics.md from `cloudrc/exposition/table.py`. The text
+around the tables is written by hand.
+
+`tools/chart_values.py` defines the chart's values, schema and table. Shipped profiles and missions
+are copied, because a chart can read only its own files.
 """
 
 from __future__ import annotations
@@ -36,47 +38,47 @@ PARTS = {
     **dict.fromkeys(("uplink", "downlink"), "#one-direction-of-a-link"),
     **dict.fromkeys(KINDS, "#plug-ins-of-the-cloud"),
 }
-"""Key of a part that has its own section -> link to the section."""
+"""Key of an experiment that has its own section on the page -> link to the section."""
 ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
 _PERIOD = "100 Hz, while there is telemetry and a setpoint"
 _LINK = "once per change; again when a session, a mission or a state of the guard begins"
 _STAMPS = {
-    ("departure of the telemetry, which is the instant of the measurement", "100 Hz, in a session"):
+    ("instant of the measurement, when the telemetry leaves", "100 Hz, in a session"):
         "/odometry /telemetry",
     ("instant of the physics step", "100 Hz"): "/ground_truth /contact_force /reference",
     ("arrival at cloud", "once per telemetry that arrives"): "/uplink_delay",
     ("arrival at world", "once per command that arrives"): "/downlink_delay",
     ("first physics step that follows the command", "once per command applied"): "/command_applied",
     ("physics step in which the state changes", "once per event"): "/guard",
-    ("the first odometry after the contact, at most 10 ms later", "once per event"): "/contact",
-    ("begin of the session at this end", "once per event"): "/session",
+    ("first odometry after the contact, at most 10 ms later", "once per event"): "/contact",
+    ("when the session begins at this end", "once per event"): "/session",
     ("departure of the command", _PERIOD):
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
     ("instant of the event", "once per event"): "/mission",
     ("when this end notices the fault", "once per fault; repetitions are only counted"): "/fault",
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
-    ("when this end notices it", _LINK): "/link",
+    ("when this end notices the change", _LINK): "/link",
     ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
-    ("when the deadline was handled", "100 Hz per end"): "/lateness",
+    ("when the loop handles the deadline", "100 Hz per end"): "/lateness",
 }  # fmt: skip
 SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.split()}
-"""Topic -> meaning of a row's stamp, and how often a row is written."""
+"""Topic -> meaning of a row's stamp, and when a row is written."""
 OPEN = {
     "version": "the version",
     "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
     "defaults (on one machine with those of plug-ins, as `config_sha256` in report.json; in a "
     "cluster without those of plug-ins); empty for a process without configuration",
 }
-"""Label of a metric with an open set of values -> description of the values."""
+"""Label of a metric whose values cannot be listed -> description of the values."""
 
 
 def outputs() -> dict[Path, str]:
-    """Make everything that `make docs` writes: file -> text."""
+    """Generate everything that `make docs` writes: file -> text."""
     return {
         **_insert(ROOT / "docs" / "experiment.md", _experiment()),
         **_insert(ROOT / "docs" / "topics.md", _topics()),
         **_insert(ROOT / "docs" / "metrics.md", _metrics()),
-        **_insert(CHART / "README.md", table("key | default | meaning", _values(ChartValues()))),
+        **_insert(CHART / "README.md", f"\n{_chart()}"),
         CHART / "values.yaml": VALUES_HEAD + _values_text(ChartValues()),
         CHART / "values.schema.json": json.dumps(_chart_schema(), indent=2) + "\n",
         **{
@@ -88,12 +90,12 @@ def outputs() -> dict[Path, str]:
 
 
 def leftovers() -> list[Path]:
-    """List the copies in the chart whose originals are gone."""
+    """List copies in the chart that have no original any more."""
     return sorted({*(CHART / "files").glob("*/*.yaml")} - outputs().keys())
 
 
 def _insert(page: Path, text: str) -> dict[Path, str]:
-    """Put generated text between the marks of a page; the rest is written by hand."""
+    """Replace the text between the marks of a page by generated text."""
     parts = re.split("(<!-- made by `make docs`.*-->\n|<!-- end -->\n)", page.read_text())
     if len(parts) != 5:
         raise ValueError(f"{page.name}: no place for generated text")
@@ -102,7 +104,7 @@ def _insert(page: Path, text: str) -> dict[Path, str]:
 
 
 def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
-    """Write a table in Markdown; `columns` are the heads of its columns, with bars between them."""
+    """Format a table in Markdown; `columns` contains the column titles, separated by bars."""
     lines = [f"| {columns} |", f"|{'---|' * len(columns.split('|'))}"]
     for row in rows:
         lines.append(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |")
@@ -110,7 +112,7 @@ def table(columns: str, rows: Iterable[Iterable[object]]) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Convert a default to plain YAML values."""
+    """Convert a default value to plain YAML values."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", by_alias=True, exclude_none=True)
     if isinstance(value, tuple | list):
@@ -131,7 +133,6 @@ def flow(value: Any) -> str:
 
 
 def _experiment() -> str:
-    """Write the tables of all keys of an experiment, a mission and a link profile."""
     own = [key for key, info in Experiment.model_fields.items() if not _is_section(info.annotation)]
     blocks = ["\n## Top level\n", _keys(Experiment, own)]
     for key, info in Experiment.model_fields.items():
@@ -154,7 +155,7 @@ def _summary(model: Any) -> str:
 
 
 def _keys(model: type[BaseModel], chosen: list[str] | None = None) -> str:
-    """Write the table of a model's keys, or of those at and below the `chosen` ones."""
+    """Format the table of a model's keys; with `chosen`, only these keys and those below them."""
     paths = []
     for leaf, _ in problems.leaves(model):
         for path in (leaf[:depth] for depth in range(1, len(leaf) + 1)):
@@ -183,7 +184,7 @@ def _default(value: Any) -> str:
 
 
 def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
-    """Shorten the text of an error message about a value, and link it to the keys of the value."""
+    """Shorten the error text about a value, and link it to the keys of the value."""
     if words.startswith("a list of"):
         item = problems.expectation(model, (*path, "0")).partition(" [")[0]
         words += item.removeprefix("must be a number")
@@ -197,7 +198,6 @@ def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
 
 
 def _plug_ins() -> str:
-    """Write the tables of the shipped plug-ins and their parameters."""
     blocks = [
         "A plug-in is a name, or a mapping with the key `name` and one key per parameter. The\n"
         "parameters of your own file are those of its function `build`: [plugins.md](plugins.md).\n"
@@ -215,13 +215,13 @@ def _plug_ins() -> str:
 
 
 def _files(kind: str) -> list[str]:
-    """Name the plug-ins that ship; `plugins.names` would name the installed ones, too."""
+    """Name the shipped plug-ins of a kind; `plugins.names` would include installed plug-ins."""
     folder = ROOT / plugins.PACKAGES[kind].replace(".", "/")
     return sorted(path.stem for path in folder.glob("[!_]*.py"))
 
 
 def _arguments(function: Any) -> dict[str, str]:
-    """Read the texts of the arguments from a docstring in Google style."""
+    """Read the descriptions of arguments from a docstring in Google style."""
     section = (inspect.getdoc(function) or "").partition("Args:\n")[2].partition("\n\n")[0]
     found = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
     return {name: " ".join(text.split()) for name, text in found}
@@ -240,7 +240,6 @@ def _shipped() -> str:
 
 
 def _topics() -> str:
-    """Write the tables of all topics."""
     overview = (
         (f"[`{name}`](#{name[1:]})", f"`{topic.ros_type}`", ENDS[topic.end], SAMPLING[name][1])
         for name, topic in TOPICS.items()
@@ -248,15 +247,14 @@ def _topics() -> str:
     blocks = ["\n## All topics\n", table("topic | message | written by | how often", overview)]
     for name, topic in TOPICS.items():
         text = re.sub(r", (world's clock|cloud's clock|clock of its end)", "", topic.text)
-        stamp, often = SAMPLING[name]
+        stamp, _ = SAMPLING[name]
         clock = f"{topic.end}'s clock"
         if topic.end == "either":
             clock = "the clock of the end that wrote the row"
         blocks += [
             f"## `{name}`\n",
             f"{text}.\n",
-            f"- Message: `{topic.ros_type}`, written by {ENDS[topic.end]}, {often}.\n"
-            f"- Stamp: {stamp}, on {clock}.\n",
+            f"Stamp: {stamp}, on {clock}.\n",
             table(
                 "field | type | unit | meaning",
                 ((f"`{field.name}`", field.kind, field.unit, field.text) for field in topic.fields),
@@ -266,7 +264,6 @@ def _topics() -> str:
 
 
 def _metrics() -> str:
-    """Write the tables of all metrics and of the histograms' buckets."""
     rows = []
     for metric in METRICS.values():
         labels = [
@@ -280,17 +277,23 @@ def _metrics() -> str:
         for metric in METRICS.values()
         if metric.buckets
     ]
-    return f"\n{table('metric | type | from | meaning', rows)}\n## Buckets\n\n{''.join(buckets)}"
+    head = "## Buckets\n\nUpper bounds of the buckets of each histogram [s]:\n"
+    return f"\n{table('metric | type | from | meaning', rows)}\n{head}{''.join(buckets)}"
+
+
+def _chart() -> str:
+    """Write the table of all values of the chart."""
+    return table("key | default | meaning", _values(ChartValues()))
 
 
 VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"
 WIDTH = 96
 COMPACT = (Resources, Quantities)
-"""Parts of the values whose keys Kubernetes defines; a part is written on one line."""
+"""Parts of the values whose keys Kubernetes defines; each part is written on one line."""
 
 
 def _values_text(part: BaseModel, depth: int = 0) -> str:
-    """Format a part of the values as YAML, each key below its description."""
+    """Format a part of the values as YAML, with the description above each key."""
     lines = []
     for key, value, text in _keys_of(part):
         if key == "global":
@@ -310,13 +313,13 @@ def _values_text(part: BaseModel, depth: int = 0) -> str:
 
 
 def _keys_of(part: BaseModel) -> Iterator[tuple[str, Any, str]]:
-    """Yield key, default and description of each value."""
+    """Yield name, default and description of each value."""
     for name, info in type(part).model_fields.items():
         yield info.alias or name, getattr(part, name), " ".join((info.description or "").split())
 
 
 def _chart_schema() -> dict[str, Any]:
-    """Generate the JSON schema of the values, in draft 7, without unknown keys at any level."""
+    """Generate the JSON schema of the values: draft 7, unknown keys are not allowed."""
     made = ChartValues.model_json_schema(by_alias=True)
     made = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc", **made}
     made["$defs"] = {name: _adapt(part) for name, part in made.pop("$defs").items()}
@@ -334,7 +337,7 @@ def _chart_schema() -> dict[str, Any]:
 
 
 def _adapt(part: Any) -> Any:
-    """Remove pydantic's titles and defaults; convert fixed tuples to draft 7."""
+    """Remove pydantic's titles and defaults; convert tuples of fixed length to draft 7."""
     if isinstance(part, list):
         return [_adapt(item) for item in part]
     if not isinstance(part, dict):
@@ -353,7 +356,6 @@ def _adapt(part: Any) -> Any:
 
 
 def _values(part: BaseModel, above: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield a row for each value of the chart."""
     for key, value, text in _keys_of(part):
         if isinstance(value, BaseModel) and not isinstance(value, (*COMPACT, Experiment)):
             yield from _values(value, f"{above}{key}.")

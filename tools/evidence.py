@@ -1,7 +1,7 @@
-"""Write the results of `make nightly`: index.md, numbers.json and environment.json.
+"""Write the results of `make nightly` as index.md, numbers.json and environment.json.
 
-`make nightly` runs this module last, with the folder in which the tests, `cloudrc faults`, mutmut
-and the bench of the link left their results. The page leaves out commands that did not run.
+`make nightly` runs this module last, on the folder with the results of the tests, `cloudrc faults`,
+mutmut and the link benchmark. Commands that did not run are left out.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ Rows = Iterable[Iterable[object]]
 
 
 def environment() -> dict[str, Any]:
-    """Describe the commit and the machine of the measurement."""
+    """Describe the commit and the machine."""
     git = ["git", "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip()
     return {"commit": commit or "unknown", **environment_document()}
 
 
 def read(folder: Path, names: str) -> Iterator[dict[str, Any]]:
-    """Read the JSON files that match `names`; skip empty files, which a broken command left."""
+    """Read the JSON files that match `names`; skip empty files of commands that failed."""
     for path in sorted(folder.glob(names)):
         if text := path.read_text(encoding="utf-8"):
             yield json.loads(text)
 
 
 def numbers(folder: Path) -> list[dict[str, Any]]:
-    """Keep the worst measurement of each number from the tests, with the sum of its cases."""
+    """Find the worst measurement of each number that tests recorded, and add up its cases."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for path in sorted(folder.glob("numbers/*.jsonl")):
         for row in map(json.loads, path.read_text(encoding="utf-8").splitlines()):
@@ -49,7 +49,7 @@ def numbers(folder: Path) -> list[dict[str, Any]]:
 
 
 def _badness(row: dict[str, Any]) -> float:
-    """Rate a measurement for a comparison with others; a missing measurement is the worst."""
+    """Rate a measurement: the larger, the worse; a missing measurement is the worst."""
     if row["measured"] is None:
         return float("inf")
     badness = row["measured"] - row["asked"]
@@ -72,7 +72,7 @@ def test_rows(folder: Path) -> Rows:
 
 
 def fault_rows(folder: Path) -> Rows:
-    """List the faults that were injected, and the checks that failed."""
+    """List the injected faults, and the checks that failed."""
     for each in (each for run in read(folder, "faults*.json") for each in run["faults"]):
         failed = [check["text"] for check in each["checks"] if not check["passed"]]
         told = "; ".join(filter(None, [each["reason"], *failed]))
@@ -85,7 +85,7 @@ def section(title: str, head: Iterable[str], rows: Rows) -> str:
 
 
 def page(folder: Path, here: dict[str, Any], found: list[dict[str, Any]]) -> str:
-    """Format the page: a section for each kind of results."""
+    """Format the page, with a section for each kind of result."""
     tests, faults = ("run", "tests", "failed", "errors", "skipped"), ("fault", "name")
     parts = [
         f"# Evidence of commit {here['commit']}\n",
@@ -106,7 +106,7 @@ def page(folder: Path, here: dict[str, Any], found: list[dict[str, Any]]) -> str
 
 
 def write(folder: Path) -> None:
-    """Write the page and the JSON files to a folder that holds the results."""
+    """Write the page and the JSON files to the folder with the results."""
     here, found = environment(), numbers(folder)
     write_json(folder / "environment.json", here)
     write_json(folder / "numbers.json", {"schemaVersion": 1, "numbers": found})

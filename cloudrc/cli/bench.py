@@ -1,7 +1,7 @@
-"""`cloudrc bench`: measure what the closed loop costs on this machine.
+"""`cloudrc bench`: measure how much processor time the closed loop needs on this machine.
 
-The reference is the same physics alone: `mj_step` in C (`mujoco.rollout`, one thread). The flights
-and the reference are measured in turns, and the fastest time of each counts.
+For comparison, the command also replays the physics of the same flight alone: `mj_step` in C
+(`mujoco.rollout`, one thread). It repeats every measurement and prints the shortest times.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from cloudrc.records import Record
 
 STEP = 0.002
-"""Step of the physics [s]."""
+"""Time step of the physics [s]."""
 LIMIT_NS = 120_000_000_000
 """Time limit of a measured flight, in its virtual time [ns]."""
 EPILOG = """\
@@ -62,7 +62,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _measure(experiment: ResolvedExperiment, repeats: int) -> dict[str, float]:
-    """Return the least processor time per physics step [s] of each measured part, by its name."""
+    """Return the shortest processor time per physics step [s], by name of the measured part."""
     from cloudrc.record.hash import RecordHash
 
     replay = _replay(experiment)
@@ -85,7 +85,7 @@ def _measure(experiment: ResolvedExperiment, repeats: int) -> dict[str, float]:
 def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
     """Fly once and record the inputs of the physics; return a function that replays these inputs.
 
-    The returned function returns its number of physics steps.
+    The returned function returns the number of replayed steps.
     """
     import numpy as np
 
@@ -109,9 +109,9 @@ def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
 def _flight(
     experiment: ResolvedExperiment, keep: Callable[[list[Record]], object]
 ) -> Callable[[], int]:
-    """Prepare a flight whose records go to `keep`; return a function that flies.
+    """Prepare a flight; return a function that flies, and returns the number of physics steps.
 
-    The returned function returns its number of physics steps.
+    `keep` is called with the records of the flight.
     """
     from cloudrc.cli.run import assemble
 

@@ -1,7 +1,7 @@
-"""Call teleop's API over HTTP, at http://HOST:PORT with a token, or at unix:PATH.
+"""Call the API of teleop over HTTP, at http://HOST:PORT with a token, or at unix:PATH.
 
-PATH is a socket file that only its owner can open. The token comes from a file, so that the token
-appears neither in the list of processes nor in a shell's history.
+PATH is a socket file that only its owner can open. The token is read from a file, because a token
+on the command line would appear in the list of processes and in the history of the shell.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from cloudrc.files import read, readable_by_others
 REQUEST_TIMEOUT = 10.0
 """Time limit of one request [s]."""
 STREAM_TIMEOUT = 30.0
-"""Longest silence of an event stream before the client gives up [s]; the API sends an event or a
-comment every 10 s."""
+"""Time without data after which the client stops reading a stream of events [s]. The API sends data
+at least every 10 s."""
 RETRY_STATUSES = (408, 429, 502, 503, 504)
-"""HTTP status codes after which a later attempt may succeed."""
+"""HTTP status codes after which the same request may succeed later."""
 UNIX = "unix:"
 VARIABLE = "CLOUDRC_TOKEN_FILE"
 _TOKEN = re.compile(rb"[!-~]{16,512}")
@@ -42,7 +42,7 @@ class ApiError(CloudrcError):
 
 
 class UnreachableError(ApiError):
-    """Report that the API does not answer at present; a later attempt may succeed."""
+    """Report that the API does not answer now; the same request may succeed later."""
 
 
 class Api:
@@ -60,7 +60,7 @@ class Api:
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH") from None
 
     def get(self, path: str) -> Any:
-        """Send a GET request; return and raise the same as `post`."""
+        """Send a GET request; results and errors are those of `post`."""
         with self._answer("GET", path, None, REQUEST_TIMEOUT) as answer:
             return json.loads(answer.read())
 
@@ -77,7 +77,7 @@ class Api:
             return json.loads(answer.read())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
-        """Yield missions' events with an id above `after` as they happen, until teleop ends."""
+        """Yield the events of all missions that follow the event id `after`, until teleop ends."""
         with self._answer("GET", f"/v1/events?after={after}", None, STREAM_TIMEOUT) as stream:
             for line in stream:
                 if line.startswith(b"data: "):
@@ -87,7 +87,7 @@ class Api:
     def _answer(
         self, method: str, path: str, body: bytes | None, limit: float
     ) -> Iterator[http.client.HTTPResponse]:
-        """Send a request and yield the answer; raise an error if the status is not 2xx.
+        """Send a request and yield the answer; raise an error for any HTTP status other than 2xx.
 
         `limit` is the longest wait for the server [s].
         """
@@ -143,7 +143,7 @@ def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcEr
     body: Any = None
     with suppress(OSError, ValueError, http.client.HTTPException):
         body = json.loads(answer.read())
-    body = body if isinstance(body, dict) else {}  # it may be another server that answers
+    body = body if isinstance(body, dict) else {}  # another server may have answered
     detail = escape(str(body.get("detail") or f"the API answered {answer.status} {answer.reason}"))
     problems = body.get("problems") or []
     if len(problems) > 1:
@@ -165,15 +165,15 @@ def token_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def token_file(options: argparse.Namespace) -> Path | None:
-    """Return the token file from the command line, else from the environment, else None."""
+    """Return the path of the token file from the flag, else from the environment, else None."""
     given = options.token_file or os.environ.get(VARIABLE)
     return Path(given) if given else None
 
 
 def token_reader(path: Path | None) -> Callable[[], str]:
-    """Return a function that reads the token anew at each call, or returns "" if `path` is None.
+    """Return a function that reads the token from `path`, or returns "" if `path` is None.
 
-    Warn at once if other users can read the file.
+    Print a warning if other users can read the file.
     """
     if path is None:
         return lambda: ""

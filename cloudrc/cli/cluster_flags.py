@@ -1,4 +1,4 @@
-"""The flags that name a release of the chart in a Kubernetes cluster."""
+"""Flags that name a Helm release of cloudrc in a Kubernetes cluster."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ READY_LIMIT = 300.0
 
 
 def release_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags that name a release, as in kubectl."""
+    """Declare the flags that name a release: context and namespace, as in kubectl, and release."""
     group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
     group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
     group.add_argument(
@@ -39,7 +39,7 @@ def timeout_argument(parser: argparse.ArgumentParser) -> None:
 
 
 def release_from_flags(options: argparse.Namespace) -> Release:
-    """Return the release that the flags name, or the default release of the current context.
+    """Return the release that the flags name; by default "cloudrc" in the current context.
 
     Raises:
         MissingPrerequisiteError: If the Kubernetes client or a kubeconfig is missing.

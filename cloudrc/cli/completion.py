@@ -1,7 +1,7 @@
 """`cloudrc completion SHELL`: print a script that completes command lines on the Tab key.
 
-The script contains the commands, their options, and the names that this installation ships. Thus
-the Tab key does not start Python.
+The script contains all commands, options and shipped names. Therefore completion does not have to
+start Python.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _settings() -> Iterator[str]:
-    """Yield what completes `--set`: KEY=, or KEY=NAME for each name that a key accepts."""
+    """Yield the completions of `--set`: KEY=NAME for a key that accepts names, else KEY=."""
     from cloudrc import plugins
     from cloudrc.config import problems, shipped
     from cloudrc.config.overrides import KINDS
@@ -95,7 +95,6 @@ def _settings() -> Iterator[str]:
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """Yield the argparse actions of a parser and of its subcommands."""
     for action in parser._actions:
         yield action
         if isinstance(action, argparse._SubParsersAction):
@@ -106,7 +105,7 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 def _candidates(name: str, words: Sequence[str], *, files: bool = False) -> dict[str, Any]:
     """Return code for shtab that completes one of `words`, in the syntax of each shell.
 
-    `name` distinguishes the shell functions. With `files`, paths are completed too.
+    `name` becomes part of the name of the shell function. With `files`, complete paths, too.
     """
     function, joined = f"_cloudrc_{name}", " ".join(words)
     bash = zsh = fish = ""

@@ -26,12 +26,12 @@ PROGRAMS = {
     "docker": (f"{HELPFUL}https://docs.docker.com/engine/install", ()),
     "kind": (f"{HELPFUL}https://kind.sigs.k8s.io", ()),
 }
-"""Program -> its installation page, and the modes that need the program. Docker and kind make a
-cluster on this machine; a remote cluster needs neither."""
+"""Program -> its installation page, and the modes that need the program. No mode needs Docker and
+kind, because the cluster may be on other machines."""
 MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 LATE_SLEEP = 2e-3
-"""Largest lateness of a sleep at which real-time flights still work [s]. The control loop has a
-period of 10 ms; an idle desktop stays far below this limit."""
+"""Largest lateness at the end of a sleep [s] with which flights in real time still work. For
+comparison: the control loop has a period of 10 ms."""
 MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
     "mujoco.mj_step(m, mujoco.MjData(m))"
@@ -40,9 +40,9 @@ COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 
 
 class Check(NamedTuple):
-    """The result of one check: the text `found`, and the advice `fix`.
+    """The result of one check, with a text `found` and the advice `fix`.
 
-    If `state` is "missing", the modes in `modes` cannot run. If `state` is "warn", they can.
+    If `state` is "missing", the modes in `modes` cannot run. If `state` is "warn", all modes can.
     """
 
     name: str
@@ -53,14 +53,14 @@ class Check(NamedTuple):
 
 
 def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = ()) -> Check:
-    """Make the result of a check; a failed check blocks the given modes, or warns without modes."""
+    """Make the result of a check. A failed check is "missing" if a mode needs it, else "warn"."""
     if ok:
         return Check(name, "ok", found, "", modes)
     return Check(name, "missing" if modes else "warn", found[:120], fix, modes)
 
 
 def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Check]:
-    """Yield the results in the order of display; contact a cluster only in mode "cluster"."""
+    """Yield the results of all checks; in mode "cluster" also check the cluster of `context`."""
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
     yield mujoco_steps()
@@ -108,7 +108,7 @@ def udp_loopback() -> Check:
 
 
 def timer(rounds: int = 100) -> Check:
-    """Measure how late `rounds` sleeps of 1 ms end."""
+    """Check how late sleeps of 1 ms end; sleep `rounds` times."""
     late = []
     for _ in range(rounds):
         start = time.monotonic()
@@ -155,7 +155,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Print all checks; exit 3 if the wanted mode cannot run."""
+    """Print the results of all checks; return 3 if the requested mode cannot run, else 0."""
     mode, checks = options.mode, list(all_checks(options.mode, options.context))
     blocking = [check.name for check in checks if check.state == "missing" and mode in check.modes]
     code = MissingPrerequisiteError.exit_code if blocking else 0

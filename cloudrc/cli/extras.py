@@ -1,4 +1,4 @@
-"""The optional dependencies, the modes that need them, and how to install missing ones."""
+"""List optional dependencies, the modes that need them, and how to install missing packages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "kube": ("kubernetes",),
     "api": ("fastapi", "uvicorn"),
 }
-"""Extra in pyproject.toml -> its modules; their packages on PyPI have the same names."""
+"""Name of an extra in pyproject.toml -> the modules that it installs."""
 MODES: dict[str, tuple[str, ...]] = {
     "local": ("world", "record", "report"),
     "virtual": ("world", "record", "report"),
@@ -24,7 +24,7 @@ MODES: dict[str, tuple[str, ...]] = {
 
 
 def missing(extra: str) -> list[str]:
-    """List the modules of an extra that are not installed; import none of them."""
+    """List the modules of an extra that are not installed, without importing any module."""
     return [module for module in EXTRAS[extra] if importlib.util.find_spec(module) is None]
 
 

@@ -32,9 +32,9 @@ examples:
 exit codes: 0 all checks passed, 1 a check failed, 2 bad input,
   6 a worker was killed, 130 interrupted"""
 SEED_MAX = 2**52
-"""Largest first seed. A search counts on from it, and a seed is below 2^53."""
+"""Largest value of --seed and --first; a search counts up from --first, to seeds below 2^53."""
 MINUTES_MAX = 10_000.0
-"""Longest search [min]: a week."""
+"""Longest duration of a search [min]: a week."""
 ACTIONS = {
     "list": "list all faults with their injection and the expected reaction",
     "run": "inject faults, or those of a schedule's file, and check the reaction",
@@ -66,7 +66,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _name_or_file(text: str) -> str | Path:
-    """Parse the name of a fault, or the path of a schedule's file."""
     is_path = "/" in text or text.endswith((".yaml", ".yml")) or os.path.isfile(text)
     return input_file(text) if is_path else text
 
@@ -82,7 +81,6 @@ def _minutes(text: str) -> float:
 
 
 def _folder(text: str) -> Path:
-    """Parse the path of an output folder; refuse one that cannot be made."""
     path = Path(text)
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
     if not (existing.is_dir() and os.access(existing, os.W_OK)):
@@ -101,7 +99,7 @@ OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
         "--store": (_folder, STORE, "DIR", STORED),
     },
 }
-"""Options of each action: function that reads the value, default, metavar, help text."""
+"""Action -> option -> function that parses the value, default, metavar, help text."""
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -115,7 +113,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def print_faults(options: argparse.Namespace) -> int:
-    """Print all faults with their injection and the expected reaction."""
+    """Print each fault: how it is injected, and the expected reaction of the system."""
     from cloudrc.faults.scenarios import SCENARIOS
 
     names = ("id", "name", "injects", "expects")
@@ -158,7 +156,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _run(job: tuple[str, int]) -> Outcome:
-    """Run one fault, by its name and a seed, in this process or in a worker."""
     from cloudrc.faults.scenarios import find
 
     (name, seed), began = job, time.monotonic()
@@ -179,7 +176,7 @@ def _print_outcome(scenario: Scenario, outcome: Outcome, briefly: bool) -> None:
 
 
 def fly_file(options: argparse.Namespace) -> int:
-    """Fly the schedule in a file; exit with 1 if a safety invariant breaks."""
+    """Fly the schedule of faults in a file; return 1 if the flight breaks a safety invariant."""
     from cloudrc.faults.schedule import load
     from cloudrc.faults.trial import fly
 
@@ -202,7 +199,7 @@ def fly_file(options: argparse.Namespace) -> int:
 
 
 def search(options: argparse.Namespace) -> int:
-    """Fly random schedules for `--minutes`; print the failures and the command to continue."""
+    """Fly random schedules of faults; print the failures and the command to continue."""
     from cloudrc.faults.search import Search, search_rows, search_summary
 
     kind, shown = "adversarial" if options.adversarial else "random", options.output == "table"

@@ -27,14 +27,11 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
 def find_local_run(
     options: argparse.Namespace, look: Callable[[Path, str], _Found | None], nobody: str
 ) -> _Found | None:
-    """Find the run that `--run` names, else ./runs/latest, else the only run that is flying.
+    """Find a run in flight: the run of `--run`, else ./runs/latest, else the only run in flight.
 
-    `look` takes the folder of a flying run and the URL of its API ("" without), and returns what
-    the command needs, or None. If the run of `--run` is not flying, the error has the text
-    `nobody`.
-
-    Returns:
-        The result of `look`; None if no run is flying, or if the flags name a cluster.
+    Call `look` with the run's folder and the URL of its API ("" if the run has no API), and return
+    the result of `look`. Return None if no run is in flight or if the flags name a cluster. If the
+    run of `--run` is not in flight, raise an error with the text `nobody`.
     """
     from cloudrc.drivers.local import under_way
 
@@ -69,10 +66,10 @@ def find_local_run(
 def no_run_error(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
-    """Add to `error`, about a cluster, that no run flies on this machine either.
+    """Extend the `error` that no cluster was found: no run is in flight on this machine either.
 
-    If the flags name a cluster, return the error unchanged. `flags` lists the flags that name a
-    local run.
+    If the flags name a cluster, return `error` unchanged. `flags` lists the flags that name a
+    local run, for the error text.
     """
     if options.context or options.namespace:
         return error

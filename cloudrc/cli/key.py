@@ -34,7 +34,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Make or rotate a key, or remove the previous key from the file."""
+    """Run `key new` (make or rotate a key) or `key drop` (remove the previous key)."""
     from cloudrc.drivers.keyfile import read_keys
     from cloudrc.files import write_atomically
     from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
@@ -51,7 +51,7 @@ def execute(options: argparse.Namespace) -> int:
         keys, said = KeySet(old.current), f" is the only key now, {old.previous.name} is removed"
     else:
         keys, said = old, " is the only key already"
-    target = Path(os.path.realpath(path))  # of a symbolic link
+    target = Path(os.path.realpath(path))  # keep a symbolic link: replace the file it points to
     try:
         if keys != old:
             write_atomically(target, write(keys).encode("ascii"), 0o600)

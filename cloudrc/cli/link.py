@@ -1,7 +1,7 @@
-"""Parse `cloudrc link ACTION` and run the action, which is in `cli/link_<name>.py`; `show` is here.
+"""Run `cloudrc link ACTION`.
 
-`cli/link_verify.py` imports much. So it is imported only when it runs, and this module declares its
-arguments.
+This module contains the action `show`; the modules `cli/link_<action>.py` contain all others. The
+arguments of `verify` are here, too, because the module of `verify` imports large packages.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ACTIONS = {
     "set": "change the link during a flight",
     "run": "shape one direction of the link until SIGTERM",
 }
-"""Help line of each action, in the order of the help."""
+"""Action -> its line in the help."""
 SHOW_EPILOG = """\
 examples:
   cloudrc link show lossy
@@ -82,9 +82,9 @@ RANGES: dict[str, tuple[float, float]] = {
 }
 """Option of `show` -> its least and largest value."""
 ROWS = 1000
-"""Least number of packets in the picture of a trace; a short trace gets several for each row."""
+"""Smallest number of packets in the picture of a trace, which may have fewer rows."""
 SECONDS = 30.0
-"""Default time that the picture shows [s]; longer if the profile's time line is longer."""
+"""Shortest time that the picture shows by default [s]; a longer time line is shown in full."""
 KINDS = ("png", "svg", "pdf")
 
 
@@ -168,7 +168,7 @@ def show_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def show(options: argparse.Namespace) -> int:
-    """Draw a profile and print its statistics; the last line is the picture's path."""
+    """Draw a profile into a file; print statistics and, in the last line, the path of the file."""
     require("a picture of a link", ("report",))
     output = options.output or Path(f"{Path(options.profile).stem}.png")
     if output.suffix[1:] not in KINDS:
@@ -193,7 +193,7 @@ def show(options: argparse.Namespace) -> int:
 
 
 def _profile(name: str) -> tuple[Profile, bool]:
-    """Load a profile, or make one of a trace; return also whether it is a trace."""
+    """Load a link profile, or make a profile from a CSV trace; return whether `name` is a trace."""
     from cloudrc.config.load import load_profile
     from cloudrc.config.schema import Direction, Profile
     from cloudrc.link.traces import read_trace
@@ -209,7 +209,7 @@ def _profile(name: str) -> tuple[Profile, bool]:
 def _way(
     asked: Direction, name: str, options: argparse.Namespace
 ) -> tuple[DirectionSample, Numbers]:
-    """Simulate one direction; if it never changes, the statistics come from a longer stream."""
+    """Simulate one direction; if its conditions are constant, use more packets than are drawn."""
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import numbers
     from cloudrc.link.profile import Timeline
@@ -236,7 +236,7 @@ def _way(
 
 
 def _row_times(times: Sequence[float]) -> list[int]:
-    """Return when to send [ns]: once per row of a trace, or more often if it has few rows."""
+    """Return when to send packets [ns]: at each row of a trace, and between rows if it is short."""
     rows = [round(time * 1e9) for time in times]
     share = -(-ROWS // len(rows))
     if len(rows) == 1 or share == 1:
@@ -246,7 +246,6 @@ def _row_times(times: Sequence[float]) -> list[int]:
 
 
 def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[int]) -> Stream:
-    """Simulate packets with the kind and size of a flight's datagrams."""
     from cloudrc.link.model import LinkDirection, sample
     from cloudrc.tunnel.codec import SIZES, Kind
 
@@ -268,7 +267,7 @@ _STATISTICS: dict[str, tuple[str, float, Callable[[Numbers], float]]] = {
     "lost in a row, mean": ("", 1.0, lambda one: fmean(one.runs) if one.runs else nan),
     "lost in a row, most": ("", 1.0, lambda one: max(one.runs, default=0)),
 }
-"""Name -> unit, scale and value of each line."""
+"""Name of a statistic -> unit, factor from SI to this unit, and function that gives the value."""
 
 
 def _table(counted: dict[str, Numbers]) -> str:

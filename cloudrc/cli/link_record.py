@@ -1,7 +1,7 @@
 """Run `cloudrc link record SOURCE`: turn measured delays into a trace for a profile.
 
-The source is a run, an MCAP file, a log of ping or irtt, or a CSV file. The command recognises the
-kind of source by its content.
+The source is a run, an MCAP file, a log of ping or irtt, or a CSV file. The command detects the
+format from the content of the source.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ A trace describes one direction. A run has two: without --direction the command
 writes both, and adds the direction to each file name."""
 DIRECTIONS: tuple[Direction, ...] = ("uplink", "downlink")
 UNPACKED_MAX = 64 << 20
-"""Longest log that is unpacked [bytes]: 10 min of irtt at 100 Hz."""
+"""Largest size of an unpacked log [bytes]: 10 min of irtt at 100 Hz."""
 SETTLING_NS = 2_000_000_000
-"""Time before a session's last datagram in which no datagram counts as lost [ns], because a missing
-datagram may still be under way."""
+"""Length of the part at the end of a session in which no datagram counts as lost [ns]: a missing
+datagram may still have been on its way."""
 TOPICS = {
     "uplink": ("/telemetry", "/uplink_delay"),
     "downlink": ("/delay_estimate", "/downlink_delay"),
 }
-"""Direction -> topic with a row per sent datagram, topic with a row per arrived datagram."""
+"""Direction -> topic with one row per sent datagram, topic with one row per arrived datagram."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,7 +83,6 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _write(packets: Packets, path: Path, direction: str) -> None:
-    """Write one trace; print its statistics and the settings that use it."""
     from statistics import fmean, pstdev
 
     from cloudrc.link.logs import trace_of
@@ -106,7 +105,6 @@ def _write(packets: Packets, path: Path, direction: str) -> None:
 
 
 def _is_run(path: Path) -> bool:
-    """Return whether a path is a run's folder or an MCAP file; both hold both directions."""
     if path.is_dir():
         return True
     with path.open("rb") as file:
@@ -114,7 +112,6 @@ def _is_run(path: Path) -> bool:
 
 
 def _from_log(path: Path, options: argparse.Namespace) -> Packets:
-    """Read a log of ping or irtt, or a CSV file; recognise the kind by the content."""
     from cloudrc.link.logs import is_ping, read_csv, read_irtt, read_ping, refuse_others
     from cloudrc.link.traces import read_lines
 
@@ -130,7 +127,6 @@ def _from_log(path: Path, options: argparse.Namespace) -> Packets:
 
 
 def _unpack(path: Path) -> list[str]:
-    """Unpack a file that irtt has compressed."""
     import gzip
     import zlib
 
@@ -158,9 +154,10 @@ def _recording(path: Path) -> Recording:
 
 
 def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
-    """Match sent and arrived datagrams by epoch and counter; of duplicates the first counts.
+    """Compute one-way delays by matching the records of sent and of arrived datagrams.
 
-    Raise a BadInputError that names `path` if the recording has no one-way delays.
+    If a datagram arrived twice, the shorter delay counts. Raise a BadInputError that names `path`
+    if the recording has no one-way delays.
     """
     from cloudrc.link.logs import Log
 
@@ -181,8 +178,8 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
         log.counts["duplicates left out"] += (epoch, counter) in delays
         delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
     rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
-    # The far end may refuse datagrams sent before the session was open there, or near its end. The
-    # link did not lose these: leave them out.
+    # The receiver may refuse datagrams sent before its session opened or near the session's end.
+    # The link did not lose these datagrams: leave them out.
     latest_first = reversed(list(_columns(arrivals, "epoch", "stamp_ns")))
     opened_ns = {epoch: stamp_ns for epoch, stamp_ns in latest_first}  # the first arrival remains
     last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
@@ -198,10 +195,9 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 
 
 def _halves(recording: Recording, path: Path) -> Packets:
-    """Estimate each packet's delay as half of a round trip, at the time of sending the command.
+    """Estimate one-way delays as halves of the measured round trips, at the time when they began.
 
-    Losses are not visible. Telemetry repeats an echo until the next command arrives; the repeats
-    do not count.
+    A round trip does not show which datagrams were lost.
     """
     from cloudrc.link.logs import Log
 
@@ -212,15 +208,14 @@ def _halves(recording: Recording, path: Path) -> Packets:
         if isnan(rtt):
             continue
         if (rtt, loop) == previous:
-            log.counts["repeated echoes left out"] += 1
+            log.counts["periods without a new round trip left out"] += 1
             continue
         previous = rtt, loop
-        log.entries.append((stamp_ns * 1e-9 - loop, rtt / 2))
+        log.entries.append((stamp_ns * 1e-9 - rtt, rtt / 2))
     if not log.entries:
         raise log.error("holds no round trip; give the folder of a run that flew")
     return log.packets()
 
 
 def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:
-    """Iterate over columns row by row; integers stay integers."""
     return zip(*(table[name].tolist() for name in names), strict=True)

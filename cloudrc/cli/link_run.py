@@ -1,8 +1,7 @@
-"""Run `cloudrc link run`: the sidecar with its clock, sockets, programs and threads.
+"""Run `cloudrc link run`: the process that shapes one direction of the link, a sidecar in a pod.
 
-/link.json on the metrics port shows the state of the shaper. Each answer needs calls of tc and ip,
-so answers are cached for one second. Every `cloudrc link` imports this module, so the module itself
-imports little.
+GET /link.json on the metrics port returns the state of the shaper. The process calls tc and ip for
+this answer, and caches the answer for one second.
 """
 
 from __future__ import annotations
@@ -38,14 +37,14 @@ if TYPE_CHECKING:
 
 EPILOG = ""
 STATUS_PERIOD = 1.0
-"""How long an answer of /link.json is cached [s]."""
+"""Time for which the process caches the answer to GET /link.json [s]."""
 EMPTY_STATUS = "{}\n"
-"""Answer of /link.json before the shaper works."""
+"""Answer to GET /link.json before the shaper has started."""
 TOOL_TIMEOUT = 5.0
 """Time limit of one call of tc or ip [s]."""
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
-"""Command that tc gets after each real command: the one line of its answer ends the real answer."""
+"""Command sent to tc after every command: the answer to `_END` marks the end of the answer."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -120,13 +119,13 @@ def log(line: str) -> None:
 
 
 def make_profile_loader(direction: str) -> Load:
-    """Make the function that reads one direction of a profile file."""
+    """Return a function that reads one direction of a link profile from a file."""
     from cloudrc.assembly import link_profile
     from cloudrc.config.load import load_profile
     from cloudrc.link.follow import Loaded
 
     def load(path: Path) -> Loaded:
-        profile = load_profile(path.absolute())  # absolute: never the name of a shipped profile
+        profile = load_profile(path.absolute())  # absolute: not a shipped name
         values = profile.model_dump(mode="json", exclude_defaults=True)
         return Loaded(link_profile(getattr(profile, direction)), values)
 
@@ -161,8 +160,6 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
 
 
 def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None:
-    """Call a function forever in a thread, with random pauses between two limits [s]."""
-
     def work() -> None:
         while True:
             action()
@@ -172,14 +169,14 @@ def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None
 
 
 def inspect_network(host: str) -> Near | None:
-    """Find the netem qdiscs of this network namespace and its route to a host (IPv4 address)."""
+    """Find the netem qdiscs of this network namespace and the route to `host`, an IPv4 address."""
     from cloudrc.link.sidecar import look_near
 
     return look_near(run_tool, host)
 
 
 class LinkStatusSource:
-    """Describes the state of a sidecar as JSON; any thread may call `text`."""
+    """Caches the state of a sidecar as JSON. Any thread may call `text`."""
 
     def __init__(
         self,
@@ -191,7 +188,7 @@ class LinkStatusSource:
         self._lock, self._text, self._valid_until = threading.Lock(), EMPTY_STATUS, -STATUS_PERIOD
 
     def text(self) -> str:
-        """Return the state as JSON; ask tc and ip at most once a second."""
+        """Return the state as JSON; call tc and ip at most once a second."""
         from cloudrc.link.sidecar import write_told
 
         with self._lock:
@@ -204,7 +201,7 @@ class LinkStatusSource:
 
 
 def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) -> Answer:
-    """Run a program to its end in a new process."""
+    """Run a program in a new process, wait until it ends, and return its output."""
     from cloudrc.link.netem import NOT_FOUND, Answer
 
     try:
@@ -221,36 +218,36 @@ def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) ->
 class Programs:
     """Runs tc and ip.
 
-    A step of a time line must take effect within milliseconds, and starting a process takes longer.
-    Therefore one lasting `tc -batch -` makes all changes and listings of qdiscs.
+    The steps of a time line have to take effect within milliseconds; starting a process takes
+    longer. Therefore one `tc -batch -` process stays open for all changes and lists of qdiscs.
     """
 
     def __init__(self, tables: str = "") -> None:
-        """Start no process yet; `tables` is the folder with the distribution tables of tc."""
+        """Set the folder with the distribution tables of tc; start no process yet."""
         self._environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
         self._tc: subprocess.Popen[bytes] | None = None
 
     def __call__(self, words: Sequence[str]) -> Answer:
-        """Run a command and return its answer."""
+        """Run a command of tc or ip, and return its answer."""
         try:
             match list(words):
                 case ["tc", "qdisc", "change", *_]:
                     return self._ask(" ".join(words[1:]), lists=False)
                 case ["tc", "-s", "-j", "qdisc", "show", *_]:
                     return self._ask(" ".join(words[3:]), lists=True)
-        except OSError:  # killed, or too old for -batch: start one for this command
+        except OSError:  # tc was killed or is too old for -batch: start it for this command alone
             self.close()
         return run_tool(words, self._environment)
 
     def close(self) -> None:
-        """End the lasting tc process, if there is one."""
+        """Kill the open tc process, if there is one."""
         if self._tc is not None:
             self._tc.kill()
             self._tc.communicate()
             self._tc = None
 
     def _ask(self, line: str, *, lists: bool) -> Answer:
-        """Send a line to the lasting tc; raise an OSError if tc does not answer."""
+        """Send a command to the open tc process; raise an OSError if tc does not answer."""
         from cloudrc.link.netem import Answer
 
         tc, pipe = self._tc, subprocess.PIPE

@@ -39,7 +39,7 @@ KEY is a key of a direction in a profile file. With --profile, time lines start
 anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
 COLUMNS = ("delay_ms", "jitter_ms", "distribution", "loss", "rate_kbit")
-"""Keys of a direction that have their own columns in the table."""
+"""Keys of a direction that have columns of their own; the column OTHER shows all other keys."""
 LOCAL_TIMEOUT = 5.0
 """Time limit for a local relay to apply a change [s]; a relay needs about 0.2 s."""
 
@@ -55,7 +55,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Change the link and print its new state."""
+    """Change the link as the flags say, and print the new state of the link."""
     began, number = monotonic(), secrets.token_hex(4)
     from cloudrc.drivers.local import LINK_FOLDER
 
@@ -122,7 +122,7 @@ def _set_here(
 
 
 def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
-    """Read the link of the release; if the release has none, raise an error with the reason."""
+    """Return the link of a release; raise an error with the reason if the release has no link."""
     from cloudrc.cluster.link import read_link
 
     failed: CloudrcError = ClusterError(
@@ -146,7 +146,6 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
 
 
 def _note(edit: Edit, number: str) -> str:
-    """Return the text of `CHANGE_FILE`: number, cause, and whether the time line restarts."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 
@@ -168,7 +167,6 @@ def _row(state: LinkState) -> tuple[str, ...]:
 
 
 def _describe(key: str, value: Any) -> str:
-    """Describe a further setting: of a time line the number of entries, of a file the name."""
     if isinstance(value, list):
         return f"{len(value)} {key}"
     return f"{key} {Path(value).name if isinstance(value, str) else value}"

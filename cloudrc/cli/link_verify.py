@@ -1,9 +1,9 @@
 """Run `cloudrc link verify`: compare a link with its profile, by probes or in flight.
 
-By default one process per direction shapes a link on this machine; for netem in two network
-namespaces, joined by a veth pair, as between two pods. In a release each end judges the datagrams
-of the flight and serves the verdict at /link.json of its metrics port; the link containers report
-their shapers there.
+By default the command starts a link on this machine and sends probes. In a cluster it sends no
+probes: world and cloud each compare the datagrams that they receive with the profile. They serve
+their verdicts at /link.json on their metrics ports. The link containers serve the state of their
+shapers at the same path.
 """
 
 from __future__ import annotations
@@ -65,46 +65,46 @@ from cloudrc.tunnel.codec import SIZES, Kind
 RELEASE_TIMEOUT = 270.0
 """Default time limit for the verdict on a release [s]."""
 START_LIMIT = 90.0
-"""Longest time for both processes to start, which a slow disk needs [s]."""
+"""Time limit for the processes of both directions to start, long enough for a slow disk [s]."""
 COUNTS_WAIT = 1.3
-"""Time until the processes have counted the last probe [s]; they do so once a second."""
+"""Wait after the last probe [s]: the link's processes update their counts once a second."""
 POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0
-"""Pause between two polls, and longest wait for a page [s]."""
+"""Pause between two polls of a release, and time limit of one HTTP request [s]."""
 PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
 LOOPBACK, DEVICE = "127.0.0.1", "tunnel"
 HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}
-"""Direction -> address of its sending end, in that end's namespace."""
+"""Direction -> IPv4 address of the sender, in the sender's network namespace."""
 WAYS = {
     "uplink": ("world", "cloud", Kind.TELEMETRY),
     "downlink": ("cloud", "world", Kind.COMMAND),
 }
-"""Direction -> its sending end, its receiving end, and the kind of datagram sent."""
+"""Direction -> sender, receiver, and the kind of datagram that the sender sends."""
 KEYS = ("asked", "measured", "low", "high")
-"""Values of a row, in the order in which a table shows them."""
+"""Keys of the values in a row of the report, in the order of the table's columns."""
 NOT_JUDGED = "NOT JUDGED"
-"""Word in a note that something requested by the profile was not verified."""
+"""Mark in the notes on quantities of the profile that the command could not verify."""
 TOLD = {
     "correlation": f"correlation {NOT_JUDGED}: netem realises almost none of it",
     "rate": f"rate {NOT_JUDGED}: only trains of probes measure it, up to 100 Mbit/s",
     "time_line": f"its time line {NOT_JUDGED} in flight, only what follows it",
 }
-"""Quantity of a row that is not judged -> its note."""
+"""Quantity that cannot be judged -> the note that says so."""
 LOOPS = f"{NOT_JUDGED} in flight: a time line loops; probe it without --mode cluster"
 VERDICTS = {
     "off": ("not believed", "red", "does not match its profile"),
     "open": ("undecided", "yellow", "was not measured for long enough: give more --seconds"),
     "ok": ("believed", "green", "matches its profile"),
 }
-"""Verdict of the rows, the worst first -> verdict on the link, its colour and a text."""
+"""Worst verdict on a quantity of the link -> verdict on the link, its colour and text."""
 _CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
 Report: TypeAlias = dict[str, Any]
 Pods: TypeAlias = Mapping[str, Sequence[str]]
-"""End -> URLs of its own pages and of those of its link container."""
+"""World or cloud -> URLs of the metrics ports: of the process itself, and of its link container."""
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Measure the link, print the verdict; return 0 if the link is believed."""
+    """Measure the link and print the verdict; return 0 if the link matches its profile, else 1."""
     if options.seconds is not None and not 1.0 <= options.seconds <= 3600.0:
         raise BadInputError(f"--seconds {options.seconds:g}: give a number from 1 to 3600")
     interrupt_on_signals()  # on a signal, remove namespaces and processes
@@ -121,7 +121,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
-    """Read the experiment `target`, or the default experiment with the profile `target`."""
+    """Read the experiment `target`, or the default experiment with the link profile `target`."""
     experiments, profiles = shipped.names("experiment"), shipped.names("profile")
     is_profile = target not in experiments
     if shipped.is_path(target):
@@ -138,11 +138,11 @@ def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
 
 @dataclass(slots=True)
 class Way:
-    """One direction of a link under test: its probes' socket, the shaper's files and process."""
+    """One direction of a link under test: socket for its probes, shaper's process and files."""
 
     own: socket.socket
-    ports: tuple[int, int]  # where a relay receives, and where the process serves its pages
-    namespace: str  # of the network; "" for this process's
+    ports: tuple[int, int]  # port at which a relay receives, and metrics port
+    namespace: str  # network namespace; "" for the namespace of this process
     peer: tuple[str, int] = ("", 0)
     folder: Path = Path()
     process: subprocess.Popen[bytes] | None = None
@@ -151,7 +151,10 @@ class Way:
 def verify(
     title: str, experiment: ResolvedExperiment, shaper: str, seconds: float | None
 ) -> Report:
-    """Probe a link for `seconds` [s], None for as long as needed; if a row is off, probe again."""
+    """Send probes over a link for `seconds` [s] (None: as long as needed), and judge the link.
+
+    If a quantity is off, repeat the measurement once.
+    """
     plans, found = make_plans(experiment, seconds, shaper), dict[str, Findings]()
     longest = max(plan.sent[-1] for plan in plans.values())
     for look in ("sending probes", "measuring again what is off"):
@@ -169,10 +172,10 @@ def verify(
 def make_plans(
     experiment: ResolvedExperiment, seconds: float | None, shaper: str
 ) -> dict[str, Plan]:
-    """Plan probes of the size of datagrams for `seconds` [s]; None: as long as needed.
+    """Plan probes in both directions for `seconds` [s] (None: as long as needed).
 
     Raises:
-        BadInputError: If netem cannot realise the profile; names the direction.
+        BadInputError: If netem cannot realise the profile; the text names the direction.
     """
     plans, netem = {}, shaper == "netem"
     for way, (_, _, kind) in WAYS.items():
@@ -188,7 +191,7 @@ def make_plans(
 
 
 def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
-    """Send all probes over a running link and judge them."""
+    """Send all probes over a running link; return the findings on each direction."""
     since_wall_ns, found, ends = time.time_ns() - time.monotonic_ns(), {}, []
     states = {name: from_text((way.folder / STATE_FILE).read_text()) for name, way in ways.items()}
     for name, way in ways.items():
@@ -211,12 +214,12 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, 
 def run_link(
     experiment: ResolvedExperiment, shaper: str, applied: Profile | None = None
 ) -> Iterator[dict[str, Way]]:
-    """Run both directions of a link: on loopback, or for netem in two namespaces.
+    """Run both directions of a link while the block runs: on loopback, netem in two namespaces.
 
-    Tests give the processes another profile `applied`.
+    `applied` is for tests: the profile of the link's processes if it differs from the experiment's.
 
     Raises:
-        CloudrcError: If a process ends early, with its message and exit code, or starts too slowly.
+        CloudrcError: If a process of the link ends early or starts too slowly.
     """
     profile = applied or Profile(uplink=experiment.uplink, downlink=experiment.downlink)
     text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
@@ -261,17 +264,15 @@ def _start(name: str, way: Way, shaper: str) -> subprocess.Popen[bytes]:
             stdout=log,
             stderr=log,
             env={**os.environ, PARENT: str(os.getpid())},
-            start_new_session=True,  # Ctrl-C reaches this process alone, which stops them
+            start_new_session=True,  # Ctrl-C reaches only this process, which ends its children
         )
 
 
 def _advise(text: str) -> str:
-    """Replace the advice for a chart by the one for this command."""
     return text.replace("set link.mode=", "use --shaper ")
 
 
 def _ended(name: str, code: int, log: str) -> CloudrcError:
-    """Make the error for a process that ended, from its log and exit code."""
     last = (log.strip().splitlines() or ["it left no message"])[-1]
     text = f"the {name} is not shaped: {_advise(last.removeprefix('cloudrc: error: '))}"
     known = {one.exit_code: one for one in (BadInputError, MissingPrerequisiteError, TimedOutError)}
@@ -282,7 +283,7 @@ def _ended(name: str, code: int, log: str) -> CloudrcError:
 
 @contextlib.contextmanager
 def _namespaces() -> Iterator[dict[str, str]]:
-    """Make the two network namespaces of netem, joined by a veth pair; yield direction -> name."""
+    """Make two network namespaces with a veth pair between them; yield direction -> namespace."""
     if os.geteuid() != 0:
         raise MissingPrerequisiteError(
             "netem is verified between two network namespaces, which needs root; run this as root,"
@@ -310,9 +311,9 @@ def _ip(*words: str) -> None:
 
 @contextlib.contextmanager
 def inside(namespace: str) -> Iterator[None]:
-    """Move this thread into a network namespace, if one is named.
+    """Move this thread into a network namespace while the block runs; "" changes nothing.
 
-    Sockets that are opened inside and processes that are started inside stay there.
+    Sockets and processes from the block stay in the namespace after the block.
     """
     if not namespace:
         yield
@@ -329,7 +330,7 @@ def inside(namespace: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _pods(options: argparse.Namespace) -> Iterator[Pods]:
-    """Yield the URLs of a release's ends: on the hosts of --ends, or through the cluster's API."""
+    """Yield the URLs of a release: on the hosts of `--ends`, or on ports that kubectl forwards."""
     hosts = options.ends.split(",") if options.ends else []
     if hosts and (len(hosts) != 2 or not all(hosts)):
         raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")
@@ -349,10 +350,10 @@ def _pods(options: argparse.Namespace) -> Iterator[Pods]:
 
 
 def verify_release(title: str, pods: Pods, limit: float) -> Report:
-    """Wait at most `limit` [s] for the verdicts of both ends.
+    """Wait at most `limit` [s] for the verdicts of world and cloud on the directions they receive.
 
     Raises:
-        TimedOutError: If an end does not answer in time.
+        TimedOutError: If world or cloud does not answer in time.
     """
     deadline, seen = time.monotonic() + limit, dict[str, Any]()
     while True:
@@ -373,7 +374,7 @@ def verify_release(title: str, pods: Pods, limit: float) -> Report:
 
 
 def fetch(url: str) -> str:
-    """Fetch a page without a proxy; "" without an answer."""
+    """Fetch a page, without a proxy; return "" if the server does not answer."""
     try:
         with NO_PROXY.open(url, timeout=HTTP_TIMEOUT) as page:
             return str(page.read().decode())
@@ -382,13 +383,13 @@ def fetch(url: str) -> str:
 
 
 def _may_change(found: Mapping[str, Any]) -> bool:
-    """Return whether a verdict may still come; a time line that loops never gets one."""
+    """Return whether a verdict is "open" and may change; with a looping time line it never does."""
     loops = any(row["quantity"] == "time_line" and row.get("measured") for row in found["rows"])
     return bool(found["verdict"] == "open") and not loops
 
 
 def _findings(found: Mapping[str, Any], link: str) -> Findings:
-    """Combine the receiver's verdict with what the sender's link reports at a URL."""
+    """Combine the receiver's verdict with the report of the link container at the URL `link`."""
     told, rows = Told("", "", None), []
     with contextlib.suppress(ValueError):
         told = read_told(fetch(f"{link}/link.json"))
@@ -396,7 +397,8 @@ def _findings(found: Mapping[str, Any], link: str) -> Findings:
         name, values = one["quantity"], (one.get(key, nan) for key in KEYS)
         asked, measured, low, high = map(float, values)
         row = Row(name, UNITS.get(name, "1"), asked, measured, low, high, one["verdict"])
-        if name == "rate" and told.applied:  # by the shaper's word: single datagrams do not show it
+        # The datagrams of a flight do not show the rate. Take the rate that the shaper reports.
+        if name == "rate" and told.applied:
             expected = Expected({name: (asked, asked, asked)}, np.zeros(0), known=True)
             row = expected.judge(name, told.applied.rate or inf)
         rows.append(row)
@@ -404,7 +406,6 @@ def _findings(found: Mapping[str, Any], link: str) -> Findings:
 
 
 def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
-    """Yield a note for everything in one direction that was not judged."""
     judged = {row.name for row in rows if row.verdict != "told"}
     if not rows:
         yield f"{way}: no datagrams to measure; fly a mission first"
@@ -417,9 +418,9 @@ def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
 
 
 def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[str, str]) -> Report:
-    """Make the report for JSON, in SI units and shares in [0, 1], without unknown values.
+    """Make the report as plain values for JSON, in SI units; leave out unknown values.
 
-    `probes` describes the measured datagrams of each direction.
+    Losses and other shares are in [0, 1]. `probes` describes the measured datagrams per direction.
     """
     shapers = {one.evidence.shaper or "an unknown shaper" for one in findings.values()}
     verdicts = {verdict_of(one.rows) for one in findings.values()}
@@ -447,7 +448,7 @@ def _known(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def as_text(report: Report) -> str:
-    """Format a table per direction, notes, causes, and the verdict in the last line."""
+    """Format a report: a table per direction, notes, causes and, in the last line, the verdict."""
     lines = [escape(f"{report['link']}: {report['shaper']}")]
     for way, found in report["directions"].items():
         rows = [[way, "asked", "measured", "allowed", "verdict"], *map(_cells, found["rows"])]

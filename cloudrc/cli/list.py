@@ -44,7 +44,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def describe_all(kind: str) -> dict[str, str]:
-    """Return name -> description of all entries of a kind such as "profiles", sorted by name."""
+    """Return name -> description of everything of one kind, such as "profiles", sorted by name."""
     from cloudrc import plugins
     from cloudrc.config import shipped
 
@@ -58,14 +58,14 @@ def describe_all(kind: str) -> dict[str, str]:
     else:
         describe = shipped.describe if kind in YAML else _comment
         lines = {name: describe(one, name) for name in shipped.names(one)}
-    # A docstring such as "Predictor: trusts a share of the velocity." repeats the heading.
+    # Remove the kind from a docstring such as "Predictor: trusts a share of the velocity."
     prefix = re.compile(rf"^[^:]*\b{one}: ", re.IGNORECASE)
     found = {name: prefix.split(line, maxsplit=1)[-1] for name, line in sorted(lines.items())}
     return {name: line[:1].upper() + line[1:].rstrip(".") for name, line in found.items()}
 
 
 def _comment(kind: str, name: str) -> str:
-    """Return the first sentence of the first comment in a robot's or scene's MuJoCo file."""
+    """Describe a robot or scene by the first sentence of the first comment in its XML file."""
     from cloudrc.config import shipped
 
     text = (shipped.FOLDERS[kind] / f"{name}.xml").read_text("utf-8")

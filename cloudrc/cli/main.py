@@ -1,4 +1,4 @@
-"""The program `cloudrc`: run one of its commands and report an error in one line."""
+"""Run the program `cloudrc`: run the given command; print an error in one line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command in `arguments` (default: those of this process); return the exit code."""
+    """Run a command and return the exit code; by default parse the arguments of this process."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(given)
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if "--debug" in given:
             raise
         message, code = _explain(error)
-        # Text from files is escaped. Our own further lines begin with two blanks.
+        # Escape text from files, but keep the line breaks of our messages: two blanks follow them.
         shown = "\n  ".join(map(escape, message.split("\n  ")))
         print(f"cloudrc: error: {shown}", file=sys.stderr)
         return code
@@ -48,7 +48,6 @@ def _dispatch(given: Sequence[str]) -> int:
 
 
 def _explain(error: Exception) -> tuple[str, int]:
-    """Return the message and the exit code of an error."""
     if isinstance(error, CloudrcError):
         return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
     if isinstance(error, OSError):

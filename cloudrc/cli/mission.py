@@ -1,8 +1,8 @@
 """Run `cloudrc mission`: fly and steer missions, in a local run or in a cluster.
 
-Each verb is a request to the API of teleop, the process that commands missions. Only `run` in a
-cluster makes a Kubernetes Job, whose pod posts the mission to that API. A command that follows a
-mission exits with the code of the verdict.
+Each verb sends requests to the API of teleop, the process that commands missions. In a cluster,
+`run` instead creates a Kubernetes Job, whose pod posts the mission to the API. A command that waits
+for the end of a mission exits with the code of the mission's verdict.
 """
 
 from __future__ import annotations
@@ -59,18 +59,18 @@ CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
 in the cluster. A run that is found on this machine needs no token."""
 NO_API = "no run with an API flies there; name another folder, or --api URL"
 POLL_PERIOD = 0.5
-"""Pause between two polls of a mission [s]."""
+"""Time between two requests for the state of a mission [s]."""
 RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
-"""Longest times to wait for an unreachable API [s]: in a person's command, and in a Job. The pod of
-the API may first have to load its image."""
+"""Time limits for an API that does not answer [s]: for a user's command, and for the pod of a Job.
+The second limit is longer, because the pod of the API may still have to load its image."""
 TURN_MAX = 30.0
-"""Longest time for a request and the pause after it [s]. If more time has passed, this process was
-suspended, and its time limit starts anew."""
+"""Longest time that a request and the pause after the request take [s]. If more time has passed,
+this process was suspended; the time of the suspension does not count."""
 TERMINATION_LOG = Path("/dev/termination-log")
-"""File in a pod for its last message; `kubectl describe` shows the text after the pod has ended."""
+"""File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
 LIMIT_MAX = 86_400.0
-"""Time limit of a Job whose mission has no time limit [s]. Teleop ends the mission earlier, at the
-limit of the release's experiment."""
+"""Time limit of a Job if the mission file gives no time limit [s]. Teleop ends the mission
+earlier, by the time limit of the release's experiment."""
 
 _Answer = TypeVar("_Answer")
 Json = dict[str, Any]
@@ -143,7 +143,6 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _metres(text: str) -> float:
-    """Parse a coordinate [m] for argparse; the API checks its range."""
     try:
         return float(text)
     except ValueError:
@@ -157,9 +156,9 @@ def _read(name: str) -> Document:
 
 
 def read_mission(name: str, shown: str = "") -> Json:
-    """Read a mission file, or a mission that cloudrc ships; the API checks the content.
+    """Read a mission file, or a mission that cloudrc ships; the API checks the content later.
 
-    `shown` is the name for people, by default the name of the file.
+    `shown` is the mission's name in lists and messages, by default the name of the file.
 
     Raises:
         BadInputError: If the file does not exist, or if it contains no mission.
@@ -173,16 +172,16 @@ def read_mission(name: str, shown: str = "") -> Json:
 
 
 class MissionFollower:
-    """Follows one mission until its verdict, also while the API restarts in a new pod."""
+    """Follows one mission until its verdict, even if the API restarts in a new pod meanwhile."""
 
     def __init__(self, api: Api, patience: float) -> None:
-        """Store the API; `patience` is the longest time without an answer [s]."""
+        """Store the API; `patience` is the time limit for an API that does not answer [s]."""
         self._api, self._patience, self._last_event = api, patience, 0
 
     def post(self, mission: Mapping[str, Any]) -> str:
-        """Wait until the API answers, and post a mission; return the mission's id.
+        """Post a mission, and repeat the request until the API answers; return the mission's id.
 
-        Raise the errors of `Api.post`, but a TimedOutError if the API stays unreachable.
+        Raise a TimedOutError if the API does not answer in time; other errors are as in `Api.post`.
         """
         view = self._retry(lambda: self._api.post("/v1/missions", mission))
         print_line(f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}")
@@ -201,7 +200,7 @@ class MissionFollower:
             time.sleep(POLL_PERIOD)
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
-        """Repeat a request until the API answers or was unreachable for too long."""
+        """Repeat a request until the API answers; raise a TimedOutError after `patience`."""
         deadline, reported = Deadline(self._patience, TURN_MAX), False
         while True:
             try:
@@ -224,7 +223,7 @@ def describe_verdict(verdict: Mapping[str, Any]) -> str:
 
 
 def _fly(options: argparse.Namespace) -> int:
-    """Post a mission and follow the mission until its verdict; cancel the mission on Ctrl-C."""
+    """Post a mission, wait for its verdict, return the exit code; on Ctrl-C cancel the mission."""
     if options.api is None:
         raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
     interrupt_on_signals()
@@ -250,8 +249,7 @@ def _fly(options: argparse.Namespace) -> int:
 
 
 def _write_termination_message(text: str) -> None:
-    """Write the last message of a pod for Kubernetes; do nothing outside a pod."""
-    with suppress(OSError):  # Kubernetes then takes the last line of the log, which says the same
+    with suppress(OSError):  # on failure Kubernetes shows the last line of the log instead
         if TERMINATION_LOG.exists():
             TERMINATION_LOG.write_text(text + "\n", encoding="utf-8")
 
@@ -328,7 +326,6 @@ def _logs(options: argparse.Namespace, api: Api) -> int:
 
 
 def _order(options: argparse.Namespace, api: Api) -> int:
-    """Send one of the requests hold, resume and goto."""
     point = None
     if options.verb == "goto":
         point = {"position_m": [options.x, options.y, options.z]}
@@ -374,10 +371,7 @@ def _print_state(mission: Json) -> None:
 
 
 def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
-    """Print the robot's state, and the age of cloud's last message [s].
-
-    `seen` has the values of the newest telemetry. Both arguments are None before the first message.
-    """
+    """Print the robot's state by the newest telemetry, and the age of cloud's last message [s]."""
     heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
     if seen is None:
         print(f"no telemetry from the robot yet; is the link up? cloud heard {heard}")
@@ -419,7 +413,7 @@ def _release(options: argparse.Namespace) -> Release:
 
 @contextmanager
 def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
-    """Make the API of a release reachable, by a forwarded port, while the block runs."""
+    """Yield the API of a release, which is reachable over a forwarded port while the block runs."""
     release, path = _release(options), token_file(options)
     from cloudrc.cluster.pods import api_url, operator_token
 
@@ -429,9 +423,9 @@ def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
 
 
 def _time_limit(name: str, mission: Json) -> float:
-    """Check the format of a mission before its Job is created; return its time limit [s].
+    """Check the format of a mission before the Job is created; return the mission's time limit [s].
 
-    The API checks the rest, for example whether the waypoints are inside the fence.
+    The API checks later whether the mission can be flown, for example inside the fence.
 
     Raises:
         BadInputError: If the mission is invalid; the text lists all problems.
@@ -445,7 +439,7 @@ def _time_limit(name: str, mission: Json) -> float:
         request = MissionRequest.model_validate_json(json.dumps(mission))
     except ValidationError as error:
         raise_problems(_read(name), from_pydantic(error, MissionRequest), name)
-        raise  # if no problem was listed
+        raise  # raise_problems found nothing to report
     return request.time_limit_s or LIMIT_MAX
 
 
@@ -457,7 +451,7 @@ def _run_job(options: argparse.Namespace) -> int:
 
     find_deployment(release, "cloud")
     limit = _time_limit(options.mission, mission)
-    # After 'helm install' without --wait this takes some seconds: the link starts last.
+    # After 'helm install' without --wait, the release needs some seconds to become ready.
     wait_ready(release, timeout=options.timeout, tell=print_line)
     job = run_job(release, mission, limit=limit, queue=options.queue)
     print(f"Job {job.name} in namespace '{release.namespace}'", flush=True)

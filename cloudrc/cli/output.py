@@ -38,7 +38,7 @@ def is_live(stream: TextIO) -> bool:
 
 
 def print_or_drop(text: str, stream: TextIO | None = None) -> None:
-    """Print a text (default: on stdout) and flush; drop it if the reader has closed the pipe."""
+    """Print a text (default: on stdout) and flush; print nothing if the reader closed the pipe."""
     stream = stream or sys.stdout
     try:
         print(text, file=stream, flush=True)
@@ -47,8 +47,8 @@ def print_or_drop(text: str, stream: TextIO | None = None) -> None:
 
 
 def discard_output(stream: TextIO) -> None:
-    """Redirect a stream to /dev/null, because Python flushes the stream once more at exit."""
-    with contextlib.suppress(OSError, ValueError):  # a test's stream has no file
+    """Redirect a closed stream to /dev/null, so that Python's flush at exit raises no error."""
+    with contextlib.suppress(OSError, ValueError):  # the stream of a test has no descriptor
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
         os.close(null)
@@ -64,7 +64,7 @@ def paint(text: str, colour: str) -> str:
 def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     """Align rows of equal length in columns; return one line per row.
 
-    The cells are escaped. The columns whose index is in `right` are aligned right.
+    Unprintable characters are escaped. Columns with an index in `right` are aligned to the right.
     """
     from rich.console import Console
     from rich.table import Table
@@ -81,7 +81,7 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
 
 
 def escape(text: str) -> str:
-    """Escape unprintable characters, so that a text cannot break its line or control a terminal."""
+    """Escape unprintable characters: a text must neither break its line nor control a terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -91,7 +91,7 @@ def print_line(line: str, stream: TextIO | None = None) -> None:
 
 
 def format_number(value: float) -> str:
-    """Return a value of any unit as text with four significant digits; write counts in full."""
+    """Format a value of any unit with four significant digits, and a count with all digits."""
     if float(value).is_integer() and abs(value) < 1e5:
         return f"{value:.0f}"  # counts
     if 1e-4 <= abs(value) < 1e5:

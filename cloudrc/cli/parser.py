@@ -1,4 +1,4 @@
-"""The parser of the command line, built from a table of the commands and their help lines."""
+"""Build the parser of the command line from a table of commands and their help lines."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ GROUPS: dict[str, dict[str, str]] = {
         "relay": "the emulated link between world and cloud",
     },
 }
-"""Group of commands -> command -> help line. A command's module is `cloudrc/cli/<name>.py`."""
+"""Group of commands -> command -> help line. `cloudrc/cli/<command>.py` contains the command."""
 PROCESSES = ("world", "cloud", "relay")
-"""Commands without a module of their own: `cloudrc/cli/processes.py` contains them."""
+"""Commands that `cloudrc/cli/processes.py` contains; they have no modules of their own."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 COUNT_MAX = 10_000
 """Largest number of repeats, seeds or processes that a flag accepts. Before Python 3.11.6, a pool
-hangs if it gets more than 16,384 tasks (cpython issue 105829)."""
+of processes hangs with more than 16,384 tasks (cpython issue 105829)."""
 
 ABOUT = "Fly a simulated drone from a simulated cloud, over an emulated network."
 EXAMPLES = """\
@@ -66,13 +66,13 @@ class Parser(argparse.ArgumentParser):
         raise BadInputError(f"{message}; see '{self.prog} --help'")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Suggest the most similar choice, where argparse itself would list all choices."""
+        """Refuse an unknown choice and suggest the most similar one; argparse would list all."""
         if action.choices is not None and value not in action.choices:
             raise argparse.ArgumentError(action, describe_unknown(value, action.choices))
 
 
 def describe_unknown(given: str, names: Iterable[str]) -> str:
-    """Return an error text about an unknown name: suggest a similar name, or list all `names`."""
+    """Return an error text that suggests a name similar to `given`, or else lists all `names`."""
     known = sorted(names)
     if near := difflib.get_close_matches(given, known, n=1, cutoff=0.5):
         return f"no '{given}'; did you mean '{near[0]}'?"
@@ -80,7 +80,7 @@ def describe_unknown(given: str, names: Iterable[str]) -> str:
 
 
 def whole_number(low: int, high: int) -> Callable[[str], int]:
-    """Return a function that reads a whole number in a range, as a type for argparse."""
+    """Return a type for argparse: a function that parses a whole number from `low` to `high`."""
 
     def read(text: str) -> int:
         if not text.isdecimal() or not low <= int(text) <= high:
@@ -94,7 +94,7 @@ read_count = whole_number(1, COUNT_MAX)
 
 
 def input_file(text: str) -> Path:
-    """Read the path of an input file, as a type for argparse.
+    """Parse the path of an input file, as a type for argparse.
 
     Refuse pipes and devices, because opening them could block forever.
     """
@@ -104,10 +104,10 @@ def input_file(text: str) -> Path:
 
 
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
-    """Build the parser of all commands, but declare arguments for the `wanted` commands only.
+    """Build the parser, which knows all commands, but only the arguments of the `wanted` commands.
 
-    Thus the modules of the other commands are not imported. The help lists the commands in groups.
-    `for_completion` also makes argparse list the commands, for the completion script.
+    Therefore only the modules of the `wanted` commands are imported. With `for_completion`, the
+    help also contains argparse's list of commands, which the completion script needs.
     """
     common, about = Parser(add_help=False), "show the traceback of an error"
     common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)
@@ -141,7 +141,7 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
 
 
 def _find_command(name: str) -> Any:
-    """Return the module or object with a command's functions `arguments` and `execute`."""
+    """Return the module or `Command` that has a command's functions `arguments` and `execute`."""
     if name in PROCESSES:
         return getattr(importlib.import_module("cloudrc.cli.processes"), name)
     return importlib.import_module(f"cloudrc.cli.{name}")

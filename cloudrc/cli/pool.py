@@ -1,4 +1,4 @@
-"""Run work on several cores; end commands and their worker processes on signals."""
+"""Run work in worker processes, and end a command and its workers on signals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class WorkerDiedError(InvalidRunError):
 def interrupt_on_signals() -> None:
     """Raise KeyboardInterrupt on SIGTERM and SIGHUP, as on Ctrl-C.
 
-    If SIGHUP is ignored at the start, as under `nohup`, it stays ignored.
+    Under `nohup`, which ignores SIGHUP, this process continues to ignore SIGHUP.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
@@ -40,13 +40,13 @@ def _hung_up(number: int, frame: FrameType | None) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this worker process when the parent process has ended, even by a kill."""
+    """End this worker process when the parent process ends, even if SIGKILL ended the parent."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
     def wait() -> None:
         parent.join()
-        os._exit(1)  # without clean-up: nobody waits for this process
+        os._exit(1)  # without clean-up, because no process waits for the result
 
     threading.Thread(target=wait, daemon=True).start()
 
@@ -55,9 +55,8 @@ def _end_with_parent() -> None:
 def _isolated_start() -> Iterator[None]:
     """Isolate worker processes that start inside the block.
 
-    The workers ignore the terminal's signals, because a new process inherits ignored signals; the
-    parent process ends the workers. The workers import no Python from the working folder, because
-    the files there may come from somebody else.
+    The workers ignore SIGINT and SIGHUP, because the parent process ends them. They import no
+    module from the working folder, whose files may come from somebody else.
     """
     before = {n: signal.signal(n, signal.SIG_IGN) for n in (signal.SIGINT, signal.SIGHUP)}
     safe_path = os.environ.get("PYTHONSAFEPATH", "")
@@ -75,9 +74,9 @@ def map_in_order(
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    At most `jobs` worker processes run, and at most one for each core. With one job or one core,
-    this process does the work. The function must be at module level, so that a worker can import
-    it. Ctrl-C, or closing the generator, ends the running calls and drops the others.
+    At most `jobs` worker processes run, and at most one per core. In place of a single worker, this
+    process makes all calls. The function has to be at module level: a worker imports the function.
+    Ctrl-C or closing the generator kills the workers and drops all calls that have not ended.
     """
     workers = min(jobs, len(work), os.cpu_count() or 1)
     if workers <= 1:
@@ -95,7 +94,7 @@ def map_in_order(
     except BrokenProcessPool as error:
         text = "a worker was killed, perhaps by the kernel because memory ran out"
         raise WorkerDiedError(f"{text}; use fewer processes") from error
-    except BaseException:  # Ctrl-C, or the caller wants no more results
+    except BaseException:  # Ctrl-C, or the caller has closed the generator
         for worker in multiprocessing.active_children():
             worker.kill()
         raise
@@ -106,7 +105,10 @@ def map_in_order(
 def take_each(
     results: Generator[Result, Any, None], take: Callable[[Result], None]
 ) -> tuple[str, int]:
-    """Take all results; return why the work ended early and the exit code, or "" and 0."""
+    """Call `take` with each result until the work ends or is interrupted.
+
+    Return "" and 0, or the reason why the work ended early and the exit code.
+    """
     try:
         with closing(results):
             for result in results:

@@ -1,6 +1,7 @@
-"""Run `cloudrc world`, `cloudrc cloud` and `cloudrc relay`: the processes of a local run or a pod.
+"""Run the processes `cloudrc world`, `cloudrc cloud` and `cloudrc relay` of a local run or a pod.
 
-With `--link DIR` the relay applies the changes of `cloudrc link set` and publishes its state:
+With `--link DIR`, the relay and `cloudrc link set` exchange files: `link set` writes the files in
+the first line of this list, the relay writes the others.
 
     DIR/profile.json, change.json            requested profile; missing before the first change
     DIR/uplink.json, downlink.json           applied state of the link (`cloudrc/link/state.py`)
@@ -43,16 +44,16 @@ if TYPE_CHECKING:
     from cloudrc.record.recorder import Recorder
 
 TRACE_MAX = 2 << 20
-"""Maximum size of a trace file that an end reads because the link container names it [bytes]. An
-honest container's traces come from a ConfigMap, which holds at most 1 MiB."""
+"""Maximum size of a trace file whose name comes from the link container [bytes]. World and cloud do
+not trust this container. Real traces come from a ConfigMap, which holds at most 1 MiB."""
 PERIOD = 1.0
-"""Time between two updates of the relay's counts in the exporter [s]."""
+"""Time between two updates of the relay's counts in the metrics [s]."""
 RELEASED_PERIOD = 2.0
-"""Period in which the relay writes, and the ends read, the lateness of datagrams [s]."""
+"""Time between two updates of the files with the lateness of datagrams [s]."""
 
 
 class Command(NamedTuple):
-    """A command of this module, as the pair of functions that other commands' modules have."""
+    """A command of this module: the functions that other commands have in their own modules."""
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
@@ -61,7 +62,7 @@ class Command(NamedTuple):
 def _add(
     parser: argparse._ActionsContainer, flag: str, kind: str, text: str, *, required: bool = False
 ) -> None:
-    """Declare a flag; `kind` is the kind of its value, and the metavar in the help."""
+    """Declare a flag; `kind` is the metavar and tells the type of the flag's value."""
     read: Callable[[str], object] = {"HOST:PORT": read_address, "SIZE": read_size}.get(kind, Path)
     parser.add_argument(flag, type=read, metavar=kind, help=text, required=required)
 
@@ -116,9 +117,9 @@ def _relay_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def read_address(text: str) -> Address:
-    """Read HOST:PORT for argparse; an IPv6 address is in brackets.
+    """Parse HOST:PORT for argparse; an IPv6 address is in brackets.
 
-    [::] means all IPv4 and IPv6 addresses, or, on a machine without IPv6, all IPv4 addresses.
+    The host [::] means all addresses of this machine; without IPv6 it becomes 0.0.0.0.
     """
     try:
         host, port = split_address(text)
@@ -136,13 +137,13 @@ def _has_ipv6() -> bool:
 
 
 def show_address(where: Address) -> str:
-    """Write an address as HOST:PORT, with an IPv6 address in brackets."""
+    """Format an address as HOST:PORT, with an IPv6 address in brackets."""
     host, port = where
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def read_size(text: str) -> float:
-    """Read a size in the notation of Kubernetes [bytes], as a type for argparse."""
+    """Parse a size in the notation of Kubernetes, such as 500M, for argparse; return bytes."""
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti)?", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 500M or 1Gi")
@@ -153,10 +154,10 @@ def read_size(text: str) -> float:
 
 
 def ipv4_addresses(name: str) -> list[str]:
-    """Return the IPv4 addresses of a host name, since relay and netem shape IPv4 only.
+    """Return the IPv4 addresses of a host name; relay and netem shape IPv4 only.
 
     Raises:
-        OSError: If the name has no IPv4 address; the text says so if it has IPv6 addresses.
+        OSError: If the name has no IPv4 address; the text tells whether it has IPv6 addresses.
     """
     try:
         return _addresses(name, socket.AF_INET)
@@ -181,10 +182,10 @@ def _addresses(name: str, family: int) -> list[str]:
 
 
 def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0)) -> Address:
-    """Resolve an address before the control loop starts, so that the loop never waits for DNS.
+    """Resolve an address, before the control loop starts: the loop must not wait for DNS.
 
-    The result has the address family of `listen`, the process's own address. If `listen` is [::],
-    the result may have either family. `flag` is for the error text.
+    The result is IPv4 or IPv6, like the address `listen` of this process; if `listen` is [::], the
+    result may be either. `flag` names the command-line flag in the error text.
 
     Raises:
         BadInputError: If the host cannot be resolved.
@@ -209,7 +210,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn of an exposed address; name flag and address if the block cannot open a socket."""
+    """Warn of an exposed address; if the block cannot bind `listen`, name `flag` in the error."""
     warn_if_exposed(listen)
     try:
         yield
@@ -221,7 +222,7 @@ def _listening(flag: str, listen: Address) -> Iterator[None]:
 
 
 def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
-    """Serve the metrics of a process at the address of `--metrics`; None without the flag."""
+    """Serve the metrics of this process at the address of `--metrics`; None without the flag."""
     if options.metrics is None:
         return None
     from cloudrc.drivers.exporter import Exporter
@@ -270,16 +271,16 @@ def _run_cloud(options: argparse.Namespace) -> int:
 def open_end(
     options: argparse.Namespace, name: str
 ) -> tuple[ResolvedExperiment, bytes, EndProcess]:
-    """Open the files and sockets of the end `name`, "world" or "cloud".
+    """Open the files and sockets of world or cloud; `name` is "world" or "cloud".
 
     Returns:
-        The experiment, the identity of the machine's clock, and the process of the end.
+        The experiment, the identity of this machine's clock, and the `EndProcess` to run.
     """
     from cloudrc.config.load import fingerprint, load_experiment, read_experiment
     from cloudrc.drivers.keyfile import KeyFile
     from cloudrc.drivers.machine import clock_id
 
-    feed = Feed.on_stdout(watched=options.feed)  # before a plug-in is loaded, which may print
+    feed = Feed.on_stdout(watched=options.feed)  # before plug-ins are loaded: they may print
     exporter, path, clock = open_exporter(options, name), str(options.config), clock_id()
     given = read_experiment(path)
     # Only cloud loads the plug-ins, which fill in their default parameters.
@@ -308,7 +309,7 @@ def open_end(
 
 
 def open_peer(options: argparse.Namespace) -> Peer:
-    """Bind the socket of an end; it sends to `--peer`, or to the address in the file `--route`."""
+    """Bind the socket of world or cloud. `--peer` or the file `--route` has the peer's address."""
     if options.route is None:
         target: Address | Path = resolve_address("--peer", options.peer, options.listen)
     else:
@@ -320,18 +321,18 @@ def open_peer(options: argparse.Namespace) -> Peer:
 
 
 def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
-    """Make the recorder of an end; without `--record` the recorder writes to /dev/null.
+    """Make the recorder of world or cloud; without `--record` the recorder writes to /dev/null.
 
-    The recording of the previous process is renamed to NAME.before.mcap, because it may show why
-    that process ended. The size limit `--record-max` holds for both recordings together. `clock`
-    names the clock of the recording's stamps, and `clock_id` identifies the machine's clock.
+    The recording of a previous process is kept as NAME.before.mcap, because it may show why that
+    process ended. `--record-max` limits the size of both recordings together. `clock` ("world" or
+    "cloud") names the clock of the stamps; `clock_id` identifies this machine's monotonic clock.
     """
     from cloudrc.record.recorder import Recorder
     from cloudrc.record.writer import McapWriter
 
     path: Path = options.record or Path(os.devnull)
     kept, size_max = 0, None
-    with suppress(OSError):  # the recorder meets the same error and reports it
+    with suppress(OSError):  # the recorder will meet the same error and report it
         if path.is_file() and (size := path.stat().st_size):
             path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
             kept = size
@@ -346,7 +347,7 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
 
 
 def _link_state(options: argparse.Namespace) -> Path | None:
-    """Return the file in which the link publishes its state; None if no flag names the file."""
+    """Return the file with the state of the link; None if no flag tells its path."""
     if options.link is None and options.route is not None:
         return Path(options.route).with_name("link.json")
     return options.link  # type: ignore[no-any-return]
@@ -355,9 +356,9 @@ def _link_state(options: argparse.Namespace) -> Path | None:
 def link_monitor(
     options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
 ) -> LinkMonitor:
-    """Make the monitor that compares received datagrams with the link's profile.
+    """Make the monitor that compares the received datagrams with the link profile.
 
-    `uplink` says which direction the end receives. The monitor follows changes of the profile.
+    `uplink` is True in cloud, False in world. The monitor follows changes of the profile in flight.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
@@ -370,7 +371,7 @@ def link_monitor(
         profile = Profile.model_validate_json(json.dumps(values))
         return link_profile(profile.uplink, file_max), link_profile(profile.downlink, file_max)
 
-    # With a route the link is a container, which is not trusted: its files have a smaller limit.
+    # Without --link, the link is a container. It is not trusted: limit its files to a smaller size.
     file_max = TRACE_MAX if options.link is None else SIZE_MAX
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     check = LinkMonitor(uplink=uplink, flow=Flow(experiment.seed, uplink, kind, SIZES[kind]))
@@ -380,7 +381,6 @@ def link_monitor(
 
 
 def _run_relay(options: argparse.Namespace) -> int:
-    """Forward datagrams until a signal stops the process."""
     stop, exporter = StopSignal(), open_exporter(options, "link")
     from cloudrc import assembly
     from cloudrc.config.load import fingerprint, read_experiment
@@ -446,7 +446,7 @@ def open_relay(
 
 
 def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
-    """Return the profiles at the start of the relay, by direction: "uplink" and "downlink"."""
+    """Return "uplink" and "downlink" -> the profile of this direction when the relay starts."""
     from cloudrc.assembly import link_profile
 
     ways = {"uplink": experiment.uplink, "downlink": experiment.downlink}
@@ -455,7 +455,7 @@ def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
 
 
 def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
-    """Wrap `stop` in a function that also exports the relay's counts every `PERIOD`."""
+    """Return a function that first exports the relay's counts, if due, and then calls `stop`."""
     due = 0.0
 
     def ask() -> bool:
@@ -470,9 +470,9 @@ def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Cal
 
 
 class RelayControl:
-    """Applies the changes of `cloudrc link set`, in a folder, to both directions of a relay.
+    """Applies the changes of `cloudrc link set` to a relay, and publishes the relay's state.
 
-    A thread reads and writes the files. Only the relay's loop replaces the profiles.
+    A separate thread reads and writes the files. The relay's loop replaces the profiles.
     """
 
     def __init__(
@@ -486,11 +486,11 @@ class RelayControl:
         """Publish the initial state.
 
         Args:
-            folder: Folder of the profile and of the link's state; created if missing.
-            links: The links, by direction: "uplink" and "downlink".
-            first: The profiles at the start, by direction.
-            asked: Called with a direction and the requested mean delay [s] at each change.
-            relay: The relay of the links.
+            folder: Folder of the files that the module's docstring lists; created if missing.
+            links: "uplink" and "downlink" -> the link of this direction.
+            first: Direction -> its profile at the start.
+            asked: Called at each change with the direction and its new mean delay [s].
+            relay: The relay of both links.
         """
         from cloudrc.cli.link_run import make_profile_loader
 
@@ -505,7 +505,7 @@ class RelayControl:
             self._publish(way, loaded, time.monotonic_ns())
 
     def stop_after(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Wrap `stop` in a function for the relay's loop that first applies pending changes."""
+        """Return a function that first applies pending changes and then calls `stop`."""
 
         def ask() -> bool:
             if self._pending:
@@ -515,7 +515,7 @@ class RelayControl:
         return ask
 
     def swap(self) -> None:
-        """Apply the pending profiles; the relay's loop calls this between datagrams."""
+        """Apply the pending profiles, between two datagrams, in the thread of the relay's loop."""
         self._relay.take_in()
         while self._pending:
             way, loaded = self._pending.popleft()
@@ -523,13 +523,13 @@ class RelayControl:
             self._applied.append((way, loaded, time.monotonic_ns()))
 
     def follow(self) -> None:
-        """Check the folder for changes, without end."""
+        """Call `look` periodically, in a thread that never ends."""
         while True:
             self.look()
             time.sleep(PROFILE_PERIOD / 2 if self._pending else PROFILE_PERIOD)
 
     def look(self) -> None:
-        """Check the folder once for requested changes; publish applied changes and lateness."""
+        """Read requested changes from the folder; publish applied changes and the lateness."""
         changes = {way: file.poll() for way, file in self._files.items()}
         self._pending += [(way, loaded) for way, loaded in changes.items() if loaded is not None]
         with suppress(OSError):  # such as a full disk: the next check tries again
@@ -556,7 +556,7 @@ class RelayControl:
             change=loaded.change.number,
             cause=loaded.change.cause if changes else "",
             asked=requested,
-            # The time line of an initial profile starts with the first datagram.
+            # None: the time line of the first profile starts with the first datagram.
             origin_ns=since_ns if changes and loaded.change.restart else None,
         )
         self._asked(way, requested["delay"] or 0.0)

@@ -1,4 +1,4 @@
-"""Progress of a flight: a status line on a terminal, one line per event elsewhere."""
+"""Show the progress of a flight: a line per event and, on a terminal, a status line."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ ENDINGS = ("done", "cancelled", "timed_out")
 
 
 class FlightView:
-    """Shows a flight on a stream: one line per event and, on a terminal, a status line."""
+    """Prints the events of a flight to a stream and, on a terminal, updates a status line."""
 
     def __init__(self, stream: TextIO, waypoints: int) -> None:
-        """Prepare the view; write nothing yet. `waypoints` is the mission's number of waypoints."""
+        """Set the stream and the number of waypoints of the mission; print nothing yet."""
         self._stream, self._waypoints = stream, waypoints
         self._first_ns = self._now_ns = NEVER_NS
         self._began = self._seen = monotonic()
@@ -44,7 +44,7 @@ class FlightView:
             self._status = Live(console=terminal, transient=True, get_renderable=self.line)
 
     def see(self, records: Iterable[Record]) -> None:
-        """Show the next records of world or cloud, which are sorted by time."""
+        """Show new records of world or cloud, in the order of time."""
         if self._status:
             self._status.start()
         for record in records:
@@ -60,7 +60,7 @@ class FlightView:
                     self._waypoint = record.waypoint
                 case GuardChange():
                     self._guard = record.state
-                    # The robot always holds after its mission; that is no event.
+                    # The robot holds its position after every mission: do not print this.
                     if record.state > GuardState.TRACK and not self._ended:
                         self._event(f"{record.state.name}: {record.cause}")
                 case MissionEvent():
@@ -70,7 +70,7 @@ class FlightView:
                     self._event(in_words(record))
 
     def line(self) -> Text:
-        """Return the status line; a narrow terminal cuts off its end, the least important part."""
+        """Return the status line; its end is least important, as a narrow terminal crops it."""
         elapsed, flown = self._seen - self._began, (self._now_ns - self._first_ns) * 1e-9
         number = self._waypoint + 1
         cells = (
@@ -87,7 +87,6 @@ class FlightView:
         return line
 
     def _place(self) -> str:
-        """Return the robot's position; "" until it is known."""
         # Round first, then add 0.0: that turns a negative zero into a positive one.
         x, y, z = (round(coordinate, 2) + 0.0 for coordinate in self._position)
         return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"

@@ -31,7 +31,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Copy a damaged recording; print the kept share and the known losses."""
+    """Copy a damaged recording; print which share of the data was kept, and the known losses."""
     require("a recovery", ("record",))
     from cloudrc.record.reader import recover
 
@@ -41,7 +41,7 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"{target}: already there; name another file with --to")
     try:
         recovery = recover(source, target)
-    except OSError as error:  # names a temporary file
+    except OSError as error:  # this error names a temporary file, not `target`
         reason = error.strerror or error
         raise BadInputError(f"{target}: {reason}; name another file with --to") from error
     if options.output != "table":

@@ -1,15 +1,16 @@
-"""`cloudrc report RUN`: write the report of a recorded run again, and print its summary."""
+"""`cloudrc report RUN`: write the report of a recorded run again, and print a summary."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import escape, format_document, output_argument, paint, table
+from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
 from cloudrc.errors import BadInputError
 
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
@@ -24,7 +25,7 @@ MAIN = {
     "hold_count": "times in HOLD",
     "real_time_factor": "real-time factor",
 }
-"""Number in the summary -> its label; report.html and report.json contain all numbers."""
+"""Numbers that the summary shows, and their labels. The report files contain all numbers."""
 EPILOG = """\
 examples:
   cloudrc report runs/latest
@@ -62,6 +63,7 @@ def execute(options: argparse.Namespace) -> int:
     unmeasured = metrics.not_measured(experiment.report.metrics, options.metric)
     run = replace(run, notes=(*run.notes, *unmeasured))
     document = write_report(options.run, recording, experiment, run, own=options.metric)
+    print_traceback(options, document)
     for_people = options.output == "table"
     print(
         summary(document, options.run) if for_people else format_document(document, options.output)
@@ -70,7 +72,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def summary(report: Mapping[str, Any], folder: Path) -> str:
-    """Return the verdict, the failures, the main numbers and the path of report.html as text."""
+    """Summarize a report as text: verdict, failures, main numbers and path of report.html."""
     from cloudrc.metrics import Number
     from cloudrc.report.page import readable
 
@@ -90,3 +92,10 @@ def summary(report: Mapping[str, Any], folder: Path) -> str:
         count = numbers["fault_count"].value
         lines.append(paint(f"  faults noted in flight: {count:.0f}, see the report", "yellow"))
     return "\n".join([*lines, "", escape(str(folder / "report.html"))])
+
+
+def print_traceback(options: argparse.Namespace, report: Mapping[str, Any]) -> None:
+    """With --debug, print the traceback of the first failure of a plug-in to stderr."""
+    if getattr(options, "debug", False) and "traceback" in report:
+        for line in report["traceback"].splitlines():
+            print_line(line, sys.stderr)

@@ -1,4 +1,4 @@
-"""`cloudrc run`: fly an experiment, write recording and report into a folder, print the verdict."""
+"""`cloudrc run`: fly an experiment, write a recording and a report, and print the verdict."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals
-from cloudrc.cli.report import summary
+from cloudrc.cli.report import print_traceback, summary
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
     from cloudrc.world.endpoint import WorldEndpoint
 
 Flight = Callable[[Path], dict[str, Any]]
-"""Function that flies and writes all files of a run into a folder; returns the report's content."""
+"""Function that flies, writes all files of the run into a folder, and returns the report."""
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
 
 GRACE = 30.0
-"""Time from the mission's time limit until the program itself ends the flight [s]."""
+"""Time from the mission's time limit until this program itself stops the flight [s]."""
 CLOCK = bytes(16)
-"""Identity of the clock that world and cloud share in virtual time."""
+"""Identity of the virtual clock, which world and cloud share."""
 EPILOG = """\
 modes:
   local    real time: four processes, UDP on 127.0.0.1
@@ -95,7 +95,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
-    """Load an experiment by name or path, change keys (KEY=VALUE), check the user's metrics."""
+    """Load an experiment by name or path with `overrides` (KEY=VALUE); check the user's metrics."""
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
 
@@ -138,6 +138,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     finally:
         if in_cluster and options.out is None and folder.exists():
             point_latest_to(folder)
+    print_traceback(options, report)
     print_or_drop(
         format_document(report, options.output) if for_programs else summary(report, folder)
     )
@@ -147,7 +148,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
 def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
     """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
-    With `latest`, the link `runs/latest` points to the new folder afterwards.
+    With `latest` and without `out`, point the symbolic link `runs/latest` to the new folder.
 
     Raises:
         BadInputError: If `out` exists and is not an empty folder, or if no folder can be made.
@@ -173,7 +174,7 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
 def _next_folder(name: str) -> Path:
     RUNS.mkdir(exist_ok=True)
     for n in itertools.count(1):
-        with contextlib.suppress(FileExistsError):  # also if another process takes it meanwhile
+        with contextlib.suppress(FileExistsError):  # another process may make this folder first
             folder = RUNS / f"{name}-{n}"
             folder.mkdir()
             break
@@ -192,7 +193,7 @@ def point_latest_to(folder: Path) -> None:
 def _local_flight(
     experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int
 ) -> Flight:
-    """Return a function that flies on this machine and shows the progress on a stream."""
+    """Return a function that flies on this machine and shows the progress on `stream`."""
     from cloudrc.cli.progress import FlightView
 
     if stream is sys.stderr and not is_live(stream):
@@ -208,7 +209,7 @@ def _local_flight(
 def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
-    """Return a function that flies in the cluster that the flags name."""
+    """Return a function that flies in the cluster that the flags in `options` name."""
     from cloudrc.cli.client import Api
     from cloudrc.cluster.client import program
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files, refuse_second_flight
@@ -235,9 +236,9 @@ def fly(
 ) -> dict[str, Any]:
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
-    During the flight `see` is called with new records: in virtual mode with all records, in local
-    mode with a selection. If the flight is interrupted, the recording stays, and the report's
-    verdict is "interrupted". Without `page` no report.html is written.
+    During the flight `see` is called with new records; in local mode some records are left out. An
+    interrupted flight also gets a report, with the verdict "interrupted". Without `page`, write no
+    report.html.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
@@ -254,7 +255,7 @@ def fly(
 
 
 def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
-    """Make world, cloud, and the virtual-time run that connects them, but do not fly yet."""
+    """Build world and cloud, and connect them for a flight in virtual time; do not fly yet."""
     from cloudrc import assembly
     from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.tunnel.end import Identity
@@ -268,9 +269,9 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
 def _record_virtual(
     experiment: ResolvedExperiment, folder: Path, see: See
 ) -> Iterator[tuple[Recording, Run]]:
-    """Fly in virtual time and yield the recording, so that the block writes the report.
+    """Fly in virtual time, and yield the recording and facts about the run.
 
-    After the block, attach the written report to the file of the recording.
+    The block writes the report; after the block, attach the report to the recording's file.
     """
     from cloudrc.record.columns import Recording, merged
     from cloudrc.record.hash import RecordHash
@@ -310,9 +311,9 @@ def _record_virtual(
 def _record_local(
     experiment: ResolvedExperiment, folder: Path, see: See
 ) -> Iterator[tuple[Recording, Run]]:
-    """Fly in processes, merge the recordings, and yield the result, for the block's report.
+    """Fly in real time, and yield the merged recording and facts about the run.
 
-    After the block, write the merged recording with the report attached.
+    The block writes the report; after the block, attach the report to the recording's file.
     """
     from cloudrc.drivers.local import LocalRun
     from cloudrc.record.hash import messages_sha256
@@ -327,7 +328,7 @@ def _record_local(
     if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
         from cloudrc.world.scene import compile_model
 
-        compile_model(world.robot, world.scene)  # an invalid model would end a process in flight
+        compile_model(world.robot, world.scene)  # report an invalid model before the flight
     local, broken = LocalRun(folder, see, api=not absent), None
     interrupted = True
     try:

@@ -15,11 +15,12 @@ from typing import Any, TypeAlias
 
 from cloudrc.cli.output import escape, format_document, format_number, print_or_drop, table
 from cloudrc.cli.pool import map_in_order, take_each
+from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import fly, load, new_folder
 from cloudrc.metrics.verdict import EXIT_CODES
 
 Report: TypeAlias = Mapping[str, Any]
-"""The content of a `report.json`."""
+"""Content of a file report.json."""
 METHOD = "95 % interval of the median, by order statistics"
 
 
@@ -43,7 +44,7 @@ def interval(values: Sequence[float]) -> tuple[float, float] | None:
 
 
 def summarise(reports: Sequence[Report]) -> dict[str, Any]:
-    """Return the counts of successful and of all runs, and the median and interval per number."""
+    """Count all runs and successful runs; compute median and interval of each measurement."""
     numbers = {}
     for name, unit in _units(reports).items():
         found = [r["numbers"][name]["value"] for r in reports if name in r["numbers"]]
@@ -58,7 +59,7 @@ def _units(reports: Sequence[Report]) -> dict[str, str]:
 
 
 def as_table(summary: Mapping[str, Any]) -> str:
-    """Return a summary as a table; the last line counts the successful runs."""
+    """Format the result of `summarise` as a table; the last line counts the successful runs."""
     rows = [("number", "median", "95 % interval", "unit")]
     for name, entry in summary["numbers"].items():
         between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
@@ -70,7 +71,7 @@ def as_table(summary: Mapping[str, Any]) -> str:
 
 
 def as_csv(reports: Sequence[Report]) -> str:
-    """Return one line of CSV per run: seed, verdict and all numbers."""
+    """Format reports as CSV, one line per run: seed, verdict and all measurements."""
     units, text = _units(reports), io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["seed", "verdict", *(f"{name} [{unit}]" for name, unit in units.items())])
@@ -81,9 +82,9 @@ def as_csv(reports: Sequence[Report]) -> str:
 
 
 def fly_seeds(options: argparse.Namespace) -> int:
-    """Fly seeds 1 to N and print one table; return 0 only if all runs succeed.
+    """Fly seeds 1 to N and print one table; return 0 if all runs succeed.
 
-    If Ctrl-C or a killed worker ends the flights early, the table has the finished seeds.
+    If Ctrl-C or a killed worker process ends the command early, the table has the finished seeds.
     """
     # Load the experiment here too, so that a mistake is reported once, not N times.
     name = load(options.experiment, options.set).name
@@ -98,7 +99,9 @@ def fly_seeds(options: argparse.Namespace) -> int:
         line = f"{count:>7}  seed {report['seed']}  {report['verdict']}{failure}"
         if for_people or sys.stderr.isatty():
             print_or_drop(escape(line), sys.stdout if for_people else sys.stderr)
-        if report["verdict"] == "interrupted":  # with one core, this process flies
+        if not any("traceback" in earlier for earlier in reports[:-1]):
+            print_traceback(options, report)
+        if report["verdict"] == "interrupted":  # Ctrl-C in this process, which flies on one core
             raise KeyboardInterrupt
 
     stopped, code = take_each(map_in_order(_fly_one, work, len(work)), take)
@@ -121,7 +124,6 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
 
 def _fly_one(job: tuple[str, list[str], Path, int]) -> dict[str, Any]:
-    """Fly one seed in a worker process; return the content of its report.json."""
     experiment, overrides, folder, seed = job
     run_folder = folder / f"seed-{seed}"
     run_folder.mkdir()

@@ -29,11 +29,12 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import MissionStore
 
 FILES_MAX = 8_192
-"""Limit of open files of this process: idle connections must leave room for an emergency stop."""
+"""Limit of open files of this process. It is high, because idle connections must not prevent an
+emergency stop."""
 LOCK_PERIOD = 0.2
-"""Pause between two attempts to open the missions' file while another teleop locks it [s]."""
+"""Time between two attempts to open the journal while another teleop process locks it [s]."""
 PAUSE_LIMIT_NS = 500_000_000
-"""Longest time that an ending teleop waits until the robot holds its position [ns]."""
+"""Longest time for which teleop, asked to end, waits until the robot holds its position [ns]."""
 EPILOG = """\
 teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. It ends
 on SIGTERM, on Ctrl-C and when its parent process has ended; with --start also
@@ -77,7 +78,7 @@ def api_address(text: str) -> Address | Path:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run teleop until its mission has ended or a signal stops the process."""
+    """Run teleop until a signal stops the process or, with --start, the mission has ended."""
     from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.geometry.scene import load_scene
@@ -95,7 +96,7 @@ def execute(options: argparse.Namespace) -> int:
         if server is not None:
             opened.callback(server.stop)
         book = _open_store(options.journal, stop, server)
-        if book is not None:  # else stopped while another teleop held the journal
+        if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
             service = MissionService(experiment.criteria.contact_speed_max_mps, book, scene)
             single_mission = _start(options, experiment, service)
@@ -108,7 +109,7 @@ def execute(options: argparse.Namespace) -> int:
 def serve_api(
     options: argparse.Namespace, experiment: ResolvedExperiment, scene: Scene
 ) -> ApiServer:
-    """Start the API; until `_fly` adds the missions, the API answers that teleop is starting."""
+    """Start the API; until the mission service runs, the API answers that teleop is starting."""
     from cloudrc import assembly
     from cloudrc.link.state import publish
     from cloudrc.teleop.api import ApiServer, Bridge, create_app
@@ -144,10 +145,10 @@ def log_line(text: str) -> None:
 
 
 def ending(service: MissionService, asked: Callable[[], bool]) -> Callable[[], bool]:
-    """Return a function that says whether teleop may end: after a request, once the robot holds.
+    """Return a function that tells whether teleop's process may end.
 
-    Once `asked()` is true, the function pauses the mission. After `PAUSE_LIMIT_NS` teleop may end
-    in any case.
+    Once `asked()` is true, the function pauses the mission. The process may end when the robot
+    holds its position, or after `PAUSE_LIMIT_NS`.
     """
     until_ns: list[int] = []
 
@@ -156,7 +157,7 @@ def ending(service: MissionService, asked: Callable[[], bool]) -> Callable[[], b
             return False
         if not until_ns:
             service.pause(time.monotonic_ns())
-            until_ns.append(time.monotonic_ns() + PAUSE_LIMIT_NS)  # the disk may have taken long
+            until_ns.append(time.monotonic_ns() + PAUSE_LIMIT_NS)  # pause() may take long
         return service.settled or time.monotonic_ns() > until_ns[0]
 
     return may_end
@@ -183,7 +184,7 @@ def _fly(
     feed.ready()
 
     def tell(records: Sequence[Record]) -> None:
-        feed.tell(record for record in records if isinstance(record, Fault))  # cloud has events
+        feed.tell(record for record in records if isinstance(record, Fault))  # cloud feeds events
         if exporter is not None:
             exporter.see(records)
 
@@ -209,9 +210,9 @@ def _fly(
 def _open_store(
     path: Path | None, stop: Callable[[], bool], server: ApiServer | None
 ) -> MissionStore | None:
-    """Open the stored missions at `path`, or make a store in memory if `path` is None.
+    """Open the journal of missions at `path`, or make a store in memory if `path` is None.
 
-    Wait while another teleop locks the file; return None if `stop()` is true before.
+    Wait while another teleop process locks the file; return None if `stop()` becomes true first.
     """
     from cloudrc.teleop.store import MissionStore, StoreLockedError, connect, open_store
 
@@ -234,7 +235,7 @@ def _open_store(
 def _start(
     options: argparse.Namespace, experiment: ResolvedExperiment, service: MissionService
 ) -> bool:
-    """Start the experiment's mission if `--start` is given; return whether teleop flies it."""
+    """With `--start`, start the experiment's mission; return whether teleop flies this mission."""
     from cloudrc import assembly
     from cloudrc.teleop.store import ConflictError, Order
 
@@ -243,7 +244,7 @@ def _start(
     criteria = experiment.criteria
     plan = assembly.mission_plan(experiment.mission, criteria.time_limit_s, experiment.seed)
     if any(each.order.plan == plan for each in service.book.open()):
-        return True  # the previous process started it with the same options: it resumes
+        return True  # a previous process started this mission: it resumes
     try:
         order = Order(plan, experiment.name, contact=criteria.contact)
         service.create(order, time.monotonic_ns())

@@ -3,7 +3,7 @@
 The signal passes through three plug-ins. The operator gives the setpoint:
 
     telemetry > estimators (how long is the loop delay?)
-              > predictors (where will the robot be by then?)
+              > predictors (where will the robot be after this delay?)
               > controllers (which velocity leads to the setpoint?) > command
                                                 ^
               operator > teleop (missions) ---- setpoint

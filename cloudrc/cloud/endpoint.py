@@ -1,11 +1,11 @@
-"""Run cloud's end of the tunnel: receive telemetry and send a command every 10 ms.
+"""Cloud's end of the tunnel: receive telemetry and send a command every 10 ms.
 
-Cloud asks for a session with hellos and uses the epoch that world assigns. While cloud has nothing
-to command, it sends ALIVE datagrams: if world receives nothing from this cloud, it gives the
+Cloud asks for a session with HELLO datagrams, and uses the epoch (session number) that world
+assigns. While there is no command, cloud sends ALIVE datagrams, so that world does not give the
 session to another cloud.
 
-Cloud and teleop exchange messages only: teleop gets the robot's status and returns setpoints and
-operator requests.
+Cloud and teleop exchange messages only. Teleop gets the robot's status, and returns setpoints and
+the operator's requests.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cloudrc.cloud.operator import (
 from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, SessionOpened
 from cloudrc.tunnel import codec
-from cloudrc.tunnel.channel import REPEATED, USED
+from cloudrc.tunnel.channel import LATE, REPEATED, USED
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
@@ -31,22 +31,21 @@ from cloudrc.tunnel.keys import Key
 from cloudrc.tunnel.session import NO_EPOCH
 
 MISSED_MAX = 50
-"""Number of missed periods, not yet forgiven, from which on cloud reports a fault [periods]. Every
-machine misses a few periods."""
+"""Number of missed periods of 10 ms at which cloud reports a fault. Forgiven periods do not
+count."""
 FORGIVEN_NS = 200_000_000
-"""Time after which one missed period is forgiven: it no longer counts [ns]. With this value, 5 % of
-all periods may be missed."""
+"""Time in which one missed period is forgiven [ns]; 5 % of all periods may be missed."""
 
 
 class MissedPeriods:
-    """Reports once that cloud misses many periods, and again only after all were forgiven."""
+    """Report a fault when cloud misses many periods, and again only after all were forgiven."""
 
     def __init__(self) -> None:
         self._missed, self._reported = 0, False
         self._forgiven_ns = NEVER_NS  # when all missed periods will be forgiven
 
     def miss(self, count: int, now_ns: int) -> list[Fault]:
-        """Count missed periods of 10 ms at `now_ns` [ns]; return a fault to report, or nothing."""
+        """Count missed periods of 10 ms at `now_ns` [ns]; return the fault to report, if any."""
         full_ns = now_ns + MISSED_MAX * FORGIVEN_NS
         if self._forgiven_ns <= now_ns:
             self._missed, self._reported, self._forgiven_ns = 0, False, now_ns
@@ -67,27 +66,27 @@ PERIOD_NS = 10_000_000
 HELLO_PERIOD_NS = 100_000_000
 """Shortest time between two periodic hellos [ns]."""
 KEY_PERIOD_NS = 5_000_000_000
-"""Time between two hellos with a new key while the session uses the old key [ns]. World may not
-have the new key yet, and then counts these hellos as forged. 12 hellos a minute raise no alert."""
+"""Time between two hellos with a new pre-shared key while the session uses the old key [ns]. Until
+world has the new key, it counts these hellos as forged; 12 hellos a minute raise no alert."""
 GIVE_UP_NS = 5_000_000_000
-"""Longest time for which cloud tries to tell the robot that the mission is over [ns]."""
+"""Longest time for which cloud tries to tell the robot that the mission has ended [ns]."""
 SILENCE_NS = 500_000_000
-"""Time without telemetry after which cloud says hello again [ns]; world may have restarted."""
+"""Time without telemetry after which cloud asks for a session again [ns]."""
 ALIVE_PERIOD_NS = 100_000_000
 """Time between two ALIVE datagrams while there is no command [ns]."""
 PATIENCE_NS = 5_000_000_000
 """Time without a session after which cloud reports a fault [ns]."""
 COUNT_PERIOD_NS = 1_000_000_000
-"""Time between two records of the counts [ns]."""
+"""Time between two records of the counters [ns]."""
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class CloudEndpoint(TunnelEnd):
-    """The remote controller's end of the tunnel; an `Endpoint`.
+    """The remote controller's end of the tunnel: an `Endpoint` that commands the robot.
 
     Attributes:
-        teleop: Teleop as cloud sees it.
+        teleop: Source of setpoints and operator requests.
         guard: State of the guard in the newest telemetry.
     """
 
@@ -106,7 +105,7 @@ class CloudEndpoint(TunnelEnd):
             loop: Estimator, predictor and controller.
             teleop: Source of setpoints and operator requests.
             identity: Identity and keys of this end.
-            newest_wins: Whether late telemetry is dropped.
+            newest_wins: Whether telemetry is dropped that arrives after newer telemetry.
             start_ns: Cloud's monotonic clock now [ns].
         """
         super().__init__(identity, Direction.DOWNLINK, newest_wins)
@@ -120,7 +119,7 @@ class CloudEndpoint(TunnelEnd):
         self._alarm, self._missed_periods = EmergencyStopRepeater(), MissedPeriods()
         self._asked = 0  # highest number of an operator request in this session
         self._tick_ns = start_ns
-        self._hello_ns = start_ns - KEY_PERIOD_NS  # of the last periodic hello
+        self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
         self._alive_ns = start_ns
         self._heard_ns = start_ns
         self._flying_ns = start_ns
@@ -129,12 +128,12 @@ class CloudEndpoint(TunnelEnd):
 
     @property
     def counts(self) -> Counter[str]:
-        """A copy of the counters: how often each event has happened so far."""
+        """Copy of the counters: name of an event -> how often the event has happened."""
         return Counter(self._counts | self._loop.counts)
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended, and the robot holds or does not answer for GIVE_UP_NS."""
+        """Whether the mission has ended, and the robot confirms it or GIVE_UP_NS have passed."""
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 
@@ -157,7 +156,7 @@ class CloudEndpoint(TunnelEnd):
             if now_ns - self._heard_ns > PATIENCE_NS:
                 self._records += self._complaints.say("no_session", SILENCE_TEXT, now_ns)
         elif self._session.is_outdated:
-            self._hellos = 0  # with the new key
+            self._hellos = 0  # the next hello has the new key
             self._say_hello_if_due(now_ns, KEY_PERIOD_NS)
         self.teleop.handle_deadline(now_ns)
         if self.teleop.outputs:
@@ -178,7 +177,7 @@ class CloudEndpoint(TunnelEnd):
             self._records += self._loop.take_faults()
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Handle one datagram. Count and drop an invalid datagram."""
+        """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
         try:
             kind, epoch, counter, body = self._session.open(data)
             if kind == TELEMETRY:
@@ -204,12 +203,12 @@ class CloudEndpoint(TunnelEnd):
     def _refuse(self, outcome: str, data: bytes, now_ns: int) -> None:
         self._counts[outcome] += 1
         if outcome == "old_epoch" and codec.peek(data)[1] > self._session.epoch:
-            self._say_hello_if_due(now_ns)  # world's acceptance of a new epoch may be lost
+            self._say_hello_if_due(now_ns)  # world's ACCEPT of a new session may be lost
         elif self._wants_session(now_ns):
             self._records += self._complaints.about(outcome, data, now_ns)
 
     def _say_hello_if_due(self, now_ns: int, period_ns: int = HELLO_PERIOD_NS) -> None:
-        """Send a hello once a period. While two keys are valid, use them in turn."""
+        """Send a hello once per `period_ns`; while two keys are valid, use them in turn."""
         if now_ns < self._hello_ns + period_ns:
             return
         self._hello_ns = now_ns
@@ -219,14 +218,12 @@ class CloudEndpoint(TunnelEnd):
         self._greet(self._handshake.make_hello(), key)
 
     def _wants_session(self, now_ns: int) -> bool:
-        """Whether cloud asks for a session: it has none, or receives nothing from world."""
         return self._session.epoch == NO_EPOCH or now_ns - self._heard_ns > SILENCE_NS
 
     def _greet(self, hello: bytes, key: Key) -> None:
         self._queue([self._session.greet(Kind.HELLO, hello, key)])
 
     def _receive_accept(self, epoch: int, accept: Accept, now_ns: int) -> None:
-        """Begin the epoch that world assigns to this process, if the epoch is new."""
         asks = self._wants_session(now_ns)
         nonces = self._handshake.receive_accept(epoch, accept, asks=asks)
         if nonces is None:
@@ -246,9 +243,8 @@ class CloudEndpoint(TunnelEnd):
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
     def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
-        """Record telemetry of this epoch; pass usable telemetry to loop and teleop."""
         outcome = self._channel.take(counter)
-        if outcome != REPEATED:  # anybody can send repeats
+        if outcome != REPEATED:  # an attacker can repeat datagrams
             self._heard_ns = now_ns
         self._counts[outcome] += 1
         used = outcome == USED
@@ -257,6 +253,8 @@ class CloudEndpoint(TunnelEnd):
             delay = (now_ns - telemetry.stamp_ns - telemetry.slip_ns) * 1e-9
         if outcome != REPEATED or not self._channel.is_flooded:
             self._records.append(_new(Arrival, (now_ns, True, epoch, counter, delay, used)))
+        if outcome == LATE:
+            self._loop.observe_late(telemetry, now_ns)
         if used:
             self.guard = telemetry.guard
             self._alarm.see(telemetry.guard, telemetry.mission)
@@ -280,10 +278,11 @@ class CloudEndpoint(TunnelEnd):
                     self._loop.start_mission()
 
     def _relay(self, request: OperatorRequest) -> None:
-        """Relay a request to world, or drop it; teleop repeats a dropped request.
+        """Relay an operator's request to world, or drop it; teleop repeats a dropped request.
 
-        Cloud itself repeats an emergency stop without a number. Without a session, cloud relays
-        nothing. Cloud relays no start before telemetry arrives, and none while it repeats a stop.
+        Cloud drops every request while there is no session. Cloud drops a start before the first
+        telemetry, and while it repeats an emergency stop. An emergency stop without a number is not
+        relayed: cloud itself numbers and repeats it.
         """
         if request.number > codec.NUMBER_MAX:  # somebody with the keys has used up the numbers
             self._counts["words_dropped"] += 1

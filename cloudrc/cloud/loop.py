@@ -1,93 +1,126 @@
 """Compute each command from the newest telemetry with estimator, predictor and controller.
 
-A plug-in may raise an exception, or return values that are not finite or not numbers. The loop then
-uses a safe value (the last good horizon, the last sample, zero velocity). It counts every failure
-and reports the first failure of each plug-in. The loop never stops.
+If a plug-in raises an exception, or returns values that are not finite numbers, the loop uses a
+safe value: the last good horizon, the last sample, or zero velocity. The loop counts every failure,
+reports the first failure of each plug-in, and goes on.
 
-Telemetry echoes the newest command that world has applied. While no echo shows that the robot flies
-the commands, the loop freezes: it commands zero velocity and does not call the controller.
-Therefore no integral winds up, and no predictor assumes motion that the robot did not fly. Only the
-echo of a new command ends the freeze.
+Telemetry echoes the stamp of the newest command that world has applied. While no new echo arrives,
+the robot does not fly the commands, and the loop freezes: it commands zero velocity and does not
+call the controller. No integral winds up, and no predictor assumes motion that the robot did not
+fly. The echo of a new command ends the freeze.
 
-The loop measures all ages on cloud's own clock and compares world's stamps only with each other,
-so it needs no clock synchronisation.
+The loop measures ages on cloud's clock, and subtracts stamps of world's clock only from each other.
+It needs no clock synchronisation.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+import traceback
+from collections import Counter, deque
 from collections.abc import Callable
 from math import isfinite, nan
+from typing import NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.errors import describe_error
+from cloudrc.errors import describe_error, locate_error
 from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
 from cloudrc.records import Control, Fault
 
 HORIZON_MAX = 1.0
 """Longest horizon of a prediction [s]. Source: docs/reference/control.md, "Predictors"."""
 FREEZE_NS = 400_000_000
-"""Time without a new echo, in addition to the horizon, after which the loop freezes [ns].
+"""If no telemetry shows that the robot follows a new command, the loop freezes after the horizon
+plus this time [ns].
 Source: docs/reference/plant.md, "Frozen reference"."""
+FRESH_ECHO_NS = 50_000_000
+"""Longest hold of an echo that is a delay sample [ns]: five command periods. While the downlink is
+silent, the hold grows, and the delay of the link does not."""
+ECHOES = 32
+"""Number of echoes that cloud remembers, so that each command counts once."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 INSTEAD = {
     "estimator": "cloud uses the last good horizon",
     "predictor": "cloud uses the last sample without a prediction",
     "controller": "cloud commands zero velocity",
 }
-"""Kind of plug-in -> what cloud does when the plug-in fails."""
+"""Kind of plug-in -> what cloud does when a plug-in of this kind fails."""
+TRACEBACK_MAX = 4000
+"""Longest recorded traceback [characters]; of a longer one the end is kept."""
+
+
+class InvalidResultError(ValueError):
+    """A plug-in returned a value that is not a number, or not finite."""
+
+
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class DelayMeter:
-    """Feeds a delay estimator with echoes and gets the horizon from the estimator.
+    """Feed a delay estimator with the delays of commands, and get the horizon from the estimator.
 
     Attributes:
         rtt: Last round trip, without the hold time on world [s]; NaN before the first.
-        loop_delay: Last `now - echo_stamp`, with the hold time [s]; NaN before the first.
-        newest_echo_ns: Stamp of the newest command that an echo shows as flown [ns], cloud's clock.
+        loop_delay: Last round trip, with the hold time on world [s]; NaN before the first.
+        newest_echo_ns: Stamp of the newest command that telemetry shows as applied [ns], cloud's
+            clock.
     """
 
     def __init__(self, estimator: Estimator, counts: Counter[str]) -> None:
-        """Use `estimator`, and count clamped horizons in `counts`."""
+        """Use `estimator`, and count horizons outside of 0 to 1 s in `counts`."""
         self._estimator, self._counts = estimator, counts
         self._stamp_ns, self.newest_echo_ns = 0, NEVER_NS
+        self._echoes: deque[int] = deque(maxlen=ECHOES)
         self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process new telemetry at its arrival `now_ns` [ns].
+        """Process the telemetry to be used, at its arrival `now_ns` [ns].
 
-        A repeated echo is no sample. While the downlink is silent, world repeats the echo of the
-        same command; the growing age of that command would corrupt the estimate.
+        Each telemetry with a fresh echo is one sample of eq. (1), even if the echo is repeated.
+        Samples of new echoes alone would have the shortest holds, and the mean would be too small.
+        Source: docs/reference/control.md, "The delay sample".
         """
         self._stamp_ns = telemetry.stamp_ns
         echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
-        if echo_ns <= self.newest_echo_ns:
+        self.observe_echo(telemetry)
+        if echo_ns == NEVER_NS or hold_ns > FRESH_ECHO_NS:
             return
-        self.newest_echo_ns, loop_ns = echo_ns, now_ns - echo_ns
+        loop_ns = now_ns - echo_ns
         self.loop_delay, self.rtt = loop_ns * 1e-9, (loop_ns - hold_ns) * 1e-9
-        applied_minus_stamp = (telemetry.stamp_ns - hold_ns - echo_ns) * 1e-9
-        self._estimator.update(DelaySample(self.loop_delay, self.rtt, applied_minus_stamp))
+        self._estimator.update(DelaySample(self.loop_delay, self.rtt))
+
+    def observe_echo(self, telemetry: Telemetry) -> None:
+        """Process the echo of telemetry, which may be late: it shows when a command was applied.
+
+        Late telemetry often has the only echo of a command that another one soon replaced. Without
+        these commands, which are the slow ones, the average delay would be too small.
+        """
+        echo_ns = telemetry.echo_stamp_ns
+        if echo_ns == NEVER_NS or echo_ns in self._echoes:
+            return
+        self._echoes.append(echo_ns)
+        self.newest_echo_ns = max(self.newest_echo_ns, echo_ns)
+        applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
+        self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
 
     def horizon(self, now_ns: int) -> float:
-        """Return the horizon for a command that leaves at `now_ns` [ns], in [0, 1] s.
+        """Return the horizon for a command that leaves at `now_ns` [ns], limited to 0 to 1 s.
 
         Raises:
-            ValueError: If the estimator's horizon is not finite.
+            InvalidResultError: If the estimator's horizon is not finite.
         """
         horizon = float(self._estimator.horizon((now_ns - self._stamp_ns) * 1e-9))
         if 0.0 <= horizon <= HORIZON_MAX:
             return horizon
         if not isfinite(horizon):
-            raise ValueError(f"its horizon is {horizon}")
+            raise InvalidResultError(f"its horizon is {horizon}")
         self._counts["horizon_clamped"] += 1
         return min(max(horizon, 0.0), HORIZON_MAX)
 
 
 class ControlLoop:
-    """Runs estimator, predictor and controller of one session.
+    """Runs estimator, predictor and controller in the sessions of one cloud.
 
     Attributes:
         faults: Faults since the last `take_faults`.
@@ -102,7 +135,7 @@ class ControlLoop:
     ) -> None:
         """Connect three plug-ins; every session gets a new estimator.
 
-        The constructor does not catch exceptions of the plug-ins, because nothing flies yet.
+        An exception of a plug-in is not caught here, because nothing flies yet.
         """
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
@@ -153,7 +186,7 @@ class ControlLoop:
         return self._basis is not None
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process new telemetry at its arrival `now_ns` [ns], cloud's clock."""
+        """Process telemetry that arrived at `now_ns` [ns], cloud's clock."""
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
         if self._undated:
             self.faults += [fault._replace(stamp_ns=now_ns) for fault in self._undated]
@@ -167,17 +200,24 @@ class ControlLoop:
         except BaseException as error:
             self._note("predictor", error, now_ns)
 
+    def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
+        """Process telemetry that is older than the newest: only its echo counts."""
+        try:
+            self._delays.observe_echo(telemetry)
+        except BaseException as error:
+            self._note("estimator", error, now_ns)
+
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
     ) -> tuple[Command, Control]:
         """Compute the command that is due at `now_ns` [ns], and the record of this period.
 
         Args:
-            setpoint: The setpoint.
+            setpoint: The newest setpoint.
             now_ns: Cloud's clock [ns].
             dt: Time since the last command [s], > 0.
-            epoch: Epoch of the session, for the record.
-            counter: Counter of the command, for the record.
+            epoch: Number of the session, for the record.
+            counter: Counter of the command's datagram, for the record.
         """
         basis, delays = self._basis, self._delays
         assert basis is not None, "check `ready` first"
@@ -214,8 +254,8 @@ class ControlLoop:
         faults, self.faults = self.faults, []
         return faults
 
-    # A sum is finite only if all its terms are finite. It may overflow, but a robot cannot fly
-    # numbers of that size anyway.
+    # A sum is finite only if all terms are finite. Finite terms whose sum overflows are refused,
+    # too, because no robot can fly them.
 
     def _predict(self, basis: Odometry, horizon: float, now_ns: int) -> Odometry:
         try:
@@ -224,7 +264,7 @@ class ControlLoop:
             w, x, y, z = estimate.orientation_wxyz
             orientation = (float(w), float(x), float(y), float(z))
             if not isfinite(sum(position) + sum(velocity) + sum(orientation)):
-                raise ValueError(f"it returned {estimate}")
+                _refuse(position=position, velocity=velocity, orientation=orientation)
             stamp_ns, rate = estimate.stamp_ns, estimate.angular_velocity_body
             return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
         except BaseException as error:
@@ -238,7 +278,7 @@ class ControlLoop:
             output = self._controller.update(estimate, setpoint, dt)
             velocity, yaw_rate = _triple(output.velocity), float(output.yaw_rate)
             if not isfinite(sum(velocity) + yaw_rate):
-                raise ValueError(f"it returned {output}")
+                _refuse(velocity=velocity, yaw_rate=(yaw_rate,))
             proportional, integral = _triple(output.proportional), _triple(output.integral)
             derivative = _triple(output.derivative)
             terms = (velocity, yaw_rate, proportional, integral, derivative)
@@ -248,7 +288,7 @@ class ControlLoop:
             return STAND_STILL
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether no new echo has come for too long; the first echo has the same time limit."""
+        """Whether the robot has followed no new command for the `horizon` [s] plus FREEZE_NS."""
         if self._echoed_ns < self._delays.newest_echo_ns:
             self._echoed_ns = self._delays.newest_echo_ns
         elif self._echoed_ns == NEVER_NS:
@@ -256,22 +296,33 @@ class ControlLoop:
         return now_ns - self._echoed_ns > horizon * 1e9 + FREEZE_NS
 
     def _note(self, kind: str, error: BaseException, now_ns: int, instead: str = "") -> None:
-        """Count a failure of a plug-in, and report the first failure of its kind.
+        """Count a failure of a plug-in; report the first failure of each kind of plug-in.
 
-        A plug-in may raise any exception; only a user's Ctrl-C is raised again. A failure whose
-        `now_ns` is NEVER_NS gets the stamp of the next telemetry.
+        A plug-in may raise any exception; only KeyboardInterrupt (a user's Ctrl-C) is raised again.
+        If `now_ns` is NEVER_NS, the fault gets the arrival time of the next telemetry.
         """
         if isinstance(error, KeyboardInterrupt):
             raise error
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:
-            what = f"the {kind} failed ({describe_error(error)}); {instead or INSTEAD[kind]}"
-            fault = Fault(now_ns, code, f"{what}; fix cloud.{kind} or choose another")
+            where = "" if isinstance(error, InvalidResultError) else f", {locate_error(error)}"
+            what = f"the {kind} failed ({describe_error(error)}{where})"
+            text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
+            frames = "".join(traceback.format_tb(error.__traceback__))[-TRACEBACK_MAX:]
+            trace = frames.encode(errors="replace").decode() + describe_error(error)
+            fault = Fault(now_ns, code, text, trace)
             (self._undated if now_ns == NEVER_NS else self.faults).append(fault)
 
 
+def _refuse(**values: tuple[float, ...]) -> NoReturn:
+    """Raise an InvalidResultError that names the first value that is not finite."""
+    wrong = (each for each in values.items() if not isfinite(sum(each[1])))
+    name, value = next(wrong, next(iter(values.items())))
+    shown = ", ".join(f"{number:.4g}" for number in value)
+    raise InvalidResultError(f"its {name} is ({shown})")
+
+
 def _triple(numbers: Vector) -> Vector:
-    """Convert a vector that a plug-in returned to three floats."""
     x, y, z = numbers
     return float(x), float(y), float(z)

@@ -1,4 +1,4 @@
-"""Connect cloud's end to teleop by messages, and repeat an emergency stop until the robot stops."""
+"""Connect cloud to teleop by messages; repeat an emergency stop until the robot has stopped."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class Operator(Protocol):
-    """Teleop as cloud sees it: teleop itself, or the socket to teleop's process."""
+    """Teleop, in this process or in a process behind a socket."""
 
     @property
     def outputs(self) -> Sequence[Output | Fault]:
@@ -24,7 +24,7 @@ class Operator(Protocol):
 
     @property
     def outcome(self) -> MissionEvent | None:
-        """Last event of the mission; None while cloud has to continue."""
+        """Last event of the mission once the mission has ended; None before."""
 
     @property
     def settled(self) -> bool:
@@ -34,7 +34,7 @@ class Operator(Protocol):
         """Pass the newest telemetry, received at `now_ns` [ns], to teleop."""
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Let teleop do what is due at `now_ns` of cloud's clock [ns]."""
+        """Let teleop do what is due at `now_ns` [ns], cloud's clock."""
 
     def take_outputs(self) -> Sequence[Output | Fault]:
         """Return the messages since the last call."""
@@ -44,7 +44,7 @@ def is_for_session(epoch: int, output: Output | Fault) -> bool:
     """Return whether a message from teleop is valid in the session with this epoch.
 
     Setpoints and starts are valid only in the session for which teleop made them, because another
-    cloud may have moved the robot since. Teleop repeats both. No other message makes the robot fly.
+    cloud may have moved the robot since; teleop repeats both. No other message makes the robot fly.
     """
     if isinstance(output, Setpoint) or (
         isinstance(output, OperatorRequest) and output.request is Request.START
@@ -56,9 +56,9 @@ def is_for_session(epoch: int, output: Output | Fault) -> bool:
 def make_robot_status(
     telemetry: Telemetry, epoch: int, world: str, delays: tuple[float, float, float]
 ) -> RobotStatus:
-    """Make the message that tells teleop of new telemetry.
+    """Make the status message for teleop from new telemetry.
 
-    `delays` are horizon, round trip and loop delay of the last command [s]; NaN before the first.
+    `world` identifies world's process. `delays` are horizon, round trip and loop delay [s].
     """
     fields = (
         *(epoch, telemetry.odometry.position, telemetry.guard, telemetry.mission, world),
@@ -69,9 +69,9 @@ def make_robot_status(
 
 
 class EmergencyStopRepeater:
-    """Numbers an emergency stop, and repeats it until telemetry shows that the robot obeyed.
+    """Number an emergency stop, and repeat it until telemetry shows that the robot has obeyed.
 
-    Teleop may ask for the stop any number of times. Without a session, the stop waits for one.
+    Teleop may request the stop any number of times. The stop waits while there is no session.
 
     Attributes:
         sounds: Whether the stop is being repeated.
@@ -87,24 +87,24 @@ class EmergencyStopRepeater:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
     def restart_numbers(self) -> None:
-        """Start numbering from 0, because world counts the requests of each session anew."""
+        """Start numbering from 0, because world numbers the requests of each session from 0."""
         self._number = self._acted_on = self._due_ns = 0
 
     def see(self, guard: GuardState, acted_on: int) -> None:
-        """Note the guard's state and the number of the last request that world has acted on."""
+        """Note the guard's state and the number of the last request that world has carried out."""
         self._acted_on, self._stopped = acted_on, guard is GuardState.ESTOP
         if self._stopped and 0 < self._number <= acted_on:
             self.sounds = False
 
     def acknowledge(self) -> None:
-        """End the repetition if the robot is stopped: teleop has seen and acknowledges the stop."""
+        """End the repetition if the robot is stopped: the operator acknowledges the stop."""
         self.sounds = self.sounds and not self._stopped
 
     def due(self, asked: int, now_ns: int) -> OperatorRequest | None:
-        """Return a copy of the emergency stop if one is due at `now_ns` [ns], else None.
+        """Return a copy of the emergency stop if a copy is due at `now_ns` [ns], else None.
 
-        World acts on rising numbers only. `asked` is the highest number so far; the stop gets a
-        higher number.
+        World carries out requests with rising numbers only. `asked` is the highest number so far in
+        this session; the stop gets a higher number.
         """
         if not self.sounds or now_ns < self._due_ns:
             return None

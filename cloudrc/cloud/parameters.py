@@ -1,6 +1,6 @@
 """Check the parameters that an experiment file gives to plug-ins.
 
-Every error names the parameter, the value and the reason in one line.
+The message of a ValueError names the parameter, the value and the reason in one line.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def gain(name: str, value: object) -> float:
 
 
 def vector(name: str, value: object) -> Vector:
-    """Return `value` as a tuple if it is three finite numbers >= 0; else raise ValueError."""
+    """Return `value` as a tuple if it has three finite numbers >= 0; else raise ValueError."""
     if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != 3:
         raise ValueError(f"{name}: {value!r} must be three numbers, for x, y and z")
     x, y, z = (

@@ -1,6 +1,6 @@
-"""Select a release by context, namespace and name; send requests to its cluster; run kubectl, helm.
+"""Select a Helm release of cloudrc, send requests to its Kubernetes cluster, run kubectl and helm.
 
-Errors of the cluster and of the programs become one sentence.
+Every error of the cluster or of a program becomes a message of one sentence.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
 
 DEFAULT_RELEASE = "cloudrc"
 COMPONENTS = ("world", "cloud")
-"""Components with a pod of their own."""
+"""Components of a release that have a pod of their own."""
 REQUEST_TIMEOUT = 15.0
 """Time limit for one request to the API server [s]."""
 VERSION_TIMEOUT = 5.0
 """Time limit for the API server to return its version [s]."""
 OUTAGE_MAX = 30.0
-"""Longest time for which a request is repeated while the API server does not answer [s]."""
+"""Longest time for which a request is tried again while the API server does not answer [s]."""
 OUTAGE_PERIOD = 1.0
-"""Time between two tries [s]."""
+"""Time between two attempts of a request [s]."""
 STOP_LIMIT = 2.0
-"""Time from SIGTERM to SIGKILL in which a program can end [s]."""
+"""Time from SIGTERM to SIGKILL, in which a program can end by itself [s]."""
 OLDEST = (1, 29)
-"""Oldest Kubernetes version that the chart supports, as kubeVersion in Chart.yaml."""
+"""Oldest Kubernetes version that the chart supports (`kubeVersion` in Chart.yaml)."""
 WHERE_TO_GET = {
     "kubectl": "https://kubernetes.io/docs/tasks/tools/",
     "helm": "https://helm.sh/docs/intro/install/",
 }
-"""Program -> page that explains the installation."""
+"""Program -> web page that explains the installation."""
 PACKAGE = Path(__file__).resolve().parents[1]
 _KINDS = {
     **{name: ("CoreV1Api", name[:-1]) for name in ("pods", "services", "secrets", "events")},
@@ -48,19 +48,19 @@ _KINDS = {
     "jobs": ("BatchV1Api", "job"),
     "deployments": ("AppsV1Api", "deployment"),
 }
-"""Kind of objects -> class of the Kubernetes client, and the kind's name in its methods."""
+"""Kind of objects -> class of the Kubernetes client, and the name of the kind in its methods."""
 
 _Answer = TypeVar("_Answer")
 
 
 class ClusterError(CloudrcError):
-    """The cluster, or an object in it, refused or failed."""
+    """Report that the cluster refused a request, or that an object in the cluster failed."""
 
     exit_code = 5
 
 
 class UnavailableError(ClusterError):
-    """The API server does not answer or is overloaded; a later try may succeed."""
+    """Report that the API server does not answer or is overloaded; a later attempt may succeed."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Release:
 
     Attributes:
         context: Context of the kubeconfig; None for the current context.
-        namespace: Namespace of the release; None for the context's own (kubectl only).
+        namespace: Namespace of the release; None (with kubectl only) for the context's namespace.
         name: Name of the Helm release.
     """
 
@@ -79,28 +79,28 @@ class Release:
 
     @property
     def where(self) -> str:
-        """Namespace and context in words, for messages."""
+        """Namespace and context as a phrase for messages."""
         context = f" of context '{self.context}'" if self.context else ""
         return f"in namespace '{self.namespace}'{context}"
 
     @property
     def flags(self) -> list[str]:
-        """Flags of kubectl that select context and namespace."""
+        """Flags that select context and namespace in kubectl."""
         given = {"context": self.context, "namespace": self.namespace}
         return [f"--{name}={value}" for name, value in given.items() if value]
 
     @property
     def helm_flags(self) -> list[str]:
-        """Flags of helm that select context and namespace."""
+        """Flags that select context and namespace in helm."""
         return [flag.replace("--context", "--kube-context") for flag in self.flags]
 
     @property
     def cloudrc_flags(self) -> list[str]:
-        """Flags of cloudrc that select context, namespace and release."""
+        """Flags that select context, namespace and release in cloudrc."""
         return [*self.flags, f"--release={self.name}"]
 
     def labels(self, component: str) -> dict[str, str]:
-        """Return the labels of a component of this release: "world", "cloud", "mission"."""
+        """Return the Kubernetes labels of a component: "world", "cloud" or "mission"."""
         return {
             "app.kubernetes.io/name": "cloudrc",
             "app.kubernetes.io/instance": self.name,
@@ -109,7 +109,7 @@ class Release:
 
     @cached_property
     def client(self) -> Any:
-        """The Kubernetes client."""
+        """Client of the Kubernetes API with the kubeconfig's login."""
         from kubernetes import client, config
 
         configuration = client.Configuration()
@@ -122,7 +122,7 @@ class Release:
     def request(
         self, verb: str, kind: str, *, timeout: float = REQUEST_TIMEOUT, **arguments: Any
     ) -> Any:
-        """Send a request about objects in the release's namespace.
+        """Send a request about objects in the release's namespace; return the client's answer.
 
         Args:
             verb: "list", which returns a list; or "get", "create" or "delete".
@@ -143,7 +143,7 @@ class Release:
         return answer.items if verb == "list" else answer
 
     def find(self, kind: str, component: str) -> list[Any]:
-        """List the objects of a kind that belong to a component."""
+        """List the objects of one kind, such as "pods", that belong to a component."""
         selector = ",".join(f"{name}={value}" for name, value in self.labels(component).items())
         found: list[Any] = self.request("list", kind, label_selector=selector)
         return found
@@ -151,7 +151,7 @@ class Release:
 
 @contextmanager
 def _login_errors(where: str) -> Iterator[None]:
-    """Raise an error if the kubeconfig's login program fails; the client only logs the failure."""
+    """Raise an error if the login program of the kubeconfig fails, which the client only logs."""
 
     def refuse(record: logging.LogRecord) -> bool:
         raise MissingPrerequisiteError(
@@ -159,7 +159,7 @@ def _login_errors(where: str) -> Iterator[None]:
             f"{' '.join(record.getMessage().split())}; install it, or run it by hand to see why"
         )
 
-    root = logging.getLogger()  # the logger of the client's module for kubeconfigs
+    root = logging.getLogger()  # the client's module for kubeconfigs uses it
     root.addFilter(refuse)
     try:
         yield
@@ -172,10 +172,10 @@ def connect(
 ) -> Release:
     """Select a release by the kubeconfig, without a request to the cluster.
 
-    The default of `context` is the current one, that of `namespace` the context's, or "default".
+    The defaults are the current context, and the namespace of the context or "default".
 
     Raises:
-        MissingPrerequisiteError: If there is no valid kubeconfig or no such context.
+        MissingPrerequisiteError: If there is no valid kubeconfig, or if the context is unknown.
     """
     from kubernetes import config
 
@@ -212,10 +212,10 @@ def server_version(release: Release) -> tuple[int, int]:
 
 @contextmanager
 def explain_errors(doing: str, where: str) -> Iterator[None]:
-    """Convert exceptions of the Kubernetes client to a ClusterError with one sentence.
+    """Convert exceptions of the Kubernetes client to a ClusterError with a message of one sentence.
 
     Args:
-        doing: Action as verb and kind of object: "list jobs".
+        doing: The failed action as verb and kind of object, such as "list jobs".
         where: Cluster and namespace, from `Release.where`.
     """
     from kubernetes.client.exceptions import ApiException
@@ -238,7 +238,6 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
 
 
 def _refusal(error: Any, status: int, doing: str) -> str:
-    """Describe a refusal of the API server, with the next step."""
     try:
         message = json.loads(error.body)["message"]
     except (ValueError, KeyError, TypeError):
@@ -254,7 +253,7 @@ def _refusal(error: Any, status: int, doing: str) -> str:
 
 
 def _root(error: BaseException) -> str:
-    """Return the innermost cause; the outer exceptions only report repeated tries."""
+    """Return the text of the innermost cause; the outer exceptions report repeated attempts."""
     reason = getattr(error, "reason", None)
     if isinstance(reason, BaseException):
         return _root(reason)
@@ -262,9 +261,9 @@ def _root(error: BaseException) -> str:
 
 
 def retry(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
-    """Repeat a request while the API server does not answer, for `OUTAGE_MAX` at most.
+    """Call `ask` again while the API server does not answer, for `OUTAGE_MAX` at most.
 
-    The first error goes to `tell`; the last one is raised.
+    `tell` gets the first error. The last error is raised.
     """
     until = None
     while True:
@@ -295,7 +294,9 @@ def run(
     given: str = "",
     stdout: IO[bytes] | None = None,
 ) -> str:
-    """Run kubectl or helm, and return its output; "" if the output goes to a file `stdout`.
+    """Run kubectl or helm with the standard input `given`, and return the program's output.
+
+    With a file `stdout`, the output goes to the file, and the result is "".
 
     Raises:
         ClusterError: If the program fails; the message is that of the program.
@@ -317,7 +318,7 @@ def run(
 
 
 def last_words(stderr: bytes) -> str:
-    """Extract a program's error message as one line, without warnings and log lines."""
+    """Extract the error message from a program's standard error, as one line."""
     text = stderr.decode(errors="replace")
     lines = [" ".join(line.split()) for line in text.splitlines() if line.strip()]
     first = next((i for i, line in enumerate(lines) if line.lower().startswith("error")), -1)
@@ -326,7 +327,7 @@ def last_words(stderr: bytes) -> str:
 
 
 def end_process(process: subprocess.Popen[bytes]) -> None:
-    """End a program; kill it if it does not end within `STOP_LIMIT`."""
+    """End a program by SIGTERM, and by SIGKILL after `STOP_LIMIT`."""
     process.terminate()
     try:
         process.wait(STOP_LIMIT)
@@ -336,7 +337,7 @@ def end_process(process: subprocess.Popen[bytes]) -> None:
 
 
 def chart_folder(package: Path = PACKAGE) -> Path:
-    """Find the Helm chart: inside the package in a wheel, beside the package in a repository.
+    """Find the folder of the Helm chart, in an installed package or in a repository.
 
     Raises:
         MissingPrerequisiteError: If the chart is missing.

@@ -1,7 +1,7 @@
-"""Install a release, wait until it is ready, and fly one experiment on it.
+"""Install a release, wait until it is ready, and fly one experiment with it.
 
-A flight installs or upgrades the release, flies the mission by a Job, fetches and merges the
-recordings of both pods, and writes the report.
+A flight installs or upgrades the release, flies the mission by a Kubernetes Job, fetches and merges
+the recordings of the pods of world and cloud, and writes the report.
 """
 
 from __future__ import annotations
@@ -30,14 +30,13 @@ LOOK_PERIOD = 1.0
 HELM_LIMIT = 120.0
 """Time limit for one helm command [s]; helm does not wait for pods."""
 FAILURE_TIME = 5.0
-"""A failure is reported if it lasts longer than this [s]; some objects appear after their pod."""
+"""Time after which a pod's failure is reported [s]; objects that the pod needs may come late."""
 FLUSH = 1.0
-"""Time after which a recorder has certainly flushed its buffer [s]; the buffer holds at most half a
-second of records."""
+"""Time after which a recorder has certainly written its buffer of half a second [s]."""
 FETCHES = 4
-"""Largest number of attempts to fetch recordings that contain the mission's end."""
+"""Largest number of attempts to fetch recordings that contain the end of the mission."""
 FLOWN = (0, 1, 6, 130)
-"""Exit codes of a Job whose mission has flown: success, failure, invalid, interrupted."""
+"""Exit codes of a Job whose mission was flown: success, failure, invalid, interrupted."""
 HINTS = {
     "cluster unreachable": "is the cluster up? ask it: kubectl cluster-info",
     "incompatible with Kubernetes": "make a newer one: kind create cluster",
@@ -46,17 +45,17 @@ HINTS = {
     "the specifications of the schema": "see what there is: helm show values charts/cloudrc",
     "already exists": "is it another release's? see: helm list --all-namespaces",
 }
-"""Words in an error message of helm -> what to do next."""
+"""Words in an error message of helm -> advice to the user."""
 
 
 def install(release: Release, values: Mapping[str, Any], timeout: float, tell: Tell) -> None:
-    """Install or upgrade a release and wait until it is ready to fly, as `wait_ready`.
+    """Install or upgrade a release, and wait until its pods are ready, as `wait_ready` does.
 
     Args:
-        release: Name and place; a missing namespace is created.
+        release: Context, namespace and name; a missing namespace is created.
         values: Values that override the chart's defaults.
         timeout: Time limit for the pods to become ready [s].
-        tell: Gets a line about each change of the pods' state.
+        tell: Receives a line about each change of the pods' state.
     """
     arguments = ["upgrade", "--install", release.name, str(chart_folder()), *release.helm_flags]
     arguments += ["--create-namespace", "--values=-"]
@@ -65,7 +64,7 @@ def install(release: Release, values: Mapping[str, Any], timeout: float, tell: T
 
 
 def current_values(release: Release) -> dict[str, Any]:
-    """Read the values with which a release was installed; empty if the release does not exist."""
+    """Read the values with which a release was installed; {} if the release does not exist."""
     arguments = ["list", "--output=json", f"--filter=^{release.name}$", *release.helm_flags]
     if not json.loads(_helm(arguments) or "[]"):
         return {}
@@ -74,7 +73,6 @@ def current_values(release: Release) -> dict[str, Any]:
 
 
 def _helm(arguments: Sequence[str], given: str = "") -> str:
-    """Run helm, and add a hint to helm's error message."""
     try:
         return run("helm", arguments, timeout=HELM_LIMIT, given=given)
     except ClusterError as error:
@@ -83,12 +81,12 @@ def _helm(arguments: Sequence[str], given: str = "") -> str:
 
 
 def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: None) -> None:
-    """Wait until both pods of a release have its newest version and are ready.
+    """Wait until the pods of world and cloud have the release's newest version and are ready.
 
-    Each change of the pods' state goes to `tell`.
+    `tell` receives a line about each change of the pods' state.
 
     Raises:
-        ClusterError: If a pod will never run; the message has the cause.
+        ClusterError: If a pod will never run; the message names the cause.
         TimedOutError: If the pods are not ready within `timeout` [s].
     """
     selector = f"app.kubernetes.io/instance={release.name}"
@@ -116,7 +114,7 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
 
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
-    """Return why a component is not ready ("" if it is), and whether it never will be."""
+    """Return why a component is not ready ("" if ready), and whether it can never be ready."""
     deployment = pods.find_deployment(release, component)
     status = deployment.status
     for condition in status.conditions or []:  # for example Pod Security or a quota
@@ -136,7 +134,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
 
 
 def refuse_second_flight(release: Release, ask: Ask) -> None:
-    """Raise an error if a mission is under way; an installation would replace both pods."""
+    """Raise a ClusterError if a mission is under way; an installation would replace both pods."""
     if found := find_flight(release, ask):
         raise ClusterError(
             f"{found[0]} is under way on release '{release.name}' {release.where}; wait for it, "
@@ -147,15 +145,14 @@ def refuse_second_flight(release: Release, ask: Ask) -> None:
 def fly_in_cluster(
     experiment: ResolvedExperiment, folder: Path, release: Release, timeout: float, tell: Tell
 ) -> dict[str, Any]:
-    """Fly one experiment on a release, fill its run folder, and return the report.
+    """Fly one experiment with a release, fill its run folder, and return the report.
 
     Args:
         experiment: A complete and checked experiment.
-        folder: Folder of the run. It is empty until the mission has flown; then it gets
-            configuration, recordings, metrics, logs and report.
-        release: The release that flies; installed if missing, and kept afterwards.
-        timeout: Time for the release to become ready [s].
-        tell: Called with progress, a line at a time.
+        folder: Folder of the run, which gets configuration, recordings, metrics, logs and report.
+        release: The release that flies; it is installed if it is missing, and stays afterwards.
+        timeout: Time limit for the release to become ready [s].
+        tell: Receives the progress, one line per call.
     """
     from cloudrc.config.load import dump
 
@@ -174,16 +171,19 @@ def fly_in_cluster(
 
 
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Put an experiment with its link into a release's values; the others stay as `before`."""
+    """Put an experiment and its link into a release's values; other values stay as in `before`."""
     link = {**before.get("link", {}), "profile": ""}
-    # The chart's own Job would fly its mission at the same time.
+    # With a mission, the chart would start a second Job.
     mission = {**before.get("mission", {}), "enabled": False}
     flown = experiment.model_dump(mode="json")
     return {**before, "link": link, "mission": mission, "experiment": flown}
 
 
 def refuse_local_files(experiment: ResolvedExperiment) -> None:
-    """Refuse an experiment that pods cannot fly: it names local files, or its mission is steps."""
+    """Raise a BadInputError if an experiment names local files, or if its mission has steps.
+
+    The pods cannot read files of this machine, and the API accepts missions with waypoints only.
+    """
     from cloudrc.config.load import FILE_READERS
 
     cloud, link, world = experiment.cloud, experiment.link, experiment.world
@@ -210,7 +210,6 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
-    """Fly the mission by a Job; cancel the mission if the user interrupts."""
     mission, limit = experiment.mission.model_dump(mode="json"), experiment.criteria.time_limit_s
     document = {
         "name": experiment.name,
@@ -234,10 +233,10 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
 
 
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Contents:
-    """Fetch recordings, metrics and logs into a folder, and merge the recordings.
+    """Fetch recordings, metrics and logs into a folder; return the merged recording.
 
-    The report needs only the recordings; the errors of other files go to `tell`. If `want_end`,
-    the recordings are fetched again until they contain the mission's end.
+    The report does not need metrics and logs: `tell` receives their errors. With `want_end`, fetch
+    the recordings again until they contain the end of the mission.
     """
     from cloudrc.record.merge import cut_to_last_mission, merge
 
@@ -269,7 +268,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
 
 
 def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) -> None:
-    """Copy the recording from before a container's restart; the report does not need it."""
+    """Fetch the recording that a restarted container made before its last restart."""
     try:
         statuses = pods.container_statuses(pods.find_pod(release, component))
         if any(each.name == component and each.restart_count for each in statuses):

@@ -1,7 +1,7 @@
-"""Fly missions as Kubernetes Jobs: create, follow and delete them.
+"""Fly missions as Kubernetes Jobs: create, follow and delete a mission's Job.
 
-The container of a Job posts the mission to the release's API, follows the mission, and ends with
-the exit code of the mission's verdict. The objects are those of the chart's
+The container of the Job posts the mission to the release's API, follows the mission, and ends with
+the exit code of the mission's verdict. The Job has the form of the chart's
 `examples/mission-job.yaml`.
 """
 
@@ -34,34 +34,34 @@ from cloudrc.cluster.pods import (
 from cloudrc.errors import CloudrcError, TimedOutError
 
 EXAMPLE = "examples/mission-job.yaml"
-"""File in the chart with the objects of a mission; `run_job` fills in the names of a release."""
+"""File in the chart with the Job and the ConfigMap of a mission, the template for `run_job`."""
 COMPONENT = "mission"
-"""Label `component` of missions' Jobs, pods and ConfigMaps."""
+"""Label `component` of the Jobs, pods and ConfigMaps of missions."""
 FILE = "mission.yaml"
-"""Key of the mission in the ConfigMap."""
+"""Key in the ConfigMap under which the mission is stored."""
 UID_LABEL = "batch.kubernetes.io/controller-uid"
 """Label with the Job's UID, which Kubernetes sets on the Job's pod."""
 FROM_POD = ("nodeSelector", "tolerations", "affinity", "imagePullSecrets", "securityContext")
 FROM_CONTAINER = ("image", "imagePullPolicy", "securityContext")
-"""Keys that a mission's pod and container take from the release's teleop."""
+"""Keys that the pod and the container of a mission take from teleop's pod and container."""
 START_ALLOWANCE = 120
-"""Time to start the pod and to receive the robot's state, added to the mission's time limit [s]."""
+"""Time to start the pod and to get the robot's state, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
-"""Time for earlier missions to end, added to the deadline of a Job that may queue [s]."""
+"""Time for earlier missions to end, added to the time limit of a Job that may wait [s]."""
 DEADLINE_MAX = 2**31 - 1
-"""Largest deadline that Kubernetes accepts [s]."""
+"""Largest time limit that Kubernetes accepts for a Job [s]."""
 END_ALLOWANCE = 60.0
-"""Time for Kubernetes to end a Job after its deadline [s]."""
+"""Time in which Kubernetes ends a Job after the Job's time limit [s]."""
 KEEP_FINISHED = 3600
-"""How long Kubernetes keeps a finished Job [s]."""
+"""Time for which Kubernetes keeps a finished Job [s]."""
 LOOK_PERIOD = 0.5
 """Time between two requests for the state of a Job [s]."""
 DELETE_LIMIT = 40.0
-"""Time limit for a deleted Job to end [s]; Kubernetes gives its pod 30 s."""
+"""Time limit for a deleted Job to end [s]; Kubernetes gives the Job's pod 30 s."""
 Ask: TypeAlias = Callable[[str, str], Any]
-"""Function that asks an API, by its URL and a token, for the state of robot and missions."""
+"""Function of an API's URL and token that gets the state of robot and missions from the API."""
 ENDED = ("complete", "failed")
-"""States of a Job that has ended."""
+"""States of a Job that has ended, in `JobStatus.state`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,14 +89,14 @@ def run_job(
     limit: float = 60.0,
     queue: bool = False,
 ) -> JobStatus:
-    """Create the Job of a mission; the Job runs to its end even if no client watches it.
+    """Create the Job of a mission; the Job runs to its end even if no client follows it.
 
     Args:
         release: Release that flies the mission.
         mission: Mission in the API's format: name, start, time_limit_s, waypoints.
         name: Name of the Job; default: an unused name.
         limit: Time limit of the mission [s].
-        queue: Whether to wait while another mission flies; else the mission is refused.
+        queue: Whether to wait while another mission flies; otherwise the API refuses the mission.
 
     Raises:
         ClusterError: If the cluster refuses the Job, or if the release does not exist.
@@ -105,7 +105,7 @@ def run_job(
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
     plan, job = yaml.safe_load_all((chart_folder() / EXAMPLE).read_text("utf-8"))
     labels = {
-        **release.labels(COMPONENT),  # the NetworkPolicies select by these
+        **release.labels(COMPONENT),  # used by the NetworkPolicies
         "app.kubernetes.io/part-of": "cloudrc",
         "app.kubernetes.io/managed-by": "cloudrc",
     }
@@ -130,7 +130,7 @@ def run_job(
 
 
 def _owner(version: str, kind: str, owner: Any) -> dict[str, Any]:
-    """Build an owner reference: Kubernetes deletes an object together with its owner."""
+    """Build an owner reference: Kubernetes deletes an object when its owner is deleted."""
     metadata = owner.metadata
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
 
@@ -138,7 +138,6 @@ def _owner(version: str, kind: str, owner: Any) -> dict[str, Any]:
 def _fill_pod(
     pod: dict[str, Any], release: Release, deployment: Any, name: str, queue: bool
 ) -> None:
-    """Adapt the example's pod to a release: image, nodes, address of the API, Secret."""
     volumes = {volume["name"]: volume for volume in pod["volumes"]}
     volumes["mission"]["configMap"]["name"] = name
     volumes["tokens"]["secret"]["secretName"] = tokens_secret(release)
@@ -156,7 +155,6 @@ def _fill_pod(
 
 
 def _api_address(release: Release) -> str:
-    """Find the URL of the release's API inside the cluster."""
     for service in release.find("services", "cloud"):
         for port in service.spec.ports or []:
             if port.name == "api":
@@ -173,16 +171,16 @@ def deadline_of(limit: float, queue: bool) -> int:
 
 
 def follow_limit(limit: float, queue: bool) -> float:
-    """Compute the time after which a Job has certainly ended [s], from its mission's limit [s]."""
+    """Compute a time after which a Job has certainly ended [s], from its mission's limit [s]."""
     return deadline_of(limit, queue) + END_ALLOWANCE
 
 
 def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
-    """Find a Job that has not ended, or else a mission that the API shows.
+    """Find a Job that has not ended, or else the mission that the API shows as under way.
 
     Returns:
-        The flight in words, and the command that ends it. None if nothing flies, or if the API
-        does not answer: a broken release must not prevent its own repair.
+        The flight in words, and the command that ends the flight. None if nothing flies, or if the
+            API does not answer: then the user must be able to repair the release.
     """
     for job in release.find("jobs", COMPONENT):
         if (status := _status(job, None)).state not in ENDED:
@@ -196,7 +194,7 @@ def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
 
 
 def delete_job(release: Release, name: str) -> None:
-    """Delete a Job with its pod and ConfigMap; the pod cancels its mission before it ends."""
+    """Delete a Job with its pod and ConfigMap; the pod cancels the mission before it ends."""
     release.request("delete", "jobs", name=name, propagation_policy="Foreground")
     until, jobs = time.monotonic() + DELETE_LIMIT, partial(release.find, "jobs", COMPONENT)
     while any(job.metadata.name == name for job in retry(jobs, lambda text: None)):
@@ -211,7 +209,7 @@ def delete_job(release: Release, name: str) -> None:
 def _status(job: Any, pod: Any) -> JobStatus:
     exit_code, message, state = None, "", "pending"
     for container in container_statuses(pod) if pod is not None else ():
-        if container.name == COMPONENT:  # beside it, a mesh may have its own containers
+        if container.name == COMPONENT:  # a service mesh may add containers
             ended = container.state.terminated
             state = "flying" if ended or container.state.running else state
             exit_code = ended and ended.exit_code
@@ -225,7 +223,6 @@ def _status(job: Any, pod: Any) -> JobStatus:
 
 
 def _failure(condition: Any) -> str:
-    """Describe why Kubernetes ended a Job."""
     if condition.reason == "DeadlineExceeded":
         return "the Job took longer than its activeDeadlineSeconds"
     return f"{condition.reason}: {condition.message}"
@@ -234,10 +231,10 @@ def _failure(condition: Any) -> str:
 def follow(
     release: Release, name: str, write: Callable[[str], None], *, timeout: float
 ) -> JobStatus:
-    """Follow a Job until it has ended; `write` gets each line of its log once.
+    """Follow a Job until it has ended; `write` receives each line of the Job's log.
 
     Raises:
-        ClusterError: If the Job's pod cannot run; the message has the cause.
+        ClusterError: If the Job's pod cannot run; the message names the cause.
         TimedOutError: If the Job has not ended within `timeout` [s].
     """
     until, written = time.monotonic() + timeout, 0
@@ -263,7 +260,7 @@ def _log(release: Release, pod: Any) -> list[str]:
 
 
 def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
-    """Read a Job's state and log; raise a ClusterError if its pod will never run."""
+    """Read a Job's state and log; raise a ClusterError if the Job's pod will never run."""
     job = release.request("get", "jobs", name=name)
     uids = ((pod, pod.metadata.labels.get(UID_LABEL)) for pod in list_pods(release, COMPONENT))
     pod = next((pod for pod, uid in uids if uid == job.metadata.uid), None)

@@ -1,12 +1,12 @@
-"""Change the link of a release in flight: `cloudrc link set` in a cluster.
+"""Change the link of a release in flight, for `cloudrc link set` in a cluster.
 
-The new profile is first sent to both running link containers, so that it is in force within a
-second. Then it is written into the ConfigMap, so that restarted containers use it, too. If a
-container refuses a change, the ConfigMap stays unchanged. If a change fails, the message lists what
-has the change and what has not. Traces are files beside the profile.
+The new profile goes first to the link containers of both pods, which use it within a second. Then
+it goes into the ConfigMap, which restarted containers read. If a container refuses the profile, the
+ConfigMap stays unchanged. After a failure, the message lists where the change is in force. Traces
+are further files beside the profile.
 
-For speed, this module uses kubectl, which starts in 0.1 s; the Python client takes 0.5 s. In the
-containers it uses a few lines of `sh` instead of Python.
+This module uses kubectl, which starts in 0.1 s; the Python client takes 0.5 s. For the same reason
+it runs `sh` in the containers, not Python.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from cloudrc.link.state import CHANGE_FILE, STATE_FILE, LinkState, from_text, re
 READ_LIMIT = 15.0
 """Time limit for the API server to answer [s]."""
 FOLDER = "/run/cloudrc"
-"""Folder in a link container with its route, its state and the change that was sent to it."""
+"""Folder in a link container with the files of the link: route, state, received change."""
 APPLY_LIMIT = 5.0
-"""Time limit for the sidecar to apply a change [s]; this usually takes 0.2 s."""
+"""Time limit for a link container to apply a change [s]; usually it takes 0.2 s."""
 SEND_LIMIT = 25.0
 """Time limit to send a change to a container and to read the answer [s]."""
 SIZE_MAX = 1_000_000
-"""Largest size of a ConfigMap's files [bytes]; a little less than Kubernetes' limit of 1 MiB."""
+"""Largest total size of the files in a ConfigMap [bytes], a little below Kubernetes' 1 MiB."""
 _LOOK_PERIOD = 0.02
-"""Time between two reads of the sidecar's state [s]."""
+"""Time between two checks of a link container's state [s]."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class LinkParts:
 
     Attributes:
         name: Name of the ConfigMap that the link containers follow.
-        files: Files in that ConfigMap: the profile, its traces, the record of the last change.
+        files: Files of the ConfigMap by name: profile, traces, record of the last change.
         pods: Component -> name of its newest running pod.
     """
 
@@ -61,7 +61,7 @@ def read_link(release: Release) -> LinkParts | None:
     selector = f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={release.name}"
     words = [*release.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
     found = json.loads(run("kubectl", words, timeout=READ_LIMIT))["items"]
-    # The newest pod comes last and wins.
+    # The newest pod comes last, and replaces older pods in the dictionary below.
     found.sort(key=lambda item: str(item["metadata"]["creationTimestamp"]))
     maps = [each for each in found if PROFILE in each.get("data", {})]
     pods = {
@@ -89,13 +89,13 @@ done
 cat {STATE_FILE}
 """
 """Script for `sh` in a link container. Arguments: the folder, the number of the change, and the
-length of the document on standard input. In one step, the script puts the document where the
-sidecar reads it. Then it waits until the sidecar has accepted or refused the change, and prints the
-sidecar's state."""
+length of the change on standard input. The script renames the complete change to the file that the
+container reads. Then it waits until the container has accepted or refused the change, and prints
+the container's state."""
 
 
 def send_change(release: Release, pod: str, handed: Handed) -> str:
-    """Send a change to a pod's link container; return its state (JSON) after the change."""
+    """Send a change to a pod's link container; return the container's state as JSON."""
     document, number = write_handed(handed), read_change(handed.change).number
     words = ["sh", "-c", APPLY_SCRIPT, "sh", FOLDER, number, str(len(document.encode()))]
     command = [*release.flags, "exec", "--stdin", pod, "--container=link", "--", *words]
@@ -103,13 +103,13 @@ def send_change(release: Release, pod: str, handed: Handed) -> str:
 
 
 class Sent(NamedTuple):
-    """A change that was sent to both link containers, and that neither refused.
+    """A change that was sent to both link containers, and that neither container has refused.
 
     Attributes:
         edit: The edited profile.
         files: Files for the ConfigMap.
-        states: For each direction that reports its state: the state after the change.
-        failed: For each other direction: the error.
+        states: States of the containers that have answered, after the change.
+        failed: Errors of the containers that have not answered.
     """
 
     edit: Edit
@@ -131,11 +131,11 @@ def send(
         release: The release.
         link: The present link of the release.
         profile: New profile, as in `cloudrc.config.load.edit_profile`.
-        settings: Values to set, also as in `edit_profile`.
-        note: Returns the text of a file beside the profile: who changed the profile, and why.
+        settings: Values to set, as in `cloudrc.config.load.edit_profile`.
+        note: Makes the record of the change: who changed the profile, and why.
 
     Raises:
-        BadInputError: If the request is not valid, or a container refuses the change.
+        BadInputError: If the request is not valid, or if a container refuses the change.
     """
     edit, files = with_files(link.files, profile, settings)
     files[CHANGE_FILE] = note(edit)
@@ -170,7 +170,7 @@ def send(
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
-    """Write a change into the ConfigMap; raise an error if that or a container has failed."""
+    """Write a change into the ConfigMap; raise an error if the write or a container has failed."""
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:
@@ -186,7 +186,6 @@ def keep(release: Release, link: LinkParts, sent: Sent) -> None:
 
 
 def _needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
-    """Select from a ConfigMap's files the profile and the files that the profile names."""
     ways = [value for value in values.values() if isinstance(value, dict)]
     named = {Path(str(way[key])).name for way in ways for key in FILE_READERS if way.get(key)}
     return {name: text for name, text in files.items() if name == PROFILE or name in named}
@@ -198,7 +197,7 @@ def with_files(
     """Edit the profile in `files`; return the edit, and the files that are new or changed.
 
     Raises:
-        BadInputError: If the request is not valid, or the files are too large for a ConfigMap.
+        BadInputError: If the request is not valid, or if the files are too large for a ConfigMap.
     """
     new: dict[str, str] = {}
     with TemporaryDirectory(prefix="cloudrc-") as name:

@@ -1,7 +1,7 @@
-"""Access the pods of a release: find them, explain failures, forward ports, read tokens and files.
+"""Access the pods of a release: find them, explain failures, forward ports, fetch files.
 
-A recording is copied while it grows. The end of the copy may be cut off, as after a kill; the rest
-is readable.
+A recording grows while it is copied. Its copy may therefore end in the middle of a record, like the
+recording of a killed process; everything before is readable.
 """
 
 from __future__ import annotations
@@ -41,40 +41,40 @@ FATAL = {
     ),
     **dict.fromkeys(("CrashLoopBackOff", "Error"), "container '{name}' ends repeatedly{end}"),
 }
-"""Reason, in Kubernetes' words, why a container will never run -> description."""
+"""Reason in Kubernetes' words why a container will never run -> text of the error message."""
 RESTARTS_MAX = 2
-"""Largest number of restarts up to which a container may still start."""
+"""Largest number of restarts after which a container is still expected to start."""
 TOKENS, OPERATOR = "tokens", "operator"
-"""Volume with the API's tokens in the pods of cloud and missions, and key of the operator's."""
+"""Name of the volume with the API's tokens, and of the file in it with the operator's token."""
 API_PORT = 8080
-"""TCP port of teleop's API in the cloud pod."""
+"""TCP port of teleop's API in cloud's pod."""
 METRICS = {
     "world": {"world": 9100, "link": 9102},
     "cloud": {"cloud": 9100, "teleop": 9101, "link": 9102},
 }
-"""Component -> container -> port of its metrics."""
+"""Component -> container -> TCP port of the container's metrics."""
 DATA = "/var/lib/cloudrc"
 """Folder of the recordings in the pods of world and cloud."""
 NO_PROXY = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-"""Opens URLs on this machine and ignores proxies that environment variables name."""
+"""Opens URLs of this machine directly, even if environment variables name a proxy."""
 START_LIMIT = 20.0
-"""Time limit for kubectl to forward the ports [s]."""
+"""Time limit for kubectl to start to forward ports [s]."""
 LOOK_PERIOD = 0.05
-"""Time between two reads of kubectl's output [s]."""
+"""Time between two checks of kubectl's output [s]."""
 COPY_LIMIT, READ_LIMIT = 120.0, 30.0
-"""Time limits to copy one recording, and to read the metrics or the log of a container [s]."""
+"""Time limits to copy one recording, and to read the metrics or the log of one container [s]."""
 _FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
 
 
 def list_pods(release: Release, component: str) -> list[Any]:
-    """List the pods of a component, the newest first, without pods that are being deleted."""
+    """List the pods of a component, the newest first; omit pods that are being deleted."""
     found = release.find("pods", component)
     alive = [pod for pod in found if pod.metadata.deletion_timestamp is None]
     return sorted(alive, key=lambda pod: str(pod.metadata.creation_timestamp), reverse=True)
 
 
 def find_pod(release: Release, component: str) -> Any:
-    """Find the newest running pod of a component; the error says whether the release exists."""
+    """Find the newest running pod of a component; else raise a ClusterError with the cause."""
     pods = list_pods(release, component)
     if not pods:
         raise _no_release(release)
@@ -89,7 +89,7 @@ def find_pod(release: Release, component: str) -> Any:
 
 
 def find_deployment(release: Release, component: str) -> Any:
-    """Find the Deployment of a component; the error says how to install a missing release."""
+    """Find the Deployment of a component; raise a ClusterError if the release does not exist."""
     found = release.find("deployments", component)
     if not found:
         raise _no_release(release)
@@ -105,7 +105,7 @@ def _no_release(release: Release) -> ClusterError:
 
 
 def pod_failure(pod: Any) -> str:
-    """Describe in one sentence why a pod will never run; "" if the pod may run."""
+    """Describe in one sentence why a pod will never run; return "" if the pod may run."""
     for status in container_statuses(pod):
         waiting, ended = status.state.waiting, status.last_state and status.last_state.terminated
         reason = waiting.reason if waiting else ""
@@ -126,17 +126,17 @@ def pod_failure(pod: Any) -> str:
 
 
 def container_statuses(pod: Any) -> list[Any]:
-    """List the states of a pod's containers, those that start first at the front."""
+    """List the statuses of a pod's containers, init containers first."""
     return [*(pod.status.init_container_statuses or []), *(pod.status.container_statuses or [])]
 
 
 def one_line(text: str | None) -> str:
-    """Write a text of Kubernetes on one line."""
+    """Join the lines of a text from Kubernetes."""
     return " ".join((text or "").split())
 
 
 def tokens_secret(release: Release) -> str:
-    """Find the name of the Secret with the API's tokens."""
+    """Return the name of the Secret with the API's tokens."""
     for volume in find_deployment(release, "cloud").spec.template.spec.volumes or []:
         if volume.name == TOKENS and volume.secret is not None:
             return str(volume.secret.secret_name)
@@ -147,9 +147,9 @@ def tokens_secret(release: Release) -> str:
 
 
 def operator_token(release: Release) -> str:
-    """Read the operator's token; the user needs the right to get Secrets.
+    """Read the operator's token; the user needs the permission to get Secrets.
 
-    The message of an error never contains a token.
+    No error message contains the token.
     """
     name = tokens_secret(release)
     secret = release.request("get", "secrets", name=name)
@@ -165,14 +165,14 @@ def operator_token(release: Release) -> str:
 
 @contextmanager
 def api_url(release: Release) -> Iterator[str]:
-    """Forward a port to a release's API while the block runs, and yield the API's URL."""
+    """Forward a port of this machine to a release's API during the `with` block; yield the URL."""
     with forwarded(release, find_pod(release, "cloud").metadata.name, [API_PORT]) as ports:
         yield f"http://127.0.0.1:{ports[API_PORT]}"
 
 
 @contextmanager
 def forwarded(release: Release, pod: str, ports: Sequence[int]) -> Iterator[dict[int, int]]:
-    """Forward ports of a pod while the block runs, including ports on its loopback device.
+    """Forward ports of a pod to this machine during the `with` block, also loopback ports.
 
     Yields:
         Port in the pod -> port on 127.0.0.1 of this machine.
@@ -201,7 +201,6 @@ def forwarded(release: Release, pod: str, ports: Sequence[int]) -> Iterator[dict
 
 
 def _forwarded_ports(output: IO[bytes]) -> dict[int, int]:
-    """Read from kubectl's output: port in the pod -> port on this machine."""
     text = os.pread(output.fileno(), 4096, 0)
     return {int(remote): int(local) for local, remote in _FORWARDING.findall(text)}
 
@@ -209,11 +208,11 @@ def _forwarded_ports(output: IO[bytes]) -> dict[int, int]:
 def fetch_recording(
     release: Release, component: str, target: Path, *, previous: bool = False
 ) -> None:
-    """Copy the recording of "world" or "cloud" to a file.
+    """Copy the recording of "world" or "cloud" from its pod to a file.
 
     Args:
         release: The release.
-        component: Name of pod and container.
+        component: "world" or "cloud", the name of both pod and container.
         target: File to write.
         previous: Whether to copy the recording from before the container's last restart.
     """
@@ -225,7 +224,7 @@ def fetch_recording(
 
 
 def fetch_metrics(release: Release, component: str) -> dict[str, str]:
-    """Read the metrics of a pod: container -> text in Prometheus' format."""
+    """Read the metrics of a component's pod: container -> text in Prometheus' format."""
     pod, ports = find_pod(release, component).metadata.name, METRICS[component]
     texts = {}
     with forwarded(release, pod, list(ports.values())) as local:
@@ -242,7 +241,7 @@ def fetch_metrics(release: Release, component: str) -> dict[str, str]:
 
 
 def fetch_logs(release: Release, component: str) -> dict[str, str]:
-    """Read the logs of a pod: container -> text."""
+    """Read the logs of a component's pod: container -> text."""
     pod = find_pod(release, component)
     return {
         container.name: pod_log(release, pod.metadata.name, container.name)

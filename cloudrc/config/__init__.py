@@ -1,1 +1,1 @@
-"""Read, complete and check configuration files; the result is one immutable experiment."""
+"""Read and check configuration files, fill in defaults, and return an immutable experiment."""

@@ -1,7 +1,7 @@
-"""Read and write YAML, and keep the file and line of each value.
+"""Read and write YAML, and keep the file and line of each value for error messages.
 
-Deviation: scalars follow YAML 1.2's core schema, not PyYAML's 1.1: `1e-3` is a number; `on`, `yes`
-and `12:30` are text. Duplicate keys are refused.
+Scalars follow the core schema of YAML 1.2, while PyYAML alone follows YAML 1.1. Thus `1e-3` is a
+number, and `on`, `yes` and `12:30` are text. Duplicate keys are refused.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from cloudrc import files
 from cloudrc.errors import BadInputError
 
 KeyPath = tuple[str, ...]
-"""Keys from the top of a document down to a value; the indices of lists are text, too."""
+"""The keys that lead from the top of a document to a value. The index of a list entry is text."""
 
 SIZE_MAX = 8 << 20
-"""Largest file that is read [bytes]: more than any mission needs."""
+"""Largest size of a configuration file [bytes]."""
 VALUES_MAX = 300_000
-"""Largest number of values in a document: aliases inside aliases multiply the values."""
+"""Largest number of values in a document. A short file with nested aliases can have far more."""
 SET_LABEL = "--set"
-"""Label of a value that was set on the command line."""
+"""`Source.label` of a value from the command line."""
 
 _SCALARS = {
     "null": (r"~|null|Null|NULL|", [*"~nN", ""]),
@@ -37,7 +37,7 @@ _SCALARS = {
         [*"-+.0123456789"],
     ),
 }
-"""Tag of each kind of scalar -> its pattern and possible first characters.
+"""Type of a scalar -> pattern of its text, and possible first characters of the text.
 Source: YAML 1.2.2, section 10.3.2."""
 _TAG = "tag:yaml.org,2002:"
 
@@ -55,7 +55,6 @@ class _Dumper(yaml.SafeDumper):
     yaml_implicit_resolvers: dict[str, list[Any]] = {}  # noqa: RUF012
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write every value in full, because people read resolved files."""
         return True
 
 
@@ -66,14 +65,14 @@ _Loader.add_constructor(f"{_TAG}int", lambda loader, node: int(node.value))
 
 
 def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
-    """Parse one YAML document; `name` stands for it in messages.
+    """Parse one YAML document; `name` is the document's name in error messages.
 
     Returns:
-        The document as dictionaries with text keys, lists and scalars; and the line of each value,
-        counted from 1.
+        The document as dictionaries with text keys, lists and scalars. Also the line number of each
+        value; the first line has the number 1.
 
     Raises:
-        BadInputError: If the text is not YAML, repeats a key or has an object that is not plain.
+        BadInputError: If the text is not YAML, repeats a key or contains tags of other types.
     """
     lines: dict[KeyPath, int] = {}
     try:
@@ -93,20 +92,20 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
 
 
 def parse_value(text: str, name: str) -> Any:
-    """Parse a value of the command line; `name` stands for it in messages.
+    """Parse a value from the command line; `name` is the value's name in error messages.
 
-    In a scalar without quotes, ` #` starts no comment and `: ` starts no mapping. Several lines are
-    a YAML document.
+    Text without quotes and brackets is one scalar, even if it contains ` #` or `: `. A value of
+    several lines is a YAML document.
 
     Raises:
-        BadInputError: If brackets or quotes hold no YAML, or if text follows them.
+        BadInputError: If a value in brackets or quotes is not YAML, or if more text follows it.
     """
     stripped = text.strip()
     if "\n" in stripped:
         return parse_yaml(text, name)[0]
     quoted = len(stripped) > 1 and stripped[0] in "'\"" and stripped[0] == stripped[-1]
     if quoted or stripped.startswith(("[", "{")):
-        # A comment would swallow the outer bracket; what follows the value adds an element.
+        # If text follows the value, the list has a second entry. A comment hides the last bracket.
         value, *rest = parse_yaml(f"[{stripped}, ]", name)[0]
         if rest:
             raise BadInputError(f"{name}: {stripped}: text behind the value; delete or quote it")
@@ -117,7 +116,7 @@ def parse_value(text: str, name: str) -> Any:
 
 
 def write_yaml(value: Any) -> str:
-    """Write plain values as YAML; `parse_yaml` of the text returns equal values."""
+    """Format plain values as YAML; `parse_yaml` of the result returns equal values."""
     return yaml.dump(
         value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None,
         width=100,
@@ -125,7 +124,7 @@ def write_yaml(value: Any) -> str:
 
 
 def _construct(loader: Any, node: Any, path: KeyPath, lines: dict[KeyPath, int]) -> Any:
-    """Convert a node to plain values, and note the lines of all values in it."""
+    """Convert a YAML node to plain values; store the line of each value in `lines`."""
     lines.setdefault(path, node.start_mark.line + 1)
     if len(lines) > VALUES_MAX:
         raise _refuse(node, f"more than {VALUES_MAX} values")
@@ -154,13 +153,13 @@ def _refuse(node: Any, problem: str) -> yaml.MarkedYAMLError:
 
 
 class Source(NamedTuple):
-    """The place where a value is written."""
+    """Where a value comes from, for error messages and relative paths."""
 
     label: str  # "paper.yaml:12", "--set"
-    folder: Path  # where a relative path in the value starts
+    folder: Path  # a relative path in the value starts here
 
     def absolute(self, path: str) -> Path:
-        """Resolve a path that this file contains; never raise an exception."""
+        """Make the `path` from a configuration file absolute; the target need not exist."""
         return Path(os.path.realpath(self.folder / os.path.expanduser(path)))
 
 
@@ -170,14 +169,18 @@ class Document:
 
     Attributes:
         tree: Dictionaries with text keys, lists and scalars.
-        sources: Path of a value -> its place; a value without an entry has its parent's place.
+        sources: Keys of a value -> source of the value. A value without an entry comes from the
+            same source as its parent.
     """
 
     tree: dict[str, Any]
     sources: dict[KeyPath, Source] = field(default_factory=dict)
 
     def source(self, path: KeyPath) -> Source:
-        """Find the place of a value: a `--set` at or below `path`, else the nearest place above."""
+        """Find the source of the value at `path`.
+
+        If `--set` has set the value or a part of it, the source is `--set`.
+        """
         for key, source in self.sources.items():
             if source.label == SET_LABEL and key[: len(path)] == path:
                 return source
@@ -185,14 +188,14 @@ class Document:
         return next(filter(None, above), Source("default", Path()))
 
     def get(self, *path: str) -> Any:
-        """Return the value at `path`; None if it or one of its parents is missing."""
+        """Return the value at `path`, or None if there is no such value."""
         value: Any = self.tree
         for key in path:
             value = child(value, key)
         return value
 
     def set_value(self, path: KeyPath, value: Any, source: Source) -> None:
-        """Set the value at `path`; its parents exist, and an index may be a list's length."""
+        """Set the value at `path`, whose parents exist; an index equal to the length appends."""
         parent = self.get(*path[:-1])
         if isinstance(parent, list):
             parent[int(path[-1]) : int(path[-1]) + 1] = [value]
@@ -203,7 +206,7 @@ class Document:
 
 
 def child(node: Any, key: str) -> Any:
-    """Return the value at a key of a mapping or an index of a list; None if there is none."""
+    """Return the value at a key of a mapping or at an index of a list; None if there is none."""
     if isinstance(node, dict):
         return node.get(key)
     if isinstance(node, list) and key.isdecimal() and int(key) < len(node):
@@ -212,10 +215,10 @@ def child(node: Any, key: str) -> Any:
 
 
 def read_document(path: Path, name: str) -> Document:
-    """Read a YAML file whose top level is a mapping; `name` stands for it in messages.
+    """Read a YAML file whose top level is a mapping; `name` is its name in error messages.
 
     Raises:
-        BadInputError: If the file cannot be read, is too large, or is no such YAML.
+        BadInputError: If the file cannot be read, is too large, or is not a YAML mapping.
     """
     try:
         text = files.read(path, SIZE_MAX).decode("utf-8")

@@ -1,11 +1,11 @@
 """Load an experiment and resolve it: replace names and defaults by values.
 
-The steps: read the file; apply `--set`; insert mission and link profile, below the experiment's own
-values; complete the plug-ins; check everything against the schema, the scene and the disk. One
-error lists all problems, each with its line.
+Loading reads the file, applies `--set`, inserts the mission and the link profile, and fills in the
+parameters of the plug-ins. It then checks the result against the schema, the scene and the files
+on disk. One error lists all problems, each with its file and line.
 
 A resolved experiment contains its mission, both directions of the link, all parameters of the
-plug-ins and all limits. Written to a file, it is an experiment file that gives the same run.
+plug-ins and all limits. If `dump` writes it to a file, `cloudrc run FILE` repeats the flight.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ from cloudrc.geometry.scene import load_scene
 from cloudrc.link.traces import read_table, read_trace
 
 COMMAND_AGE_MAX_MS = 250.0
-"""Value of guard.command_age_max_ms if neither experiment nor profile gives one [ms].
+"""Default of guard.command_age_max_ms if experiment and link profile give no value [ms].
 Source: docs/reference/plant.md, "Command age"."""
 DIRECTIONS = ("uplink", "downlink")
 FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
-"""Key of a direction whose value is a path -> function that reads the file."""
+"""Key of a direction whose value is the path of a file -> function that reads this file."""
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def speed_cap(command_age_max_ms: float) -> float:
-    """Compute the largest speed from which the robot stops within 8.7 m [m/s].
+    """Compute the largest speed v [m/s] from which the robot stops within 8.7 m.
 
-    The robot flies for T = `command_age_max_ms` [ms] plus 0.2 s before it brakes at 3 m/s^2:
-    v · (T + 0.2 s) + v^2 / 6 = 8.7 m.
+    If commands stop arriving, the robot keeps its speed for T + 0.2 s, where T is
+    `command_age_max_ms` [ms], and then brakes at 3 m/s^2: v · (T + 0.2 s) + v^2 / 6 = 8.7 m.
     Source: docs/reference/plant.md, "Speed cap".
     """
     delay = command_age_max_ms * 1e-3 + 0.2
@@ -69,7 +69,7 @@ def speed_cap(command_age_max_ms: float) -> float:
 
 
 class ResolvedGuard(Guard):
-    """A guard with a value for each limit."""
+    """The section `guard` with a value for each limit."""
 
     command_age_max_ms: CommandAge = COMMAND_AGE_MAX_MS
     speed_max_mps: Speed = Field(None, validate_default=True)
@@ -91,7 +91,7 @@ class ResolvedGuard(Guard):
 
 
 class ResolvedCloud(Cloud):
-    """Plug-ins with all their parameters, defaults included."""
+    """The section `cloud` with all parameters of the plug-ins, including defaults."""
 
     estimator: PlugIn
     predictor: PlugIn
@@ -99,7 +99,7 @@ class ResolvedCloud(Cloud):
 
 
 class ResolvedExperiment(Experiment):
-    """An experiment with values in place of all names and defaults."""
+    """An experiment in which all names and defaults are replaced by values."""
 
     mission: Mission
     guard: ResolvedGuard
@@ -107,12 +107,12 @@ class ResolvedExperiment(Experiment):
 
     @property
     def uplink(self) -> Direction:
-        """All conditions from world to cloud."""
+        """All conditions of the link from world to cloud."""
         return self.link.uplink
 
     @property
     def downlink(self) -> Direction:
-        """All conditions from cloud to world."""
+        """All conditions of the link from cloud to world."""
         return self.link.downlink
 
 
@@ -121,11 +121,11 @@ def load_experiment(
 ) -> ResolvedExperiment:
     """Load an experiment for a flight by name or path, and import the plug-ins that it names.
 
-    The texts `key=value` in `settings` override the file, in any order. Paths become absolute.
-    `build` is False for `read_experiment`.
+    The texts `key=value` in `settings` override values of the file. Relative paths become absolute.
+    Without `build`, neither import nor check the plug-ins.
 
     Raises:
-        BadInputError: If the experiment has problems; one line, or a summary and a line for each.
+        BadInputError: If the experiment has problems. The text lists each problem on its own line.
     """
     name = str(name)
     document = shipped.read("experiment", name, Path())
@@ -156,15 +156,15 @@ def load_experiment(
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment for a process that runs no cloud: plug-ins are not imported nor checked.
+    """Load an experiment without importing or checking its plug-ins, for processes without cloud.
 
-    The plug-ins have only the parameters that the file gives; the config.yaml of a run gives all.
+    The plug-ins have only the parameters that the file gives. The config.yaml of a run gives all.
     """
     return load_experiment(name, settings, build=False)
 
 
 def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
-    """Load a link profile by name or path (relative to `folder`); raises BadInputError."""
+    """Load a link profile by name, or by path relative to `folder`; raises BadInputError."""
     return check_profile(shipped.read("profile", str(name), folder or Path()), str(name))
 
 
@@ -174,20 +174,21 @@ def check_profile(document: Document, name: str) -> Profile:
 
 
 def dump(experiment: ResolvedExperiment) -> str:
-    """Write an experiment as YAML that loads as an equal experiment without other files.
+    """Format an experiment as YAML; loading this YAML returns an equal experiment.
 
-    The text does not contain traces and plug-ins outside the package, only their absolute paths.
+    The YAML contains mission and link profile. Of traces and of plug-ins outside the package, it
+    contains the absolute paths only.
     """
     return write_yaml(experiment.model_dump(mode="json"))
 
 
 def fingerprint(experiment: ResolvedExperiment) -> str:
-    """Return the SHA-256 of the text from `dump`; equal hashes mean equal flights."""
+    """Return the SHA-256 of the YAML from `dump`; experiments with equal hashes are equal."""
     return hashlib.sha256(dump(experiment).encode()).hexdigest()
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Whether a key is inside the mission or the profile, which a file may give by name."""
+    """Whether a key is inside the mission or the profile, for which a file may give a name."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
@@ -195,9 +196,9 @@ def _is_inside_name(path: KeyPath) -> bool:
 def _validate(
     document: Document, model: type[_Model], name: str, found: Sequence[Problem] = ()
 ) -> _Model:
-    """Check a document against its model, and raise an error if it or `found` has problems."""
+    """Check a document against its model; raise an error about all problems, including `found`."""
     known = {problem.path for problem in found}
-    # Messages describe what a file may contain: in a file, a mission may be a name, too.
+    # Error messages describe a file, in which for example the mission may be a name.
     file_model = Experiment if model is ResolvedExperiment else model
     try:
         # In JSON mode pydantic accepts lists for tuples and is still strict.
@@ -216,7 +217,7 @@ def _default(document: Document, path: KeyPath, value: Any) -> None:
 
 @contextmanager
 def _collect(found: list[Problem], path: KeyPath) -> Iterator[None]:
-    """Convert an error about the value at `path` to a problem, so that one error lists all."""
+    """If the block raises a BadInputError, add a problem of the value at `path` to `found`."""
     try:
         yield
     except BadInputError as error:
@@ -224,7 +225,7 @@ def _collect(found: list[Problem], path: KeyPath) -> Iterator[None]:
 
 
 def _inline_mission(document: Document) -> None:
-    """Replace the mission's name by the contents of its file."""
+    """Replace the name of the mission by the content of the mission's file."""
     _default(document, ("mission",), Experiment().mission)
     name = document.tree["mission"]
     if isinstance(name, str):
@@ -235,7 +236,7 @@ def _inline_mission(document: Document) -> None:
 
 
 def _inline_profile(document: Document) -> None:
-    """Insert the profile's values where the experiment gives none for a direction."""
+    """Insert values of the link profile for keys of a direction that the experiment lacks."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
     if not isinstance(name, str) or _has_all_values(document):
@@ -260,7 +261,7 @@ def _inline_profile(document: Document) -> None:
 
 
 def _has_all_values(document: Document) -> bool:
-    """Whether both directions have every key, as in a resolved file."""
+    """Whether both directions have all keys, as in the file of a resolved experiment."""
     given = [document.get("link", way) for way in DIRECTIONS]
     return all(
         isinstance(one, dict) and one.keys() >= Direction.model_fields.keys() for one in given
@@ -268,7 +269,7 @@ def _has_all_values(document: Document) -> bool:
 
 
 def _remove_profile_values(document: Document) -> None:
-    """Remove the profile's values from a resolved file, before another profile replaces it."""
+    """Remove the values of the present profile, before another profile replaces this profile."""
     if not _has_all_values(document):
         return
     for way in DIRECTIONS:
@@ -284,7 +285,7 @@ def _remove_profile_values(document: Document) -> None:
 
 
 def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
-    """Make the paths of traces and tables absolute; check that the files can be read."""
+    """Make the paths of traces and tables absolute, and read these files; return problems."""
     found: list[Problem] = []
     for path in ((*above, way, key) for way in DIRECTIONS for key in FILE_READERS):
         given, source = document.get(*path), document.source(path)
@@ -297,7 +298,6 @@ def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
 
 
 def _resolve_files(document: Document) -> list[Problem]:
-    """Make the paths of robot, scene and the user's metrics absolute; metrics are not imported."""
     found: list[Problem] = []
     for key in ("robot", "scene"):
         path, name = ("world", key), document.get("world", key)
@@ -306,7 +306,7 @@ def _resolve_files(document: Document) -> list[Problem]:
                 folder = document.source(path).folder
                 document.tree["world"][key] = shipped.model_path(key, name, folder)
     names = document.get("report", "metrics")
-    if isinstance(names, str):  # a single one
+    if isinstance(names, str):  # one metric without a list
         names = document.tree["report"]["metrics"] = [names]
     for index, name in enumerate(names if isinstance(names, list) else ()):
         if isinstance(name, str) and plugins.is_path(name):
@@ -316,15 +316,15 @@ def _resolve_files(document: Document) -> list[Problem]:
 
 
 CHANGEABLE_KEYS = Change.model_fields.keys() - {"at_s"}
-"""Keys of a direction that an entry of `changes` may set."""
+"""Keys of a direction that an entry of its list `changes` may set."""
 TIME_LINE_KEYS = ("changes", "trace", "blackouts")
-"""Keys of a direction that make its conditions depend on time."""
+"""Keys of a direction by which the conditions of the link depend on time: the time line."""
 _HERE = "link set"
 _EXAMPLE = "for example downlink.delay_ms=120, or --profile handover"
 
 
 class Edit(NamedTuple):
-    """A profile that `cloudrc link set` has edited."""
+    """A link profile after a change by `cloudrc link set`."""
 
     values: dict[str, Any]  # as in a profile file, without defaults; paths are absolute
     cause: str  # the request in words
@@ -333,13 +333,13 @@ class Edit(NamedTuple):
 
 
 def edit_profile(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
-    """Replace the present profile by `profile` if that is given, and set values in it.
+    """Set values in the link profile `before`, or in the profile named `profile` if it is given.
 
-    A value that the user sets stays in force: it is removed from the time line (changes, trace).
-    The rest of the time line continues.
+    The time line (changes, trace) no longer changes a key that the user sets, and still changes
+    other keys.
 
     Raises:
-        BadInputError: If the request is empty or not valid.
+        BadInputError: If the request is empty or invalid.
     """
     if profile is None and not settings:
         raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")
@@ -372,7 +372,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
 
 
 def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:
-    """Remove the key that the user sets from a direction's time line; return notes about it."""
+    """Remove `key` from the time line of a direction; return notes for the user about effects."""
     direction = document.get(way)
     if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:
         return []

@@ -1,8 +1,8 @@
-"""Check whether a mission can be flown in a scene.
+"""Check whether the robot can fly a mission in a scene.
 
-Each waypoint must be where the guard lets the robot fly. At each waypoint and on the straight ways
-between them, the way from the spawn included, the whole robot must be clear of the pipes' walls.
-The board is not checked: the paper's last waypoint is behind the board.
+Each waypoint must be in the region in which the guard lets the robot fly. The robot must keep a
+distance from the walls of pipes at each waypoint, and on the straight path to the waypoint from the
+spawn point or from the previous waypoint. The board may be in the way, as in the paper's mission.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from cloudrc.geometry.scene import Scene
 
 _YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"
 _REPORTED = 20
-"""Largest number of problems of one kind that are listed."""
+"""Largest number of problems of one kind in an error message."""
 _SPANS = zip("xyz", fence.INNER_LOW, fence.INNER_HIGH, strict=True)
 _INNER = ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in _SPANS) + " [m]"
-"""Where the guard lets the robot fly, in words."""
+"""Text that describes the region in which the guard lets the robot fly, in the world frame."""
 
 
 def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
-    """List the problems of a mission in a scene, with paths relative to the mission."""
+    """List the problems of a mission in a scene; their paths start at the mission."""
     if mission.steps is not None:
         if mission.waypoints:
             reason = "a mission has waypoints or steps, not both; delete one"
@@ -48,7 +48,7 @@ def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
 def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
-    # A waypoint counts as reached within its tolerance; half of it is left for the flight's errors.
+    # The robot may reach a waypoint at half its tolerance; control errors need the other half.
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
     in_fence = np.all((positions >= fence.LOW) & (positions <= fence.HIGH), axis=1)
     outside = outside_fence(positions, slack) | ~in_fence
@@ -79,7 +79,7 @@ def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
 
 
 def _check_ways(positions: Array, scene: Scene) -> Iterator[Problem]:
-    """List the straight ways between positions [m], shape (n, 3), that lead into a wall."""
+    """List the straight paths between `positions` [m], shape (n, 3), that lead into a wall."""
     through = find_crossed_pipe(scene, positions[:-1], positions[1:])
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
         name = scene.pipes[through[index]].name
@@ -93,10 +93,10 @@ def _check_ways(positions: Array, scene: Scene) -> Iterator[Problem]:
 
 
 def _check_steps(steps: Steps, scene: Scene) -> str:
-    """Check the box that setpoints are drawn from; return the problem, or "" if there is none."""
+    """Check the box of the random setpoints; return the problem, or "" if there is none."""
     axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    with np.errstate(over="ignore"):  # infinity is beyond the fence
+    with np.errstate(over="ignore"):  # an infinite position is outside the fence, too
         positions = np.array(steps.centre_m) + box * np.array(steps.range_m)
     if outside_fence(positions).any():
         return (

@@ -1,13 +1,12 @@
-"""Apply `--set key=value` to a document, and complete the parameters of plug-ins.
+"""Apply `--set key=value` to a document, and fill in the parameters of plug-ins.
 
-- Shorter keys are set first. Therefore the order of `mission=steps` and `mission.steps.count=3`
-  does not matter.
-- If the value is a name, as in `controller: pid`, a longer key turns the name into a mapping:
+- Keys with fewer parts are set first. Therefore the order of `mission=steps` and
+  `mission.steps.count=3` does not matter.
+- A parameter turns the name of a plug-in into a mapping: if the file has `controller: pid`, then
   `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`.
 - An index that is one above the last index appends to a list.
 
-Parameters of a plug-in are checked against the signature of its `build`, which also gives their
-defaults.
+The signature of the function `build` of a plug-in gives types and defaults of its parameters.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _DEFAULTS = Experiment().model_dump(mode="json")
 
 
 def parse_settings(texts: Iterable[str]) -> dict[KeyPath, Any]:
-    """Parse texts `key=value`, the values by `document.parse_value`; shorter keys come first.
+    """Parse texts `key=value`; return path -> value, keys with fewer parts first.
 
     Raises:
         BadInputError: If a text has no key or no `=`, if a key is set twice, or if a value is not
@@ -56,9 +55,9 @@ def parse_settings(texts: Iterable[str]) -> dict[KeyPath, Any]:
 
 
 def apply_overrides(document: Document, overrides: Mapping[KeyPath, Any]) -> None:
-    """Set values in a document, in order.
+    """Set values in a document, in the order of `overrides`.
 
-    A value that is the relative path of a file counts from the working folder.
+    A relative path in a value starts at the working folder.
 
     Raises:
         BadInputError: If an index is not a number or beyond the end of its list.
@@ -72,7 +71,7 @@ def apply_overrides(document: Document, overrides: Mapping[KeyPath, Any]) -> Non
             present = document.get(*path[:depth])
             node = copy.deepcopy(default) if present is None else present
             if path[0] == "cloud" and path[1] in KINDS and depth == 2 and isinstance(node, str):
-                node = {"name": node}  # keeps the place of the name
+                node = {"name": node}  # not by `set_value`: the name keeps its source
                 document.tree["cloud"][key] = node
             elif not isinstance(node, dict | list):
                 document.set_value(path[:depth], [] if below == "0" else {}, source)
@@ -96,9 +95,8 @@ def _check_index(document: Document, path: KeyPath) -> None:
 def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
     """Replace each plug-in of an experiment by a mapping with its name and its parameters.
 
-    With `build`, check all parameters, complete them and build the plug-in once. Without `build`,
-    import nothing, because file and plug-ins may come from somebody else. Return the problems of
-    names and parameters; the schema finds values of a wrong type.
+    With `build`, check the parameters, add defaults, and build each plug-in once as a test. Without
+    `build`, import no plug-in, because it may come from somebody else. Return the problems.
     """
     found: list[Problem] = []
     for key, kind in KINDS.items():
@@ -120,22 +118,22 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
         except BadInputError as error:
             found.append(Problem(path, "", str(error)))
         else:
-            # Not by `set_value`: the given parameters keep their places in the file.
+            # Not by `set_value`: the parameters keep their sources.
             document.tree["cloud"][key] = {"name": name, **parameters}
     return found
 
 
 def build_plugin(kind: str, choice: PlugIn) -> Any:
-    """Build a plug-in of a resolved experiment; convert parameters to the types in its `build`.
+    """Build a plug-in of a resolved experiment; convert its parameters to the declared types.
 
-    `kind` is a key of `cloudrc.plugins.PACKAGES`.
+    `kind` is a key of `cloudrc.plugins.PACKAGES`, such as "controllers".
     """
     checked = _check(kind, choice.name, choice.model_extra or {})
     return plugins.load(kind, choice.name, **dict(checked))
 
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
-    """Create a model of a plug-in's parameters from the signature of its `build`."""
+    """Create a pydantic model of a plug-in's parameters from the signature of its `build`."""
     empty = inspect.Parameter.empty
     fields: dict[str, Any] = {
         name: (

@@ -1,6 +1,6 @@
-"""Describe the problems of a configuration: one line each, with place, reason and remedy.
+"""Describe problems of a configuration, each in one line: file, key, value, and how to fix it.
 
-The texts come from the schema: a key's type, range and unit, and the known key nearest to a typo.
+The texts use the schema: type, range and unit of a key, or the known key most similar to a typo.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _TYPES = {
 }
 _SIGNS = {Ge: ">=", Gt: ">", Le: "<=", Lt: "<"}
 _LISTED = 50
-"""Largest number of problems that are listed."""
+"""Largest number of problems in one error message."""
 
 
 def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:
-    """List all keys without keys below them, and their fields; index 0 stands for any index."""
+    """Yield the keys that have no keys below them, with their fields; "0" stands for any index."""
     for key, info in model.model_fields.items():
         inner = list(_models(info.annotation))
         many = ("0",) if _is_list(info.annotation) else ()
@@ -43,7 +43,7 @@ def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPat
 
 
 def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
-    """Find the field of the last key of `path`; None if the schema has no such field."""
+    """Find the field of the schema at `path`; None if there is no such field."""
     field, models = None, [model]
     for key in path:
         if not key.isdecimal():
@@ -54,7 +54,7 @@ def field_at(model: type[BaseModel], path: KeyPath) -> FieldInfo | None:
 
 
 def expectation(model: type[BaseModel], path: KeyPath) -> str:
-    """Describe what the value at `path` must be: "must be a number >= 0 [ms]"."""
+    """Describe which values are valid at `path`, such as "must be a number >= 0 [ms]"."""
     field = field_at(model, path)
     if field is None:
         return "is not valid"
@@ -75,7 +75,7 @@ def expectation(model: type[BaseModel], path: KeyPath) -> str:
 
 
 def _nearest_key(model: type[BaseModel], path: KeyPath) -> str:
-    """Suggest a known key in place of an unknown key."""
+    """Suggest a known key that is similar to the unknown key at `path`."""
     *above, key = path
     field = field_at(model, tuple(above))
     models = _models(field.annotation) if field else [] if above else [model]
@@ -95,7 +95,7 @@ def _near(key: str, known: list[str]) -> str | None:
 
 
 def _types(annotation: Any) -> Iterator[Any]:
-    """List the plain types and models in an annotation, also those inside aliases and unions."""
+    """Yield all plain types and models in an annotation, also inside aliases and unions."""
     if get_origin(annotation) is Literal:
         return
     arguments = [argument for argument in get_args(annotation) if argument is not Ellipsis]
@@ -119,7 +119,7 @@ def _is_list(annotation: Any) -> bool:
 
 
 def _limits(part: Any) -> Iterator[str]:
-    """List the limits in a field or an annotation, as ">= 0"."""
+    """Yield the limits in a field or an annotation, such as ">= 0"."""
     if isinstance(part, FieldInfo):
         inner = (*part.metadata, part.annotation)
     else:
@@ -138,9 +138,9 @@ def _unit(field: FieldInfo) -> str:
 class Problem(NamedTuple):
     """One problem of a configuration."""
 
-    path: KeyPath  # keys down to the value
-    value: str  # in words; empty without a value
-    reason: str  # what the value must be, and what to do
+    path: KeyPath  # keys that lead to the value
+    value: str  # the value as short text; "" if there is no value
+    reason: str  # why the value is invalid, and how to fix it
 
     def __str__(self) -> str:
         return ": ".join(part for part in (".".join(self.path), self.value, self.reason) if part)
@@ -149,16 +149,15 @@ class Problem(NamedTuple):
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[Problem]:
-    """Convert the errors that `model` raised, at most `limit`; `prefix` are the keys above it."""
+    """Convert validation errors of `model`, at most `limit`; `prefix` is the path of the model."""
     details = error.errors(include_url=False)[:limit]
     return [_problem(detail, model, prefix) for detail in details]
 
 
 def raise_problems(document: Document, problems: Iterable[Problem], name: str) -> None:
-    """Raise a BadInputError that lists all problems with their places; do nothing if none exist.
+    """Raise a BadInputError that lists all problems, if there are any, with file and line.
 
-    If a part of a value has a problem, too, the value's own problem is left out: a plug-in that
-    lacks a parameter is not also "a name instead of a mapping".
+    If a value and a key below it both have problems, list only the problem of the key below.
     """
     every = list(problems)
     above = {problem.path[:n] for problem in every for n in range(1, len(problem.path))}
@@ -173,7 +172,7 @@ def raise_problems(document: Document, problems: Iterable[Problem], name: str) -
 
 
 def in_words(value: Any) -> str:
-    """Describe a value from a file in a short text."""
+    """Describe a value of a configuration in a short text."""
     if isinstance(value, dict):
         return "a mapping"
     if isinstance(value, list | tuple):
@@ -185,7 +184,7 @@ def in_words(value: Any) -> str:
 
 
 _WITHOUT_VALUE = ("extra_forbidden", "missing", "value_error", "too_long")
-"""Types of pydantic's errors whose value is not repeated: it is missing, large or in the reason."""
+"""Types of pydantic's errors after which the message does not repeat the value."""
 _REASONS: Mapping[str, str] = {
     "value_error": "{error}",
     "too_long": "must have at most {max_length} entries",
@@ -194,12 +193,12 @@ _REASONS: Mapping[str, str] = {
     "finite_number": "must be finite",
     "literal_error": "must be {expected}",
 }
-"""Type of pydantic's error -> reason."""
+"""Type of pydantic's error -> format of `Problem.reason`."""
 
 
 def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> Problem:
     kind, keys = detail["type"], tuple(map(str, detail["loc"]))
-    # A union's members have tags such as <name>, which are not keys; an unknown key is kept as is.
+    # Drop the tags of unions, such as <name>: they are not keys. Keep an unknown key unchanged.
     unknown = keys[-1:] if kind == "extra_forbidden" else ()
     known = keys[: len(keys) - len(unknown)]
     path = tuple(key for key in known if not key.startswith("<")) + unknown

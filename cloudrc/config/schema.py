@@ -1,8 +1,8 @@
 """Define every key of experiments, missions and link profiles, with its unit, range and default.
 
 The name of a key ends with its unit (`delay_ms`); `cloudrc/assembly.py` converts the values to SI
-units. Unknown keys are refused. The defaults are the paper's scheme with the published gains.
-`Experiment` is what a file may contain; `config.load.ResolvedExperiment` is what a run flies.
+units. Unknown keys are refused. The defaults are the control scheme and the gains of the paper.
+`Experiment` describes a file. `config.load.ResolvedExperiment` is the result of loading the file.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ Point = tuple[Finite, Finite, Finite]
 NotNegative = Annotated[float, Field(ge=0)]
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 Positive = Annotated[float, Field(gt=0)]
-# The guard's limits have bounds on both sides: none of them can be switched off.
+# Every limit of the guard has a smallest and a largest value, so that nobody can switch it off.
 COMMAND_AGE_MS = 1, 10_000
-"""Range of the age limit of commands: smallest and largest value [ms]."""
+"""Smallest and largest value of guard.command_age_max_ms [ms]."""
 CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
 Speed = Annotated[float, Field(ge=0.01, le=10)]
 Acceleration = Annotated[float, Field(ge=0.1, le=100)]
 YawRate = Annotated[float, Field(ge=0.01, le=10)]
 HoldTime = Annotated[float, Field(ge=0.1, le=3600)]
 DURATION_MAX = 1_000_000
-"""Largest value for a time limit or a dwell in a mission [s]: eleven days."""
+"""Largest value of a time limit, or of a dwell time in a mission [s]: eleven days."""
 Dwell = Annotated[float, Field(ge=0, le=DURATION_MAX)]
 TimeLimit = Annotated[float, Field(gt=0, le=DURATION_MAX)]
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -56,14 +56,14 @@ class GilbertElliott(Section):
     """Loss in bursts: a two-state Markov chain that takes one step per packet."""
 
     bad_start: Probability
-    """Chance per packet that the good state turns bad, 0 to 1; 0: no burst begins"""
+    """Chance per packet that the good state turns bad; 0: no burst begins"""
     bad_end: Probability
-    """Chance per packet that the bad state turns good, 0 to 1; a burst has 1 / bad_end packets on
-    average. Must be above 0 if bad_start is"""
+    """Chance per packet that the bad state turns good; a burst has 1 / bad_end packets on average.
+    Must be above 0 if bad_start is above 0"""
     loss_bad: Probability = 1.0
-    """Chance that a packet is lost in the bad state, 0 to 1; 1: all are lost"""
+    """Chance that a packet is lost in the bad state"""
     loss_good: Probability = 0.0
-    """Chance that a packet is lost in the good state, 0 to 1; 0: none is lost"""
+    """Chance that a packet is lost in the good state"""
     delay_bad_ms: NotNegative = 0.0
     """Extra one-way delay in the bad state [ms]; netem refuses a value above 0"""
 
@@ -90,7 +90,7 @@ class Blackout(Section):
     start_s: NotNegative
     """Start, in time since the link came up [s]"""
     duration_s: Positive
-    """Length [s], above 0"""
+    """Length [s]"""
 
 
 class Change(Section):
@@ -101,9 +101,9 @@ class Change(Section):
     delay_ms: NotNegative | None = None
     """New mean one-way delay [ms]; null: unchanged"""
     jitter_ms: NotNegative | None = None
-    """New jitter [ms], as in the direction; null: unchanged"""
+    """New jitter [ms]; null: unchanged"""
     loss: Loss | None = None
-    """New loss, a chance from 0 to 1 or bursts; null: unchanged"""
+    """New loss; null: unchanged"""
     rate_kbit: Positive | None = None
     """New rate of the bottleneck [kbit/s]; null: unchanged"""
 
@@ -114,38 +114,38 @@ class Direction(Section):
     delay_ms: NotNegative = 0.0
     """Mean one-way delay [ms]; a round trip is the sum of both directions"""
     jitter_ms: NotNegative = 0.0
-    """Spread of the delay [ms]; half width of uniform, standard deviation of the other
+    """Spread of the delay [ms]; half the width of uniform, the standard deviation of the other
     distributions. A delay below 0 becomes 0, which raises the mean"""
     distribution: Literal["uniform", "normal", "pareto", "table"] = "uniform"
-    """Distribution of the jitter; pareto has a long tail; table: that of the delays in the file
-    `table`"""
+    """Distribution of the jitter; pareto has a long tail; table: the delays in the file `table`"""
     table: str | None = None
     """CSV file as for `trace`; its delays, shifted to mean 0 and scaled to `jitter_ms`, are the
     distribution. Needed with distribution: table"""
     correlation: Probability = 0.0
-    """Correlation of a packet's jitter with the next packet's, 0 to 1"""
+    """Correlation between the jitter of a packet and of the next packet"""
     loss: Loss = 0.0
-    """Loss: a chance per packet from 0 to 1, or a mapping for loss in bursts"""
+    """Chance that a packet is lost, or a mapping for loss in bursts"""
     duplicate: Probability = 0.0
-    """Chance that a packet arrives twice, 0 to 1; the copy has its own delay"""
+    """Chance that a packet arrives twice; the copy has its own delay"""
     reorder: Probability = 0.0
-    """Chance that a packet has no delay and overtakes others, 0 to 1; no effect with keep_order"""
+    """Chance that a packet has no delay and so arrives before earlier ones; no effect with
+    keep_order"""
     corrupt: Probability = 0.0
-    """Chance that one bit of a packet is flipped, 0 to 1; the receiver refuses such a packet"""
+    """Chance that one bit of a packet is flipped; the receiver refuses such a packet"""
     keep_order: bool = False
     """Whether packets arrive in the order of sending, as from a queue"""
     rate_kbit: Positive | None = None
-    """Rate of the bottleneck [kbit/s], 28 bytes of headers included; null: none"""
+    """Rate of the bottleneck [kbit/s]; a packet has 28 bytes of headers; null: no bottleneck"""
     queue_packets: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
-    """Packets that the bottleneck holds, with the one being sent; further packets are dropped"""
+    """Packets that the bottleneck holds; further packets are dropped"""
     changes: tuple[Change, ...] = ()
-    """Changes of the conditions over time; at_s must rise"""
+    """Changes of the conditions over time; at_s must rise from entry to entry"""
     trace: str | None = None
-    """CSV file with the columns time_s,delay_ms[,loss]; it replaces delay_ms, and loss if it has
-    that column. A relative path starts at the file that names it"""
+    """CSV file with the columns time_s,delay_ms[,loss], which replace the keys delay_ms and loss. A
+    relative path starts at the folder of the file that names it"""
     loop: bool = False
-    """Whether the trace begins again after its end; then changes and blackouts repeat with it. Not
-    for netem"""
+    """Whether trace, changes and blackouts begin again after the end of the trace; netem refuses
+    it"""
     blackouts: tuple[Blackout, ...] = ()
     """Intervals in which every packet is lost; they may overlap"""
 
@@ -200,17 +200,17 @@ class Waypoint(Section):
     """A point to fly to."""
 
     position_m: Point
-    """Position of the base [m], world frame; must be where the guard lets the robot fly and clear
-    of the pipes' walls, and so must the straight way there"""
+    """Position of the base [m], world frame. The guard must allow the point and the straight line
+    to it, and both must be clear of the pipes' walls"""
     yaw_deg: Finite = 0.0
-    """Heading [deg]; only 0 is accepted, the onboard controller holds yaw at 0"""
+    """Heading [deg]; only 0 is accepted, because the onboard controller holds the yaw at 0"""
     tolerance_m: Positive = 0.10
-    """Distance from the point at which it counts as reached [m]"""
+    """Distance [m] within which the point counts as reached"""
     dwell_s: Dwell = 0.5
-    """Time that the robot must stay within the tolerance [s]; 0: it flies on"""
+    """Time that the robot must stay within the tolerance [s]; 0: the robot flies on at once"""
     time_limit_s: TimeLimit | None = None
-    """Time limit for the leg to this point [s]; a HOLD does not count. Beyond it the mission fails.
-    null: 3 times the expected time"""
+    """Time limit for the flight to this point [s], without time in HOLD. Beyond it the mission
+    fails. null: 3 times the expected time"""
 
 
 class Steps(Section):
@@ -219,12 +219,12 @@ class Steps(Section):
     count: Annotated[int, Field(ge=1, le=1000)] = 10
     """Number of setpoints"""
     period_s: TimeLimit = 4.0
-    """Time between two setpoints [s], whether or not the first was reached"""
+    """Time between two setpoints [s]"""
     centre_m: Point = (0.0, 0.0, 1.2)
     """Centre of the box of setpoints [m], world frame"""
     range_m: NotNegatives = (1.0, 1.0, 0.7)
-    """Half the size of that box per axis [m]; it must be inside the fence and clear of the pipes'
-    walls"""
+    """Half the size of the box per axis [m]; the box must be inside the fence and clear of the
+    pipes' walls"""
 
 
 class Mission(Section):
@@ -233,9 +233,10 @@ class Mission(Section):
     description: str = ""
     """One line about the mission, for lists"""
     start: Literal["spawn", "here"] = "spawn"
-    """Where the mission starts; spawn: the robot's place on the ground; here: where the robot is"""
+    """Where the mission starts; spawn: the start position on the ground; here: where the robot
+    is"""
     waypoints: tuple[Waypoint, ...] = Field((), max_length=MAX_WAYPOINTS)
-    """Points to fly to in this order, at most 10000"""
+    """Points to fly to, in this order"""
     steps: Steps | None = None
     """Random setpoints in place of waypoints"""
 
@@ -244,34 +245,34 @@ class LowLevel(Section):
     """The onboard velocity loop: the published gains at the true time step."""
 
     gain_p: NotNegatives = (4.0, 4.0, 10.0)
-    """Proportional gain per axis [N/(m/s)]; 0 switches the term off"""
+    """Proportional gain per axis [N/(m/s)]"""
     gain_i: NotNegatives = (1.0, 1.0, 2.5)
-    """Integral gain per axis [N/m]; 0 switches the term off"""
+    """Integral gain per axis [N/m]"""
     gain_d: NotNegatives = (0.30, 0.30, 0.50)
-    """Derivative gain per axis [N/(m/s^2)]; 0 switches the term off"""
+    """Derivative gain per axis [N/(m/s^2)]"""
     integral_limit_xy: NotNegative = 0.10
-    """Limit on the integral of the velocity error in x and y [m]; it is clipped there"""
+    """Limit of the integrated velocity error in x and y [m]"""
     integral_limit_z: NotNegative = 0.40
-    """Limit on the integral of the velocity error in z [m]; it is clipped there"""
+    """Limit of the integrated velocity error in z [m]"""
 
 
 class Sensors(Section):
     """White noise on the odometry for cloud; the onboard controller sees the true state."""
 
     position_noise_m: NotNegative = 0.0
-    """Standard deviation of the position noise per axis [m]; 0: none"""
+    """Standard deviation of the position noise per axis [m]"""
     velocity_noise_mps: NotNegative = 0.0
-    """Standard deviation of the velocity noise per axis [m/s]; 0: none"""
+    """Standard deviation of the velocity noise per axis [m/s]"""
 
 
 class World(Section):
     """The robot and its scene."""
 
     robot: str = "pelican"
-    """Robot that ships with cloudrc, or a path of an MJCF file (.xml) for which the onboard
-    controller is made: mass, inertia, rotors"""
+    """Name of a shipped robot, or path of an MJCF file (.xml) with the mass, inertia and rotors for
+    which the onboard controller is made"""
     scene: str = "pipes"
-    """Scene that ships with cloudrc, or a path of an MJCF file (.xml)"""
+    """Name of a shipped scene, or path of an MJCF file (.xml)"""
     low_level: LowLevel = LowLevel()
     sensors: Sensors = Sensors()
 
@@ -280,28 +281,27 @@ class Guard(Section):
     """Limits of the onboard guard; only world reads them."""
 
     command_age_max_ms: CommandAge | None = None
-    """Age limit of a command [ms], counted from the odometry that it is based on. The robot holds
-    its position if its newest command is older. null: the link profile's value, else 250"""
+    """Largest age of the odometry from which a command was computed [ms]. If the newest command is
+    older, the robot holds its position. null: the link profile's value, else 250"""
     speed_max_mps: Speed | None = None
-    """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest speed
-    from which the robot stops within 8.7 m despite commands of that age, 6 at 250 ms; a larger
-    value is refused"""
+    """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest value
+    allowed, with which the robot stops within 8.7 m; 6 if command_age_max_ms is 250"""
     acceleration_max_mps2: Acceleration = 12.0
-    """Cap on the change of the reference velocity [m/s^2]"""
+    """Cap on the acceleration that the guard lets the onboard controller follow [m/s^2]"""
     yaw_rate_max_radps: YawRate = 1.0
     """Cap on the commanded yaw rate [rad/s]; a faster command is shortened"""
     hold_max_s: HoldTime = 60.0
-    """Time in HOLD during a mission after which the robot lands [s]. On the ground the mission ends
-    after the same time without a fresh command, at least 10 s. Below 1 s minus
-    guard.command_age_max_ms, every silence in flight ends in LAND"""
+    """Time in HOLD during a mission after which the robot lands [s]. On the ground, a mission ends
+    after the same time without a fresh command, but not before 10 s. If the value is below 1 s
+    minus guard.command_age_max_ms, every silence in flight ends in LAND"""
 
 
 class Tunnel(Section):
     """How both ends treat late datagrams."""
 
     order: Literal["newest", "arrival"] = "newest"
-    """Which datagram counts; newest: the last sent, a late one is dropped; arrival: the last to
-    arrive"""
+    """newest: the datagram sent last counts, late datagrams are dropped; arrival: the datagram that
+    arrived last counts"""
 
 
 class Link(Section):
@@ -344,17 +344,17 @@ class Criteria(Section):
     contact: bool = True
     """Whether the tip of the arm must touch the board"""
     contact_speed_max_mps: Positive = 0.25
-    """Largest speed of the tip at that touch [m/s]; a faster one is a failure"""
+    """Largest speed of the tip when it touches the board [m/s]; with a higher speed the flight
+    fails"""
     time_limit_s: TimeLimit = 60.0
-    """Time limit of the mission [s], counted from its start; then it fails"""
+    """Time limit of the mission [s], counted from its start; after this time the mission fails"""
 
 
 class Report(Section):
     """Additions to the report of a run."""
 
     metrics: tuple[str, ...] = ()
-    """Your own metrics for `cloudrc run`: paths of Python files; a name here must be installed,
-    else the run is refused"""
+    """Your own metrics for `cloudrc run`: paths of Python files, or names of installed metrics"""
 
 
 class Experiment(Section):

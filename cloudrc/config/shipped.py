@@ -1,4 +1,4 @@
-"""Find configuration files by name or path, and read them."""
+"""Find and read configuration files: shipped files by name, other files by path."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FOLDERS = {
 
 
 def names(kind: str) -> list[str]:
-    """List the shipped files of a kind by their configuration names, sorted."""
+    """List the names of the shipped files of a kind, such as "profile", in alphabetical order."""
     return sorted(path.stem for path in FOLDERS[kind].iterdir() if path.suffix in (".yaml", ".xml"))
 
 
@@ -32,9 +32,7 @@ def describe(kind: str, name: str) -> str:
 
 
 def read(kind: str, name: str, folder: Path) -> Document:
-    """Read an experiment, mission or profile by its name or its path relative to `folder`.
-
-    A path contains a slash or ends with `.yaml`.
+    """Read an experiment, mission or profile by name, or by path relative to `folder`.
 
     Raises:
         BadInputError: If there is no such file, or the file cannot be read.
@@ -43,7 +41,7 @@ def read(kind: str, name: str, folder: Path) -> Document:
         check_name(kind, name)
         return read_document(FOLDERS[kind] / f"{name}.yaml", f"{name}.yaml")
     path = folder / os.path.expanduser(name)
-    if not os.path.exists(path):  # False, not an exception, for an impossible name
+    if not os.path.exists(path):  # unlike Path.exists, no exception for an invalid name
         raise _no_file("no such file", kind, path)
     return read_document(path, name)
 
@@ -72,7 +70,7 @@ def model_path(kind: str, name: str, folder: Path) -> str:
 
 
 def is_path(name: str) -> bool:
-    """Whether a name is the path of a file outside the package."""
+    """Whether `name` is the path of a file, not the name of a shipped file."""
     return "/" in name or "\\" in name or name.endswith((".yaml", ".yml"))
 
 

@@ -1,4 +1,4 @@
-"""Run the endpoints: only drivers own the control loop's clocks, sockets and threads.
+"""Run the endpoints, world and cloud. Only drivers use clocks, sockets and threads for them.
 
-Drivers know only the contract of endpoints in `cloudrc/endpoint.py`.
+Drivers call endpoints only through the interface in `cloudrc/endpoint.py`.
 """

@@ -1,4 +1,4 @@
-"""Serve the metrics and probes of a process over HTTP, on threads of their own."""
+"""Serve the metrics and the health checks of a process over HTTP, on separate threads."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from cloudrc.exposition.table import Kind, Labels, Metric, of_role
 from cloudrc.records import Counted, Record
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
-"""Content type of the text that `generate_latest` makes."""
+"""Content type of Prometheus' text format."""
 CLIENT_WAIT_MAX = 5.0
-"""Longest wait for a client [s]; Prometheus' default scrape timeout is 10 s."""
+"""Longest wait for data from or to a client [s]."""
 CONNECTIONS_MAX = 16
-"""Largest number of connections. One more closes the oldest, so that silent clients use up neither
-the files nor the threads of the process."""
+"""Largest number of open connections. A further connection closes the oldest one, so that idle
+clients cannot use up the files or threads of the process."""
 KEPT = 0.25
-"""How long a page is reused [s]: making a page takes 1.4 ms and may delay the control loop."""
+"""Time for which a page of metrics is reused [s]: making a page may delay the control loop."""
 CONFIG_DIGITS = 12
-"""Length of the shortened hash of the process's configuration [hexadecimal digits]."""
+"""Number of hexadecimal digits that the metrics show of the hash of the configuration."""
 STILL_MAX = 5.0
-"""Time without a record after which the control loop counts as standing still [s]. A running loop
-makes a record every second."""
+"""Time without a record after which the control loop counts as stopped [s]. A running loop makes at
+least one record per second."""
 CGROUP = Path("/sys/fs/cgroup")
 CPU_COUNTS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
-"""Files below CGROUP with a container's CPU counts: of cgroup v2, then two places of cgroup v1."""
+"""Files below `CGROUP` that may contain a container's CPU counts, first of cgroup v2, then v1."""
 
 
 class Answer(NamedTuple):
@@ -53,10 +53,10 @@ class Answer(NamedTuple):
 
 
 class _Server(socketserver.ThreadingTCPServer):
-    """Answers each request on a thread of its own with the page of the requested path.
+    """Answers each request on its own thread.
 
-    `http.server.HTTPServer` is not used, because it may wait for a name server. The accept queue is
-    long, so that a burst of connections delays no probe of kubelet.
+    `http.server.HTTPServer` may wait for a name server and is therefore not used. The queue of new
+    connections is long, so that health checks by Kubernetes succeed during a burst of connections.
     """
 
     allow_reuse_address = True
@@ -71,16 +71,16 @@ class _Server(socketserver.ThreadingTCPServer):
         threading.Thread(target=self.serve_forever, args=(0.25,), daemon=True).start()
 
     def server_bind(self) -> None:
-        """Bind the address; the host `::` also accepts IPv4."""
+        """Bind the address; the host `::` accepts IPv6 and IPv4."""
         if self.address_family == socket.AF_INET6:
             self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         super().server_bind()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer on a new thread; close the oldest connection if there are too many."""
+        """Answer on a new thread; above `CONNECTIONS_MAX`, close the oldest connection."""
         self._newest.append(request)
         if len(self._newest) > CONNECTIONS_MAX:
-            with suppress(OSError):  # it has been answered
+            with suppress(OSError):  # the client has its answer
                 self._newest.popleft().shutdown(socket.SHUT_RDWR)
         super().process_request(request, client_address)
 
@@ -106,11 +106,11 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing: a request comes every few seconds."""
+        """Log nothing, because a request arrives every few seconds."""
 
 
 def read_throttling(root: Path = CGROUP) -> Readings:
-    """Read how much the CPU limit has throttled this container; empty outside a container.
+    """Read how much the CPU limit has throttled this container; {} outside a container.
 
     Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
     Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
@@ -133,18 +133,18 @@ def read_throttling(root: Path = CGROUP) -> Readings:
 
 
 class Exporter:
-    """The metrics of one process."""
+    """Collects the metrics of one process and serves them over HTTP."""
 
     def __init__(self, role: str, *, missions: bool = True) -> None:
-        """Set the role, "world", "cloud", "teleop" or "link".
+        """Set the role of the process: "world", "cloud", "teleop" or "link".
 
-        A cloud with a separate teleop exports no metrics of `missions`.
+        `missions` is False in a cloud whose separate teleop exports the metrics of missions.
         """
         self._role, self._metrics = role, of_role(role)
         self._live = LiveMetrics(role, missions=missions)
         self._sync_age: Callable[[], float | None] = lambda: None
         self._said_ready, self._config = False, ""
-        self._seen_at: float | None = None  # None: the loop has not begun
+        self._seen_at: float | None = None  # time of the newest records; None before the first
         self._server: _Server | None = None
         self._page_lock = threading.Lock()
         self._made_at, self._made_page = -inf, Answer(503, "")
@@ -153,12 +153,12 @@ class Exporter:
         ProcessCollector(registry=self._registry)
 
     def see(self, records: Iterable[Record]) -> None:
-        """Update the metrics with records, oldest first; takes less than 1 us per record."""
+        """Update the metrics with records, oldest first, in less than 1 us per record."""
         self._seen_at = time.monotonic()
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether a process other than world and cloud is ready. Their records show it."""
+        """Set whether teleop or a link is ready. For world and cloud, the records show this."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -168,7 +168,7 @@ class Exporter:
 
     @property
     def link(self) -> Link:
-        """The metrics of the emulated link; only with the role "link"."""
+        """The metrics of the emulated link. Only the role "link" has them."""
         assert self._live.link is not None, "only a link is shaped"
         return self._live.link
 
@@ -181,20 +181,20 @@ class Exporter:
         self.link.asked(direction, delay)
 
     def unresolved(self, count: int) -> None:
-        """Set the count of failed look-ups of the peer's name. Any thread may call this."""
+        """Set the number of failed DNS queries for the peer's name. Any thread may call this."""
         self._live.see([Counted(0, "link", "unresolved", count)])
 
     def recording(self, sync_age: Callable[[], float | None]) -> None:
-        """Set the function that returns the time since the last sync [s]; None before any sync."""
+        """Set the function that returns the time since the recording's last sync to disk [s]."""
         self._sync_age = sync_age
 
     @property
     def is_ready(self) -> bool:
-        """Whether `ready` was set or, for an end of the tunnel, its peer has answered."""
+        """Whether `ready` was set or, in world and cloud, whether the peer's datagrams arrive."""
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
     def serve(self, address: tuple[str, int]) -> int:
-        """Start to answer at a host and port; return the port, which port 0 leaves to the kernel.
+        """Start to serve at a host and port; return the port. For port 0 the kernel chooses one.
 
         Raise a MissingPrerequisiteError if the address cannot be bound.
         """
@@ -214,14 +214,14 @@ class Exporter:
         return int(self._server.server_address[1])
 
     def close(self) -> None:
-        """Stop the server, which takes up to 0.25 s."""
+        """Stop the server; this takes up to 0.25 s."""
         if self._server is not None:
             self._server.shutdown()
             self._server.server_close()
             self._server = None
 
     def collect(self) -> Iterator[Family]:
-        """Yield all current metrics to the registry."""
+        """Yield all current metrics; the registry of prometheus_client calls this."""
         readings: Readings = self._live.read() | read_throttling()
         readings["cloudrc_build_info"] = {(__version__, self._role, self._config): 1.0}
         readings["cloudrc_ready"] = unlabelled(self.is_ready)
@@ -236,7 +236,7 @@ class Exporter:
         return generate_latest(self._registry).decode()
 
     def _page(self) -> Answer:
-        """Return a text at most `KEPT` old; requests wait while a new text is made."""
+        """Return the page of metrics, at most `KEPT` old; one thread at a time makes a new page."""
         with self._page_lock:
             now = time.monotonic()
             if now - self._made_at >= KEPT:
@@ -248,7 +248,7 @@ class Exporter:
         return Answer(200, "ready\n") if self.is_ready else Answer(503, "no peer yet\n")
 
     def _liveness(self) -> Answer:
-        """Answer whether this process's own loop runs, independently of link and other end."""
+        """Answer whether the loop of this process runs, even if the link or the peer is down."""
         still = 0.0 if self._seen_at is None else time.monotonic() - self._seen_at
         if still <= STILL_MAX:
             return Answer(200, "alive\n")
@@ -256,7 +256,6 @@ class Exporter:
 
 
 def _family(metric: Metric, reading: dict[Labels, float] | Histogram) -> Family:
-    """Convert a reading to a metric family of prometheus_client."""
     if isinstance(reading, Histogram):
         bounds = [*map(str, reading.bounds), "+Inf"]
         buckets = list(zip(bounds, reading.cumulative(), strict=True))

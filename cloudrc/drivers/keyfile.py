@@ -1,4 +1,4 @@
-"""Read the key file of an end, and follow its changes in flight, since a Secret may be rotated."""
+"""Read the key file of world or cloud, and reload it in flight: an operator may rotate the key."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from cloudrc.records import Fault
 from cloudrc.tunnel.keys import KeyRing, KeySet, parse
 
 PERIOD_NS = 500_000_000
-"""Time between two checks of the file [ns]; a check is one system call while nothing changes."""
+"""Time between two checks whether the file has changed [ns]; a check costs one system call."""
 SIZE_MAX = 4096
 """Size limit of a key file [bytes]."""
 
 
 class KeyFile:
-    """Follows the key file of one end of the tunnel; `ring` always holds the valid keys."""
+    """Reloads the key file of world or cloud when it changes; `ring` holds the valid keys."""
 
     def __init__(self, path: Path, now_ns: int) -> None:
         """Read the file at `now_ns` [ns, monotonic clock]; raise the errors of `read_keys`."""
@@ -25,9 +25,9 @@ class KeyFile:
         self.ring = KeyRing(read_keys(path))
 
     def follow(self, now_ns: int) -> list[Fault]:
-        """Check the file for changes, if a check is due at `now_ns` [ns, monotonic clock].
+        """Reload the file if it has changed and a check is due at `now_ns` [ns, monotonic clock].
 
-        Return records of a new key or of the reason to keep the old keys.
+        Return a record of the new key, or of the error for which the old keys stay valid.
         """
         if now_ns < self._due_ns:
             return []
@@ -39,7 +39,7 @@ class KeyFile:
         try:
             keys = read_keys(self._path)
         except BadInputError as error:
-            self._seen = None  # try again: `version` does not show a change of permissions
+            self._seen = None  # retry: `version` does not show new permissions
             self._trouble = f"the old keys stay in use: {error}"
             return [] if last == self._trouble else [Fault(now_ns, "key", self._trouble)]
         if keys == before:
@@ -51,9 +51,9 @@ class KeyFile:
 
 
 def read_keys(path: Path, named: str = "--key ") -> KeySet:
-    """Read a key file without waiting, even if it is a pipe; `named` is the option that names it.
+    """Read a key file, without blocking on a pipe; `named` is the flag that gave `path`.
 
-    Raise a BadInputError if the file holds no key. The message quotes no part of the file.
+    Raise a BadInputError if the file contains no key; the text contains no part of the file.
     """
     try:
         return parse(read(path, SIZE_MAX))

@@ -1,12 +1,12 @@
 """Run relay, world, teleop and cloud as processes on this machine and supervise them.
 
-The supervisor starts the processes in the order of their dependencies and reads their feeds. It
-ends all processes when teleop ends after the mission, when another process dies or stands still,
-or when the user interrupts.
+The supervisor (this process) starts the others in the order of their dependencies, and reads the
+records that they print. It ends all processes when teleop ends after the mission, when another
+process ends or hangs, or when the user interrupts.
 
-During a flight, a locked file in a folder of this user, the flight file, names the folder of the
-run and the address of the operator's API. Other programs trust this file, and never a run's folder,
-which may come from somebody else.
+During a flight, the flight file names the folder of the run and the address of the operator's API.
+It is a locked file in a private folder of this user. Commands trust the flight file, but not the
+folder of the run, which may come from somebody else.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
 START_LIMIT = 60.0
-"""Time limit for a process to become ready [s]; a cold start reads some 100 MB from disk."""
+"""Time limit for a process to become ready [s]; the first start reads some 100 MB from disk."""
 STOP_LIMIT = 1.5
 """Time limit for a process to end after SIGTERM [s]; then the process is killed."""
 SILENCE_LIMIT = 5.0
-"""Time without a line from a process after which this process counts as hung [s]. Every process
-sends a line at least once a second."""
+"""Time after the last printed line at which a process counts as hung [s]. Every process prints a
+line at least once a second."""
 PAUSE = 1.0
-"""Longest turn of the supervisor's loop [s]. A longer turn means that the supervisor itself stood
-still: it was stopped, or this machine is overloaded."""
+"""Longest turn of the supervisor's loop [s]. After a longer turn, the supervisor itself was paused,
+for example because this machine is overloaded; that time does not count for time limits."""
 SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
-"""Longest name of a socket of a run, below the folder for temporary files."""
+"""Longest path of a run's socket, relative to the folder for temporary files."""
 API_FILE = "api.json"
-"""File in a run's folder with the address of the run's API, for programs other than cloudrc."""
+"""File in a run's folder with the address of the run's API, for programs of other authors."""
 AUDIT_FILE = "audit.jsonl"
-"""File in a run's folder that logs who sent which command over the API."""
+"""File in a run's folder: a log of the commands that the API received, and of their senders."""
 LINK_FOLDER = "link"
-"""Folder in a run's folder for the relay's state and its changed profile during the flight."""
+"""Folder in a run's folder, for the relay's state and the profile from `cloudrc link set`."""
 UNANNOUNCED = (
     "'cloudrc mission' and 'cloudrc link set' cannot find this run: no folder for its flight file "
     "(XDG_STATE_HOME); give 'cloudrc mission' --api {}"
@@ -58,7 +58,7 @@ UNANNOUNCED = (
 
 
 def places() -> list[Path]:
-    """List the folders for flight files; a login has two, a cron job perhaps only the second.
+    """List the folders for flight files: in XDG_RUNTIME_DIR, if it is set, and XDG_STATE_HOME.
 
     Source: XDG Base Directory Specification.
     """
@@ -69,7 +69,7 @@ def places() -> list[Path]:
 
 @contextlib.contextmanager
 def announced(run: Path, api: str = "") -> Iterator[bool]:
-    """Announce a flight while the block runs; yield whether its flight file could be written.
+    """Keep a flight file while the block runs; yield whether the file could be written.
 
     `run` is the folder of the run, `api` the address of the operator's API ("" without an API).
     """
@@ -79,12 +79,12 @@ def announced(run: Path, api: str = "") -> Iterator[bool]:
 
 
 def _write_flight(place: Path, flight: str, stack: contextlib.ExitStack) -> bool:
-    """Write a locked flight file, which `stack` removes; return whether the folder allows it."""
+    """Write a locked flight file, which `stack` removes; return False if this is impossible."""
     path = place / f"{os.getpid()}-{secrets.token_hex(4)}.json"
     with contextlib.suppress(OSError):
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         if _is_private(place):
-            new = path.with_suffix(".new")  # renamed once it is locked
+            new = path.with_suffix(".new")  # renamed after it is locked
             file = stack.enter_context(new.open("xb", buffering=0))
             for name in (path, new):
                 stack.callback(name.unlink, missing_ok=True)
@@ -96,22 +96,21 @@ def _write_flight(place: Path, flight: str, stack: contextlib.ExitStack) -> bool
 
 
 def under_way() -> dict[Path, str]:
-    """Map the folder of each current flight of this user to the address of its API, or ""."""
+    """Return the flights of this user: folder of the run -> address of its API ("" without)."""
     found = {}
     for path in (path for place in places() if _is_private(place) for path in place.glob("*.json")):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:  # its flight goes on
+            except BlockingIOError:  # locked: the flight is under way
                 flight = json.load(file)
                 found[Path(flight["run"])] = str(flight["api"])
-            else:  # left by a flight that was killed
+            else:  # not locked: the process of this flight was killed
                 path.unlink()
     return found
 
 
 def _is_private(place: Path) -> bool:
-    """Check that a folder exists, that this user owns it, and that nobody else has access."""
     with contextlib.suppress(OSError):
         state = place.stat()
         return state.st_uid == os.getuid() and not state.st_mode & 0o077
@@ -124,15 +123,15 @@ class ProcessDiedError(InvalidRunError):
 
 @dataclass
 class Child:
-    """A process of the run.
+    """A process that the supervisor has started.
 
     Attributes:
-        name: Name of the process's command.
+        name: Command of the process, such as "relay".
         process: The process, running or ended.
         log: File with the process's standard error.
-        unread: Start of a feed line whose end has not arrived yet.
-        heard: When the last line of the feed arrived [s], monotonic clock.
-        ready: Whether the process can receive.
+        unread: Start of a line of the process's output whose end has not arrived yet.
+        heard: Time at which the last line arrived [s], monotonic clock.
+        ready: Whether the process can receive datagrams.
     """
 
     name: str
@@ -143,27 +142,27 @@ class Child:
     ready: bool = False
 
     def take(self, data: bytes) -> list[Record]:
-        """Take the next piece of the feed; return the records that it completes."""
+        """Process the next piece of the process's output; return the records in complete lines."""
         records: list[Record] = []
         *lines, self.unread = (self.unread + data).split(b"\n")
         for line in lines:
             self.heard = time.monotonic()
             self.ready |= line == READY.encode()
-            with contextlib.suppress(ValueError):  # the line READY, or no record
+            with contextlib.suppress(ValueError):  # the line is READY or not a record
                 records.append(from_line(line.decode()))
         return records
 
 
 class LocalRun:
-    """Runs and supervises the four processes of a flight; `notes` has sentences for the report."""
+    """Runs and supervises the four processes of a flight; `notes` are sentences for its report."""
 
     def __init__(
         self, folder: Path, see: Callable[[list[Record]], None], *, api: bool = True
     ) -> None:
-        """Prepare the run in `folder`, which must contain config.yaml; no process is started yet.
+        """Prepare a run in `folder`, which contains config.yaml; start no process yet.
 
-        The run adds world.mcap, cloud.mcap and four logs. `see` gets the records of the processes'
-        feeds; `api` tells whether the operator gets an API during the flight.
+        The run adds world.mcap, cloud.mcap and four logs. `see` is called with the records that the
+        processes print; `api` tells whether teleop serves the operator's API during the flight.
         """
         self._folder, self._see, self._api = folder, see, api
         self._children: list[Child] = []
@@ -171,13 +170,12 @@ class LocalRun:
         self.notes: tuple[str, ...] = ()
 
     def fly(self, limit: float) -> None:
-        """Fly until the mission is over, at most `limit` [s]; then all processes have ended.
+        """Fly until the mission is over, at most `limit` [s]; then end all processes.
 
         Raises:
             ProcessDiedError: If a process ends too early; the message names the process.
-            TimedOutError: If the limit is reached, or if a process falls silent; the message says
-                which.
-            BadInputError: If no folder for sockets has a short path.
+            TimedOutError: If the limit is reached, or if a process hangs; the message names it.
+            BadInputError: If the path of every folder for sockets is too long.
             KeyboardInterrupt: If the user interrupts.
         """
         # A Unix socket's path must be short; the path of the run's folder may be long.
@@ -265,7 +263,6 @@ class LocalRun:
         self._see(self._listen())
 
     def _listen(self) -> list[Record]:
-        """Return the records of all feeds since the last call; wait at most 50 ms."""
         records: list[Record] = []
         for key, _ in self._selector.select(0.05):
             child: Child = key.data
@@ -301,9 +298,9 @@ class LocalRun:
 
 
 def socket_folder() -> str:
-    """Choose a folder for temporary files with a path that is short enough for Unix sockets.
+    """Choose a folder for temporary files whose path is short enough for Unix sockets.
 
-    Raise a BadInputError, which names TMPDIR, if there is no such folder.
+    Raise a BadInputError if there is no such folder.
     """
     given = tempfile.gettempdir()
     for folder in dict.fromkeys((given, os.environ.get("XDG_RUNTIME_DIR", ""), "/tmp")):

@@ -1,4 +1,4 @@
-"""This machine: its monotonic clock, time limits by it, and its Python interpreter."""
+"""Access to this machine: identity of its clock, time limits, and its Python interpreter."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 
 
 def clock_id() -> bytes:
-    """Return 16 bytes that identify the monotonic clock: the kernel's boot id.
+    """Return 16 bytes that identify this machine's monotonic clock: the boot id of the kernel.
 
-    Processes with equal bytes share the clock. Without a boot id the bytes are random, and no
-    one-way delays are reported.
+    World and cloud measure one-way delays only if their bytes are equal. If the kernel has no boot
+    id, the bytes are random, and therefore differ.
     """
     try:
         boot = bytes.fromhex(_boot_id().replace("-", "").strip())
@@ -33,20 +33,20 @@ def _boot_id() -> str:
 
 
 def interpreter(*words: str) -> list[str]:
-    """Build a command that runs this Python interpreter, for example with `-m cloudrc relay`.
+    """Build a command line for this Python interpreter, for example with `-m cloudrc relay`.
 
-    The working folder may hold a run from somebody else. The new process imports from this folder
-    only if the present process does, for example under `python -m`.
+    The working folder may contain files from somebody else. Therefore the new process imports
+    modules from the working folder only if this process does, for example under `python -m`.
     """
     here = os.getcwd() in sys.path or "" in sys.path
     return [sys.executable, *(() if here else ("-P",)), *words]
 
 
 class Deadline:
-    """A time limit that does not count the time in which this process itself stood still.
+    """A time limit that excludes the time for which this process was suspended.
 
     Attributes:
-        pause: Total time for which this process stood still [s].
+        pause: Total time for which this process was suspended [s].
     """
 
     def __init__(
@@ -54,14 +54,14 @@ class Deadline:
     ) -> None:
         """Start a time limit of `limit` [s] by a monotonic `clock` [s].
 
-        `turn_max` [s] is the longest time between two calls of `passed` while this process runs.
+        If more than `turn_max` [s] pass between two calls of `passed`, the process was suspended.
         """
         self._left, self._turn_max, self._clock = limit, turn_max, clock
         self._before = clock()
         self.pause = 0.0
 
     def passed(self) -> bool:
-        """Check whether the limit has passed; to be called in every turn of a loop."""
+        """Return whether the limit has passed. The caller's loop calls this in every turn."""
         now = self._clock()
         turn, self._before = now - self._before, now
         if turn > self._turn_max:

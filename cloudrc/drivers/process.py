@@ -1,7 +1,7 @@
-"""Run one end as a process: record its data, feed its supervisor, and stop on signals.
+"""Run world or cloud as a process: record its data, report to the supervisor, stop on signals.
 
-The process ends on SIGTERM or SIGINT, or when its parent process is gone. It feeds its supervisor
-one line of JSON per record on standard output; prints of plug-ins go to standard error, its log.
+The process ends on SIGTERM or SIGINT, or when its parent process has ended. It prints its feed to
+standard output: a line of JSON per record. Prints of plug-ins go to standard error, the log.
 """
 
 from __future__ import annotations
@@ -46,43 +46,43 @@ if TYPE_CHECKING:
     from cloudrc.record.recorder import Recorder
 
 PARENT = "CLOUDRC_PARENT"
-"""Environment variable that holds the supervisor's process id."""
+"""Environment variable with the process id of the supervisor."""
 READY = "ready"
-"""The line that a process writes when it can receive, and then regularly while its loop runs."""
+"""Line that a process prints when it can receive datagrams, and then every `ALIVE_PERIOD`."""
 ALIVE_PERIOD = 1.0
-"""Time between two lines READY [s]."""
+"""Time between two lines `READY` while the loop of a process runs [s]."""
 EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
-"""Record types of which the feed sends every record."""
+"""Types of records that are always part of the feed."""
 SAMPLED = (TelemetrySent, Control)
-"""Record types of which the feed sends at most one record per `PERIOD_NS`."""
+"""Types of records of which the feed contains at most one record per `PERIOD_NS`."""
 PERIOD_NS = 100_000_000
-"""Shortest time between two samples of the feed, or two checks of the link's state [ns]."""
+"""Shortest time between two records of a type in `SAMPLED`, and between two checks of the link's
+state [ns]."""
 RELEASED_PERIOD_NS = 2_000_000_000
-"""Time between two records of how late the relay's datagrams left [ns]."""
+"""Time between two records of the lateness with which the relay sends datagrams [ns]."""
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
-"""Types of records at which a mission may begin. A recording may be cut at such a record; therefore
-the link's state is recorded again after it."""
+"""Types of records at which a mission may begin. The state of the link is recorded again after such
+a record, so that a recording cut at the record contains the state."""
 NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 """Errors that an unreadable or malformed file can raise."""
 
 
 class StopSignal:
-    """Tells whether the process must end.
+    """Tells whether this process has to end.
 
-    Create this object first: until then, the first process of a container ignores SIGTERM.
+    Create this object first: without it, the first process of a container ignores SIGTERM.
     """
 
     def __init__(self) -> None:
-        """Handle SIGTERM and SIGINT, and remember the parent process."""
         self._asked = False
-        # The supervisor passes its own id, since it may be gone before this line runs.
+        # If the supervisor has ended before this line runs, getppid() is not the supervisor's id.
         parent = os.environ.pop(PARENT, "")
         self._parent = int(parent) if parent.isdecimal() else os.getppid()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._ask)
 
     def __call__(self) -> bool:
-        """Check whether a signal has arrived or the parent process is gone."""
+        """Return whether a signal has arrived or the parent process has ended."""
         return self._asked or os.getppid() != self._parent
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
@@ -90,22 +90,22 @@ class StopSignal:
 
 
 class Feed:
-    """Sends selected records to a pipe without blocking; lines that nobody reads are lost."""
+    """Writes selected records to a pipe, without blocking: lines are lost if the pipe is full."""
 
     def __init__(self, descriptor: int, *, watched: bool = True) -> None:
-        """Make the pipe `descriptor` non-blocking; `watched` tells whether a supervisor reads it.
+        """Make the pipe `descriptor` non-blocking; `watched` tells if a supervisor reads the pipe.
 
-        Without a supervisor, as in a container, the pipe gets only events, as lines of a log.
+        Without a supervisor, as in a container, the pipe is a log and gets only events, in words.
         """
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
         self._links: dict[bool, str] = {}
-        self._rest = b""  # of a line for which the pipe had too little room
+        self._rest = b""  # end of a line for which the pipe had no space
         os.set_blocking(descriptor, False)
 
     @classmethod
     def on_stdout(cls, *, watched: bool = True) -> Feed:
-        """Reserve standard output for the feed; redirect all other prints to standard error."""
+        """Use standard output for the feed only; redirect all other prints to standard error."""
         feed = cls(os.dup(1), watched=watched)
         os.dup2(2, 1)
         return feed
@@ -115,7 +115,7 @@ class Feed:
         self._write(READY)
 
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Wrap the `stop` that a loop calls in every turn: the loop then writes READY lines."""
+        """Return a function for a loop that prints `READY` periodically, and then calls `stop`."""
         due = 0.0
 
         def ask() -> bool:
@@ -128,7 +128,7 @@ class Feed:
         return ask
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Send the records that a supervisor wants to see."""
+        """Write the records that belong to the feed: all of `EVENTS`, some of `SAMPLED`."""
         for record in records:
             if isinstance(record, EVENTS):
                 if not isinstance(record, LinkChanged) or self._is_news(record):
@@ -137,7 +137,7 @@ class Feed:
                 self._write(to_line(record))
 
     def _is_news(self, record: LinkChanged) -> bool:
-        """Tell whether the link has changed: `LinkNotes` also repeats its records."""
+        """Return whether a record shows a change of the link and is not a repetition."""
         last, self._links[record.uplink] = self._links.get(record.uplink), record.conditions
         return last != record.conditions and bool(record.cause)
 
@@ -149,21 +149,21 @@ class Feed:
         return True
 
     def _write(self, line: str) -> None:
-        """Write a whole line or drop the line; the rest of a partly written line comes first."""
+        """Complete the last line, then write a new line; drop the new line if the pipe is full."""
         data = line.encode(errors="backslashreplace") + b"\n"
-        with suppress(OSError):  # full or closed: the flight continues without the feed
+        with suppress(OSError):  # the pipe is full or closed: continue without the feed
             self._rest = self._rest[os.write(self._descriptor, self._rest) :]
             if not self._rest:
                 self._rest = data[os.write(self._descriptor, data) :]
 
 
 def to_line(record: Record) -> str:
-    """Format a record as one line of JSON: the name of its type, then its fields in order."""
+    """Format a record as one line of JSON: a list of the type's name and the fields' values."""
     return json.dumps([type(record).__name__, record])
 
 
 def in_words(event: GuardChange | MissionEvent | Fault | LinkChanged) -> str:
-    """Describe an event for a log or a screen."""
+    """Describe an event in a line of text."""
     if isinstance(event, GuardChange):
         return f"guard: {event.state.name}, {event.cause}"
     if isinstance(event, LinkChanged):
@@ -175,7 +175,7 @@ def in_words(event: GuardChange | MissionEvent | Fault | LinkChanged) -> str:
 
 
 def from_line(line: str) -> Record:
-    """Parse a record from its line; raise a ValueError if the line is not a record."""
+    """Parse a line from `to_line`; raise a ValueError if the line is not a record."""
     try:
         name, values = json.loads(line)
         kind = getattr(kinds, name)
@@ -188,7 +188,6 @@ def from_line(line: str) -> Record:
 
 
 def _from_json(kind: Any, value: Any) -> Any:
-    """Convert a JSON value to the type `kind`."""
     if hasattr(kind, "_fields"):
         hints = get_type_hints(kind)
         fields = zip(kind._fields, value, strict=True)
@@ -199,10 +198,10 @@ def _from_json(kind: Any, value: Any) -> Any:
 
 
 class LinkNotes:
-    """Turns the state of an end's outgoing link into records.
+    """Makes records of the state of the link, for the direction in which this process sends.
 
-    The link's process, which the end does not trust, publishes the state in a file. A second file
-    tells how late the relay's datagrams left.
+    The process of the link writes its state to a file, and the lateness of its datagrams to a
+    second file. World and cloud do not trust the content of these files.
     """
 
     def __init__(self, path: Path, *, uplink: bool) -> None:
@@ -213,9 +212,10 @@ class LinkNotes:
         self._due_ns = self._released_ns = 0
 
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
-        """Return the records about the link that are due after the `records` of this end.
+        """Return records about the link that are due at `now_ns` [ns, machine's monotonic clock].
 
-        `now_ns` is the machine's monotonic clock, `slip_ns` the lag of the end's own clock [ns].
+        `records` are new records of world or cloud; some types make the state due at once.
+        `slip_ns` is the time by which the clock of the records lags behind the machine's [ns].
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))
@@ -223,7 +223,7 @@ class LinkNotes:
             self._due_ns = now_ns + PERIOD_NS
             seen = version(self._path)
             if begins or seen != self._seen:
-                self._seen = seen  # do not read a malformed file ten times a second
+                self._seen = seen  # do not read a malformed file again and again
                 with suppress(*NONSENSE):
                     noted += self._read_state(begins, now_ns, slip_ns)
         if now_ns >= self._released_ns:
@@ -233,14 +233,13 @@ class LinkNotes:
         return noted
 
     def _read_lateness(self, stamp_ns: int) -> list[Counted]:
-        """Return records of how late datagrams left since the relay began."""
         found = json.loads(read(self._path.with_suffix(RELEASED_SUFFIX), STATE_MAX))
         counts = {name: int(n) for name, n in found.items() if name in RELEASED}
         way = "uplink" if self._uplink else "downlink"
         return [Counted(stamp_ns, "link", f"{way}_{name}", n) for name, n in counts.items()]
 
     def _read_state(self, begins: bool, now_ns: int, slip_ns: int) -> list[LinkChanged]:
-        """Return the record of the state if the link has changed or a mission may begin."""
+        """Return the state of the link as a record, if the link has changed or `begins` is true."""
         state = from_text(read(self._path, STATE_MAX).decode())
         asked = {key: nan if value is None else float(value) for key, value in state.asked.items()}
         changed = LinkChanged(
@@ -259,18 +258,18 @@ class LinkNotes:
 
 @dataclass
 class EndProcess:
-    """All that an end needs as a process, besides the endpoint itself.
+    """Runs world or cloud as a process.
 
     Attributes:
         end: "world" or "cloud".
-        peer: Socket of the end.
-        recorder: Writes the records of the end.
-        keys: Key file, which may get new keys.
+        peer: Socket of the process, and address of its peer.
+        recorder: Writes the records to a file.
+        keys: Key file, which is reloaded when it changes.
         feed: Sends records to the supervisor.
         exporter: Turns the records into metrics; None for no metrics.
-        flights_only: Whether only events are recorded while the robot does not fly.
-        link: State file of the link, to record the link's changes; None without a link.
-        check: Compares the link with its profile by the datagrams that this end receives.
+        flights_only: Whether to record events but no samples while the robot does not fly.
+        link: File with the state of the link; None if the state is not recorded.
+        check: Compares the received datagrams with the link profile; None for no comparison.
     """
 
     end: str
@@ -294,9 +293,10 @@ class EndProcess:
         flies: Callable[[], bool],
         slip_ns: Callable[[], int] = lambda: 0,
     ) -> None:
-        """Run the endpoint until `stop()`, then complete its recording.
+        """Run the endpoint until `stop()` returns true, then complete the recording.
 
-        `flies` tells whether the robot follows cloud; `slip_ns` is the lag of world's clock [ns].
+        `flies` returns whether the robot follows cloud. `slip_ns` returns the time by which the
+        endpoint's clock lags behind the machine's monotonic clock [ns].
         """
         thread = RecordingThread(self.recorder)
         choose = FlightsOnly(flies) if self.flights_only else list
@@ -318,7 +318,7 @@ class EndProcess:
             thread.stop()
 
     def tell(self, records: list[Record]) -> None:
-        """Send records to the supervisor and to the metrics, with the problems of the recorder."""
+        """Send records, and problems of the recorder, to the supervisor and to the metrics."""
         recorder = self.recorder
         self.feed.tell(records)
         if records and recorder.error != self._trouble:
@@ -333,9 +333,10 @@ class EndProcess:
     def look_around(
         self, records: list[Record], slip_ns: int, clock_steps: list[float]
     ) -> list[Record]:
-        """Return records of steps of the wall clock [s], new keys and changes of the link.
+        """Return records about steps of the wall clock, new keys, and the state of the link.
 
-        `records` are the newest records of the end, `slip_ns` is the lag of the end's clock [ns].
+        `records` are the newest records of the endpoint. `slip_ns` is the lag of the endpoint's
+        clock behind the machine's monotonic clock [ns]. `clock_steps` are in seconds.
         """
         now_ns = time.monotonic_ns()
         noted: list[Record] = [

@@ -1,7 +1,7 @@
 """Run one endpoint in real time on a UDP socket and the machine's monotonic clock.
 
 The loop sleeps until the endpoint's next deadline or the next datagram, whichever comes first.
-All datagrams of one wake get the same time, as the endpoint's contract requires.
+After each sleep (a wake), all new datagrams get the same time of arrival, as endpoints require.
 """
 
 from __future__ import annotations
@@ -26,24 +26,22 @@ from cloudrc.tunnel.codec import DATAGRAM_MAX
 Address = tuple[str, int]
 
 DRAIN_MAX = 256
-"""Largest number of datagrams per wake; so a flood cannot delay the loop's deadlines."""
+"""Largest number of datagrams per wake. The limit keeps a flood from delaying the deadlines."""
 RECEIVE_BUFFER = 1 << 22
-"""Requested size of the socket's buffer [bytes]: room for valid datagrams behind a flood."""
+"""Requested size of the receive buffer [bytes], large enough for a flood and valid datagrams."""
 BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
-"""Largest number of datagrams in a wake after a stall. This is more than can wait in the socket:
-Linux doubles the buffer, and a datagram takes at least 768 bytes of the buffer."""
+"""Largest number of datagrams in a wake after a stall: more than fit into the receive buffer. Linux
+doubles the requested size, and each datagram takes at least 768 bytes."""
 STALL_NS = 50_000_000
-"""Lateness of a wake above which the loop takes all waiting datagrams at once [ns]: the datagrams
-arrived before the wake."""
+"""Lateness of a wake above which the loop was stalled, and takes all datagrams at once [ns]."""
 STALL_AGAIN_NS = 1_000_000_000
-"""Limit that replaces `STALL_NS` in the wake after a stall [ns]. This limit is longer, because
-receiving a flood takes long and must not look like one stall after another."""
+"""Limit that replaces `STALL_NS` after a stall [ns], when taking all datagrams takes long."""
 SINK_PERIOD_NS = 20_000_000
-"""Longest time between two calls of the function that takes the records [ns]."""
+"""Longest time between two calls of `sink` while there are records [ns]."""
 WAIT_MAX_NS = 100_000_000
-"""Longest wait for a datagram [ns]; then the loop calls `stop` again."""
+"""Longest sleep of the loop [ns]; `stop` is called after every sleep."""
 PORTS = range(20_000, 30_000)
-"""The ports from which `free_ports` chooses."""
+"""Ports from which `free_ports` chooses."""
 ROUTE_PERIOD_NS = 500_000_000
 """Time between two checks of the route file [ns]."""
 
@@ -61,13 +59,13 @@ def split_address(text: str) -> Address:
 
 @dataclass
 class Peer:
-    """A UDP socket and the address of its peer.
+    """A UDP socket and the address to which it sends.
 
     Attributes:
         socket: The socket, bound and not blocking.
-        address: Address of the other end of the tunnel or of the relay; None while it is unknown.
-        route: File with the address as HOST:PORT, which the link's process writes when the link is
-            up and whenever the address changes; None if the address is fixed.
+        address: Address of the peer: world, cloud or the relay; None while it is unknown.
+        route: File from which `address` is read, as HOST:PORT; None if the address is fixed. The
+            process of the link writes the file when the link is up or the address changes.
     """
 
     socket: socket.socket
@@ -78,7 +76,7 @@ class Peer:
 
     @classmethod
     def bind(cls, listen: Address, where: Address | Path) -> Peer:
-        """Bind a socket at `listen`; the peer's address is fixed or comes from a route file."""
+        """Bind a socket at `listen`; `where` is the peer's address or a route file."""
         bound = bind(listen)
         if isinstance(where, Path):
             return cls(bound, None, where)
@@ -87,8 +85,8 @@ class Peer:
     def follow(self, now_ns: int) -> None:
         """Update the address from the route file, if a check is due at `now_ns` [ns].
 
-        If the file is missing, half written or no numeric address (a query to a name server would
-        block the loop), the last address stays valid.
+        If the file is missing or incomplete, or contains a host name, keep the last address: a
+        query to a name server would block the loop.
         """
         if self.route is None or now_ns < self._followed_ns:
             return
@@ -103,9 +101,9 @@ class Peer:
             self.address, self._seen = _reachable(self.socket, address), seen
 
     def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
-        """Return at most `most` waiting datagrams.
+        """Return at most `most` of the datagrams that have arrived.
 
-        A datagram above DATAGRAM_MAX is cut to DATAGRAM_MAX + 1 bytes, so that decoding fails.
+        A datagram longer than DATAGRAM_MAX is cut to DATAGRAM_MAX + 1 bytes: decoding refuses it.
         """
         datagrams: list[bytes] = []
         while len(datagrams) < most:
@@ -113,12 +111,12 @@ class Peer:
                 datagrams.append(self.socket.recv(DATAGRAM_MAX + 1))
             except BlockingIOError:
                 break
-            except ConnectionRefusedError:  # an earlier datagram of ours found nobody listening
+            except ConnectionRefusedError:  # nobody received a datagram that we sent before
                 continue
         return datagrams
 
     def send(self, datagrams: list[bytes]) -> None:
-        """Send datagrams. A datagram is lost if the address is unknown or the socket refuses it."""
+        """Send datagrams; drop them if the address is unknown or the socket refuses them."""
         if self.address is not None:
             for data in datagrams:
                 with suppress(OSError):
@@ -133,7 +131,7 @@ def _reachable(bound: socket.socket, address: Address) -> Address:
 
 
 def bind(listen: Address) -> socket.socket:
-    """Open a UDP socket that does not block. A socket at the host `::` also receives IPv4."""
+    """Open a non-blocking UDP socket; the host `::` receives IPv6 and IPv4."""
     family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
     udp = socket.socket(family, socket.SOCK_DGRAM)
     if listen[0] == "::":
@@ -149,10 +147,11 @@ def bind(listen: Address) -> socket.socket:
 
 
 def free_ports(count: int) -> list[int]:
-    """Choose ports on 127.0.0.1 by chance that are unused for both UDP and TCP.
+    """Choose random ports on 127.0.0.1 that are unused for both UDP and TCP.
 
-    They are below the ports that the kernel gives to connections, which could take them meanwhile.
-    Raise a MissingPrerequisiteError if fewer than `count` ports are unused.
+    All are below the range from which the kernel takes ports for outgoing connections: the kernel
+    could use such a port before the caller does. Raise a MissingPrerequisiteError if fewer than
+    `count` ports are unused.
     """
     found: list[int] = []
     for port in random.SystemRandom().sample(PORTS, len(PORTS)):
@@ -182,19 +181,19 @@ def serve(
 
     Args:
         endpoint: World or cloud.
-        peer: Socket of the endpoint.
+        peer: Socket of the endpoint, and address of its peer.
         end: "world" or "cloud", for the records.
-        sink: Function that takes the records, at least every 20 ms. It must not block.
-        stop: Function that is called at every wake; wakes are at most 100 ms apart.
-        slip_ns: Lag of world's clock [ns].
+        sink: Called with new records, at least every 20 ms if there are any. It must not block.
+        stop: Called at every wake, at least every 100 ms.
+        slip_ns: Returns the lag of the endpoint's clock behind the machine's monotonic clock [ns].
 
     Raises:
-        ValueError: If the endpoint's datagrams are not sealed.
+        ValueError: If the endpoint has no key and therefore cannot seal its datagrams.
     """
     if not endpoint.sealed:
         raise ValueError(f"{end} has no key; a process must seal all its datagrams")
     gc.collect()
-    gc.freeze()  # keep the collector away from the objects loaded so far
+    gc.freeze()  # the garbage collector then skips all objects loaded so far
     stalled, sink_ns = False, time.monotonic_ns()
     while not stop():
         deadline_ns = endpoint.next_deadline_ns()

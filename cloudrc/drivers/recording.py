@@ -1,8 +1,8 @@
 """Write a process's recording to its file from a background thread.
 
-The thread writes a few records at a time and sleeps in between, so it delays the loop by less than
-a millisecond. A second thread waits for the disk. Even if a sync takes seconds, the operating
-system has the data and keeps it if the process is killed.
+The thread writes a few records at a time and sleeps in between; thus it delays the control loop by
+less than a millisecond. A second thread syncs the file to the disk, which may take seconds. If the
+process is killed meanwhile, the operating system still writes the data to the disk.
 """
 
 from __future__ import annotations
@@ -27,34 +27,33 @@ if TYPE_CHECKING:
     from cloudrc.record.recorder import Recorder
 
 STEP = 0.1
-"""Smallest change between two checks that counts as a step of the wall clock [s]."""
+"""Smallest difference between the wall clock and the clock since boot that counts as a step [s]."""
 DRIFT_MAX = 1e-3
-"""Largest relative drift between both clocks; kernels slew by at most half of this value."""
+"""Largest relative drift between the two clocks that does not count as a step."""
 AFTERWARDS_NS = 90_000_000_000
-"""How long all records are still kept after the robot last followed the cloud [ns]. This time
-covers the landing after a loss of the link."""
+"""Time after the robot last followed cloud for which all records are kept [ns]. It is long enough
+for the landing after a loss of the link."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
-"""Types of records that are made all the time, with or without a flight."""
+"""Types of records that world and cloud make all the time, even between flights."""
 BATCH = 16
-"""Largest number of records that are written without a pause."""
+"""Largest number of records that the thread writes without a sleep."""
 IDLE = 0.1
-"""Sleep after the queue was emptied [s]; a wake costs more time than writing a few records."""
+"""Sleep of the thread after it has written all records [s]."""
 BUSY = 0.001
-"""Sleep while more records wait [s]."""
+"""Sleep of the thread while more records wait [s]."""
 FLUSH = 0.25
-"""Longest time between two flushes [s]; a killed process loses less than 0.5 s."""
+"""Shortest time between two flushes [s]. A killed process loses records of less than 0.5 s."""
 _SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the former: Linux
 
 
 class WallClock:
-    """Detects when the wall clock was set: the clock since boot, which nobody can set, differs."""
+    """Detects steps of the wall clock, by comparison with the clock since boot."""
 
     def __init__(self) -> None:
-        """Read both clocks for the first time."""
         self._wall, self._boot = _read_clocks()
 
     def step(self) -> float:
-        """Return by how much the clock was set since the last call [s]; 0 if it was not set."""
+        """Return the step of the wall clock since the last call [s]; 0 if there was no step."""
         wall, boot = _read_clocks()
         elapsed = boot - self._boot
         step = wall - self._wall - elapsed
@@ -63,7 +62,7 @@ class WallClock:
 
 
 def _read_clocks() -> tuple[float, float]:
-    """Read the wall clock and the clock since boot [s], without a stall in between."""
+    """Read the wall clock and the clock since boot [s]; repeat this if the process was paused."""
     while True:
         before, wall = time.clock_gettime(_SINCE_BOOT), time.time()
         boot = time.clock_gettime(_SINCE_BOOT)
@@ -72,9 +71,9 @@ def _read_clocks() -> tuple[float, float]:
 
 
 class FlightsOnly:
-    """Selects all records during a flight, and only events otherwise.
+    """Keeps all records during a flight, and only events between flights.
 
-    Between missions, the samples of an idle robot would fill a pod's volume within hours.
+    All records of an idle robot would fill a pod's volume within hours.
     """
 
     def __init__(self, flies: Callable[[], bool]) -> None:
@@ -97,22 +96,21 @@ class RecordingThread:
     """Runs a recorder in the background from `start` to `stop`."""
 
     def __init__(self, recorder: Recorder) -> None:
-        """Store the recorder. The loop puts records in, and only this class takes them out."""
         self._recorder = recorder
         self._stopping, self._flushed, self._over = threading.Event(), threading.Event(), False
-        # Daemon threads, so that a hanging disk cannot keep the process from ending.
+        # Daemon threads: the process can end even if the disk hangs.
         self._writing = threading.Thread(target=self._write, name="recording", daemon=True)
         self._syncing = threading.Thread(target=self._sync, name="recording-sync", daemon=True)
         self._safe_since: float | None = None
         self._wall, self._steps = WallClock(), deque[float]()
 
     def start(self) -> None:
-        """Start to write the recording to its file, and to sync the file to the disk."""
+        """Start the threads that write the file and sync it to the disk."""
         for thread in (self._writing, self._syncing):
             thread.start()
 
     def sync_age(self) -> float | None:
-        """Return how much of the recording a power cut would destroy [s]; None before any sync."""
+        """Return the time since the last sync to disk began [s]; None before the first sync."""
         return None if self._safe_since is None else time.monotonic() - self._safe_since
 
     def take_steps(self) -> list[float]:

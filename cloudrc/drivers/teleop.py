@@ -1,9 +1,10 @@
-"""Run teleop in its own process and connect it with cloud over Unix datagram sockets.
+"""Run teleop in its own process, and connect the processes of teleop and cloud by Unix sockets.
 
-    cloud process: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  serve_teleop - machine
+    cloud: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  teleop: serve_teleop - machine
 
-No call blocks. A datagram is lost if the socket of the other process is full or missing. Either
-process may restart: teleop repeats setpoint and requests, and keeps its events for a new cloud.
+No call blocks. A datagram is lost if the socket of the receiver is full or missing. Each process
+may restart while the other runs: teleop repeats its setpoint and requests, and stores mission
+events until cloud accepts them.
 """
 
 from __future__ import annotations
@@ -21,43 +22,43 @@ from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
 
 DATAGRAM_MAX = 8_192
-"""Size limit of a datagram [bytes]; all messages of teleop and cloud are smaller."""
+"""Size limit of a datagram between teleop and cloud [bytes]; all messages are smaller."""
 DRAIN_MAX = 1024
-"""Limit of the datagrams of one read; a socket queues fewer of them (513 under systemd)."""
+"""Largest number of datagrams that one call of `receive` returns: more than a socket can queue."""
 PATH_MAX = 107
 """Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
 PERIOD_NS = 20_000_000
-"""Period of teleop's state machine [ns]."""
+"""Period of the loop of teleop's process [ns]."""
 TELL_NS = PERIOD_NS - 5_000_000
-"""Shortest time between two states for teleop [ns], so that it gets every second telemetry."""
+"""Shortest time between two telemetry messages that cloud forwards to teleop [ns]."""
 ALIVE_NS = 200_000_000
-"""Time between two empty datagrams [ns]; without telemetry they show teleop that cloud runs."""
+"""Period of the empty datagrams that show teleop that cloud runs if no telemetry arrives [ns]."""
 STALL_NS = 100_000_000
-"""Delay of the loop above which all datagrams in the socket count as old [ns], because the socket's
-queue has been full since the delay began. Such a delay is a stall."""
+"""Lateness above which a loop counts as stalled [ns]: its socket is full of old datagrams."""
 BLIND_WAKES = 5
-"""Number of loop periods that teleop waits for a new datagram after a stall, at most."""
+"""Largest number of periods for which teleop waits for a new state of the robot after a stall."""
 SILENCE_NS = 1_000_000_000
-"""Teleop, which sends at 10 Hz, counts as away after this time without a datagram [ns]."""
+"""Time without a datagram from teleop after which cloud reports a fault [ns]."""
 EVENTS_KEPT = 256
-"""Limit of the events that wait while cloud is away."""
+"""Largest number of mission events that teleop stores while cloud does not accept them."""
 LAST_WORD_NS = 800_000_000
-"""Time for which an ending cloud still forwards teleop's request to hold [ns]. Teleop repeats the
-request for a shorter time, and a process has 1.5 s to end."""
+"""Time for which cloud, when asked to end, still forwards teleop's request to hold [ns]. Teleop
+repeats the request for a shorter time; a process has 1.5 s to end."""
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
 """Function that decodes a message; it raises a ValueError if the bytes are not a message."""
 Calls = Callable[[], Iterable[Callable[[int], None]]]
-"""Function that returns the calls that other threads have queued; each takes the time [ns]."""
+"""Function that returns the calls that other threads have queued. Each call has one argument, the
+time [ns], monotonic clock."""
 
 
 class UnixPeer:
-    """Exchange datagrams with another process over two Unix sockets."""
+    """Exchanges datagrams with another process over two Unix sockets."""
 
     def __init__(self, own: Path, other: Path) -> None:
-        """Bind `own`, which may replace the socket of an earlier process; send to `other`.
+        """Bind the path `own`, also if a socket of an earlier process exists; send to `other`.
 
-        Raise a BadInputError if the path cannot be bound.
+        Raise a BadInputError if `own` cannot be bound.
         """
         self._other = str(other)
         if len(bytes(own)) > PATH_MAX:
@@ -73,7 +74,7 @@ class UnixPeer:
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
     def receive(self) -> list[bytes]:
-        """Return the datagrams that wait in the socket."""
+        """Return the datagrams that have arrived."""
         datagrams: list[bytes] = []
         with suppress(BlockingIOError):
             while len(datagrams) < DRAIN_MAX:
@@ -81,10 +82,10 @@ class UnixPeer:
         return datagrams
 
     def send(self, data: bytes) -> bool:
-        """Send a datagram; return whether the other socket has accepted it."""
+        """Send a datagram; return whether the socket of the other process has accepted it."""
         try:
             self._socket.sendto(data, self._other)
-        except OSError:  # missing, restarting, or its queue is full
+        except OSError:  # the other process does not run, or its queue is full
             return False
         return True
 
@@ -94,19 +95,19 @@ class UnixPeer:
 
 
 class RemoteTeleop:
-    """Represent teleop in cloud's process: send telemetry to teleop, and receive its outputs.
+    """Represents teleop in cloud's process: sends telemetry to teleop and receives its outputs.
 
     Attributes:
-        outputs: Teleop's outputs since the last call of `take_outputs`.
+        outputs: Requests, setpoints and events from teleop since the last call of `take_outputs`.
     """
 
     outcome = None  # cloud does not end when a mission ends
     settled = True
 
     def __init__(self, peer: UnixPeer, encode: Encode, decode: Decode, start_ns: int) -> None:
-        """Connect to teleop at `start_ns` [ns]."""
         self._peer, self._encode, self._decode = peer, encode, decode
-        self._heard_ns: int | None = None  # or when teleop was told of the first telemetry
+        # Time of teleop's last datagram; before the first one, of the first telemetry for teleop.
+        self._heard_ns: int | None = None
         self._silent = self._stalled = False
         self._tell_ns = self._looked_ns = self._alive_ns = start_ns
         self.outputs: list[Any] = []
@@ -120,11 +121,10 @@ class RemoteTeleop:
                 self._heard_ns = now_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Receive teleop's outputs; report a fault if teleop has telemetry and is silent for 1 s.
+        """Receive teleop's outputs; report a fault if teleop does not answer telemetry for 1 s.
 
-        After a stall, drop starts and waypoints, because teleop may have withdrawn them in a
-        datagram that the full socket lost. Teleop repeats the valid ones; the next call forwards
-        them.
+        After a stall, drop outputs that start a mission or lead to a waypoint: teleop may have
+        withdrawn them in a datagram that was lost. Teleop repeats outputs that are still valid.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS
@@ -144,20 +144,19 @@ class RemoteTeleop:
             self.outputs.append(Fault(now_ns, "teleop_silent", text))
 
     def take_outputs(self) -> list[Any]:
-        """Return teleop's outputs since the last call."""
+        """Return and remove the outputs that have arrived since the last call."""
         outputs, self.outputs = self.outputs, []
         return outputs
 
 
 def _moves_robot(output: Any) -> bool:
-    """Check whether an output starts a mission or leads to a waypoint."""
     if isinstance(output, OperatorRequest):
         return output.request is Request.START
     return isinstance(output, Setpoint) and output.waypoint >= 0
 
 
 class LastWord:
-    """Delay the end of cloud while the robot flies, to forward teleop's last request to hold."""
+    """Delays the end of cloud's process in flight, to forward teleop's request to hold."""
 
     def __init__(
         self,
@@ -165,12 +164,12 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Call `asked` (has cloud to end?), `flies` (does the robot fly?) and `clock` [ns]."""
+        """Set functions that tell if cloud has to end, if the robot flies, and the time [ns]."""
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
 
     def __call__(self) -> bool:
-        """Return whether cloud may end now; cloud's loop calls this in every period."""
+        """Return whether cloud's process has to end now; cloud's loop calls this in every turn."""
         if not self._asked():
             return False
         if self._until_ns is None:
@@ -192,13 +191,13 @@ def serve_teleop(
     """Run the loop of teleop's process at 50 Hz in real time until `stop()` returns true.
 
     `machine` is a `MissionService`, or has its methods hear, see, handle_deadline and take_outputs.
-    `tell` receives the events and faults of each period, and must not block. For `calls` and
-    `stops` see `turn`.
+    `calls` and `stops` return the queued API calls and emergency stops. `tell` is called with the
+    events and faults of each period, and must not block.
     """
     unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
     deadline_ns, blind = time.monotonic_ns(), 0
     while not stop():
-        # Do not wait for datagrams: telemetry is twice as frequent, and only the newest counts.
+        # Do not wake for each datagram: only the newest state of the robot is needed per period.
         time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
         now_ns = time.monotonic_ns()
         late_ns = now_ns - deadline_ns
@@ -221,16 +220,16 @@ def turn(
     late_ns: int,
     now_ns: int,
 ) -> int:
-    """Run one period of teleop's loop: receive states, make the queued calls, send what is due.
+    """Run one period of teleop's loop: receive states of the robot, and make the queued calls.
 
-    The period begins `late_ns` late, at `now_ns` [ns]. `calls` and `stops` return the queued calls
-    and emergency stops. After a stall, teleop only receives datagrams until a new one arrives, for
-    at most `BLIND_WAKES` periods. `blind` is the return value of the last period, at first 0: the
-    number of periods that teleop still waits in this way.
+    The period begins at `now_ns`, which is `late_ns` late [ns]. The other arguments are as in
+    `serve_teleop`. After a stall, teleop does nothing until a new state of the robot arrives, for
+    at most `BLIND_WAKES` periods. Return the number of periods for which teleop still waits, and
+    pass it as `blind` in the next period; `blind` is 0 at first.
     """
     arrived, was_blind = peer.receive(), blind
     states = [data for data in arrived if data]  # an empty datagram carries no state
-    if blind:  # lateness does not count, so that a loop that is always late still continues
+    if blind:  # ignore `late_ns`: otherwise a loop that is always late would wait forever
         blind = 0 if states else blind - 1
     elif late_ns > STALL_NS:
         blind = BLIND_WAKES
@@ -238,9 +237,9 @@ def turn(
         return blind
     if arrived:
         machine.hear(now_ns)
-    # Calls come before the state, which may already show the effect of a call or of its alarm.
-    # After a stall, calls come after the state, because they may depend on the robot's position;
-    # only stops do not.
+    # Make calls before the machine sees the state, which may already show the effect of a call.
+    # After a stall, make calls after that: they may depend on the robot's position. Emergency stops
+    # do not depend on it and come first.
     for stop in stops():
         stop(now_ns)
     seen = _newest(states, decode)
@@ -257,21 +256,20 @@ def turn(
 def send(
     outputs: Sequence[Any], unsent: deque[bytes], peer: UnixPeer, encode: Encode
 ) -> list[MissionEvent | Fault]:
-    """Send outputs to cloud, after the events that wait in `unsent`; return events and faults."""
+    """Send the events in `unsent` and then `outputs` to cloud; return new events and faults."""
     while unsent and peer.send(unsent[0]):
         unsent.popleft()
     for output in outputs:
-        if isinstance(output, MissionEvent):  # events keep their order
+        if isinstance(output, MissionEvent):  # queue an event behind unsent ones
             data = encode(output)
             if unsent or not peer.send(data):
                 unsent.append(data)
-        elif not isinstance(output, Fault):  # teleop repeats all other outputs
+        elif not isinstance(output, Fault):  # may be lost: teleop repeats these outputs
             peer.send(encode(output))
     return [output for output in outputs if isinstance(output, MissionEvent | Fault)]
 
 
 def _newest(arrived: list[bytes], decode: Decode) -> Any:
-    """Decode the last datagram that is a valid message; None if there is none."""
     for data in reversed(arrived):
         with suppress(ValueError):
             return decode(data)

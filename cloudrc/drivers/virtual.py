@@ -1,8 +1,8 @@
-"""Run both ends and the link between them in one process, in virtual time.
+"""Run world, cloud and the link between them in one process, in virtual time.
 
-The run is an event heap with times in integer nanoseconds. If events have the same time, arrivals
-come first, in the order of sending, then world's deadline, then cloud's deadline. Therefore the
-same inputs give the same run, bit by bit.
+The driver handles events in the order of their times, which are integer nanoseconds. If several
+events have equal times, it handles arrivals of datagrams first, in the order of sending, then
+world's deadline, then cloud's deadline. Therefore equal inputs give bitwise equal runs.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from cloudrc.records import Record
 from cloudrc.tunnel.codec import peek
 
 Sink = Callable[[list[Record], list[Record]], None]
-"""Function that takes the records of world and of cloud since its last call."""
+"""Function that is called with the new records of world and the new records of cloud."""
 PERIOD_NS = 100_000_000
-"""Virtual time between two calls of the sink and of `until` [ns]."""
+"""Virtual time between two calls of `sink` and of `until` [ns]."""
 
 
 class VirtualRun:
-    """A run of world, cloud and two link directions in virtual time, which begins at 0."""
+    """Runs world, cloud and both directions of the link, in virtual time that starts at 0."""
 
     def __init__(
         self,
@@ -34,7 +34,7 @@ class VirtualRun:
         *,
         cloud_clock_offset_ns: int = 0,
     ) -> None:
-        """Connect the parts; cloud's clock is ahead of world's by the offset [ns]."""
+        """Connect the parts; cloud's clock is ahead of world's by `cloud_clock_offset_ns` [ns]."""
         self._world, self._cloud = world, cloud
         self._uplink, self._downlink = uplink, downlink
         self._offset_ns = cloud_clock_offset_ns
@@ -45,10 +45,10 @@ class VirtualRun:
     def fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
         """Run until `until()` is true or virtual time reaches `limit_ns` [ns].
 
-        Every 100 ms of virtual time the sink gets all records, and `until` is called.
+        Every 100 ms of virtual time, call `sink` with the new records, and then `until`.
         """
         gc_was_on = gc.isenabled()
-        gc.disable()  # a flight makes no cycles; the collector would scan its records in vain
+        gc.disable()  # a flight makes no reference cycles, so that collections would waste time
         try:
             while self.now_ns < limit_ns:
                 self._advance(min(self.now_ns + PERIOD_NS, limit_ns))
@@ -60,7 +60,7 @@ class VirtualRun:
                 gc.enable()
 
     def _advance(self, end_ns: int) -> None:
-        """Handle all events up to and including `end_ns` [ns], in their order."""
+        """Handle all events up to and including `end_ns` [ns]."""
         world, cloud, offset_ns = self._world, self._cloud, self._offset_ns
         arrivals = self._arrivals
         world_ns, cloud_ns = world.next_deadline_ns(), cloud.next_deadline_ns() - offset_ns

@@ -1,5 +1,5 @@
-"""Prometheus metrics of a process, computed from its records, without I/O.
+"""Compute the Prometheus metrics of a process from its records.
 
-`table` defines all metrics; code, documentation, dashboards and tests read this table. `live` keeps
-the current values, which `cloudrc.drivers.exporter` serves.
+`table` defines all metrics for code, documentation, dashboards and tests. `live` computes the
+current values; `cloudrc.drivers.exporter` serves them over HTTP.
 """

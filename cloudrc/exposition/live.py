@@ -1,7 +1,7 @@
 """Compute the current metrics of one process from its records.
 
-Errors of predictions and delay estimates come from `Control` records alone. Each stamp is compared
-only with stamps of its own clock, so the errors are right without a shared clock.
+The errors of predictions and of delay estimates are correct even if world and cloud do not share a
+clock: they are computed from differences between stamps of one clock.
 """
 
 from __future__ import annotations
@@ -66,18 +66,18 @@ COUNTS = {
     "cloudrc_link_released_early_total": "released_early",
     "cloudrc_dns_errors_total": "unresolved",
 }
-"""Metric -> name of its count in `Counted`, with the value of its label at {}."""
+"""Metric -> `Counted.name` of its count; {} stands for the value of the metric's label."""
 ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
-"""Metrics that only the relay or only netem has; they are absent until their count exists."""
+"""Metrics that only one kind of shaper has; they are left out while there is no count for them."""
 PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
     "cloudrc_link_release_error_seconds": ("release_error", table.RELEASE_PERCENTILES),
     "cloudrc_link_step_lateness_seconds": ("step_lateness", table.STEP_PERCENTILES),
 }
-"""Metric -> first part of its counts [ns], and label value -> name of the percentile."""
+"""Metric -> parts of the names of its counts, such as `release_error_p50_ns`, by label value."""
 
 
 def read_counts(role: str, counts: Mapping[str, int]) -> Iterator[tuple[str, dict[Labels, float]]]:
-    """Turn the counts that the process of a role keeps into metrics."""
+    """Yield name and values of each metric that is a count of a process of `role`."""
     for metric in of_role(role):
         pattern = COUNTS.get(metric.name)
         if pattern is None or (metric.name in ONE_SHAPER and pattern not in counts):
@@ -90,27 +90,27 @@ def read_counts(role: str, counts: Mapping[str, int]) -> Iterator[tuple[str, dic
 
 
 class LinkVerdict:
-    """The newest verdict on an end's incoming direction of the link."""
+    """Newest verdict of world or cloud on the direction of the link that this process receives."""
 
     def __init__(self, direction: str) -> None:
-        """Set the direction, "uplink" or "downlink"; the verdict is "open"."""
+        """Set the direction, "uplink" or "downlink"; the first verdict is "open"."""
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 
     def _on_check(self, record: LinkChecked) -> None:
-        """Store the verdict on one quantity, and drop the quantities of an older check."""
+        """Store the verdict on one quantity, and drop verdicts of earlier checks."""
         newest = [one for one in self._newest if one.stamp_ns == record.stamp_ns]
-        self._newest = (*newest, record)  # a new tuple: another thread may be reading the old one
+        self._newest = (*newest, record)  # a new tuple: another thread may read the old one
 
     @property
     def verdict(self) -> str:
-        """Overall verdict: "ok", "off", or "open" while there are too few datagrams."""
+        """Verdict on the link: "ok", "off" (not as its profile), "open" (too few datagrams)."""
         verdicts = {record.verdict for record in self._newest} - {"told"}
         return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
 
     def text(self) -> str:
-        """Make the page /link.json: the overall verdict and a row per quantity."""
-        left_out = ("stamp_ns", "uplink")  # equal in all rows; unknown values are left out, too
+        """Return the content of /link.json: the verdict on the link, and a row per quantity."""
+        left_out = ("stamp_ns", "uplink")  # equal in all rows
         rows = [
             {
                 key: value
@@ -123,27 +123,27 @@ class LinkVerdict:
         return json.dumps(document, indent=2) + "\n"
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         if self.verdict == "open":
             return {}
         return {"cloudrc_link_believed": {(self._direction,): float(self.verdict == "ok")}}
 
 
 CLOCK_SET = "wall_clock"
-"""Fault code of a step of the wall clock; `cloudrc.drivers.recording` detects steps."""
+"""Fault code for a step of the wall clock."""
 SILENCE_NS = 2_000_000_000
-"""Time without a new datagram after which an end has no peer [ns]."""
+"""Time without a new datagram from the peer after which the peer counts as disconnected [ns]."""
 
 
 class End:
-    """Metrics that world and cloud share: session, datagrams, one-way delay, timing of the loop.
+    """Metrics that both world and cloud have: session, datagrams, one-way delay, loop timing.
 
     Attributes:
-        check: Verdict on the incoming direction of the link.
+        check: Verdict on the direction of the link that this process receives.
     """
 
     def __init__(self, role: str, counts: Mapping[str, int]) -> None:
-        """Set the role, "world" or "cloud", and the counts; there is no session."""
+        """Set the role, "world" or "cloud"; `counts` maps `Counted.name` to its newest count."""
         self._counts, self._stream = counts, DatagramTally()
         self._outgoing, self._incoming = "uplink", "downlink"
         others = table.ONLY_CLOUD
@@ -162,18 +162,18 @@ class End:
         self._busy, self._clock_steps = 0.0, 0
         self._sessions, self._epoch, self._opened_ns = 0, 0, NEVER_NS
         self._arrival_ns = self._woke_ns = self._deadline_ns = NEVER_NS
-        self._silent = True  # no telemetry or command has arrived in this session
-        # Arrival [ns] and one-way delay [s] of the newest used datagram: the age of information.
+        self._silent = True  # whether no telemetry or command has arrived in this session
+        # Arrival [ns] and one-way delay [s] of the newest used datagram.
         self._newest_ns, self._newest_delay = NEVER_NS, nan
 
     @property
     def has_peer(self) -> bool:
-        """Whether a new datagram of the other end has arrived in the last 2 s."""
+        """Whether a new datagram of the peer has arrived in the last 2 s."""
         return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
 
     def _on_arrival(self, record: Arrival) -> None:
         stamp_ns, _, epoch, counter, delay, used = record
-        if self._stream.take(epoch, counter):  # a replay is no sign of life: anybody can send it
+        if self._stream.take(epoch, counter):  # not a replay, which anybody can send
             if not self._silent:
                 self._gap.observe((stamp_ns - self._arrival_ns) * 1e-9)
             self._arrival_ns, self._silent = stamp_ns, False
@@ -201,13 +201,13 @@ class End:
         self._busy += busy
 
     def _count_age(self, now_ns: int) -> None:
-        """Count the age of information at `now_ns` [ns, own clock], once per period."""
+        """Count the age of the newest used datagram at `now_ns` [ns], this process's clock."""
         delay = self._newest_delay
         if delay == delay:
             self._age.observe(delay + (now_ns - self._newest_ns) * 1e-9)
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         counts, stream, incoming = self._counts, self._stream, self._incoming
         datagrams: dict[Labels, float] = {
             (incoming, name): counts.get(name, 0) for name in self._outcomes
@@ -224,23 +224,22 @@ class End:
             "cloudrc_loop_busy_seconds_total": unlabelled(self._busy),
             "cloudrc_clock_steps_total": unlabelled(self._clock_steps),
         }
-        if not self._one_way.cumulative()[-1]:  # unknown without a shared clock: absent, never zero
+        if not self._one_way.cumulative()[-1]:  # no shared clock: leave out delays
             del readings[f"cloudrc_{incoming}_delay_seconds"]
             del readings["cloudrc_age_of_information_seconds"]
         return readings
 
 
 STEP_NS, STEPS = 1_000_000_000, 10
-"""Time between two samples for the real-time factor [ns], and number of such times in it."""
+"""The real-time factor is an average over `STEPS` intervals of `STEP_NS` [ns]."""
 ADMITTED = "cloud said hello"
-"""`SessionOpened.cause` of a session that world opens for a newly connected cloud."""
+"""`SessionOpened.cause` if world opens a session because a cloud process has connected."""
 
 
 class WorldEnd(End):
-    """Metrics of world: metrics of every end, the robot, guard, contacts, real-time factor."""
+    """Metrics of world: those of `End`, and robot, guard, contacts, real-time factor."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        """Store the counts; the guard is in state GROUND at first."""
         super().__init__(table.WORLD, counts)
         self._truth: GroundTruth | None = None
         self._guard = GuardState.GROUND
@@ -254,10 +253,9 @@ class WorldEnd(End):
 
     @property
     def has_peer(self) -> bool:
-        """Whether world receives datagrams from cloud.
+        """Whether cloud is connected: a session is open, and commands arrive.
 
-        Cloud sends nothing that these metrics see before its first command in a session. Until
-        that command, the session itself counts as a peer.
+        In a new session, before the first command, cloud counts as connected.
         """
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
 
@@ -278,7 +276,7 @@ class WorldEnd(End):
 
     def _on_guard(self, record: GuardChange) -> None:
         if record.state != self._guard or record.state is GuardState.GROUND:
-            # A touch-down repeats LAND, which is no change.
+            # A record with the state LAND at touch-down is no change of the state.
             self._changes[table.GUARD_STATES[record.state]] += 1
         self._guard = record.state
 
@@ -293,7 +291,7 @@ class WorldEnd(End):
             self._instants.append((record.stamp_ns, now_ns))
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         readings = super().read() | {
             "cloudrc_clouds_admitted_total": unlabelled(self._admitted),
             "cloudrc_guard_state": unlabelled(self._guard),
@@ -313,10 +311,9 @@ class WorldEnd(End):
 
 
 class CloudEnd(End):
-    """Metrics of cloud: metrics of every end, delays in the loop, prediction, control."""
+    """Metrics of cloud: those of `End`, and delays in the loop, prediction, control."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        """Set the counts; there is no control period yet."""
         super().__init__(table.CLOUD, counts)
         self._rtt = self._histograms["cloudrc_rtt_seconds"]
         self._loop = self._histograms["cloudrc_loop_delay_seconds"]
@@ -342,13 +339,13 @@ class CloudEnd(End):
             self._loop_delay = loop_delay
             self._loop.observe(loop_delay)
             self._rtt.observe(record.rtt)
-            if self._used_count == 1:  # with two odometries, which one echoed is unknown
+            if self._used_count == 1:  # else it is unknown which odometry had the echo
                 self._delay.echoed(record, self._newest_ns)
         self._used_count = 0
         self._delay.sent(record)
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         prediction, control = self._prediction, self._control
         readings = super().read() | {
             "cloudrc_delay_estimate_error_seconds": unlabelled(self._delay.error),
@@ -378,33 +375,32 @@ class Link:
     """Metrics of a process that shapes one direction of the link or both.
 
     Attributes:
-        tell: Returns the page /link.json: details that are not metrics.
+        tell: Returns the content of /link.json, the state of the shaper.
     """
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        """Set the counts of the process; nothing is shaped yet."""
         self.tell: Callable[[], str] = lambda: "{}\n"
         self._counts = counts
         self._shapers: dict[str, Labels] = {}
         self._delays: dict[str, float] = {}
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the shaper of a direction from now on.
+        """Set the shaper of a direction.
 
         Args:
             shaper: "relay" or "netem".
             direction: "uplink" or "downlink".
-            mode: The configured mode: "auto", "relay" or "netem".
+            mode: The shaper in the configuration: "auto", "relay" or "netem".
         """
         self._shapers[direction] = (shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:
-        """Set the mean delay [s] that the profile sets for a direction from now on."""
+        """Set the mean delay [s] that the profile now requests for a direction."""
         self._delays[direction] = delay
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
-        counts = dict(self._counts)  # one atomic copy: the loop's thread may count on
+        """Return the current metrics, without metrics whose values are unknown."""
+        counts = dict(self._counts)  # an atomic copy: another thread may change the counts
         readings: Readings = {
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
             "cloudrc_link_delay_seconds": by_label(dict(self._delays)),
@@ -418,19 +414,14 @@ class Link:
 
 
 NO_WAYPOINT = -1
-"""Waypoint index while no mission is active."""
+"""Index of the waypoint while no mission is active."""
 
 
 class Mission:
-    """Metrics of the mission, computed from its events."""
+    """Metrics of missions, computed from mission events."""
 
     def __init__(self, *, always: bool) -> None:
-        """Set the state to idle: there is no mission yet.
-
-        Args:
-            always: True to expose these metrics before the first event; False in a process that
-                may have no mission.
-        """
+        """Set whether to expose these metrics `always` or only after the first event."""
         self._shown = always
         self._state, self._waypoint, self._reached = "idle", NO_WAYPOINT, 0
         self._ended = dict.fromkeys(table.MISSION_OUTCOMES, 0)
@@ -453,7 +444,7 @@ class Mission:
             self._state, self._waypoint = "starting", NO_WAYPOINT
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         if not self._shown:
             return {}
         return {
@@ -479,24 +470,21 @@ HANDLERS: Mapping[type, str] = {
     SessionOpened: "_on_session",
     TelemetrySent: "_on_telemetry",
 }
-"""Class of a record -> name of the method that handles the record in each part that has it."""
+"""Type of a record -> name of the method that handles such records, in classes that have it."""
 
 
 class LiveMetrics:
-    """Current values of one role's metrics; one thread feeds them, any other thread may read them.
+    """Current metrics of one process. One thread calls `see`, any other thread may call `read`.
 
     Attributes:
-        end: Metrics of this end of the tunnel; None in teleop and link.
-        link: Metrics of the emulated link; None in all other processes.
+        end: Metrics of world or cloud; None in other processes.
+        link: Metrics of the emulated link; None in other processes.
     """
 
     def __init__(self, role: str, *, missions: bool = True) -> None:
-        """Set the role; no record has been seen yet.
+        """Set the role of the process: "world", "cloud", "teleop" or "link".
 
-        Args:
-            role: "world", "cloud", "teleop" or "link".
-            missions: Whether to expose metrics of missions; False in a cloud whose teleop exposes
-                them.
+        `missions` is False in a cloud whose separate teleop exposes the metrics of missions.
         """
         self._role = role
         self._counts: dict[str, int] = {}
@@ -518,7 +506,7 @@ class LiveMetrics:
         self._counts[record.name] = record.total
 
     def see(self, records: Iterable[Record]) -> None:
-        """Process records of this process, oldest first, without blocking."""
+        """Update the metrics with new records of this process, oldest first, without blocking."""
         handlers = self._handlers
         for record in records:
             handle = handlers.get(type(record))
@@ -526,7 +514,7 @@ class LiveMetrics:
                 handle(record)
 
     def read(self) -> Readings:
-        """Return the current values; unknown values are absent."""
+        """Return the current metrics, without metrics whose values are unknown."""
         readings: Readings = dict(read_counts(self._role, dict(self._counts)))
         for part in self._parts:
             readings |= part.read()

@@ -1,8 +1,7 @@
 """Compute parts of the live metrics: histograms, lost datagrams, errors of predictions.
 
-A handler of records runs on the loop's thread and has a budget of 1 us. Therefore a handler only
-stores the newest record and counts. `read` does all other work, on the thread that serves the
-scrape.
+Records are handled in the thread of the control loop, in less than 1 us each: the handlers only
+store records and count. `read` does all other work, in the thread that serves the metrics.
 """
 
 from __future__ import annotations
@@ -20,17 +19,17 @@ from cloudrc.records import Control
 
 
 class Histogram:
-    """Counts values in buckets; one thread observes, any other thread may read.
+    """Counts values in buckets. One thread calls `observe`, any other thread may read.
 
     Attributes:
-        bounds: Upper bounds of the buckets, inclusive, rising.
-        total: Sum of all values.
+        bounds: Upper bounds of the buckets, inclusive, in rising order.
+        total: Sum of all observed values.
     """
 
     __slots__ = ("_counts", "bounds", "total")
 
     def __init__(self, bounds: tuple[float, ...]) -> None:
-        """Set the bounds; all counts are 0."""
+        """Set the upper bounds of the buckets."""
         self.bounds = bounds
         self.total = 0.0
         self._counts = [0] * (len(bounds) + 1)
@@ -41,65 +40,72 @@ class Histogram:
         self.total += value
 
     def cumulative(self) -> list[int]:
-        """Count the values up to each bound; the last entry counts all values."""
-        return list(accumulate(list(self._counts)))  # one atomic copy: the loop may count on
+        """Return the number of values up to each bound and, as last entry, of all values."""
+        return list(accumulate(list(self._counts)))  # copy: another thread counts
 
 
 Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
-"""Metric name -> value for each tuple of label values, or a histogram (without labels)."""
+"""Name of a metric -> its values by tuple of label values, or a histogram, which has no labels."""
 
 
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Make a reading without labels from `value` [base unit of the metric]; absent if NaN."""
+    """Make the reading of a metric without labels from `value` [unit of the metric].
+
+    The reading of NaN is empty.
+    """
     return {} if isnan(value) else {(): value}
 
 
 def per_axis(vector: Vector) -> dict[Labels, float]:
-    """Make a reading per axis from `vector` [base unit of the metric]; NaN axes are absent."""
+    """Make the reading of a metric with the label `axis` from `vector` [unit of the metric].
+
+    Leave out axes whose value is NaN.
+    """
     values = zip(AXES, vector, strict=True)
     return {(axis,): value for axis, value in values if not isnan(value)}
 
 
 def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """Make a reading with one label from a mapping of label values to values."""
+    """Make the reading of a metric with one label from its count for each label value."""
     return {(name,): count for name, count in counts.items()}
 
 
 WINDOW = 128
-"""Number of newer datagrams after which a missing datagram counts as lost; 1.28 s at 100 Hz."""
+"""A missing datagram counts as lost after this number of newer datagrams (1.28 s at 100 Hz)."""
 _MASK = (1 << WINDOW) - 1
 _OLDEST = 1 << (WINDOW - 1)
 
 
 class DatagramTally:
-    """Counts lost and reordered datagrams of one direction by their counters, in each epoch.
+    """Counts lost and reordered datagrams of one direction of the link.
+
+    The sender numbers datagrams by a counter, which restarts in each epoch (session).
 
     Attributes:
-        lost: Datagrams that had not arrived when they left the window.
-        reordered: Datagrams that arrived after a newer datagram, without repeated datagrams.
+        lost: Number of datagrams that have not arrived before `WINDOW` newer ones were sent.
+        reordered: Number of datagrams that arrived after a newer one, except repetitions.
     """
 
     __slots__ = ("_before", "_epoch", "_first", "_newest", "_seen", "lost", "reordered")
 
     def __init__(self) -> None:
-        """Set all counts to 0; no datagram has arrived yet."""
         self.lost = self.reordered = 0
-        self._before = 0  # expected in earlier epochs
+        self._before = 0  # value of `expected` at the end of the last epoch
         self._epoch = self._first = self._newest = -1
-        self._seen = _MASK  # bit k: newest - k has arrived
+        self._seen = _MASK  # bit k: the datagram with the counter newest - k has arrived
 
     @property
     def expected(self) -> int:
-        """Number of datagrams that have left the window: each has arrived or counts as lost."""
+        """Number of datagrams for which the receiver no longer waits: arrived or lost."""
         return self._before + max(0, self._newest - self._first - WINDOW + 1)
 
     def take(self, epoch: int, counter: int) -> bool:
         """Count the arrival of a datagram; return True if the datagram is certainly new.
 
-        Any other datagram may be a replay: sending a captured datagram again needs no key.
+        Otherwise the datagram may be a replay: anybody can capture a datagram and send it again.
         """
         if epoch != self._epoch:
-            # Datagrams sent before the first arrival do not count: nobody may have listened yet.
+            # Datagrams before the first arrival are not lost: the receiver may not have run.
             self._before = self.expected
             self._epoch, self._first, self._newest, self._seen = epoch, counter, counter, _MASK
             return True
@@ -123,35 +129,34 @@ class DatagramTally:
 
 
 GAP_MAX_NS = 50_000_000
-"""Largest gap between two measurements over which positions are interpolated [ns]."""
+"""Largest time between two measurements between which positions are interpolated [ns]."""
 WAITING_MAX = 256
-"""Largest number of predictions that wait for a measurement; a horizon of 1 s needs 100."""
+"""Largest number of stored predictions or commands; 100 are enough for delays of 1 s."""
 
 
 class PredictionJudge:
     """Compares each predicted position with the position measured at the same instant.
 
     Attributes:
-        error: Newest error: predicted minus measured [m], shape (3,); NaN before the first.
+        error: Newest error: predicted minus measured position [m], shape (3,); NaN at first.
         square: Sum of the squared lengths of all errors [m^2].
         judged: Number of compared predictions.
     """
 
     def __init__(self) -> None:
-        """Create the judge; there is no prediction and no error yet."""
         self.error: Vector = (nan, nan, nan)
         self.square = 0.0
         self.judged = 0
         self.reset()
 
     def reset(self) -> None:
-        """Drop predictions and measurements at the start of a new session."""
+        """Drop all predictions and measurements, since a new session has started."""
         self._waiting: list[tuple[int, Vector]] = []
         self._measured_ns = NEVER_NS
         self._measured: Vector = (nan, nan, nan)
 
     def take(self, control: Control) -> None:
-        """Compare waiting predictions with a measurement; then store this period's prediction."""
+        """Compare stored predictions with the newest measurement; store the newest prediction."""
         stamp_ns, waiting = control.basis_stamp_ns, self._waiting
         if stamp_ns > self._measured_ns:
             before_ns, before = self._measured_ns, self._measured
@@ -175,37 +180,36 @@ class PredictionJudge:
 
 
 class DelayJudge:
-    """Compares each delay estimate with the true time until the command was applied.
+    """Compares delay estimates with true delays.
 
-    World echoes the newest applied command in its telemetry. The stamp of this telemetry's odometry
-    minus the hold time is the instant at which world applied the command, on world's clock. The
-    echo also gives the command's age on cloud's clock, which identifies the command.
+    The delay is the time from the stamp of the odometry for which cloud computed a command until
+    world applies the command. Telemetry contains an echo: when cloud sent the newest applied
+    command, by cloud's clock, and for how long world has applied the command.
 
     Attributes:
-        error: Newest error: estimate minus true time [s]; NaN before the first.
+        error: Newest error: estimated minus true delay [s]; NaN before the first.
     """
 
     def __init__(self) -> None:
-        """Create the judge; there is no command and no error yet."""
         self.error = nan
         self.reset()
 
     def reset(self) -> None:
-        """Drop all commands at the start of a new session."""
+        """Drop all stored commands, since a new session has started."""
         self._sent: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:
-        """Store a command that cloud sent."""
+        """Store a control period in which cloud sent a command."""
         self._sent[control.stamp_ns] = control
         if len(self._sent) > WAITING_MAX:
             del self._sent[next(iter(self._sent))]  # the oldest
 
     def echoed(self, control: Control, arrival_ns: int) -> None:
-        """Compute the error of the command whose echo arrived with this period's odometry.
+        """Compute the error of the delay estimate of a command whose echo has arrived.
 
         Args:
-            control: First control period after the echo.
-            arrival_ns: Arrival of the odometry with the echo [ns], cloud's clock.
+            control: First control period after the arrival of the echo.
+            arrival_ns: Arrival of the telemetry with the echo [ns], cloud's clock.
         """
         sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
         if sent is not None:

@@ -1,7 +1,7 @@
-"""The table of all Prometheus metrics: name, type, meaning, labels, and the exposing processes.
+"""Define all Prometheus metrics: name, type, meaning, labels, and the processes that expose them.
 
-Names follow the rules of Prometheus: prefix `cloudrc_`, base units, counters end in `_total`. Each
-label has a closed set of values, so that one pod has fewer than 200 series.
+Names follow the rules of Prometheus: prefix `cloudrc_`, base units, `_total` at the end of
+counters. The values of a label are known in advance: one pod has fewer than 200 series.
 """
 
 from __future__ import annotations
@@ -27,44 +27,45 @@ OUTCOMES = (
     *("sent", "used", "late", "stale", "repeated", "old_epoch", "range", "future", "malformed"),
     *("version", "direction", "accept_ignored", "tag", "hello", "busy", "unanswered"),
 )
-"""What can happen to a datagram. The sender counts "sent", the receiver the other outcomes."""
+"""Outcomes of a datagram. The sender counts "sent", the receiver counts all other outcomes."""
 ONLY_WORLD = {"stale", "range", "future", "hello", "unanswered"}
 """Outcomes that only world counts."""
 ONLY_CLOUD = {"accept_ignored"}
 """Outcomes that only cloud counts."""
 LIMITS = ("speed", "yaw_rate", "fence")
-"""Limits of the guard."""
+"""Limits to which the guard restricts commands."""
 PLUGINS = ("estimator", "predictor", "controller")
 GUARD_STATES = ("ground", "track", "hold", "land", "estop")
 """States of the guard, in the order of `cloudrc.messages.GuardState`."""
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
-"""States of a mission; the index of a state is the value of `cloudrc_mission_state`."""
+"""States of a mission; the value of `cloudrc_mission_state` is the index of the state."""
 MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
 API_REFUSALS = ("token", "role", "busy")
-"""Reasons for which the API rejects a request: no valid token; a reader's token for a request of an
-operator; too many requests at the same time."""
+"""Reasons for which the API rejects a request. "token": no valid token; "role": the token does not
+allow this request; "busy": too many requests at the same time."""
 ORDER_REFUSALS = ("invalid", "conflict")
-"""Reasons for which the API refuses an order: a value is invalid; another mission is active."""
+"""Reasons for which the API refuses a mission. "invalid": a value is invalid; "conflict": another
+mission is active."""
 BODIES = ("pipe", "board", "floor", "other")
-"""Kinds of bodies: `pipe_2` is a "pipe"; a body of any other kind counts as "other"."""
+"""Kinds of bodies that the robot can touch, such as "pipe" for the body `pipe_2`."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
-"""What can happen to a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains each."""
+"""Outcomes of a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains them."""
 SHAPERS = ("relay", "netem")
 LINK_MODES = ("auto", "relay", "netem")
 
 DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
-"""Upper bounds for delays and ages [s]."""
+"""Upper bounds of the buckets of delays and ages [s]."""
 GAP_BUCKETS = (0.05, 0.25)
-"""Upper bounds for gaps between arrivals [s]: a gap that jitter cannot explain, and the age at
-which the guard holds. There are only two bounds, to stay below 200 series per pod."""
+"""Upper bounds of the buckets of times between two arrivals [s]: 50 ms, more than jitter can cause,
+and 250 ms, after which the guard holds."""
 PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
-"""Upper bounds for loop periods [s], around the 10 ms of both loops."""
+"""Upper bounds of the buckets of loop periods [s]; the nominal period is 10 ms."""
 LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)
-"""Upper bounds for late wakes [s]."""
+"""Upper bounds of the buckets of the lateness of loops [s]."""
 RELEASE_PERCENTILES = {"50": "p50", "99": "p99", "99.9": "p999"}
-"""Label value -> name in the relay's `release_error_*` counts."""
+"""Value of the label `percentile` -> part of the name of the relay's count `release_error_*`."""
 STEP_PERCENTILES = {"50": "p50", "99": "p99"}
-"""Label value -> name in netem's `step_lateness_*` counts."""
+"""Value of the label `percentile` -> part of the name of netem's count `step_lateness_*`."""
 
 Labels = tuple[str, ...]
 
@@ -81,12 +82,12 @@ class Metric(NamedTuple):
     """One Prometheus metric.
 
     Attributes:
-        name: Name in the scrape; a histogram adds `_bucket`, `_sum` and `_count`.
+        name: Name of the metric; a histogram adds `_bucket`, `_sum` and `_count`.
         kind: Type of the metric.
         meaning: The HELP text, one or two sentences.
         roles: Processes that expose the metric.
         labels: Label name -> all possible values of the label.
-        buckets: Upper bounds of a histogram, rising, in the metric's unit.
+        buckets: Upper bounds of a histogram's buckets, in rising order and the metric's unit.
     """
 
     name: str
@@ -108,10 +109,10 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         """
         cloudrc_build_info: Always 1; the labels name the process, its version and its
             configuration. Both ends of a run have the same configuration.
-        cloudrc_ready: 1 while this process hears its peer, else 0.
-        cloudrc_cpu_periods_total: CFS periods in which this container wanted to run.
-        cloudrc_cpu_throttled_periods_total: CFS periods in which the CPU limit stopped this
-            container.
+        cloudrc_ready: 1 while this process receives messages from its peer, else 0.
+        cloudrc_cpu_periods_total: Scheduler periods (CFS) in which this container wanted CPU time.
+        cloudrc_cpu_throttled_periods_total: Scheduler periods (CFS) in which the CPU limit stopped
+            this container.
         cloudrc_cpu_throttled_seconds_total: Time for which the CPU limit stopped this container.
         """,
     ),
@@ -121,59 +122,56 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         cloudrc_session_epoch: Epoch number of the current session.
         cloudrc_sessions_opened_total: Sessions opened since this process started.
         cloudrc_datagrams_total: Datagrams by outcome; updated once a second.
-        cloudrc_datagrams_expected_total: Incoming telemetry or command datagrams whose fate is
-            known: arrived or lost.
-        cloudrc_datagrams_lost_total: Expected datagrams that had not arrived when the peer had
-            sent 128 newer ones.
+        cloudrc_datagrams_expected_total: Incoming telemetry or command datagrams that have arrived
+            or count as lost.
+        cloudrc_datagrams_lost_total: Datagrams that had not arrived when the peer had sent 128
+            newer ones.
         cloudrc_datagrams_reordered_total: Telemetry or command datagrams that arrived after a
             newer one.
         cloudrc_link_gap_seconds: Time between two arrivals: of telemetry at cloud, of commands at
             world.
-        cloudrc_link_believed: 1 if the incoming direction of the link behaves as configured, 0 if
-            it does not (/link.json on the same port says why); absent while there are too few
+        cloudrc_link_believed: 1 if the incoming direction of the link matches its profile, 0 if it
+            does not (/link.json on the same port says why); absent while there are too few
             datagrams to decide.
-        cloudrc_age_of_information_seconds: Age of the newest datagram used, sampled every period:
-            odometry in cloud, commands in world; absent unless both ends prove that they share a
+        cloudrc_age_of_information_seconds: Age of the newest odometry in cloud, of the newest
+            command in world, sampled every period; absent unless both ends prove that they share a
             clock.
-        cloudrc_loop_period_seconds: Time between two handled deadlines.
-        cloudrc_loop_lateness_seconds: Delay from a deadline to the wake of the loop.
-        cloudrc_loop_busy_seconds_total: Time spent handling deadlines.
+        cloudrc_loop_period_seconds: Time between two periods of the loop.
+        cloudrc_loop_lateness_seconds: Time from the deadline of a period to the wake of the loop.
+        cloudrc_loop_busy_seconds_total: Time for which the loop computed.
         cloudrc_recorder_dropped_records_total: Records that did not reach the recording.
-        cloudrc_recorder_sync_age_seconds: Time since the start of the newest completed sync of
-            the recording: the part that a power cut would lose; absent without a recording,
-            rising forever after recording failed.
-        cloudrc_clock_steps_total: Times that the wall clock was set, each recorded as a fault
-            with its size; flight does not depend on the wall clock.
+        cloudrc_recorder_sync_age_seconds: Time since the newest completed sync of the recording to
+            disk began: the part that a power cut would lose; absent without a recording.
+        cloudrc_clock_steps_total: Times that somebody set the wall clock; the flight does not
+            depend on the wall clock.
         """,
     ),
     (
         (WORLD,),
         f"""
-        cloudrc_clouds_admitted_total: Cloud processes that got a session: the first, one that
-            restarted, or another one.
+        cloudrc_clouds_admitted_total: Cloud processes that got a session, restarted ones included.
         cloudrc_sessions_refused_total: Session requests refused because another cloud controls
             the robot.
         cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams
             included; absent unless both ends prove that they share a clock.
         cloudrc_position_meters: True position of the base, world frame.
         cloudrc_tip_force_newtons: Force on the touch sensor at the arm's tip.
-        cloudrc_command_age_seconds: Age of the current command, sampled every period in TRACK:
-            time since the odometry that it was computed from, on world's clock, as the guard sees
-            it.
+        cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every period:
+            time since the odometry from which cloud computed the command, on world's clock.
         cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
         cloudrc_guard_transitions_total: Changes of the guard's state, by new state.
         cloudrc_guard_limited_total: Commands that a limit of the guard changed; for the fence,
-            ticks instead of commands.
+            physics steps instead of commands.
         cloudrc_guard_held_seconds_total: Time in HOLD during missions; updated once a second.
-        cloudrc_guard_starts_refused_total: Mission starts refused: in LAND or ESTOP.
-        cloudrc_contacts_total: Times that the robot came into contact with a body of the scene,
-            by kind of body.
+        cloudrc_guard_starts_refused_total: Mission starts refused because the guard was in LAND or
+            ESTOP.
+        cloudrc_contacts_total: Contacts of the robot with bodies of the scene, by kind of body.
         cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below
             0.95 a run is invalid.
         cloudrc_world_slip_seconds_total: Time by which world's clock has fallen behind the
             machine's clock.
-        cloudrc_world_stalls_total: Wakes so late that the datagrams waiting in the socket were
-            stale.
+        cloudrc_world_stalls_total: Times that world woke up so late that the datagrams waiting in
+            the socket were stale.
         """,
     ),
     (
@@ -181,14 +179,13 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         """
         cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included;
             absent unless both ends prove that they share a clock.
-        cloudrc_rtt_seconds: Round trip of applied commands, without the hold time in world; one
-            sample per echo.
-        cloudrc_loop_delay_seconds: Time from a command's stamp to its echo, with the hold time in
-            world: the paper's tau.
-        cloudrc_delay_estimate_seconds: Delay estimate, clamped: the horizon over which the newest
-            odometry is predicted.
+        cloudrc_rtt_seconds: Round trip of applied commands, without their time in world.
+        cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world: the
+            paper's tau.
+        cloudrc_delay_estimate_seconds: Delay estimate, clamped: how far ahead cloud predicts the
+            newest odometry.
         cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry
-            to the application of the command, for the newest echoed command.
+            to the application of the command, for the newest command that the robot confirmed.
         cloudrc_prediction_error_meters: Newest prediction error: predicted minus measured
             position at the same instant.
         cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction
@@ -200,12 +197,13 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         cloudrc_command_velocity_meters_per_second: Commanded velocity, world frame.
         cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
         cloudrc_horizon_clamped_total: Delay estimates above 1 s or below 0, which were clamped.
-        cloudrc_commands_frozen_total: Zero-velocity commands sent because no echo arrives.
+        cloudrc_commands_frozen_total: Zero-velocity commands sent because the robot confirmed no
+            newer command.
         cloudrc_plugin_failures_total: Plug-in calls that raised an exception or returned a value
             that is not finite.
         cloudrc_words_dropped_total: Teleop messages dropped because they were for another session
             or no request number was left.
-        cloudrc_loop_missed_periods_total: Commands that a late loop skipped.
+        cloudrc_loop_missed_periods_total: Periods without a command because the loop was late.
         """,
     ),
     (
@@ -233,23 +231,24 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
     (
         (LINK,),
         """
-        cloudrc_link_info: Always 1; the labels say what shapes a direction of the link, and the
+        cloudrc_link_info: Always 1; the labels name the shaper of a direction of the link, and the
             configured mode.
         cloudrc_link_delay_seconds: Mean one-way delay that the current link profile sets.
-        cloudrc_link_step_lateness_seconds: Lateness of the last 10,000 changes of netem's qdisc
+        cloudrc_link_step_lateness_seconds: Lateness of the last 10,000 changes of netem's settings
             on the profile's time line; absent without changes.
         cloudrc_link_datagrams_total: Datagrams at the shaper, by outcome.
-        cloudrc_link_restored_total: Times that another program removed or changed netem's qdisc.
+        cloudrc_link_restored_total: Times that another program removed or changed netem's
+            settings.
         cloudrc_link_release_error_seconds: Lateness of datagrams that left the relay in the last
             10 s; absent with netem.
-        cloudrc_link_released_early_total: Datagrams that left the relay before they were due;
-            above 0 the relay has a bug; absent with netem.
+        cloudrc_link_released_early_total: Datagrams that left the relay too early; above 0 the
+            relay has a bug; absent with netem.
         cloudrc_dns_errors_total: Failed look-ups of the peer's name; the last known address stays
             in use.
         """,
     ),
 )
-"""Exposing processes, and the names and meanings of the metrics that they expose."""
+"""Processes -> names and meanings of the metrics that they expose."""
 
 _BY_DIRECTION: Mapping[str, Labels] = {"direction": DIRECTIONS}
 _BY_AXIS: Mapping[str, Labels] = {"axis": AXES}
@@ -279,7 +278,7 @@ _LABELS: Mapping[str, Mapping[str, Labels]] = {
     "cloudrc_link_datagrams_total": {"outcome": LINK_OUTCOMES},
     "cloudrc_link_release_error_seconds": {"percentile": tuple(RELEASE_PERCENTILES)},
 }
-"""Name of a metric -> label -> all values of the label; () if the set is open."""
+"""Name of a metric -> label -> all values of the label; () if the values are not known."""
 _BUCKETS: Mapping[str, tuple[float, ...]] = {
     "cloudrc_link_gap_seconds": GAP_BUCKETS,
     "cloudrc_uplink_delay_seconds": DELAY_BUCKETS,

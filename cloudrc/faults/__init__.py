@@ -1,9 +1,9 @@
-"""Injects faults into flights in virtual time and checks how the system reacts.
+"""Inject faults into flights in virtual time, and check how the system reacts.
 
-scenario, scenarios/   named faults with the checks of what must follow, and their results
-measures               what scenarios ask about a flight
-schedule, adversary    random faults of one flight; hostile clouds
-models, flight         processes, clocks and teleop around the two ends; a whole flight
-invariants             what is checked after every step of the physics
-trial, search          one schedule, a search over many
+scenario, scenarios/   named faults with checks of the required reaction
+measures               measurements in a flight, for the checks of the scenarios
+schedule, adversary    random faults of one flight; dishonest clouds
+models, flight         models of processes, clocks and teleop; a whole flight
+invariants             safety rules, checked after every step of the physics
+trial, search          fly one schedule of faults; search over many schedules
 """

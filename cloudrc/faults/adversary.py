@@ -1,9 +1,9 @@
-"""Model dishonest clouds, which have valid keys and send any command.
+"""Model dishonest clouds, which have valid keys and can send any command.
 
-A policy sees what an honest cloud sees (the newest odometry and its own estimate of the delay) and
-sends any command, properly sealed. Some policies also lie about the odometry that a command was
-computed from, fall silent to time the guard's transitions, or make requests in the operator's name:
-world cannot tell who makes them, because cloud relays the operator's requests.
+A policy knows what an honest cloud knows: the newest odometry and its own estimate of the delay. It
+can send any command with a valid signature. Some policies also state a wrong odometry stamp, pause
+their commands, or make requests of the operator. World cannot detect such requests, because cloud
+forwards the operator's requests.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ from cloudrc.world.robot import STEP_NS
 
 Generator: TypeAlias = np.random.Generator
 Lie: TypeAlias = Callable[[Command, Control], Command]
-"""Returns the command that is sent in place of the honest one; the record holds what cloud knew."""
+"""Function that changes an honest command; it also gets cloud's record of the control period."""
 Policy: TypeAlias = Callable[[Generator], Lie]
 Words: TypeAlias = Callable[[int, RobotStatus], OperatorRequest | None]
-"""Returns a request in the operator's name, or None, at a time of cloud's clock [ns]. The status is
-the newest that cloud knows. The request's number is not used."""
+"""Function that makes a false operator request, or None, at a time on cloud's clock [ns]. The
+status is the newest that cloud knows. The number of the request is not used."""
 
 
 class DishonestLoop(ControlLoop):
-    """Computes the honest command, and changes it before it is sent."""
+    """Computes honest commands, and changes them before they are sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any) -> None:
-        """Change each command by these lies, one after the other; `plugins` as `ControlLoop`."""
+        """Apply all `lies` in turn to each command; `plugins` are as for `ControlLoop`."""
         super().__init__(*plugins)
         self._lies = lies
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
     ) -> tuple[Command, Control]:
-        """See `ControlLoop`; `dt` is the time since the last command [s]."""
+        """Implement `ControlLoop.command`; `dt` is the time since the last command [s]."""
         command, control = super().command(setpoint, now_ns, dt, epoch, counter)
         for lie in self._lies:
             command = lie(command, control)
@@ -64,9 +64,9 @@ class DishonestLoop(ControlLoop):
 
 
 class HostileOperator:
-    """An `Operator` that passes teleop's setpoints on, but replaces teleop's requests.
+    """An `Operator` that forwards teleop's setpoints, but replaces teleop's requests.
 
-    Before the first setpoint it passes the requests on, too, so that a mission begins.
+    Before the first setpoint it also forwards requests, so that a mission begins.
     """
 
     outcome, settled = None, True
@@ -79,7 +79,7 @@ class HostileOperator:
         self._number = 0  # of the last request in this session
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """See `Operator`."""
+        """Implement `Operator.see`."""
         if self._seen is None or self._seen.epoch != seen.epoch:
             self._number = 0
         self._seen, self._number = seen, max(self._number, seen.mission)
@@ -87,7 +87,7 @@ class HostileOperator:
         self._collect()
 
     def handle_deadline(self, now_ns: int) -> None:
-        """See `Operator`."""
+        """Implement `Operator.handle_deadline`."""
         self._honest.handle_deadline(now_ns)
         self._collect()
         if self._has_setpoint and self._seen is not None:
@@ -96,7 +96,7 @@ class HostileOperator:
                 self.outputs = [*self.outputs, request._replace(number=self._number)]
 
     def take_outputs(self) -> Sequence[Output | Fault]:
-        """See `Operator`."""
+        """Implement `Operator.take_outputs`."""
         outputs, self.outputs = self.outputs, []
         return outputs
 
@@ -125,13 +125,13 @@ CHOICES = {
     GuardState.LAND: LATCHED,
     GuardState.ESTOP: LATCHED,
 }
-"""Probability of each request, by the state of the guard that cloud knows of."""
+"""State of the guard as cloud knows it -> probability of each request."""
 FACE_WAIT_NS = 5_000_000_000  # longest wait for the robot to come near a face of the fence [ns]
 REACHED = (0, 1, 7, MISSION_OVER)
 
 
 def at_bad_moments(rng: Generator) -> Words:
-    """Make requests after random pauses; half of them wait until the robot is near a face."""
+    """Make requests after random pauses; half of them wait until the robot is near the fence."""
     pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
     due_ns, waits = 0, False
 
@@ -151,16 +151,16 @@ def at_bad_moments(rng: Generator) -> Words:
 
 
 def _faces(position: Vector) -> list[tuple[float, int, float]]:
-    """Return each wall and the ceiling: its distance [m], its axis, and the way to it (1 or -1)."""
+    """List walls and ceiling: distance [m], axis, and direction along the axis (1 or -1)."""
     walls = [(p - LOW[n], n, -1.0) for n, p in enumerate(position) if n < 2]
     return [(HIGH[n] - p, n, 1.0) for n, p in enumerate(position)] + walls
 
 
 def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
-    """Make the functions by which a schedule's policy changes commands and makes requests.
+    """Make the functions that change commands and make requests, for a schedule's policy.
 
     Raises:
-        BadInputError: If there is no such policy; names all policies.
+        BadInputError: If the policy does not exist; the text lists all policies.
     """
     if schedule.policy not in POLICIES:
         names = ", ".join(POLICIES)
@@ -171,7 +171,7 @@ def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
 
 
 def choose(seed: int) -> Schedule:
-    """Make the schedule of a seed: a hostile cloud, with or without random faults."""
+    """Make the schedule of a seed: a dishonest cloud, with or without random faults."""
     rng, names = generator(seed, 665), sorted(POLICIES)
     profile = ("ideal", *PAPER)[int(rng.integers(4))]
     calm = Schedule(seed, profile, duration=DURATION)
@@ -186,13 +186,12 @@ NONSENSE_NS = 80_000_000  # duration of impossible commands that makes the guard
 
 
 def _fly(command: Command, velocity: Sequence[float], **others: Any) -> Command:
-    """Replace a command's velocity [m/s], and perhaps other fields."""
     x, y, z = velocity
     return command._replace(velocity=(x, y, z), **others)
 
 
 def _towards_a_face(rng: Generator) -> Lie:
-    """Fly towards a face, an edge or a corner of the fence."""
+    """Fly towards a wall, an edge or a corner of the fence."""
     way: list[int] = rng.choice([-1, 0, 1], 3).tolist()
     way = way if any(way) else [0, 0, 1]
     speed = float(rng.choice([2.0, FAST, 40.0, 1e3]))
@@ -200,7 +199,7 @@ def _towards_a_face(rng: Generator) -> Lie:
 
 
 def _face_after_face(rng: Generator) -> Lie:
-    """Fly from a face of the fence to the opposite face, at most speed; then along another axis."""
+    """Fly at full speed between opposite sides of the fence, sometimes along another axis."""
     axis, way = int(rng.integers(3)), 1.0
     near = float(rng.uniform(0.1, 2.0))
 
@@ -230,7 +229,7 @@ def _greedy(rng: Generator) -> Lie:
 
 
 def _on_the_limit(rng: Generator) -> Lie:
-    """Fly slightly faster than the stop rule allows."""
+    """Fly slightly faster than the guard's stop rule allows."""
     more = float(rng.uniform(1.0, 1.5))
     way: list[int] = rng.choice([-1, 1], 3).tolist()
 
@@ -247,7 +246,7 @@ def _on_the_limit(rng: Generator) -> Lie:
 
 
 def _shaking(rng: Generator) -> Lie:
-    """Shake at a frequency that may be a resonance of the onboard loops."""
+    """Shake at a frequency at which the onboard control loops may resonate."""
     frequency, plane = float(rng.uniform(0.2, 10.0)), rng.permutation(3).tolist()
     bias: list[float] = rng.uniform(-3.0, 3.0, 3).tolist()
 
@@ -262,7 +261,6 @@ def _shaking(rng: Generator) -> Lie:
 
 
 def _random(rng: Generator) -> Lie:
-    """Change to a random velocity at random times."""
     velocity, until_ns = list(ZERO), 0
 
     def lie(command: Command, control: Control) -> Command:
@@ -276,7 +274,7 @@ def _random(rng: Generator) -> Lie:
 
 
 def _strange_numbers(rng: Generator) -> Lie:
-    """Send special values in all fields: too rarely for a landing, or all the time."""
+    """Send NaN, infinity and huge values: too rarely to cause a landing, or all the time."""
     share = float(rng.choice([0.01, 0.03, 1.0]))
 
     def lie(command: Command, control: Control) -> Command:
@@ -289,7 +287,7 @@ def _strange_numbers(rng: Generator) -> Lie:
 
 
 def _false_basis(rng: Generator) -> Lie:
-    """Make commands claim a wrong basis: odometry of the future, or old odometry."""
+    """State a wrong odometry stamp in commands: in the future, or too old."""
     shift_ns = int(rng.choice([1, STEP_NS, 10_000_000, 200_000_000, 2**62]))
     sign = int(rng.choice([-1, 1]))
 
@@ -302,7 +300,7 @@ def _false_basis(rng: Generator) -> Lie:
 
 
 def _stop_and_go(rng: Generator) -> Lie:
-    """Let commands become stale and fresh again, always with the same random velocity."""
+    """Alternate between stale and fresh commands of the same random velocity."""
     period_ns = int(rng.uniform(0.3e9, 3e9))
     velocity = rng.uniform(-FAST, FAST, 3).tolist()
 
@@ -314,12 +312,12 @@ def _stop_and_go(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Fly by one of `FASTEST`; `at_bad_moments` makes requests at the same time."""
+    """Fly as one of the policies in `FASTEST`; `at_bad_moments` makes requests meanwhile."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
-    """Fly fast, and sometimes make the guard land; requests acknowledge the landing in the air."""
+    """Fly fast, sometimes cause a landing, and acknowledge the landing in the air."""
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 
     def lie(command: Command, control: Control) -> Command:
@@ -338,4 +336,4 @@ POLICIES: dict[str, Policy] = {
         *(_shaking, _stop_and_go, _strange_numbers),
     )
 }
-"""Every policy by its name: towards-a-face."""
+"""Name, such as towards-a-face -> policy."""

@@ -1,6 +1,6 @@
-"""Fly an experiment in virtual time with faults, and check the invariants in every step.
+"""Fly an experiment in virtual time with faults, and check the invariants after every step.
 
-Both ends and their driver are those of production; processes and teleop are models.
+World, cloud and their driver are those of production; processes and teleop are models.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from cloudrc.world.endpoint import WorldEndpoint
 from cloudrc.world.robot import Robot
 
 Shape: TypeAlias = Callable[[DirectionProfile], DirectionProfile]
-"""Changes the conditions of one direction of the link."""
+"""Function that changes the conditions of one direction of the link."""
 SECRET = KeySet(Key(b"a key of the fault suite, 32 b.."))
 SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
@@ -45,22 +45,22 @@ def conditions(**changes: object) -> Shape:
 
 
 def silent(start: float, duration: float, **changes: object) -> Shape:
-    """Return a `Shape` in which no datagram passes, from `start` [s] on for `duration` [s]."""
+    """Return a `Shape` that loses all datagrams from `start` [s] for `duration` [s]."""
     return conditions(blackouts=(Blackout(start, duration),), **changes)
 
 
 class Flight:
     """One flight of world, cloud, teleop and link.
 
-    `rings` are the keys of the running processes, `secrets` the contents of the key files. Every
-    100 ms each of the `listeners` gets world's new records and the virtual time [ns].
+    `rings` contains the keys of the running processes, `secrets` the contents of their key files.
+    Every 100 ms, each of `listeners` is called with world's new records and the virtual time [ns].
     """
 
     def __init__(
         self,
-        *settings: str,  # of the experiment `paper`, as `--set` takes them
+        *settings: str,  # settings of the experiment `paper`, as for `--set`
         seed: int = 1,
-        cloud_clock: Clock | None = None,  # None if the two ends share a clock
+        cloud_clock: Clock | None = None,  # None if world and cloud share a clock
         link: Shape = replace,  # changes both directions of the link; by default nothing
         uplink: Shape | None = None,  # changes the direction from world to cloud instead
         downlink: Shape | None = None,  # changes the direction from cloud to world instead
@@ -69,11 +69,11 @@ class Flight:
         start: bool = True,  # whether the experiment's mission is ordered at once
         life: int = 1,  # makes the nonces differ from those of another flight
         lies: Sequence[Lie] = (),  # change cloud's commands, one after the other
-        words: Words | None = None,  # takes the operator's place in cloud
+        words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,
-        separate: bool = False,  # whether teleop is a process of its own, not in cloud's
+        separate: bool = False,  # whether teleop has its own process
     ) -> None:
-        """Prepare a flight; another cloud asks for the robot at `second` [s], if not None."""
+        """Prepare a flight; at `second` [s], if given, another cloud asks for the robot."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
@@ -99,7 +99,7 @@ class Flight:
 
     @property
     def robot(self) -> Robot:
-        """The robot of the running world."""
+        """The robot of the running world process."""
         assert isinstance(self.world.inner, WorldEndpoint), "the world is down"
         return self.world.inner.robot
 
@@ -114,43 +114,43 @@ class Flight:
         return self.run.now_ns * 1e-9
 
     def make_order(self) -> Order:
-        """Make an order of the experiment's mission."""
+        """Make an order for the experiment's mission."""
         plan = assembly.build_plan(self.experiment)
         return Order(plan, contact=self.experiment.criteria.contact)
 
     def order_if_possible(self, now_ns: int) -> None:
-        """Order the experiment's mission at `now_ns` [ns, virtual time]; ignore a refusal."""
+        """Order the experiment's mission at `now_ns` [ns, virtual time]; a refusal is ignored."""
         order, own_ns = self.make_order(), self._clock.at(now_ns)
         self.teleop.ask(lambda service, own_ns: service.create(order, own_ns), own_ns)
 
     def fly(self, until: float, is_over: Callable[[], bool] = lambda: False) -> Flight:
-        """Fly on until an instant of virtual time [s], or until `is_over`."""
+        """Continue the flight until the virtual time `until` [s] or until `is_over` is True."""
         self.run.fly(is_over, round(until * 1e9), self._sink)
         return self
 
     def fly_mission(self, limit: float = 120.0) -> Flight:
-        """Fly on until 1 s after the mission's end, at most until `limit` [s]."""
+        """Continue the flight until 1 s after the mission's end, at most until `limit` [s]."""
         self.fly(limit, lambda: self.teleop.service is not None and self.mission.ended)
         return self.fly(self.now + 1.0)
 
     def restart_pod(self, now_ns: int, down: float) -> None:
-        """Kill cloud and teleop at `now_ns` [ns]; new ones start after `down` [s]."""
+        """Kill cloud and teleop at `now_ns` [ns]; start new processes after `down` [s]."""
         self.teleop.kill(now_ns)
         self.cloud.restart(now_ns, down)
         self.cloud.at(now_ns * 1e-9 + down, self.teleop.start)
 
     def replace_key(self, end: str, keys: KeySet) -> None:
-        """Write an end's key file; a process that is down reads it later."""
+        """Write the key file of `end`; a process that is not running reads it when it starts."""
         self.secrets[end] = self.rings[end].keys = keys
 
     def end_rival(self) -> None:
-        """End the other cloud; the first cloud has to get the robot back."""
+        """Stop the second cloud; the first cloud must then get the robot back."""
         if isinstance(self.cloud.inner, EndpointGroup):
             self.cloud.inner.members = self.cloud.inner.members[:1]
         self._second = None
 
     def sha256(self) -> str:
-        """Return the hash of all records so far; without `keep` there are none."""
+        """Return the hash of all records so far; requires `keep`."""
         return self._hash.hexdigest()
 
     def trajectory(self) -> list[GroundTruth]:
@@ -158,18 +158,18 @@ class Flight:
         return [record for record in self.of_world if isinstance(record, GroundTruth)]
 
     def count(self, name: str) -> int:
-        """Return world's newest count of `name` [1], or 0 if world has recorded none."""
+        """Return the last value of world's counter `name` [1]; 0 if it was never recorded."""
         counted = [r.total for r in self.of_world if isinstance(r, Counted) and r.name == name]
         return counted[-1] if counted else 0
 
     def events(self, *names: str) -> list[MissionEvent]:
-        """Return the mission events whose name is one of `names`."""
+        """Return the mission events with one of these names."""
         return [event for event in self.teleop.events if event.event in names]
 
     def guard_now(self) -> tuple[GuardState, str]:
-        """Return the state of the running guard and its cause; GROUND while world is down.
+        """Return the guard's present state and its cause; GROUND while world is not running.
 
-        A new guard records no change at its start, so the last change may be another guard's.
+        After a restart of world, the last recorded change belongs to the old guard.
         """
         if self.world.inner is None:
             return GuardState.GROUND, "the world is down"
@@ -197,7 +197,7 @@ class Flight:
         return EndpointGroup([cloud, self._build_rival(joins_ns)])
 
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
-        """Build another cloud with the same key, which wants to fly the same mission."""
+        """Build a second cloud with the same key and its own order of the same mission."""
         teleop = TeleopModel(self.experiment.criteria.contact_speed_max_mps, name=b"rival")
         teleop.order(Order(assembly.build_plan(self.experiment)), start_ns)
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
@@ -208,7 +208,7 @@ class Flight:
         return LinkDirection(shape(profile), self.experiment.seed, uplink=up)
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:
-        """Begin a new process of an end, with its own nonce and the keys of its file."""
+        """Make the identity of a new process of `end`: a new nonce, and keys from its file."""
         self.generations[end] += 1
         self.rings[end] = KeyRing(self.secrets[end])
         nonce = f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)

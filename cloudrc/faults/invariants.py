@@ -1,27 +1,29 @@
 """Safety invariants, checked after every 2 ms step, independently of the guard.
 
-fence      The base stays inside the fence while the rotors turn. After an emergency stop or a hit
-           the robot may leave the fence, but at most by `FALL_MAX`. Rotors that have stopped turn
-           again only where the robot lies still inside.
-cap, stop  The reference stays below the caps and can be stopped before the fence; in LAND the floor
-           is no limit. After a HOLD the reference grows slowly at first.
-stale      World accepts no command, and flies none in TRACK, that was computed from odometry older
-           than the limit. HOLD ends in TRACK on `RESUME_COMMANDS` fresh commands in `RESUME_NS`.
+fence      The base stays inside the fence while the rotors turn. After a collision or an
+           emergency stop the robot may leave the fence by at most `FALL_MAX`. Rotors that were
+           stopped start again only if the robot lies still inside the fence.
+cap, stop  The reference velocity stays within its limits, and the robot can always stop before the
+           fence. During LAND it may fly down to the floor. After a HOLD the reference velocity
+           grows slowly at first.
+stale      World never accepts a command, or flies it in TRACK, if the odometry that the command is
+           based on is too old. HOLD changes to TRACK only after `RESUME_COMMANDS` fresh commands
+           within `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
-           request, after a hit, or where the robot stands.
-collision  With an honest cloud only the arm's tip touches anything, and only the board. A robot
-           that lands, or that the operator stopped, may come down on anything: the guard does not
-           know what is below.
-latch      TRACK is for missions that the operator has started. LAND and ESTOP last until the
-           operator acknowledges them.
-hold       From one TRACK to the next, and from one HOLD for silence to the next, `SETTLE_NS` pass.
-           Commands from older odometry than before may cause a HOLD sooner. In a mission a robot
-           without commands lands after the configured time; impossible commands make the robot land
-           sooner.
-tick       Each step of the physics has a tick of the guard.
+           request, after a collision, or if the robot stands.
+collision  If the cloud is honest, only the arm's tip touches something, and only the board. A robot
+           that lands, or that the operator has stopped, may touch anything, because the guard does
+           not know what is below.
+latch      The robot is in TRACK only during a mission that the operator has started. LAND and ESTOP
+           last until the operator acknowledges them.
+hold       At least `SETTLE_NS` pass from one TRACK to the next, and from one HOLD without commands
+           to the next. A HOLD may come sooner if a command is based on older odometry than the
+           command before. In a mission, a robot without commands lands after the configured time,
+           or sooner after impossible commands.
+tick       The guard runs once in each step of the physics.
 
-All limits come from the configuration and from docs/, none from the guard: from "Stop rule" and
-"Leaving HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, "The guard" in safety.md.
+All limits come from the configuration and docs/, not from the guard: from "Stop rule" and "Leaving
+HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, and "The guard" in safety.md.
 """
 
 from __future__ import annotations
@@ -51,45 +53,45 @@ FLOWN, LATCHED = (TRACK, HOLD, LAND), (LAND, ESTOP)
 REPORTED = 5  # number of breaches of each kind that are kept
 SLACK = 1e-9  # tolerance for rounding [m/s]
 STILL = 0.12
-"""Speed below which a robot lies still [m/s]: the guard's 0.1, plus one tick of free fall."""
+"""Largest speed of a robot that lies still [m/s]: the guard's 0.1, plus one step of free fall."""
 STANDS = 0.2  # speed per axis up to which a robot stands when its rotors stop [m/s]
 FALL = 1.0
-"""Speed of a robot that fell after its rotors stopped [m/s]; a drop from 0.02 m reaches 0.7."""
+"""Downward speed that proves a fall with stopped rotors [m/s]; a drop of 0.02 m reaches 0.7."""
 REST = 0.5
 """Length added to the stopping distance after TRACK [m]; the robot swings back by up to 0.2 m."""
-FALL_MAX = 1.5  # distance from the fence at which people are safe [m]
+FALL_MAX = 1.5  # largest distance that a falling robot may leave the fence [m]
 BRAKE_NS = 200_000_000  # time to stop a descent that the operator has acknowledged [ns]
-REELS_NS = 1_000_000_000  # time after a hit in which the hit explains the robot's motion [ns]
-THROWN_NS = 3_000_000_000  # time after a hit in which the robot may be thrown out of the fence [ns]
+REELS_NS = 1_000_000_000  # time after a collision in which it explains the robot's motion [ns]
+THROWN_NS = 3_000_000_000  # time after a collision in which the robot may leave the fence [ns]
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
-"""Number of fresh commands that end a HOLD, and the time within which they come [ns]."""
+"""Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""
 SETTLE_NS = 1_000_000_000
 """Shortest time from one TRACK to the next, and from one HOLD to the next [ns]."""
 INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
-"""Number of impossible commands that cause a landing, and the time within which they come [ns]."""
+"""Number of impossible commands that cause a landing, if they arrive within INVALID_NS [ns]."""
 INVALID = ("range", "future")  # reasons for which the guard rejects impossible commands
 GROUND_NS = 10_000_000_000
-"""Shortest time for which a robot on the ground waits for a mission's first command [ns]."""
+"""Shortest time that a robot on the ground waits for a mission's first command [ns]."""
 RAMP = 3.0  # largest growth of the reference after a HOLD [m/s^2]
 RAMP_MIN = 1.0
-"""Shortest time for which the reference grows slowly [s]; it is longer if the cap is higher."""
+"""Shortest time for which the reference velocity grows slowly [s]; longer with a higher limit."""
 
 
 class Breach(NamedTuple):
-    """An invariant that did not hold: its name, and what happened."""
+    """A violation of an invariant: the invariant's name, and what happened."""
 
-    time: float  # on world's clock [s]
+    time: float  # time on world's clock [s]
     kind: str
     text: str
 
 
 class Limits(NamedTuple):
-    """Limits that the guard has to keep."""
+    """Limits that the guard must keep."""
 
-    speed: float = 6.0  # of the reference [m/s]
+    speed: float = 6.0  # speed of the reference [m/s]
     acceleration: float = 12.0  # growth of the reference [m/s^2]
     yaw_rate: float = 1.0  # [rad/s]
-    age_ns: int = 250_000_000  # of a command's basis [ns]
+    age_ns: int = 250_000_000  # age of a command's odometry [ns]
     hold_ns: int = 60_000_000_000  # time in a mission after which HOLD becomes LAND [ns]
 
     @classmethod
@@ -105,21 +107,21 @@ class Limits(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of a flight; each restart of world brings another robot to check."""
+    """Collects the breaches of a flight, also those of the new robot after a restart of world."""
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.breaches: list[Breach] = []  # the first ones of each kind
         self.counts: Counter[str] = Counter()  # of breaches, by kind
-        self.margin = 9.0  # smallest distance of the base to the fence, the floor excepted [m]
+        self.margin = 9.0  # smallest distance of the base to the fence, without the floor [m]
         self.speed = 0.0  # largest reference [m/s]
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
-        """Check a robot's steps from `start_ns` [ns] on; if `honest`, contacts are breaches."""
+        """Check a robot from `start_ns` [ns] on; if `honest`, wrong contacts are breaches."""
         robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
-        """Note a breach at `now_ns` [ns]."""
+        """Record a breach at `now_ns` [ns]."""
         self.counts[kind] += 1
         if self.counts[kind] <= REPORTED:
             self.breaches.append(Breach(now_ns * 1e-9, kind, text))
@@ -134,16 +136,16 @@ class RobotInvariants:
         self._was = self._state = robot.guard.state  # after the last step; after the last event
         self._next_ns, self._steps = start_ns, 0
         self._before = ZERO  # the last reference [m/s]
-        self._newest_ns = -1  # basis of the accepted commands
-        # Motion: after a stop or a hit, and after TRACK.
+        self._newest_ns = -1  # newest odometry stamp of accepted commands [ns]
+        # Motion after a stop or a collision, and after TRACK.
         self._comes_down = False  # whether it lands, or fell after an emergency stop
-        self._falls = False  # after a stop or a hit, until it flies again
+        self._falls = False  # after a stop or a collision, until it flies again
         self._landed_ns = -2 * BRAKE_NS
         self._left, self._way = ZERO, inf  # where TRACK ended, and how far the robot may go
         # Contacts and rotors.
         self._touches, self._seen = robot.simulator.touches, 0
         self._touched_ns = -THROWN_NS
-        self._is_thrown = False  # by a hit, and not yet back inside the fence
+        self._is_thrown = False  # by a collision, and not yet back inside the fence
         self._turned = self._halted = self._is_asked = False
         # The operator, and the wait for commands.
         self._ramp_ns = round(max(RAMP_MIN, watch.limits.speed / RAMP) * 1e9)
@@ -152,14 +154,14 @@ class RobotInvariants:
         self._armed = False  # whether a mission is on
         self._released = set[GuardState]()  # states acknowledged since the last change
         self._is_reset = self._impossible = self._goes_back = False
-        self._basis_ns = -1  # of the commands in a mission
+        self._basis_ns = -1  # newest odometry stamp of commands in a mission [ns]
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
 
-    # What the robot shows.
+    # Calls of the robot.
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
-        """See `Observer`."""
+        """Implement `Observer.see_step`: check all invariants."""
         guard, steps, was = self._guard, self._simulator.steps, self._was
         state, reference, position = guard.state, guard.reference, readings.position
         if now_ns != self._next_ns or steps != self._steps + 1:
@@ -193,7 +195,7 @@ class RobotInvariants:
         self._was, self._state, self._before = state, state, reference
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """See `Observer`; count the fresh commands in a HOLD, and the impossible ones."""
+        """Implement `Observer.see_command`: count fresh and impossible commands."""
         if rejection is None:
             basis_ns = command.basis_stamp_ns
             if not 0 <= now_ns - basis_ns <= self._limits.age_ns:
@@ -215,7 +217,7 @@ class RobotInvariants:
         self._state = self._guard.state
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """See `Observer`."""
+        """Implement `Observer.see_request`: note what the operator allows."""
         match request.request:
             case Request.START:
                 if request.start is Start.SPAWN:
@@ -237,16 +239,16 @@ class RobotInvariants:
         self._state = self._guard.state
 
     def see_session(self, now_ns: int) -> None:
-        """See `Observer`."""
+        """Implement `Observer.see_session`: commands of the old session no longer count."""
         self._fresh_ns.clear()
         self._invalid_ns.clear()
 
-    # Where the robot is, and the reference that it flies.
+    # Position and reference velocity.
 
     def _check_fence(
         self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
     ) -> None:
-        """Check where the base is; a robot that fell takes off only where it lies still."""
+        """Check the base's position; a robot that fell may take off only if it lies still."""
         self._falls = self._falls or (self._was in FLOWN and state is ESTOP)
         if self._falls and state in FLOWN:
             self._falls, speed = False, hypot(*velocity)
@@ -286,14 +288,14 @@ class RobotInvariants:
             self._watch.speed = speed
         if not speed <= self._limits.speed + SLACK:  # or it is NaN
             self._note(now_ns, "cap", f"reference {speed:.3f} m/s")
-        if ramped:  # braking may be as hard as needed: at the fence, or after a hit
+        if ramped:  # braking is not limited: at the fence, or after a collision
             grown, after = growth(self._before, reference), now_ns < self._ramp_until_ns
             if not grown <= (RAMP if after else self._limits.acceleration) * STEP + SLACK:
                 text = f"reference grows by {grown:.9f} m/s in a tick"
                 self._note(now_ns, "cap", f"{text}{' after a HOLD' if after else ''}")
 
     def _leave_track(self, readings: Readings, now_ns: int) -> None:
-        """Note where TRACK ended, and how far the robot may move from there until it stops."""
+        """Store where TRACK ended, and the distance within which the robot must stop."""
         speed = max(hypot(*readings.velocity), hypot(*self._before))
         self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
         if now_ns - self._touched_ns < REELS_NS:
@@ -304,16 +306,16 @@ class RobotInvariants:
         if dx * dx + dy * dy > self._way * self._way:
             self._note(now_ns, "rest", f"{hypot(dx, dy):.2f} m from where the last command ended")
 
-    # What it touches, and how its rotors stop.
+    # Contacts and stops of the rotors.
 
     def _check_touches(self, state: GuardState, now_ns: int) -> None:
-        """Check the contacts that began in this step; after one the robot may leave the fence."""
+        """Check new contacts; after a contact the robot may leave the fence."""
         touches = self._simulator.touches
         if touches is not self._touches:
             self._touches, self._seen = touches, 0
         for _, body, _, _, _, tip in touches[self._seen :]:
             self._touched_ns, self._way, self._is_thrown = now_ns, inf, True
-            # Acknowledged right above a pipe, a robot that lands cannot stop in time.
+            # A landing that is acknowledged just above a pipe cannot stop in time.
             lands = state is LAND or (state is HOLD and now_ns - self._landed_ns <= BRAKE_NS)
             low = lands or state not in FLOWN
             allowed = (body == "board" and tip) or (
@@ -327,10 +329,10 @@ class RobotInvariants:
     def _check_rotors(
         self, state: GuardState, velocity: Vector, rotor_speeds: RotorSpeeds, now_ns: int
     ) -> None:
-        """Check how the rotors stop: on a request, after a hit, or where the robot stands.
+        """Check that the rotors stop only on a request, after a collision, or if the robot stands.
 
-        Speeds of 0 do not prove that the rotors are stopped: hard braking commands them, too.
-        Therefore the check looks for the constant `STOPPED`, which only a stop gives the simulator.
+        A rotor speed of 0 does not prove that the rotors were stopped: hard braking also commands
+        it. Therefore the check looks for the constant `STOPPED`, which only a stop uses.
         """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
         is_hit = state is ESTOP and self._was is not ESTOP and not asked
@@ -350,13 +352,11 @@ class RobotInvariants:
 
     @property
     def _just_touched(self) -> bool:
-        """Whether the robot has touched something within `REELS_NS`."""
         return self._simulator.touch_age <= REELS_NS * 1e-9
 
-    # What the operator allows, the wait for commands, and the way out of HOLD.
+    # Requests of the operator, the wait for commands, and the end of HOLD.
 
     def _check_change(self, was: GuardState, state: GuardState, now_ns: int) -> None:
-        """Check a change of the guard's state."""
         if was in LATCHED and self._released.isdisjoint(LATCHED) and state is not ESTOP:
             self._note(now_ns, "latch", f"{was.name} left for {state.name} without the operator")
         self._released.intersection_update({state})
@@ -372,7 +372,7 @@ class RobotInvariants:
                     text = f"HOLD left for TRACK on {len(fresh_ns)} fresh commands"
                     self._note(now_ns, "stale", text)
         elif state is HOLD or (was is TRACK and state is GROUND and not self._is_reset):
-            # In GROUND it had not left the ground yet.
+            # To GROUND: the robot had not left the ground yet.
             if state is HOLD and self._guard.cause is Cause.SILENCE and not self._goes_back:
                 self._check_settled("HOLD", self._held_ns, now_ns)
             self._held_ns = self._alone_ns = now_ns
@@ -386,7 +386,6 @@ class RobotInvariants:
         self._is_reset = self._impossible = False
 
     def _check_wait(self, state: GuardState, now_ns: int) -> None:
-        """Check how long the robot waits for its cloud in a mission."""
         if state is TRACK:
             if not self._armed:
                 self._note(now_ns, "latch", "TRACK without the operator's start")
@@ -398,22 +397,21 @@ class RobotInvariants:
             self._alone_ns = now_ns
 
     def _check_settled(self, name: str, last_ns: int, now_ns: int) -> None:
-        """Check that enough time has passed since the last TRACK or HOLD."""
         if now_ns - last_ns < SETTLE_NS:
             self._note(now_ns, "hold", f"{name} again after {(now_ns - last_ns) * 1e-9:.3f} s")
 
     def _wait_ns(self, state: GuardState) -> float:
-        """Return how long a robot in a mission waits for its cloud [ns]."""
+        """Return how long a robot in a mission may wait for commands [ns]."""
         if state is GROUND:
             return max(self._limits.hold_ns, GROUND_NS)
         return self._limits.hold_ns if state is HOLD else inf
 
 
 def can_stop(speed: float, below: float, above: float) -> bool:
-    """Tell whether the robot can stop before the face of the fence that it flies towards.
+    """Return whether the robot can stop before the side of the fence that it flies towards.
 
-    Along one axis the robot has a `speed` [m/s]; `below` and `above` are the distances to the two
-    faces of the fence [m].
+    Along one axis, the robot has the velocity `speed` [m/s], and the distances `below` and `above`
+    to the two sides of the fence [m].
     Source: docs/reference/plant.md, "Stop rule": 0.2 v + v^2/6 <= distance - 0.1.
     """
     if speed > 0.0:
@@ -422,7 +420,7 @@ def can_stop(speed: float, below: float, above: float) -> bool:
 
 
 def growth(before: Vector, after: Vector) -> float:
-    """Compute how much a reference grows between two ticks, `before` and `after` [m/s]."""
+    """Compute how much the reference velocity grows from `before` to `after` [m/s]."""
     (ux, uy, uz), (vx, vy, vz) = before, after
     return sqrt(_grown(ux, vx) ** 2 + _grown(uy, vy) ** 2 + _grown(uz, vz) ** 2)
 

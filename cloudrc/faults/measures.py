@@ -1,4 +1,4 @@
-"""Measure what happened in a flight, and read the metrics that its processes would show."""
+"""Measure what happened in a flight, from its records and from the metrics of its processes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from cloudrc.report.write import assess
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD
 
 AGE_MAX = 0.252 + 1e-9
-"""Largest age of a command's basis at a HOLD [s]: `command_age_max` and one tick."""
+"""Largest age of a command's odometry when a HOLD begins [s]: `command_age_max` plus one tick."""
 SOON = 5.0  # time within which a fault has to show in its metric [s]
 STANDS = 0.05  # speed up to which the robot stands [m/s]
 SAMPLE = 0.01  # time between two records of the ground truth [s]
@@ -35,7 +35,7 @@ ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose when a fault begins, from `first` to `last` [s]: by default amid the pipes."""
+    """Choose a random time from `first` to `last` [s]; by default the robot is among the pipes."""
     return float(generator(seed, 77).uniform(first, last))
 
 
@@ -43,7 +43,7 @@ def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
 
 
 def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Record]:
-    """Return the records of world, cloud or teleop up to `until` [s] of virtual time, or all."""
+    """Return the records of `role`: world, cloud or teleop; up to the virtual time `until` [s]."""
     records: Iterable[Record] = flight.of_world if role == "world" else flight.of_cloud
     records = flight.teleop.events if role == "teleop" else records
     if until is None:
@@ -55,7 +55,7 @@ def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Recor
 def reading(
     flight: Flight, role: str, name: str, *labels: str, until: float | None = None
 ) -> float:
-    """Return the value of a metric at `until` [s], or a histogram's mean; NaN if there is none."""
+    """Return a metric's value at `until` [s], for a histogram its mean; NaN if there is none."""
     shown = _read(flight, role, name, until)
     if isinstance(shown, Histogram):
         count = shown.cumulative()[-1]
@@ -66,7 +66,7 @@ def reading(
 def above(
     flight: Flight, role: str, name: str, bound: float, until: float | None = None
 ) -> tuple[int, float]:
-    """Count a histogram's values above `bound` up to `until` [s]; return count and share [1]."""
+    """Return number and share [1] of a histogram's values above `bound` until `until` [s]."""
     shown: Histogram = _read(flight, role, name, until)
     counts = shown.cumulative()
     count = counts[-1] - counts[shown.bounds.index(bound)]
@@ -82,18 +82,18 @@ def _read(flight: Flight, role: str, name: str, until: float | None) -> Any:
 def moves(
     outcome: Outcome, flight: Flight, *metrics: str, since: float, over: float | None = None
 ) -> None:
-    """Check that metrics change within 5 s of a fault that begins at `since` [s].
+    """Check that metrics change within 5 s after a fault that begins at `since` [s].
 
-    The time counts from the fault's end `over` [s] if that is given: a frozen process shows
-    nothing, and a loss is known when newer datagrams arrive. Each metric is written as role, name
-    and labels: "world guard_transitions_total hold".
+    If `over` [s] is given, the 5 s begin with the end of the fault at that time: a frozen process
+    exports nothing, and losses become known only with newer datagrams. Each metric is written as
+    role, name and labels, such as "world guard_transitions_total hold".
     """
     last = (since if over is None else over) + SOON
     end = "" if over is None else " of its end"
     for metric in metrics:
         role, *name = metric.split()
         before, after = (reading(flight, role, *name, until=each) for each in (since, last))
-        moved = after == after and before != after  # absent before is as good as another value
+        moved = after == after and before != after  # a new metric counts as changed
         outcome.true(f"metric {' '.join(name)} moves within {SOON:g} s{end}", moved)
 
 
@@ -101,32 +101,32 @@ def moves(
 
 
 def changes_into(flight: Flight, state: GuardState) -> list[GuardChange]:
-    """Return the changes into a state of the guard, without HOLDs at the end of a mission."""
+    """Return the guard's changes to a state, without the HOLD at the end of a mission."""
     return [c for c in flight.changes if c.state is state and c.cause != ENDED]
 
 
 def first_into(flight: Flight, state: GuardState) -> float:
-    """Return when the guard first went into a state [s]; NaN if never."""
+    """Return when the guard first changed to a state [s]; NaN if never."""
     return next((c.stamp_ns * 1e-9 for c in changes_into(flight, state)), nan)
 
 
 def held(flight: Flight) -> list[GuardChange]:
-    """Return the HOLDs, without those at the end of a mission."""
+    """Return the guard's changes to HOLD, without the HOLD at the end of a mission."""
     return changes_into(flight, GuardState.HOLD)
 
 
 def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> None:
-    """Check that every HOLD began before the commands were too old."""
+    """Check that every HOLD began before the last command was too old."""
     outcome.most(text, basis_age_at_hold(flight), AGE_MAX, "s")
 
 
 def basis_age_at_hold(flight: Flight) -> float:
-    """Return the largest age [s] of the newest applied command's basis at a HOLD."""
+    """Return the largest age that the last command's odometry had when a HOLD began [s]."""
     return max((age for _, age in _ages_at_hold(flight) if age == age), default=nan)
 
 
 def _ages_at_hold(flight: Flight) -> list[tuple[GuardChange, float]]:
-    """Return every HOLD in a mission with the age of `basis_age_at_hold` [s]; NaN if unknown."""
+    """Return every HOLD in a mission with the age of the last command's odometry [s], or NaN."""
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     ages = []
     for change in held(flight):
@@ -136,13 +136,13 @@ def _ages_at_hold(flight: Flight) -> list[tuple[GuardChange, float]]:
 
 
 def resumed_after(flight: Flight, back: float) -> float:
-    """Return the delay [s] from the instant `back` [s] until the guard was in TRACK again."""
+    """Return the time from `back` [s] until the guard next changed to TRACK [s]; NaN if never."""
     delays = [c.stamp_ns * 1e-9 - back for c in changes_into(flight, GuardState.TRACK)]
     return next((delay for delay in delays if delay >= -1e-9), nan)
 
 
 def busiest_second(changes: Sequence[GuardChange]) -> int:
-    """Return the largest number of changes between TRACK and HOLD within a second."""
+    """Return the largest number of changes between TRACK and HOLD within one second."""
     flown = (GuardState.TRACK, GuardState.HOLD)
     times_ns = [b.stamp_ns for a, b in pairwise(changes) if a.state in flown and b.state in flown]
     return max((sum(t <= u < t + WINDOW_NS for u in times_ns) for t in times_ns), default=0)
@@ -152,19 +152,19 @@ def busiest_second(changes: Sequence[GuardChange]) -> int:
 
 
 def told(records: Iterable[Record], code: str) -> list[Fault]:
-    """Return the faults with a code."""
+    """Return the faults with this code."""
     return [each for each in records if isinstance(each, Fault) and each.code == code]
 
 
 def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
-    """Return the events of a name in teleop's log; none while teleop is down."""
+    """Return the events with this name in teleop's log; none while teleop is not running."""
     service = flight.teleop.service
     events = service.book.events_after(0) if service is not None else []
     return [event for event in events if event["event"] == name]
 
 
 def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
-    """Check that records and telemetry tell the cause of each HOLD and TRACK.
+    """Check that records and telemetry state the cause of each HOLD and each TRACK.
 
     The text of each check begins with `what`.
     """
@@ -183,7 +183,7 @@ def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
 
 
 def status(flight: Flight) -> dict[str, Any]:
-    """Return teleop's status at this instant, as its API shows it."""
+    """Return teleop's present status, as its API shows it."""
     assert flight.teleop.service is not None
     return flight.teleop.service.state(flight.cloud.clock.at(flight.run.now_ns))
 
@@ -191,10 +191,9 @@ def status(flight: Flight) -> dict[str, Any]:
 def silence_told(
     outcome: Outcome, flight: Flight, at: float, silent: float, what: str = "", *, cloud: bool
 ) -> None:
-    """Schedule a check, `silent` [s] after `at` [s], that teleop's status tells of a silence.
+    """Check, `silent` [s] after a silence began at `at` [s], that teleop's status reports it.
 
-    The robot is silent. So is cloud, unless `cloud` is true. The text of each check begins with
-    `what`.
+    The robot is silent. If `cloud` is false, cloud is silent, too. `what` begins each check's text.
     """
 
     def check(now_ns: int) -> None:
@@ -214,20 +213,20 @@ def silence_told(
 
 
 def calm_after(flight: Flight, start: float, end: float) -> float:
-    """Return the delay [s] from `start` until the robot stood still; look until `end` [s]."""
+    """Return the time from `start` [s] until the robot stood still [s]; check until `end` [s]."""
     path = [(r.stamp_ns * 1e-9, hypot(*r.odometry.velocity)) for r in flight.trajectory()]
     fast = [time for time, speed in path if start <= time < end and speed >= STANDS]
     return fast[-1] + SAMPLE - start if fast else 0.0
 
 
 def drift(flight: Flight, start: float, end: float) -> float:
-    """Return the robot's largest distance [m] from its place at `start`, until `end` [s]."""
+    """Return the robot's largest distance [m] from its position at `start` [s], until `end` [s]."""
     path = [r.odometry for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
     return max((dist(path[0].position, each.position) for each in path), default=nan)
 
 
 def number(flight: Flight, name: str) -> float:
-    """Return a number of the report [any unit]; NaN if it is not known."""
+    """Return a metric of the flight's report [any unit]; NaN if it is unknown."""
     recording = Recording.from_records(flight.of_world, flight.of_cloud)
     numbers = assess(recording, flight.experiment, Run("virtual", "virtual")).numbers
     return numbers[name].value if name in numbers else nan
@@ -237,26 +236,26 @@ def number(flight: Flight, name: str) -> float:
 
 
 def applied_in_order(flight: Flight) -> bool:
-    """Tell whether (epoch, counter) of the applied commands rises strictly."""
+    """Return whether (epoch, counter) of the applied commands always rises."""
     order = [(r.epoch, r.counter) for r in flight.of_world if isinstance(r, CommandApplied)]
     return all(first < second for first, second in pairwise(order))
 
 
 def epochs(flight: Flight) -> list[int]:
-    """Return the epochs that world opened, in order."""
+    """Return the epochs of the sessions that world began, in order."""
     opened = [r for r in flight.of_world if isinstance(r, SessionOpened)]
     return [record.epoch for record in opened if record.end == "world"]
 
 
 def done(outcome: Outcome, flight: Flight) -> None:
-    """Check that the mission was flown to its end, each waypoint once and in order."""
+    """Check that the mission was completed, with each waypoint reached once and in order."""
     outcome.true("mission done", flight.mission.state == "done")
     reached = [event.waypoint for event in flight.events("reached")]
     outcome.true("each waypoint reached once, in order", reached == list(range(len(reached))))
 
 
 def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight:
-    """Fly the mission, at most until `limit` [s]; check `safe` and `done`."""
+    """Fly the mission, at most until `limit` [s]; then check `safe` and `done`."""
     flight.fly_mission(limit)
     safe(outcome, flight)
     done(outcome, flight)
@@ -264,7 +263,7 @@ def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight
 
 
 def safe(outcome: Outcome, flight: Flight) -> None:
-    """Check that no invariant broke, and add the hash of the flight's records."""
+    """Check that there was no breach, and add the hash of the flight's records."""
     outcome.same("breaches of an invariant", flight.watch.counts.total(), 0)
     for breach in flight.watch.breaches:
         outcome.true(f"{breach.kind} at {breach.time:.3f} s: {breach.text}", False)

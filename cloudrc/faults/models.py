@@ -1,4 +1,4 @@
-"""Model processes, clocks and teleop in virtual time, so that faults can hit them."""
+"""Model processes, clocks and teleop in virtual time, so that faults can be injected."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ T = TypeVar("T")
 FAR_NS = 1 << 62
 CFS_PERIOD = 0.1  # period of the kernel's CPU quota [s]
 SOCKET_MAX = 256
-"""Number of datagrams that wait in the socket of a frozen process; Linux' default buffer."""
+"""Number of datagrams that the socket of a frozen process can hold: Linux' default buffer."""
 UNIX_SOCKET_MAX = 11
-"""Number of datagrams that wait in a Unix socket: net.unix.max_dgram_qlen, which is 10, plus 1."""
+"""Number of datagrams that a Unix socket can hold: net.unix.max_dgram_qlen, which is 10, plus 1."""
 
 Action: TypeAlias = Callable[[int], None]
-"""Called at an instant of virtual time [ns]; makes a fault begin or end."""
+"""Function that is called at a virtual time [ns] to begin or end a fault."""
 Tamper: TypeAlias = Callable[[bytes, int], list[bytes]]
-"""Returns the datagrams that arrive in place of one, at an instant of virtual time [ns]."""
+"""Function that replaces an arriving datagram by others, at a virtual time [ns]."""
 Call: TypeAlias = Callable[[MissionService, int], object]
-"""A call of teleop's API; takes the service and its clock [ns]."""
+"""Function that calls teleop's API; takes the service and the time on teleop's clock [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """A monotonic clock of a machine, which may differ from virtual time."""
+    """Monotonic clock of a machine, which may differ from virtual time."""
 
     offset_ns: int = 0  # what the clock shows at virtual time 0 [ns]
     drift_ppm: int = 0  # how much faster than virtual time the clock is [ppm]
 
     def at(self, now_ns: int) -> int:
-        """Return what this clock shows [ns] at `now_ns` of virtual time [ns]."""
+        """Return the time that this clock shows [ns] at the virtual time `now_ns` [ns]."""
         return now_ns + self.offset_ns + now_ns * self.drift_ppm // 1_000_000
 
     def when(self, own_ns: int) -> int:
@@ -67,10 +67,10 @@ class Clock:
 class RestartableEndpoint:
     """World or cloud in a process that a scenario can kill, freeze and start; an `Endpoint`."""
 
-    sealed = True  # a flight's ends have keys
+    sealed = True  # world and cloud have keys
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
-        """Start the first process; `build` makes an end, given the time of its clock [ns]."""
+        """Start the first process; `build` makes world or cloud at a time on its clock [ns]."""
         self._build, self.clock, self._name = build, clock, name
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._scheduled, self._frozen_until_ns = 0, -1
@@ -81,13 +81,13 @@ class RestartableEndpoint:
         self._set_deadline()
 
     def at(self, seconds: float, action: Action) -> None:
-        """Schedule an action at an instant of virtual time, `seconds` [s]."""
+        """Schedule an action at the virtual time `seconds` [s]."""
         self._scheduled += 1
         heappush(self._actions, (round(seconds * 1e9), self._scheduled, action))
         self._set_deadline()
 
     def kill(self, now_ns: int) -> None:
-        """Kill the process as SIGKILL does; its records so far are kept."""
+        """Kill the process as with SIGKILL; its records so far are kept."""
         self._left = self.take_records()
         self.inner, self._waiting, self._frozen_until_ns = None, [], -1
         self._set_deadline()
@@ -98,23 +98,23 @@ class RestartableEndpoint:
         self._set_deadline()
 
     def restart(self, now_ns: int, down: float) -> None:
-        """Kill the process at `now_ns` [ns]; a new one starts after `down` [s]."""
+        """Kill the process at `now_ns` [ns]; start a new one after `down` [s]."""
         self.kill(now_ns)
         self.at(now_ns * 1e-9 + down, self.start)
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """Stop the process as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
+        """Stop the process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
         self._frozen_until_ns = max(self._frozen_until_ns, now_ns + round(duration * 1e9))
         self._set_deadline()
 
     def throttle(self, start: float, duration: float, share: float) -> None:
-        """Run only for a `share` [1] of each CFS period, from `start` [s] on for `duration` [s]."""
+        """Run for only a `share` [1] of each CFS period, from `start` [s] for `duration` [s]."""
         stall = (1.0 - share) * CFS_PERIOD
         for n in range(int(duration / CFS_PERIOD)):
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Hand a datagram to the process without calling `tamper`."""
+        """Pass a datagram to the process without a call of `tamper`."""
         if self.inner is None:
             return
         if self._frozen_until_ns <= now_ns:
@@ -123,17 +123,17 @@ class RestartableEndpoint:
             self._waiting.append(data)
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """See `Endpoint`."""
+        """Implement `Endpoint.receive_datagram`."""
         for each in [data] if self.tamper is None else self.tamper(data, now_ns):
             self.receive_now(each, now_ns)
         self._set_deadline()
 
     def next_deadline_ns(self) -> int:
-        """See `Endpoint`."""
+        """Implement `Endpoint.next_deadline_ns`."""
         return self._due_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """See `Endpoint`."""
+        """Implement `Endpoint.handle_deadline`."""
         while self._actions and self._actions[0][0] <= now_ns:
             heappop(self._actions)[2](now_ns)
         inner = self.inner
@@ -147,23 +147,23 @@ class RestartableEndpoint:
             own_ns = self.clock.at(now_ns)
             if own_ns >= inner.next_deadline_ns():
                 inner.handle_deadline(own_ns)
-            if own_ns > was_due_ns + 1000:  # a clock that drifts is off by a nanosecond
+            if own_ns > was_due_ns + 1000:  # rounding of a drifting clock: 1 ns
                 self._note_late_wake(inner, own_ns, own_ns - was_due_ns)
         self._set_deadline()
 
     def take_datagrams(self) -> list[bytes]:
-        """See `Endpoint`."""
+        """Implement `Endpoint.take_datagrams`."""
         if self.inner is None or self._frozen_until_ns >= 0:
             return []
         return self.inner.take_datagrams()
 
     def take_records(self) -> list[Record]:
-        """See `Endpoint`."""
+        """Implement `Endpoint.take_records`."""
         left, self._left = self._left, []
         return left + self.inner.take_records() if self.inner is not None else left
 
     def _note_late_wake(self, inner: Endpoint, own_ns: int, late_ns: int) -> None:
-        """Record a late wake, as the driver of real time does; others are on time."""
+        """Record a late wake, as the real-time driver does."""
         slip_ns = getattr(inner, "slip_ns", 0)
         self._left = self.take_records()
         self._left.append(Lateness(own_ns - slip_ns, self._name, late_ns * 1e-9, 0.0, slip_ns))
@@ -178,35 +178,35 @@ class RestartableEndpoint:
 
 
 class EndpointGroup:
-    """An `Endpoint` of several ends that share a socket: each end receives all datagrams."""
+    """Several clouds that share a socket, as one `Endpoint`: each receives all datagrams."""
 
     sealed = True
 
     def __init__(self, members: Sequence[Endpoint]) -> None:
         self.members = members
-        self.others: list[Record] = []  # of all ends but the first, oldest first
+        self.others: list[Record] = []  # records of all clouds but the first, oldest first
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """See `Endpoint`."""
+        """Implement `Endpoint.receive_datagram`."""
         for member in self.members:
             member.receive_datagram(data, now_ns)
 
     def next_deadline_ns(self) -> int:
-        """See `Endpoint`."""
+        """Implement `Endpoint.next_deadline_ns`."""
         return min(member.next_deadline_ns() for member in self.members)
 
     def handle_deadline(self, now_ns: int) -> None:
-        """See `Endpoint`."""
+        """Implement `Endpoint.handle_deadline`."""
         for member in self.members:
             if now_ns >= member.next_deadline_ns():
                 member.handle_deadline(now_ns)
 
     def take_datagrams(self) -> list[bytes]:
-        """See `Endpoint`."""
+        """Implement `Endpoint.take_datagrams`."""
         return [data for member in self.members for data in member.take_datagrams()]
 
     def take_records(self) -> list[Record]:
-        """See `Endpoint`; return the records of the first end only."""
+        """Implement `Endpoint.take_records`; return the records of the first cloud only."""
         first, *others = (member.take_records() for member in self.members)
         for records in others:
             self.others += records
@@ -214,18 +214,17 @@ class EndpointGroup:
 
 
 class _Peer(UnixPeer):
-    """A process's Unix datagram socket, joined to that of another one."""
+    """Unix datagram socket of a process, connected to another process's socket."""
 
     def __init__(self, is_open: Callable[[], bool]) -> None:
         self.other, self._is_open = self, is_open
         self.waiting: list[bytes] = []
 
     def receive(self) -> list[bytes]:
-        """See `UnixPeer`."""
         return _take_all(self.waiting)
 
     def send(self, data: bytes) -> bool:
-        """See `UnixPeer`; datagrams wait in the other socket while there is room."""
+        """Implement `UnixPeer.send`; datagrams wait in the other socket while it has room."""
         sent = self.other._is_open() and len(self.other.waiting) < UNIX_SOCKET_MAX
         if sent:
             self.other.waiting.append(data)
@@ -235,11 +234,11 @@ class _Peer(UnixPeer):
 class TeleopModel:
     """Teleop with a disk that survives restarts.
 
-    Teleop runs inside cloud's process, as an `Operator`, or as a process of its own. That process
+    Teleop runs inside cloud's process, as an `Operator`, or in its own process. Its own process
     wakes every 20 ms, and two Unix sockets connect it with cloud, as in production.
 
     Attributes:
-        service: Teleop itself; None while it is down.
+        service: Teleop's service; None while teleop is not running.
         events: Events of all missions, oldest first.
     """
 
@@ -254,7 +253,7 @@ class TeleopModel:
         Args:
             contact_speed_max: Limit of the speed of the arm's tip at the board [m/s].
             name: Makes the mission numbers differ from those of another teleop.
-            phase_ns: First wake of its own process [ns, virtual time]; None for no such process.
+            phase_ns: First wake of teleop's own process [ns, virtual time]; None: no own process.
         """
         self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
         self._disk = b""  # the bytes of its database
@@ -267,7 +266,7 @@ class TeleopModel:
         self.start()
 
     def start(self, now_ns: int = 0) -> None:
-        """Start a new process, which knows only what is on the disk; `now_ns` is not used."""
+        """Start a new process, which knows only what is on the disk; `now_ns` is ignored."""
         self._starts += 1
         salt = b"%s %d" % (self._name, self._starts)  # random in production
         self._database = connect()
@@ -283,39 +282,39 @@ class TeleopModel:
         self._free_ns, self._turn_ns, self._blind = 0, NEVER_NS, 0
 
     def kill(self, now_ns: int = 0) -> None:
-        """Kill the process, which leaves only the disk; `now_ns` is not used."""
+        """Kill the process; only the disk remains. `now_ns` is ignored."""
         if self.service is not None:
             self._disk = self._database.serialize()
             self._database.close()
         self.service, self.outputs = None, []
 
     def run_on(self, host: RestartableEndpoint) -> None:
-        """Run on the machine of `host`, where teleop's own process wakes even without cloud."""
+        """Run on the machine of `host`; teleop's own process wakes even if cloud is down."""
         self._host = host
         if self._phase_ns is not None:
             host.at(self._phase_ns * 1e-9, self._wake)
 
     def join(self, start_ns: int) -> Operator:
-        """Return the `Operator` of a cloud that starts at `start_ns` of its clock [ns]."""
+        """Return the `Operator` for a cloud that starts at `start_ns` on its clock [ns]."""
         if self._phase_ns is None:
             return self
-        self._clouds.waiting.clear()  # lost with the cloud before
+        self._clouds.waiting.clear()  # lost with the previous cloud
         return RemoteTeleop(self._clouds, wire.encode, wire.decode, start_ns)
 
     @property
     def missions(self) -> list[Mission]:
-        """All missions, oldest first; none while teleop is down."""
+        """All missions, oldest first; none while teleop is not running."""
         return list(self.service.book.missions.values()) if self.service is not None else []
 
     def order(self, order: Order, now_ns: int) -> None:
-        """Order a mission at `now_ns` of cloud's clock [ns]; it starts at once."""
+        """Order a mission at `now_ns` on cloud's clock [ns]; it starts at once."""
         assert self.service is not None, "teleop is down"
         self.service.create(order, now_ns)
 
     def ask(self, call: Call, now_ns: int) -> None:
-        """Make a call of the API at `now_ns` of cloud's clock [ns]; a refusal is ignored.
+        """Call teleop's API at `now_ns` on cloud's clock [ns]; a refusal is ignored.
 
-        A teleop process of its own makes the call when it wakes next.
+        In its own process, teleop processes the call at its next wake.
         """
         if self._phase_ns is None:
             self._call(call, now_ns)
@@ -323,9 +322,9 @@ class TeleopModel:
             self._calls.append(partial(self._call, call))
 
     def stop_rotors(self, now_ns: int) -> None:
-        """Make an emergency stop at `now_ns` of cloud's clock [ns].
+        """Make an emergency stop at `now_ns` on cloud's clock [ns].
 
-        A teleop process of its own sends an alarm to cloud at once, and stores the stop later.
+        In its own process, teleop sends an alarm to cloud at once, and stores the stop later.
         """
         if self.service is not None and self._phase_ns is not None:
             self._stops.append(partial(self._call, MissionService.stop_rotors))
@@ -334,27 +333,27 @@ class TeleopModel:
             self._call(MissionService.stop_rotors, now_ns)
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """Freeze teleop's own process as SIGSTOP does, from `now_ns` [ns] for `duration` [s]."""
+        """Freeze teleop's own process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
         if self.service is not None and self._phase_ns is not None and self._host is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
-            self._host.at(self._free_ns * 1e-9, self._turn)  # who is late wakes at once
+            self._host.at(self._free_ns * 1e-9, self._turn)  # a late process wakes at once
 
     # The `Operator` of a cloud in the same process.
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """See `Operator`."""
+        """Implement `Operator.see`."""
         if self.service is not None:
             self.service.see(seen, now_ns)
             self.outputs = [*self.outputs, *self._take(self.service)]
 
     def handle_deadline(self, now_ns: int) -> None:
-        """See `Operator`."""
+        """Implement `Operator.handle_deadline`."""
         if self.service is not None:
             self.service.handle_deadline(now_ns)
             self.outputs = [*self.outputs, *self._take(self.service)]
 
     def take_outputs(self) -> Sequence[Output | Fault]:
-        """See `Operator`."""
+        """Implement `Operator.take_outputs`."""
         outputs, self.outputs = self.outputs, []
         return outputs
 
@@ -387,7 +386,7 @@ class TeleopModel:
             late_ns=now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0,
             now_ns=self._host.clock.at(now_ns),
         )
-        # Events wait for a cloud that is there; everything else is repeated.
+        # Events wait until cloud runs; all other outputs are repeated.
         send(self._take(self.service), self._unsent, self._peer, wire.encode)
 
 

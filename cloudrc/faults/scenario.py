@@ -1,4 +1,4 @@
-"""Define a named fault, the checks of the reaction to it, and the result as JSON."""
+"""Define a named fault, the checks of the required reaction, and the result as JSON."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ YES = "yes"  # unit of a check that is a statement: its value is 1 if the statem
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
-    """Make a random generator; the same seed gives each `use` other random numbers."""
+    """Make a random generator; with the same seed, each `use` gets different random numbers."""
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One check of a reaction: `measured` compared with `limit`, both in `unit`."""
+    """One check of a reaction: compares `measured` with `limit`, both in `unit`."""
 
     text: str
     measured: float  # [any unit]
@@ -34,12 +34,12 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the value keeps its limit; NaN, a value that could not be measured, does not."""
+        """Whether the measured value keeps the limit; False for NaN, which means "not measured"."""
         known = isfinite(self.measured)
         return known and bool(_COMPARE[self.relation](self.measured, self.limit))
 
     def show(self) -> str:
-        """Return a line with text, value and limit."""
+        """Format text, measured value and limit on one line."""
         if self.unit == YES:
             return f"{self.text}: {'yes' if self.measured else 'NO'}"
         unit = f" {self.unit}" if self.unit else ""
@@ -49,47 +49,47 @@ class Check:
 
 @dataclass(slots=True)
 class Outcome:
-    """Result of a scenario: its checks, in order."""
+    """Result of a scenario: its checks in order."""
 
     checks: list[Check] = field(default_factory=list)
-    sha256: str = ""  # of the records of all its flights
+    sha256: str = ""  # hash of the records of all its flights
     seconds: float = 0.0  # how long it ran [s]
     error: str = ""  # the exception that ended it, if any
 
     def flown(self, sha256: str) -> None:
-        """Add the hash of the records of one flight."""
+        """Add the hash of one flight's records."""
         both = f"{self.sha256} {sha256}".encode()
         self.sha256 = hashlib.sha256(both).hexdigest() if self.sha256 else sha256
 
     def most(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that `measured` is at most its `limit`, both in `unit` [any unit]."""
+        """Check that `measured` is at most `limit`, both in `unit` [any unit]."""
         self.checks.append(Check(text, measured, "<=", limit, unit))
 
     def least(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that `measured` is at least its `limit`, both in `unit` [any unit]."""
+        """Check that `measured` is at least `limit`, both in `unit` [any unit]."""
         self.checks.append(Check(text, measured, ">=", limit, unit))
 
     def same(self, text: str, measured: float, limit: float) -> None:
-        """Check that a count, `measured`, is exactly its `limit` [1]."""
+        """Check that the count `measured` equals `limit` [1]."""
         self.checks.append(Check(text, measured, "==", limit))
 
     def true(self, text: str, holds: bool) -> None:
-        """Check that a statement holds."""
+        """Check that the statement `text` is true."""
         self.checks.append(Check(text, float(holds), "==", 1.0, YES))
 
     @property
     def passed(self) -> bool:
-        """Whether the scenario ran to its end, and all of its checks, at least one, passed."""
+        """Whether the scenario ran to its end, with at least one check, and all checks passed."""
         return not self.error and bool(self.checks) and all(each.passed for each in self.checks)
 
     @property
     def word(self) -> str:
-        """One word for a table: passed or FAILED."""
+        """The result as a word for a table, passed or FAILED."""
         return "passed" if self.passed else "FAILED"
 
 
 Inject: TypeAlias = Callable[[Outcome, int], None]
-"""Injects a fault into a flight with a seed, and adds the checks of the reaction to an outcome."""
+"""Function that injects a fault into a flight with a seed, and adds checks to an outcome."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +104,11 @@ class Scenario:
 
     @property
     def id(self) -> str:
-        """Name of the fault: F13."""
+        """Number of the fault with its letter, such as F13."""
         return f"F{self.number}"
 
     def run(self, seed: int) -> Outcome:
-        """Inject the fault with a seed, and check; an exception is noted as `error`."""
+        """Inject the fault with a seed, and check the reaction; store an exception as `error`."""
         outcome = Outcome()
         try:
             self.inject(outcome, seed)
@@ -117,7 +117,7 @@ class Scenario:
         return outcome
 
     def as_json(self, outcome: Outcome) -> dict[str, Any]:
-        """Return one result of this scenario as plain values."""
+        """Convert one result of this scenario to plain values."""
         return {
             "id": self.id,
             "name": self.name,
@@ -131,5 +131,5 @@ class Scenario:
 
 
 def scenario(number: int, name: str, *, injects: str, expects: str) -> Callable[[Inject], Scenario]:
-    """Turn the decorated function, which injects the fault, into a `Scenario` with these fields."""
+    """Decorate a function that injects a fault: convert it to a `Scenario` with these values."""
     return partial(Scenario, number, name, injects, expects)

@@ -1,4 +1,4 @@
-"""Describe the faults of one flight with their times, read and write them as YAML, or draw them."""
+"""Describe the faults of one flight and their times: drawn at random, or from a YAML file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElli
 
 
 class Kind(NamedTuple):
-    """A kind of fault: what happens, and the range of what is drawn at random."""
+    """A kind of fault: what happens, and the limits of its random duration and value."""
 
     text: str
     longest: float = 0.0  # longest duration [s]; 0 for an instant
@@ -53,10 +53,10 @@ KINDS = {
     "stopped": Kind("the operator stops the rotors, and acknowledges later"),
     "held": Kind("the operator holds the mission, resumes it after the duration", 5.0),
 }
-"""Each kind of fault by its name in a schedule's file."""
+"""Name of a fault in a schedule's file -> kind of fault."""
 SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "teleop_shut_down",
           "pod_shut_down")  # fmt: skip
-"""Kinds whose value is a share, in [0, 1]."""
+"""Kinds of fault whose value is a share, in [0, 1]."""
 DURATION_MAX = 86_400.0  # longest flight [s]
 OFFSET_MAX = 1e6  # largest difference of the two clocks [s]
 _CONFIG = ConfigDict(extra="forbid")
@@ -68,9 +68,9 @@ WAYS: tuple[Way, ...] = ("both", "up", "down")
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One fault, from `at` [s] on for `duration` [s]; a fault of the link hits one `way` or both.
+    """One fault, from `at` [s] for `duration` [s]; link faults hit one direction or both.
 
-    `KINDS` says what `value` means, in which unit.
+    `KINDS` explains the meaning and the unit of `value`.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -81,7 +81,7 @@ class Event:
     way: Way = "both"
 
     def __post_init__(self) -> None:
-        """Check the kind and its value."""
+        """Check the kind and the value."""
         if self.kind not in KINDS:
             raise ValueError(f"no fault '{self.kind}'; there are: {', '.join(KINDS)}")
         if self.kind in SHARES and self.value > 1.0:
@@ -89,7 +89,7 @@ class Event:
 
     @property
     def end(self) -> float:
-        """When the fault ends [s, virtual time]."""
+        """Time at which the fault ends [s, virtual time]."""
         return self.at + self.duration
 
 
@@ -97,44 +97,44 @@ class Event:
 class Schedule:
     """All faults of one flight.
 
-    Link and random faults use the seed. With `separate`, teleop is a process of its own, as in
-    production.
+    `seed` determines the random numbers of the link and of the faults. With `separate`, teleop runs
+    in its own process, as in production.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
     seed: Annotated[int, Field(ge=0, le=2**63)]
     profile: str = "paper-p2"
     events: tuple[Event, ...] = ()
-    duplicate: Share = 0.0  # of datagrams that arrive twice
-    reorder: Share = 0.0  # of datagrams that overtake others
+    duplicate: Share = 0.0  # share of datagrams that arrive twice
+    reorder: Share = 0.0  # share of datagrams that overtake others
     cloud_offset: Annotated[float, Field(ge=-OFFSET_MAX, le=OFFSET_MAX)] = 0.0
-    """Cloud's clock minus world's [s]; 0 for one shared clock."""
-    cloud_drift: Annotated[int, Field(ge=-100_000, le=100_000)] = 0  # how fast cloud's is [ppm]
-    policy: str = ""  # of a hostile cloud; "" for an honest one
+    """Cloud's clock minus world's clock [s]; 0 if they share one clock."""
+    cloud_drift: Annotated[int, Field(ge=-100_000, le=100_000)] = 0  # drift of cloud's clock [ppm]
+    policy: str = ""  # policy of a dishonest cloud; "" for an honest cloud
     duration: Annotated[float, Field(ge=0.1, le=DURATION_MAX)] = 60.0  # [s]
     separate: bool = False
     hold_max: Annotated[float, Field(ge=0.1, le=3600.0)] = 60.0  # HOLD becomes LAND then [s]
 
     @property
     def teleop_is_separate(self) -> bool:
-        """Whether teleop is a process of its own; a fault that freezes teleop needs that."""
+        """Whether teleop runs in its own process; faults that freeze teleop require that."""
         return self.separate or bool(self.of("teleop_paused"))
 
     @property
     def quiet_from(self) -> float:
-        """When the last fault ends [s, virtual time]; 0 if there is none."""
+        """Time at which the last fault ends [s, virtual time]; 0 without faults."""
         return max((event.end for event in self.events), default=0.0)
 
     def of(self, *kinds: str) -> list[Event]:
-        """List the faults of some kinds, by time."""
+        """List the faults of these kinds in the order of time."""
         return sorted((e for e in self.events if e.kind in kinds), key=lambda e: e.at)
 
 
 def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> DirectionProfile:
-    """Add a schedule's faults of the link to the conditions of one direction.
+    """Add the link faults of a schedule to the conditions of one direction.
 
     Raises:
-        BadInputError: If the profile has a time line and a fault changes the conditions, too.
+        BadInputError: If both the profile and a fault change the conditions over time.
     """
     mine = [event for event in schedule.events if event.way in ("both", way)]
     blackouts = [Blackout(e.at, e.duration) for e in mine if e.kind == "blackout"]
@@ -156,7 +156,7 @@ def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> Direction
 
 
 def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change:
-    """Return the change at the instant `at` [s]: the profile with all faults active then."""
+    """Return the conditions at the time `at` [s] with all faults that are active then."""
     delay, jitter, loss = profile.delay, profile.jitter, profile.loss
     for event in active:
         if event.kind == "delay":
@@ -171,7 +171,7 @@ def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change
 
 
 def dump(schedule: Schedule, note: str = "") -> str:
-    """Write a schedule as YAML, with a note at its top."""
+    """Format a schedule as YAML, with a note at the top."""
     values, plain = asdict(schedule).items(), asdict(Schedule(-1))
     document: dict[str, Any] = {name: value for name, value in values if value != plain[name]}
     document["events"] = [
@@ -187,10 +187,10 @@ _SCHEDULE = TypeAdapter(Schedule)
 
 
 def load(path: Path) -> Schedule:
-    """Read a schedule.
+    """Read a schedule from a file.
 
     Raises:
-        BadInputError: If the file is no schedule, or its schedule cannot be flown.
+        BadInputError: If the file is no valid schedule.
     """
     try:
         return _SCHEDULE.validate_python(yaml.safe_load(path.read_text(encoding="utf-8")))
@@ -202,18 +202,18 @@ def load(path: Path) -> Schedule:
     raise BadInputError(f"{path}: is no schedule of faults: {text}")
 
 
-CALM = 45.0  # time from which on there are no faults, so that the robot has to recover [s]
+CALM = 45.0  # time after which there are no faults and the robot must recover [s]
 DURATION = 60.0  # duration of a flight [s]
 PROFILES = ("ideal", "wifi", "lte", "5g", "lossy", "paper-p1", "paper-p2", "paper-p3")
 PAPER = PROFILES[-3:]
-HOLDS = 0.8, 3.0  # shortest and longest `hold_max` that is drawn [s]; to fly on takes 0.75 s
-ONCE = ("second_cloud", "key_rotated")  # kinds of which a flight has one at most
+HOLDS = 0.8, 3.0  # range of a random `hold_max` [s]; to end a HOLD takes 0.75 s
+ONCE = ("second_cloud", "key_rotated")  # kinds of fault that a flight has at most once
 
 
 def compose(seed: int) -> Schedule:
-    """Make the schedule of a seed: up to 12 faults within 45 s, then 15 s without faults.
+    """Make the schedule of a seed: up to 12 faults in 45 s, then 15 s without faults.
 
-    A schedule without faults is flown on a plain link, where any HOLD is a false alarm.
+    A schedule without faults uses a link on which every HOLD is a false alarm.
     """
     rng, kinds, events = generator(seed, 40), sorted(KINDS), list[Event]()
     for _ in range(int(rng.integers(13))):
@@ -232,7 +232,7 @@ def compose(seed: int) -> Schedule:
         cloud_drift=int(rng.integers(-500, 501)) if rng.random() < 0.3 else 0,
         duration=DURATION,
         separate=bool(rng.random() < 0.5),
-        # In a third of the schedules it is shorter than many a silence: the robot lands.
+        # In a third of the schedules it is shorter than most silences, so the robot lands.
         hold_max=round(float(rng.uniform(*HOLDS)), 1) if rng.random() < 1 / 3 else 60.0,
     )
 

@@ -1,6 +1,6 @@
-"""Search for schedules that break an invariant, for some minutes; shrink and store them.
+"""Fly random schedules for some minutes to find breaches of invariants; shrink and store them.
 
-The seeds are consecutive numbers: a search that ended before seed N continues with `--first N`.
+Seeds are consecutive numbers. To continue a search that ended before seed N, use `--first N`.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from cloudrc.faults.schedule import Schedule, compose, dump
 from cloudrc.faults.trial import INVARIANTS, Finding, checked_in, fly
 
 KINDS: dict[str, Callable[[int], Schedule]] = {"random": compose, "adversarial": choose}
-"""Kinds of searches: random faults, and hostile clouds with or without random faults."""
+"""Kinds of search: random faults, and dishonest clouds with or without random faults."""
 CHUNK = 500  # number of seeds that are handed to the pool at once
 SHRINK_MAX = 120.0  # longest time to shrink one schedule [s]
 
 Job: TypeAlias = tuple[str, int]
 Map: TypeAlias = Callable[[Callable[[Job], Finding], Sequence[Job], int], Iterator[Finding]]
-"""Calls a function on each job in several processes; yields the results in order."""
+"""Function that calls another function on each job in several processes, and keeps the order."""
 
 
 def fly_seed(job: Job) -> Finding:
-    """Fly the schedule of a kind and a seed."""
+    """Fly the schedule that belongs to a kind of search and a seed."""
     kind, seed = job
     return fly(KINDS[kind](seed))
 
 
 class Search:
-    """A search of one of `KINDS` and its result so far; `next` is the next seed."""
+    """A search and its result so far; `next` is the next seed."""
 
     def __init__(self, kind: str, first: int, store: Path) -> None:
-        """Prepare a search; `store` is the folder for failing schedules, made when needed."""
+        """Prepare a search of a kind in `KINDS`; `store` is the folder for failing schedules."""
         self.kind, self.first, self.next, self._store = kind, first, first, store
         self.failures: list[dict[str, Any]] = []  # schedules that broke an invariant, shrunk
         self._checked: Counter[str] = Counter()
@@ -46,10 +46,10 @@ class Search:
     def run(
         self, minutes: float, call: Map, jobs: int = 1
     ) -> Generator[dict[str, Any] | None, None, None]:
-        """Fly seed after seed until `minutes` [min] are over; at least one.
+        """Fly one seed after another for `minutes` [min], at least one seed.
 
         Yields:
-            After each flight, what was stored if it failed, else None.
+            After each flight: the stored failure, or None if no invariant was broken.
         """
         began = time.monotonic()
         while True:
@@ -62,7 +62,7 @@ class Search:
                     return
 
     def document(self) -> dict[str, Any]:
-        """Return the result so far as plain values."""
+        """Return the result so far as plain values, for JSON."""
         return {
             "schemaVersion": 1,
             "kind": self.kind,
@@ -93,7 +93,6 @@ class Search:
         return self.failures[-1]
 
     def _keep(self, finding: Finding) -> dict[str, Any]:
-        """Shrink and store a failing schedule."""
         kinds, until = finding.kinds, time.monotonic() + SHRINK_MAX
 
         def fails(schedule: Schedule) -> bool:
@@ -114,14 +113,14 @@ class Search:
 
 
 def shrink(schedule: Schedule, fails: Callable[[Schedule], bool]) -> Schedule:
-    """Remove faults from a failing schedule, then simplify the rest, while it still fails."""
+    """Simplify a schedule as long as it still fails: fewer faults, then weaker faults."""
     simpler = (each for each in _simpler(schedule) if each != schedule and fails(each))
     found = next(simpler, None)
     return schedule if found is None else shrink(found, fails)
 
 
 def _simpler(schedule: Schedule) -> Iterator[Schedule]:
-    """Yield schedules without all faults, a half, a quarter ... one; then with weaker faults."""
+    """Yield variants of a schedule: fewer faults, default settings, shorter faults."""
     events, size = schedule.events, len(schedule.events)
     while size:
         for at in range(0, len(events), size):
@@ -137,9 +136,9 @@ def _simpler(schedule: Schedule) -> Iterator[Schedule]:
 
 
 def search_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Return a table of a search: each invariant with its upper bound of failure probability.
+    """Return a table of a search: each invariant with an upper bound of its failure probability.
 
-    The bound is the rule of three: 0 events in N runs mean p < 3/N with 95 % confidence.
+    The bound is the rule of three: with 0 breaches in N flights, p < 3/N with 95 % confidence.
     """
     lines: list[tuple[str, ...]] = [("invariant", "broken in", "of N", "95 % bound")]
     for name, words in INVARIANTS.items():
@@ -150,7 +149,7 @@ def search_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def search_summary(document: dict[str, Any]) -> str:
-    """Describe in one sentence how much a search flew, and the extreme values."""
+    """Describe in one sentence the number of flights and the extreme values."""
     return (
         f"{document['count']} {document['kind']} schedules in {document['seconds']:.0f} s, seeds "
         f"{document['first']} to {document['next'] - 1}: {len(document['failures'])} broken, "

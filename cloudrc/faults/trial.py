@@ -1,8 +1,8 @@
-"""Flies one schedule in virtual time, and returns the invariants that broke.
+"""Fly one schedule in virtual time, and return the invariants that were broken.
 
-An operator flies one mission after the other, and acknowledges each landing and emergency stop. In
-the calm at the end the robot must fly again; otherwise the robot is stuck. The link's faults change
-the conditions of the link: see `cloudrc.faults.schedule.shaped`.
+An operator orders one mission after another, and acknowledges each landing and emergency stop.
+During the last part of the flight, without faults, the robot must fly again; otherwise it is stuck.
+`cloudrc.faults.schedule.shaped` applies the faults of the link.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ INVARIANTS = {
     "alarm": "false alarms",
     "error": "errors in an end",
 }
-"""Each invariant, and what a breach of it is called in a table."""
-BACK = 10.0  # time of calm in which the robot must have flown [s]
+"""Name of an invariant -> name of its breaches in a table."""
+BACK = 10.0  # time without faults in which the robot must have flown [s]
 FORGETFUL = ("world_killed", "teleop_killed", "teleop_shut_down", "pod_killed", "pod_shut_down")
-"""Faults after which another robot flies, or a new teleop that may not know of an earlier stop."""
+"""Faults after which the robot or teleop is new, so that teleop may not know of an earlier stop."""
 PATIENCE_NS = 1_000_000_000  # shortest time between two actions of the operator [ns]
 CAPTURED = 2_000  # number of datagrams that an intruder keeps
 NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)
@@ -61,35 +61,35 @@ IMPOSSIBLE = (nan, inf, -inf)
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of the flight of a schedule."""
+    """Result of flying a schedule."""
 
     schedule: Schedule
     breaches: tuple[Breach, ...]  # the first ones of each kind
-    sha256: str = ""  # of all records, if they were kept
+    sha256: str = ""  # hash of all records, if they were kept
     margin: float = 9.0  # smallest distance of the base to the fence's walls and ceiling [m]
     speed: float = 0.0  # largest reference [m/s]
-    missions: int = 0  # that were done
+    missions: int = 0  # number of completed missions
 
     @property
     def kinds(self) -> set[str]:
-        """The invariants that broke."""
+        """Names of the broken invariants."""
         return {breach.kind for breach in self.breaches}
 
 
 def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
-    """Fly a schedule with `settings` of the experiment, as `--set` takes them.
+    """Fly a schedule with further `settings` of the experiment, as for `--set`.
 
     With `keep` the records are kept and hashed, which doubles the time.
 
     Raises:
-        BadInputError: If there is no such profile or policy.
+        BadInputError: If the schedule names an unknown profile or policy.
     """
     flight = _prepare(schedule, settings, keep)
     watch, operator, order = flight.watch, Operator(flight, schedule), OrderInvariant(flight)
     inject(flight, schedule)
     try:
         flight.fly(schedule.duration)
-    except Exception as error:  # an end has to survive whatever comes
+    except Exception as error:  # world and cloud must survive every fault
         watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
     checks: dict[str, Callable[[], None]] = {
         "waypoint": order.check_waypoints,
@@ -104,7 +104,7 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
 
 
 def checked_in(schedule: Schedule) -> frozenset[str]:
-    """Return the invariants that a flight of this schedule has to keep."""
+    """Return the invariants that a flight of this schedule must keep."""
     honest = not schedule.policy  # a dishonest cloud may touch things and end the mission
     recovers = honest and schedule.duration - schedule.quiet_from >= BACK
     is_stopped = bool(schedule.of("stopped")) and not schedule.of(*FORGETFUL)
@@ -146,7 +146,7 @@ def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Fligh
 
 
 class Operator:
-    """Orders one mission after the other, and acknowledges each landing and emergency stop."""
+    """Orders one mission after another, and acknowledges each landing and emergency stop."""
 
     def __init__(self, flight: Flight, schedule: Schedule) -> None:
         self._flight = flight
@@ -155,7 +155,7 @@ class Operator:
         flight.listeners.append(self._look)
 
     def check_stuck(self) -> None:
-        """Check that the robot has flown in the calm at the end."""
+        """Check that the robot has flown during the last part of the flight, without faults."""
         flight, now_ns = self._flight, self._flight.run.now_ns
         if now_ns - self._tracked_ns > BACK * 1e9:
             state, cause = flight.guard_now()
@@ -164,13 +164,12 @@ class Operator:
             flight.watch.note(now_ns, "stuck", f"{text} {mission}")
 
     def check_stops(self) -> None:
-        """Check that each emergency stop has stopped the robot."""
+        """Check that each emergency stop had an effect."""
         for at_ns in self._unmet_ns:
             text = f"the operator's stop at {at_ns * 1e-9:.2f} s has stopped nothing"
             self._flight.watch.note(self._flight.run.now_ns, "obeyed", text)
 
     def _look(self, records: list[Record], now_ns: int) -> None:
-        """Act on new records of world, every 100 ms."""
         flight = self._flight
         state, _ = flight.guard_now()
         if state is GuardState.TRACK:
@@ -181,7 +180,7 @@ class Operator:
         service = flight.teleop.service
         if service is None or now_ns < self._next_ns or flight.cloud.inner is None:
             return
-        # What the operator sees: a world that was restarted is in GROUND, and changes nothing.
+        # A restarted world is in GROUND without a change of state, so ask for the state.
         own_ns = flight.cloud.clock.at(now_ns)
         seen = service.state(own_ns)["seen"]
         is_over = not flight.teleop.missions or flight.mission.ended
@@ -195,7 +194,7 @@ class Operator:
 
 
 class OrderInvariant:
-    """Checks that commands are applied, and waypoints reached, once and in order."""
+    """Checks that commands are applied, and waypoints are reached, once and in order."""
 
     def __init__(self, flight: Flight) -> None:
         self._flight = flight
@@ -203,10 +202,10 @@ class OrderInvariant:
         flight.listeners.append(self.see)
 
     def see(self, records: list[Record], now_ns: int) -> None:
-        """Check that no command is older than an earlier one, or of an epoch that has ended.
+        """Check that no applied command is older than an earlier one, or belongs to an old session.
 
-        A restarted world continues from the last epoch that its cloud knows. If cloud knows none,
-        world starts at the first epoch again, which is allowed.
+        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
+        world starts with the first epoch again, which is allowed.
         """
         for record in records:
             if isinstance(record, CommandApplied):
@@ -215,7 +214,7 @@ class OrderInvariant:
                 self._check(record.epoch, -1, record.stamp_ns)
 
     def check_waypoints(self) -> None:
-        """Check the waypoints of each mission in teleop's log."""
+        """Check the order of the waypoints of each mission in teleop's log."""
         reached: dict[str, list[int]] = {}
         for event in events_of_missions(self._flight, "reached"):
             reached.setdefault(event["mission"], []).append(event["waypoint"])
@@ -243,7 +242,7 @@ def _check_alarms(flight: Flight) -> None:
 
 
 def inject(flight: Flight, schedule: Schedule) -> None:
-    """Schedule in a flight the faults of processes, datagrams, teleop and the operator."""
+    """Schedule all faults of a flight except those of the link."""
     for event in schedule.events:
         process = flight.world if event.kind.startswith("world") else flight.cloud
         if event.kind.endswith("throttled"):
@@ -259,9 +258,9 @@ def inject(flight: Flight, schedule: Schedule) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return the actions of each kind of fault with their times [s]; `process` is the one hit."""
+    """Return the actions of each kind of fault with their times [s]; `process` is affected."""
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
-    gone = at + event.value * lasts  # for teleop that was asked to end
+    gone = at + event.value * lasts  # end of teleop after it was asked to end
 
     def ask(call: Call) -> Action:
         return lambda now_ns: teleop.ask(call, flight.cloud.clock.at(now_ns))
@@ -311,7 +310,7 @@ def _tamper(events: list[Event], rng: np.random.Generator) -> Tamper:
 
 
 def flipped(data: bytes, rng: np.random.Generator, flips: int) -> bytes:
-    """Return a datagram with some bits flipped."""
+    """Return a datagram with `flips` flipped bits."""
     bits = bytearray(data)
     for place in rng.choice(8 * len(data), min(flips, 8 * len(data)), replace=False).tolist():
         bits[place >> 3] ^= 1 << (place & 7)
@@ -319,7 +318,7 @@ def flipped(data: bytes, rng: np.random.Generator, flips: int) -> bytes:
 
 
 def _bugs(schedule: Schedule, clock: Clock) -> Lie:
-    """Make the lie of a schedule's bugs: `value` impossible commands a second of cloud's clock."""
+    """Make a function that adds `value` impossible commands per second of virtual time."""
     rng, events = generator(schedule.seed, 43), schedule.of(*BUGS)
     due = [event.at for event in events]
 
@@ -335,7 +334,7 @@ def _bugs(schedule: Schedule, clock: Clock) -> Lie:
 
 
 def _ruined(command: Command, event: Event, rng: np.random.Generator) -> Command:
-    """Make one of the four numbers not finite, or the velocity huge."""
+    """Replace one of the four numbers by NaN or infinity, or the velocity by a huge one."""
     if event.kind == "values_huge":
         x, y, z = rng.choice([1e308, -1e308], 3).tolist()
         return command._replace(velocity=(x, y, z))

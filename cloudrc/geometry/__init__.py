@@ -1,1 +1,1 @@
-"""Geometry of scene and robot, without a physics engine."""
+"""Geometry of scene and robot; needs no physics engine."""

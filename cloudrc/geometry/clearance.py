@@ -27,27 +27,27 @@ _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 
 
 class Spheres(NamedTuple):
-    """Spheres in the body frame: `positions`, shape (k, 3), and `radii`, shape (k,) [m]."""
+    """Spheres, body frame: centres `positions` [m], shape (k, 3), and `radii` [m], shape (k,)."""
 
     positions: Array
     radii: Array
 
 
 def key_points() -> Spheres:
-    """Return the 225 points that determine the clearance: arm, rotors, base box, top rod."""
+    """Return the 225 points that determine the clearance: on arm, rotors, base box and top rod."""
     return _points(_box(2, 2, 2), arm=9)
 
 
 def robot_points() -> Spheres:
-    """Return points of the whole robot, dense enough to find every overlap with a wall.
+    """Return points of the whole robot, dense enough to find every overlap with a pipe's wall.
 
-    Neighbouring points are at most 0.034 m apart, less than the 0.038 m of a wall's thickness.
+    Neighbouring points are at most 0.034 m apart, less than a wall's thickness of 0.038 m.
     """
     return _points(_box(4, 4, 7), arm=21)
 
 
 def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) -> Array:
-    """Transform points to the world frame [m], shape (n, k, 3).
+    """Return the robot's points in the world frame [m], for n poses, shape (n, k, 3).
 
     Args:
         points: Points in the body frame.
@@ -67,10 +67,10 @@ def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) ->
 
 
 def distance_to_pipe(pipe: Pipe, points: Array) -> Array:
-    """Compute the distance of points [m], world frame, shape (..., 3), to a pipe's wall.
+    """Compute the distance of points from a pipe's wall [m], shape (...); negative inside the wall.
 
-    In the plane of s (along the axis) and r (distance from the axis) the wall is a rectangle. The
-    result is the distance to that rectangle [m], shape (...): negative inside the wall.
+    `points` are in [m], world frame, shape (..., 3). With s along the axis and r from the axis, the
+    wall is a rectangle in the (s, r) plane.
     """
     relative = points - np.asarray(pipe.centre)
     s = relative @ np.asarray(pipe.axis)
@@ -116,9 +116,9 @@ def clearance_per_pipe(
 
 
 def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) -> Array:
-    """Compute the robot's distance from the nearest wall of `clearance_per_pipe` [m], shape (n,).
+    """Compute the robot's distance from the nearest pipe's wall [m], shape (n,).
 
-    The distance is infinite in a scene without pipes.
+    The arguments are those of `clearance_per_pipe`. Without pipes the distance is infinite.
     """
     distances = clearance_per_pipe(scene, positions, orientations_wxyz)
     nearest: Array = distances.min(axis=1, initial=np.inf)
@@ -126,10 +126,10 @@ def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) 
 
 
 def pipe_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:
-    """Find the first pipe whose bore contains the base, by index; -1 for none, shape (n,).
+    """Return the index of the first pipe whose bore contains the base, or -1; shape (n,).
 
-    In a bore |s| <= half the length and r < the inner radius; see `distance_to_pipe`. `positions`
-    are those of the base [m], world frame, shape (n, 3).
+    The base is in the bore if it is between both ends and nearer to the axis than the inner radius.
+    `positions` are those of the base [m], world frame, shape (n, 3).
     """
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     result = np.full(len(at), -1, dtype=np.int64)

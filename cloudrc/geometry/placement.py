@@ -1,4 +1,4 @@
-"""Check whether the robot can fly to a position: the guard's limits, the pipes, and the way."""
+"""Check whether the robot can fly to a position: the guard's limits, and pipes in the way."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
 CLEARANCE_MIN = 0.04
-"""Smallest distance of the whole robot from a wall, at a waypoint and on the way to it [m]. This is
-more than 32 mm, the steady error of a hover with the published gains."""
+"""Smallest distance of the whole robot from a pipe's wall, at a waypoint and on the way to it [m].
+The value is above 32 mm, the steady error of a hover with the published gains."""
 STEP_MIN = 0.02
-"""Shortest step along a way [m]; without it, the check of a way near a wall would never end."""
+"""Shortest step in which a straight way is checked [m], so that the check near a wall ends."""
 _SEARCH = 1.5  # [m] largest distance of a suggested legal point
-_AT_ONCE = 50  # candidates whose ways are looked at together
+_AT_ONCE = 50  # number of candidates whose ways are checked together
 _FAR = 1e3  # [m] limit of coordinates, so that no square overflows
 
 
 def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]:
-    """Tell which positions [m], world frame, shape (n, 3), are where the guard lets no robot fly.
+    """Tell which positions are outside the box in which the guard lets the robot fly.
 
-    Positions up to `slack` [m], shape () or (n,), outside the guard's box still count as inside.
+    `positions` are in [m], world frame, shape (n, 3). Positions up to `slack` [m], shape () or
+    (n,), outside the box count as inside.
     """
     positions = np.clip(positions, -_FAR, _FAR)
     nearest = np.clip(positions, fence.INNER_LOW, fence.INNER_HIGH)
@@ -34,12 +35,12 @@ def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]
 
 
 def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
-    """Find the pipe within `CLEARANCE_MIN` of the level robot, by index; -1 for none, shape (n,).
+    """Return the index of the pipe within `CLEARANCE_MIN` of the robot, or -1, shape (n,).
 
     Args:
         scene: The scene; its board does not count.
         positions: Positions of the base [m], world frame, shape (n, 3).
-        yaws: Headings of the robot [rad], shape (n,).
+        yaws: Headings of the level robot [rad], shape (n,).
     """
     if not scene.pipes:
         return np.full(len(positions), -1, dtype=np.int64)
@@ -50,13 +51,13 @@ def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray
 def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
     """Find the first pipe that the robot, level and with yaw 0, would touch on a straight way.
 
-    The check moves along each way in steps as long as the robot's distance from the nearest wall.
-    A robot that begins nearer to a wall than `CLEARANCE_MIN` may move away from that wall.
+    The check moves along each way in steps as long as the robot's distance from the nearest wall. A
+    way may begin nearer to a wall than `CLEARANCE_MIN` if it leads away from this wall.
 
     Args:
         scene: The scene; its board does not count.
         starts: Starts of the ways [m], world frame, not far outside the fence, shape (n, 3).
-        ends: Ends of the ways [m], world frame, likewise, shape (n, 3).
+        ends: Ends of the ways [m], world frame, not far outside the fence, shape (n, 3).
 
     Returns:
         Index of the pipe, or -1, shape (n,).
@@ -71,7 +72,7 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
         at = starts[flying] + share[:, None] * (ends - starts)[flying]
         distances = _distances(scene, at, np.zeros(len(at)))
         nearest = distances.min(axis=1)
-        if np.isinf(least).any():  # where the robot begins, it may be
+        if np.isinf(least).any():  # a way may begin near a wall
             least = np.minimum(CLEARANCE_MIN, nearest - STEP_MIN)
         touching = nearest < least[flying]
         result[flying[touching]] = distances[touching].argmin(axis=1)
@@ -85,15 +86,15 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
 def find_nearest_legal(
     scene: Scene, position: Vector, yaw: float, before: Vector | None = None
 ) -> Vector | None:
-    """Find a point within 1.5 m that the guard lets the robot reach and that overlaps no pipe.
+    """Find a point within 1.5 m that the guard lets the robot reach, clear of pipes; else None.
 
     The search goes along x, y and z, and towards and away from the axes of the pipes. All
-    candidates are whole centimetres, so that the checked point is printed without rounding.
+    candidates are whole centimetres, so that a message shows the checked point without rounding.
 
     Args:
         scene: The scene.
         position: Position of the base [m], world frame, shape (3,).
-        yaw: Heading [rad].
+        yaw: Heading of the level robot [rad].
         before: Start of the straight way to the point [m], shape (3,); None if it is unknown.
     """
     start = np.clip(position, fence.INNER_LOW, fence.INNER_HIGH)
@@ -121,7 +122,6 @@ def find_nearest_legal(
 
 
 def _distances(scene: Scene, positions: Array, yaws: Array) -> Array:
-    """Compute the distance of the level robot from each pipe [m], shape (n, number of pipes)."""
     facing = np.zeros((len(positions), 4))
     facing[:, 0], facing[:, 3] = np.cos(yaws / 2), np.sin(yaws / 2)
     return clearance_per_pipe(scene, positions, facing, robot_points())

@@ -1,12 +1,12 @@
-"""Read the pipes, the board and the floor of a scene from its MJCF file.
+"""Read the pipes, the board and the floor of a scene from its MJCF file, without MuJoCo.
 
-For programs without MuJoCo, the file repeats the ideal shapes as numbers:
-`<custom><numeric name="pipe_1" data="..."/>`, in metres, world frame.
+For this purpose the file repeats the ideal shapes as numbers: `<custom><numeric name="pipe_1"
+data="..."/>`, in metres, world frame.
 
 | name | data |
 |---|---|
 | `pipe_*` | centre x y z, axis x y z, length, inner radius, outer radius |
-| `board` | x of the front face, y from, y to, z from, z to |
+| `board` | x of the front face, smallest and largest y, smallest and largest z |
 | `floor` | z; 0 if the file has no `floor` |
 """
 
@@ -21,7 +21,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.messages import Vector
 
 SPAWN: Vector = (0.0, 0.0, 0.1)
-"""Where the robot starts in the shipped scenes [m], world frame, shape (3,)."""
+"""Position of the base at the start of a mission in the shipped scenes [m], world frame."""
 SCENES = Path(__file__).parents[1] / "world" / "scenes"
 
 
@@ -48,7 +48,7 @@ class Pipe:
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A wall that the robot can touch; its front face points along -x.
+    """A wall that the robot can touch with its arm; the front face points along -x.
 
     Attributes:
         x: Position of the front face [m], world frame.
@@ -69,8 +69,8 @@ class Scene:
         name: File name without .xml.
         pipes: The pipes, in the order of the file.
         board: The board; None if the scene has none.
-        floor: Height z of the floor [m].
-        spawn: Where the robot starts [m], world frame, shape (3,).
+        floor: z of the floor [m], world frame.
+        spawn: Position of the base at the start of a mission [m], world frame, shape (3,).
     """
 
     name: str
@@ -81,11 +81,11 @@ class Scene:
 
 
 def load_scene(name: str) -> Scene:
-    """Read a scene by the path of its .xml file, or a shipped scene by its file name without .xml.
+    """Read a scene by the path of an .xml file, or a shipped scene by its file name without .xml.
 
     Raises:
-        BadInputError: If the file does not exist, or its numbers do not fit the table in the
-            docstring of this module.
+        BadInputError: If the file does not exist, or if its numbers have another form than in the
+            table of this module's docstring.
     """
     path = Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml"
     try:

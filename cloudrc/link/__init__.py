@@ -1,1 +1,1 @@
-"""Emulate the network between world and cloud by profiles, a pure model and two shapers."""
+"""Emulate the network between world and cloud, defined by a profile, by netem or a relay."""

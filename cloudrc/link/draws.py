@@ -1,16 +1,18 @@
 """Draw the random impairments of each packet from counter-based random numbers.
 
-Seed, direction, epoch and kind of datagram select a stream; the packet's counter is its place in
-the stream. So the impairment of a packet does not depend on earlier calls. The functions are pure,
-with a cache for speed, and draw for blocks of 256 packets, with one column of numbers per purpose.
-So a purpose that a profile does not use does not change the numbers of other purposes.
+Seed, direction, session (epoch) and kind of datagram select a stream of random numbers. The counter
+of the packet is its position in the stream. So its impairment does not depend on earlier calls.
 
-A state that carries over from packet to packet (burst, correlation) restarts from its stationary
-distribution every 64 blocks (16,384 packets), which bounds the work for any counter.
+Numbers are drawn for blocks of 256 packets, in a separate column for each purpose. So a purpose
+that a profile does not use does not change the numbers of other purposes. The functions are pure; a
+cache makes them fast.
 
-The impairment of a packet is a tuple with one entry per copy that arrives: no entry if the packet
-is lost, two entries if it is duplicated. An entry is OVERTAKES or the sum that jitter and the bad
-state add to the delay [ns]; the sum may be negative.
+Bursts and correlated jitter carry a state from packet to packet. The state restarts from its
+stationary distribution every 64 blocks (16,384 packets), which bounds the work for any counter.
+
+The impairment of a packet is a tuple with one entry for each copy that arrives: no entry for a lost
+packet, two entries for a duplicated packet. An entry is the extra delay from jitter and bad state
+[ns], which may be negative, or the constant OVERTAKES.
 """
 
 from __future__ import annotations
@@ -28,13 +30,13 @@ from numpy.typing import NDArray
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 
 BLOCK = 256
-"""Number of packets whose draws are made together."""
+"""Number of packets whose random numbers are drawn together."""
 CHAIN_BLOCKS = 64
 """Number of blocks after which bursts and correlated jitter restart."""
 OVERTAKES = -(1 << 62)
-"""Entry of a packet that skips queue and delay (`reorder`)."""
+"""Entry of a packet that skips both queue and delay (`reorder`)."""
 PARETO_CUT = 1e-3
-"""Probability of the tail that is cut off the Pareto distribution."""
+"""Probability of the tail that is cut off the Pareto distribution, in [0, 1]."""
 
 _CACHED = 256
 _OUTPUTS_PER_COUNT = 4
@@ -51,7 +53,7 @@ Fate: TypeAlias = tuple[int, ...]
 
 
 class Purpose(IntEnum):
-    """Decision about a packet for which a column of random numbers is drawn."""
+    """Use of a column of random numbers: one decision about each packet."""
 
     DELAY = 0
     COPY_DELAY = 1
@@ -64,7 +66,7 @@ class Purpose(IntEnum):
 
 
 def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
-    """Compute the key of a Philox generator for one kind of datagram in a session and direction."""
+    """Compute the Philox key of the stream for one kind of datagram in a session and direction."""
     name = f"cloudrc link {seed} {'up' if uplink else 'down'} {epoch} {kind}"
     digest = blake2b(name.encode(), digest_size=16).digest()
     return int.from_bytes(digest[:8], "little"), int.from_bytes(digest[8:], "little")
@@ -72,10 +74,10 @@ def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
 
 @lru_cache(maxsize=_CACHED)
 def uniforms(key: StreamKey, purpose: Purpose, block: int) -> Floats:
-    """Draw independent uniform variates for the packets of a block: in (0, 1), shape (256,).
+    """Draw independent uniform variates in (0, 1) for the packets of a block, shape (256,).
 
-    Source: J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011:
-    Philox 4x64-10.
+    Source: J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011: Philox
+    4x64-10.
     """
     counter = np.array([block * (BLOCK // _OUTPUTS_PER_COUNT), 0, 0, purpose], dtype=np.uint64)
     generator = np.random.Philox(key=np.array(key, dtype=np.uint64), counter=counter)
@@ -88,10 +90,10 @@ def uniforms(key: StreamKey, purpose: Purpose, block: int) -> Floats:
 
 @lru_cache(maxsize=_CACHED)
 def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) -> tuple[float, ...]:
-    """Draw standard normal variates, shape (256,), with a `correlation` [1] of neighbours.
+    """Draw standard normal variates of a block; neighbours have this `correlation`, in [0, 1].
 
     The variates follow the autoregression z_n = c · z_(n-1) + sqrt(1 - c²) · e_n. So every variate
-    is exactly standard normal.
+    is exactly standard normal. Their shape is (256,).
 
     Deviation: tc-netem mixes (1 - c) · new + c · old, which narrows the distribution.
     """
@@ -113,10 +115,10 @@ def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) ->
 
 @lru_cache(maxsize=_CACHED)
 def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> tuple[bool, ...]:
-    """Run the two-state chain over a block: True for packets in the bad state, shape (256,).
+    """Simulate the two-state burst chain over a block: True for bad packets, shape (256,).
 
-    `bad_start` and `bad_end` are the probabilities per packet, in [0, 1], that the bad state
-    starts and ends.
+    `bad_start` is the probability per packet that the bad state starts, and `bad_end` that the bad
+    state ends, both in [0, 1].
     """
     if not bad_start:
         return (False,) * BLOCK
@@ -136,10 +138,11 @@ def bad_states(key: StreamKey, block: int, bad_start: float, bad_end: float) -> 
 def impairments(
     key: StreamKey, block: int, profile: DirectionProfile, jitter: float, loss: Loss
 ) -> list[Fate]:
-    """Draw the impairments of the 256 packets of a block, with the jitter [s] and loss in force.
+    """Draw the impairments of the 256 packets of a block.
 
-    A lost packet is neither duplicated nor reordered. The copy of a packet has an independent
-    delay with the same distribution.
+    `jitter` [s] and `loss` are the values in force, which a time line may change. A lost packet is
+    neither duplicated nor reordered. The copy of a duplicated packet has an independent delay with
+    the same distribution.
 
     Deviation: tc-netem delivers one copy of a packet that is both duplicated and lost.
     """
@@ -161,23 +164,24 @@ def impairments(
 
 @lru_cache(maxsize=_CACHED)
 def bit_flips(key: StreamKey, block: int, corrupt: float) -> dict[int, float]:
-    """Draw the damaged packets: index in the block -> flipped bit, as a share of the datagram.
+    """Draw the damaged packets of a block: index in the block -> position of the flipped bit.
 
-    `corrupt` is the chance of damage per packet, in [0, 1].
+    The position is a share of the datagram's length, in [0, 1]. `corrupt` is the probability of
+    damage per packet, in [0, 1].
     """
     places = uniforms(key, Purpose.CORRUPT_BIT, block)
     return {n: float(places[n]) for n in _packets_hit(key, Purpose.CORRUPT, block, corrupt)}
 
 
 def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfile) -> list[float]:
-    """Draw the jitter of a block in units of `jitter`, with mean 0, shape (256,).
+    """Draw jitter for a block in units of the profile's `jitter`, with mean 0, shape (256,).
 
     Uniform jitter is in (-1, 1); other jitter has standard deviation 1. Pareto jitter has exponent
     3 and is cut off at the 99.9 % quantile: it ranges from -0.69 to 12.1, with median -0.32.
 
-    With a correlation c, the function transforms normal variates that have correlation c. So the
-    distribution stays exact, but the correlation of the result differs from c: uniform
-    (6/π) · asin(c/2), at most 0.018 below c; pareto 0.39 for c = 0.5 and 0.86 for c = 0.9.
+    With a correlation c, the function transforms normal variates of correlation c. So the
+    distribution stays exact, but the jitter has another correlation: (6/π) · asin(c/2) if uniform,
+    which is at most 0.018 below c; if pareto, 0.39 for c = 0.5 and 0.86 for c = 0.9.
 
     Source: tc-netem(8) for the meaning of jitter, iproute2 netem/pareto.c for the exponent.
     Deviation: netem cuts its Pareto table at 4, so its jitter has only 0.82 of the specified
@@ -205,7 +209,6 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
 def _offsets(
     key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfile, jitter: float
 ) -> list[int]:
-    """Draw the jitter of a block [ns]."""
     if not jitter:
         return [0] * BLOCK
     scaled = jitter * 1e9 * np.array(shape(key, purpose, block, profile))
@@ -214,14 +217,13 @@ def _offsets(
 
 
 def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) -> list[int]:
-    """Draw which packets of a block are hit by an event with probability `chance` (in [0, 1])."""
     if not chance:
         return []
     return [int(n) for n in np.flatnonzero(uniforms(key, purpose, block) < chance)]
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
-    """Remove the lost packets from a table; delay the packets in the bad state."""
+    """Remove lost packets from a table of impairments; delay the packets in the bad state."""
     extra = round(loss.delay_bad * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
     for n, bad in enumerate(bad_states(key, block, loss.bad_start, loss.bad_end)):

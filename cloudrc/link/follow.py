@@ -1,9 +1,9 @@
-"""Follow what changes in flight: the profile and the address of the peer.
+"""Follow changes of a link in flight: of its profile and of the peer's address.
 
-A change of a release's ConfigMap is permanent, but a kubelet may need a minute to copy it to a pod.
-So `cloudrc link set` also writes the same files, as one document, into the folder of the route
-file. Whichever of ConfigMap and document arrives first takes effect. Both carry the same number of
-the change, so the later one is ignored.
+`cloudrc link set` changes the release's ConfigMap, so that the change is permanent. A kubelet may
+need a minute to copy the ConfigMap to a pod. Therefore `cloudrc link set` also writes the same
+files, as one JSON document, into the folder of the route file. ConfigMap and document contain the
+number of the change: the first to arrive takes effect, the other is ignored.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from cloudrc.link.relay import Address
 
 PROFILE_PERIOD = 0.05
-"""Time between two checks of the profile's file [s]."""
+"""Time between two checks whether the profile's file has changed [s]."""
 PEER_PAUSE = (0.5, 1.0)
 """Shortest and longest pause before the peer's name is resolved again [s]. The pause is random, so
 that the links of many releases do not query their name server at the same time.
 Source: docs/reference/faults.md, "F19"."""
 HANDED_FILE = "asked.json"
-"""Name of the document with a change from `cloudrc link set`, in the folder of the route file."""
+"""Name of the JSON document that `cloudrc link set` writes, in the folder of the route file."""
 SIZE_MAX = 1_200_000
-"""Size limit of the document in `HANDED_FILE` [bytes]: a ConfigMap's content as JSON."""
+"""Size limit of the JSON document [bytes]: room for the content of a ConfigMap."""
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 _KNOWN = 64
-"""Number of changes that are remembered, to recognise a change that arrives twice."""
+"""Number of recent changes that are remembered, to recognise a change that arrives twice."""
 
 
 class Loaded(NamedTuple):
@@ -45,7 +45,7 @@ class Loaded(NamedTuple):
 
     Attributes:
         direction: The direction that this process shapes, in SI units.
-        values: Both directions as in the file, without defaults, for people.
+        values: Both directions as in the file, without defaults, to show to users.
         change: The last change of the profile: its number and cause.
     """
 
@@ -55,15 +55,15 @@ class Loaded(NamedTuple):
 
 
 Load = Callable[[Path], Loaded]
-"""Function that reads and checks a profile's file; it raises a BadInputError if that fails."""
+"""Function that reads and checks a profile's file; raises a BadInputError if it is invalid."""
 
 
 class ProfileFile:
-    """Reads the file of a profile again whenever the file changes.
+    """Reads a profile's file again whenever the file changes.
 
-    Kubernetes mounts a ConfigMap as a folder of links into `..data`, a link that Kubernetes
-    replaces in one step; then the path leads to another file. A check is a single system call,
-    because the process checks 20 times per second and its shaper must not be late.
+    Kubernetes mounts a ConfigMap as links into the folder `..data`. `..data` is itself a link,
+    which Kubernetes replaces in one step, so that the same path leads to another file. A check for
+    a change runs 20 times per second, so it takes only one system call.
     """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
@@ -71,15 +71,15 @@ class ProfileFile:
         self._seen: object = None
 
     def first(self) -> Loaded:
-        """Read the file at the start; raise a BadInputError if that fails."""
+        """Read the file at the start; raise a BadInputError if the profile is invalid."""
         self._seen = version(self._path)
         return self._read()
 
     def poll(self) -> Loaded | None:
-        """Read the file after a change; None without a change, or if the new profile is refused.
+        """Return the new profile if the file has changed and the profile is valid, otherwise None.
 
-        A refusal is logged. If the file changes during the read, somebody is still writing, and
-        the next call reads again.
+        An invalid profile is logged. If the file changes while it is read, another process is still
+        writing; then the next call reads the file again.
         """
         seen = version(self._path)
         if seen == self._seen:
@@ -106,11 +106,11 @@ class ProfileFile:
 
 
 class Handed(NamedTuple):
-    """A change that `cloudrc link set` writes directly into a pod, as a document.
+    """A change that `cloudrc link set` writes directly into a pod, as a JSON document.
 
     Attributes:
         change: Number and cause of the change, as the text of `CHANGE_FILE`.
-        files: Name -> text: `profile.yaml` and the traces that it names.
+        files: File name -> text, for `profile.yaml` and the traces that the profile names.
     """
 
     change: str
@@ -118,15 +118,15 @@ class Handed(NamedTuple):
 
 
 def write_handed(handed: Handed) -> str:
-    """Format a change as the text of the document."""
+    """Format a change as the text of the JSON document."""
     return json.dumps(handed._asdict())
 
 
 def read_handed(text: str) -> Handed:
-    """Parse the text of the document.
+    """Parse the text of the JSON document.
 
     Raises:
-        ValueError: If the text is no such document, or if a file name could lead to another folder.
+        ValueError: If the text is invalid, or if a file name could lead to another folder.
     """
     found = json.loads(text)
     try:
@@ -140,9 +140,10 @@ def read_handed(text: str) -> Handed:
 
 
 class _HandedFile(ProfileFile):
-    """Reads the document that `cloudrc link set` writes into a pod.
+    """Reads the JSON document that `cloudrc link set` writes into a pod.
 
-    A document that exists at the start is ignored, because the ConfigMap has the same change.
+    A document that exists when the process starts is ignored, because the ConfigMap already
+    contains the same change.
     """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
@@ -152,8 +153,8 @@ class _HandedFile(ProfileFile):
     def _read(self) -> Loaded:
         """Read the document; raise a ValueError if the file belongs to another user.
 
-        If the sidecar runs as root, the pod's other containers share the folder but do not run as
-        root.
+        This protects a sidecar that runs as root: the other containers of the pod can write to the
+        folder, but do not run as root.
         """
         if self._path.lstat().st_uid != os.geteuid():
             raise ValueError(f"{self._path} belongs to another user")
@@ -166,7 +167,7 @@ class _HandedFile(ProfileFile):
 
 
 class Profiles:
-    """Follows the profile's file and the document with a change; applies each change once."""
+    """Follows the profile's file and the JSON document; applies each change once."""
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]
@@ -176,13 +177,13 @@ class Profiles:
         self._known: dict[str, dict[str, Any]] = {}
 
     def first(self) -> Loaded:
-        """Read the profile at the start; raise a BadInputError if that fails."""
+        """Read the profile at the start; raise a BadInputError if the profile is invalid."""
         loaded = self._file.first()
         self._is_known(loaded)
         return loaded
 
     def poll(self) -> Loaded | None:
-        """Return the new profile after a change; None without a change."""
+        """Return the profile of a change that has arrived; None if no change has arrived."""
         for source in self._sources:
             loaded = source.poll()
             if loaded is not None and not self._is_known(loaded):
@@ -190,10 +191,10 @@ class Profiles:
         return None
 
     def _is_known(self, loaded: Loaded) -> bool:
-        """Remember a change; return whether the same change has arrived before.
+        """Return whether the same change has arrived before; otherwise remember the change.
 
-        `helm upgrade` changes the profile, but leaves the number of the previous change beside it.
-        So equal numbers do not prove equal changes: the contents must be equal, too.
+        `helm upgrade` changes the profile but keeps the number of the previous change. So two
+        changes are the same only if both their numbers and their contents are equal.
         """
         number = loaded.change.number
         if not number:
@@ -205,10 +206,10 @@ class Profiles:
 
 
 class PeerName:
-    """Resolves the name of the peer, whose address may change.
+    """Resolves the name of the other pod, whose address changes when the pod is replaced.
 
-    While an old and a new pod overlap, a headless Service returns both addresses. The address that
-    appeared later belongs to the new pod and is used.
+    While an old and a new pod overlap, a headless Service returns the addresses of both pods. The
+    address that appeared last belongs to the new pod; this class uses that address.
 
     Attributes:
         failures: Number of failed resolutions.
@@ -217,7 +218,10 @@ class PeerName:
     def __init__(
         self, peer: Address, resolve: Callable[[str], Sequence[str]], log: Callable[[str], None]
     ) -> None:
-        """Set up; `resolve` returns the addresses of a name or raises an OSError."""
+        """Follow `peer`, a host name and a port.
+
+        `resolve` returns the addresses of a host name or raises an OSError; `log` writes one line.
+        """
         self._name, self._port = peer
         self._resolve, self._log = resolve, log
         self._known: list[str] = []
@@ -225,9 +229,9 @@ class PeerName:
         self.failures = 0
 
     def poll(self) -> Address | None:
-        """Resolve the name once; None before the first success. Log one line for each change.
+        """Resolve the name once and return the peer's address; log each change of the address.
 
-        If a later attempt fails, the known address stays.
+        If the resolution fails, return the last known address, or None if there is none yet.
         """
         before = self._known[-1:]
         try:

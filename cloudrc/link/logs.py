@@ -1,16 +1,15 @@
-"""Read the packets of measured links from logs of ping, fping and irtt, and from CSV files.
+"""Read the delays and losses of real links from logs of ping, fping and irtt, and from CSV files.
 
     ping -D -O HOST, ping --apple-time HOST, fping -D HOST
     irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
-A telemetry datagram has 204 bytes, a command datagram 88 bytes. irtt measures both directions if
-the clocks of the two hosts agree; ping measures round trips. The columns of a CSV log name their
-units, such as `time_ms,delay_us,loss` or `timestamp_ns,rtt_ms`. The readers take half of each round
-trip if the user asks for that (`halve`).
+irtt's option -l sets the packet size: a telemetry datagram has 204 bytes, a command datagram 88.
+irtt measures both directions if the clocks of the two hosts agree. ping measures round trips; with
+`halve`, half of each round trip counts as the delay. The columns of a CSV log name their units,
+such as `time_ms,delay_us,loss` or `timestamp_ns,rtt_ms`.
 
-Every reader fills a `Log`, and `Log.packets` makes the same checks for all logs. `Packets.notes`
-counts the rows that are left out, merged or sorted. A log is refused if more than 1 % of its rows
-cannot be used.
+Every reader fills a `Log`, and `Log.packets` checks it in the same way. `Packets.notes` counts the
+rows that are left out, merged or sorted. A log with more than 1 % unusable rows is rejected.
 
 Source: ping(8) of iputils, macOS and BusyBox; fping(8); irtt-client(1), JSON format 1.
 """
@@ -40,17 +39,19 @@ Direction: TypeAlias = Literal["uplink", "downlink"]
 Entry: TypeAlias = tuple[float, float | None]
 """Time of sending [s] and delay [s]; the delay is None if the packet was lost."""
 LONGEST = 5.0
-"""Longest plausible median delay [s]; values with a larger median are probably in another unit."""
+"""Largest plausible median delay [s]; a larger median suggests that the unit is wrong."""
 UNUSABLE_MAX = 0.01
-"""Largest share of rows that may be left out; above this share the log is refused."""
+"""Largest share of rows that may be left out, in [0, 1]; with more, the log is rejected."""
 GAP, GAP_OF_PING, GAP_MIN = 20, 2, 1.0
-"""A note reports a gap above GAP (for ping GAP_OF_PING) median times between packets, if the gap is
-also above GAP_MIN [s]. The limit for ping is lower, because ping sends regularly."""
+"""Limits for gaps between packets. A gap is reported if it is longer than GAP_MIN [s] and longer
+than GAP (for ping GAP_OF_PING) times the median time between packets. ping sends regularly, so its
+limit is lower."""
 STEPS_MAX = 3
-"""Up to this number of jumps back in time, a jump is a step of the clock or a new session; more
-jumps mean that the rows are shuffled."""
+"""Largest number of jumps back in time that count as clock steps or new sessions. With more jumps,
+the rows are only out of order and are sorted."""
 PACKETS_MAX = 10_000_000
-"""Limit of packets in a log of ping, since a number may be forged: three weeks at five a second."""
+"""Largest number of packets in a log of ping: three weeks at five packets per second. The limit
+rejects wrong sequence numbers before they use up the memory."""
 HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
@@ -62,9 +63,9 @@ class Packets:
     """The packets of a log in the order of sending.
 
     Attributes:
-        sent: Times of sending, on any clock, strictly rising [s], shape (n,).
+        sent: Times of sending on any clock, strictly rising [s], shape (n,).
         delays: One-way delays [s], None for lost packets, shape (n,).
-        notes: What was left out, merged or sorted, and how often.
+        notes: Texts such as "3 out of order, sorted", for the user.
         halved: Whether the delays are halves of round trips.
     """
 
@@ -75,29 +76,29 @@ class Packets:
 
     @property
     def arrived(self) -> list[float]:
-        """Return the delays of the packets that arrived [s]."""
+        """Delays of the packets that arrived [s]."""
         return [delay for delay in self.delays if delay is not None]
 
     @property
     def lost(self) -> int:
-        """Return the number of lost packets."""
+        """Number of lost packets."""
         return len(self.delays) - len(self.arrived)
 
     @property
     def duration(self) -> float:
-        """Return the time from the first to the last packet sent [s]."""
+        """Time from the first to the last packet sent [s]."""
         return self.sent[-1] - self.sent[0]
 
 
 @dataclass(slots=True)
 class Log:
-    """The rows that a reader finds in a source.
+    """The rows that a reader finds in a log.
 
     Attributes:
-        entries: The packets in the order of the source.
-        counts: What was left out, merged or changed -> how often.
-        unusable: One reason for each row that cannot be used.
-        gap: Shortest gap, and shortest jump back, in median times between packets [1].
+        entries: The packets in the order of the log.
+        counts: Description of rows left out, merged or sorted -> number of these rows.
+        unusable: For each row that cannot be used, the reason.
+        gap: Shortest gap that is reported, as a multiple of the median time between packets [1].
     """
 
     name: str
@@ -108,10 +109,10 @@ class Log:
     gap: int = GAP
 
     def packets(self) -> Packets:
-        """Check the packets, sort them by the time of sending, and note what was changed.
+        """Check the packets, sort them by time of sending, and note what was changed.
 
-        Raises a BadInputError if more than 1 % of the rows cannot be used or repeat the time of an
-        earlier row, if no packet arrived, if a delay is negative, or if the times jump back.
+        Raises a BadInputError if no packet arrived, if a delay is negative, if the times jump back,
+        or if more than 1 % of the rows are unusable or repeat the time of an earlier row.
         """
         self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
         arrived = [delay for _, delay in self.entries if delay is not None]
@@ -120,7 +121,7 @@ class Log:
         self.refuse_early(min(arrived))
         times = np.array([sent for sent, _ in self.entries])
         self._refuse_steps(times)
-        unique = dict(reversed(self.entries))  # of packets with the same time the first remains
+        unique = dict(reversed(self.entries))  # of packets with the same time, the first is kept
         repeated = len(times) - len(unique)
         same = f"{repeated} of {len(times)} packets have the same time as another one"
         self._refuse_beyond_limit(repeated, f"{self.name}: {same}; give times with more digits")
@@ -142,7 +143,7 @@ class Log:
         return BadInputError(f"{self.name}: {text}")
 
     def refuse_early(self, least: float) -> None:
-        """Refuse a log whose shortest delay, `least` [s], is negative."""
+        """Raise an error if the shortest delay, `least` [s], is negative: the clocks differ."""
         if least < 0.0:
             raise self.error(
                 f"a packet arrived {-least * 1e3:.4g} ms before it was sent: the two clocks differ;"
@@ -150,7 +151,7 @@ class Log:
             )
 
     def _refuse_steps(self, times: Floats) -> None:
-        """Refuse times that jump far back one to three times: sorting would mix two sessions."""
+        """Raise an error after one to three long jumps back: sorting would mix sessions."""
         steps = np.diff(times)
         back = np.flatnonzero(steps < -self._far(steps))
         if 1 <= len(back) <= STEPS_MAX:
@@ -160,7 +161,7 @@ class Log:
             )
 
     def _far(self, steps: Floats) -> float:
-        """Return the time above which a gap or a jump back is unusual for this log [s]."""
+        """Return the duration above which a gap or a jump back is unusual [s]."""
         return max(GAP_MIN, self.gap * float(np.median(np.abs(steps)))) if len(steps) else GAP_MIN
 
     def _refuse_beyond_limit(self, count: int, reason: str = "") -> None:
@@ -171,10 +172,10 @@ class Log:
 
 
 def trace_of(packets: Packets) -> Trace:
-    """Make a trace that reproduces the delays and losses for a stream of the same rate.
+    """Make a trace that repeats the delays and losses of a log at the log's packet rate.
 
-    Each row begins halfway between its packet and the packet before. So a replayed packet may be
-    late or early by half a period and still gets its own row. Time begins at the first packet.
+    Each row holds for half a period before and after the time at which its packet was sent. So a
+    packet that is replayed a little early or late gets the right row. Time 0 is the first packet.
     """
     sent = packets.sent
     halfway = [(before + after) / 2 - sent[0] for before, after in pairwise(sent)]
@@ -198,11 +199,11 @@ _OTHERS = {
         "the output of traceroute or mtr, which has no delay of each packet; give one of ping -D"
     ),
 }
-"""Pattern in a file's first lines -> which tool wrote the file, and what the user should give."""
+"""Pattern in a file's first lines -> the tool that wrote the file, and remedy for the user."""
 
 
 def refuse_others(lines: list[str], name: str) -> None:
-    """Refuse the output of a tool that does not measure the delay of each packet; name the tool."""
+    """Raise an error that names the tool, if its output lacks the delay of each packet."""
     head = "\n".join(lines[:50])
     for pattern, what in _OTHERS.items():
         if re.search(pattern, head, re.MULTILINE):
@@ -210,21 +211,21 @@ def refuse_others(lines: list[str], name: str) -> None:
 
 
 _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError
-"""Errors that JSON with an unexpected layout can raise."""
+"""Errors that reading JSON with an unexpected layout can raise."""
 
 
 def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool) -> Packets:
     """Read the output of `irtt client -o FILE.json`.
 
     The client stands for the robot: its packets are the uplink. If irtt does not know in which
-    direction a packet was lost, the packet counts as lost in both directions. Times of sending are
-    on the client's monotonic clock, so steps of its wall clock do not matter.
+    direction a packet was lost, the packet counts as lost in both directions. The times of sending
+    are on the client's monotonic clock, so steps of the client's wall clock have no effect.
 
-    `direction` may be None only with `halve`. `name` is the name of the file, for messages.
+    `direction` may be None only with `halve`. `name` is the file name for messages.
 
     Raises:
-        BadInputError: If the file is not such an output, if it contradicts its own counts, or if
-            `halve` is false and the file has no usable one-way delays.
+        BadInputError: If the file is no output of irtt, if its packets contradict its own
+            statistics, or if `halve` is false and the file has no usable one-way delays.
     """
     log = Log(name, halved=halve)
     try:
@@ -252,7 +253,6 @@ def _arrived(trip: dict[str, Any]) -> bool:
 
 
 def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log) -> None:
-    """Compare the packets of an irtt log with the counts in the same log."""
     arrived = sum(map(_arrived, trips))
     copies = int(stats.get("duplicates", 0))
     log.counts["duplicates left out"] += copies
@@ -266,7 +266,7 @@ def _compare_counts(stats: dict[str, Any], trips: list[dict[str, Any]], log: Log
 
 
 def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
-    """Reject a log that has no one-way delays, whose clocks differ, or in which a clock steps."""
+    """Raise an error if one-way delays are missing, if the clocks differ, or if a clock steps."""
     if any(not {"send", "receive"} <= trip["delay"].keys() for trip in arrived):
         raise BadInputError(f"{log.name} (irtt's server sent no stamps): has round trips; {HALVE}")
     both = [int(trip["delay"][key]) for trip in arrived for key in ("send", "receive")]
@@ -278,7 +278,7 @@ def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
         passed, wall = (
             np.diff([int(stamp[clock]) for stamp in stamps]) for clock in ("monotonic", "wall")
         )
-        # 1 ms, and 0.1 % for a clock in adjustment.
+        # 1 ms, plus 0.1 % for a clock that NTP adjusts.
         far = np.flatnonzero(np.abs(wall - passed) > 1_000_000 + passed // 1000)
         if len(far):
             raise log.error(
@@ -292,15 +292,15 @@ _IRTT_NAMES = {
     "uplink": ("true_down", "send"),
     "downlink": ("true_up", "receive"),
 }
-"""What is read -> irtt's value of `lost` for packets to leave out, irtt's name of the delay."""
+"""Delays to read -> irtt's value of `lost` for packets to leave out, irtt's key of the delay."""
 
 
 def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     """Read the time of sending and the delay of each packet [s]; time 0 is the first packet.
 
-    Packets lost in the other direction are left out. A packet lost on the uplink never reached the
-    downlink; the uplink delay of a packet lost on the downlink is unknown, so its time of sending
-    on the downlink is estimated with the median uplink delay.
+    Packets lost in the other direction are left out. A downlink packet is sent when the uplink
+    packet arrives. If the downlink packet is lost, irtt does not report this time; it is estimated
+    with the median uplink delay.
     """
     other, key = _IRTT_NAMES[what]
     part, usual = 0.5 if what == "halves" else 1.0, 0
@@ -328,23 +328,26 @@ _LOST_WORDS = {
 }
 """Words in the delay column that mark a lost packet."""
 _LOST_NUMBERS = (-1.0, -999.0, -9999.0)
-"""Numbers in the delay column that mark a lost packet [unit of the column]. Such a number counts as
-a mark only if the column has no other negative number."""
+"""Numbers in the delay column that may mark a lost packet [unit of the column]. The number is a
+mark only if the column has no other negative number."""
 _FLAGS = {"0": False, "1": True, "false": False, "true": True, "no": False, "yes": True}
 _LATE = {"s": 1e11, "ms": 1e14, "us": 1e17}
-"""Unit -> largest plausible time since 1970, about the year 5000. A larger value means that the
-true unit is finer than the column's name says."""
+"""Unit of a time column -> largest plausible time since 1970 [this unit], about the year 5000. If a
+value is larger, the column's name has the wrong unit."""
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:
     """Read a CSV log with a header; unknown columns are skipped.
 
-    A packet counts as lost if its `loss` is 1; if its delay is empty or a word such as "timeout";
-    if its delay is -1, -999 or -9999, and the column has no other negative number; or if its delay
-    is 0, all other delays are far from 0, and there is no column `loss`.
+    A packet counts as lost in any of these cases:
 
-    `trust_units` accepts values that seem to be in another unit. Without `halve`, round trips are
-    rejected. `name` is the name of the file, for messages.
+    - The column `loss` contains 1.
+    - The delay is empty, or a word such as "timeout".
+    - The delay is -1, -999 or -9999, and the column has no other negative number.
+    - The delay is 0, all other delays are far from 0, and the log has no column `loss`.
+
+    `trust_units` accepts values that seem to be in another unit. Round trips are rejected if
+    `halve` is false. `name` is the file name for messages.
 
     Raises:
         BadInputError: If the log cannot be used; the text names line, value and remedy.
@@ -380,7 +383,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
 
 
 def _check_unit(packets: Packets, unit: str, name: str) -> None:
-    """Reject delays that are probably in another unit than the column says; name the other unit."""
+    """Raise an error if the delays are probably in another unit than the column says."""
     factor = 1 / SCALES[unit]
     top, middle = max(packets.arrived), median(packets.arrived)
     found = ""
@@ -394,7 +397,7 @@ def _check_unit(packets: Packets, unit: str, name: str) -> None:
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the only column of one of these kinds; return its name and its unit ("" without)."""
+    """Find the only column of these kinds; return its name and unit ("" if it names no unit)."""
     known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
     found = [column for column in columns if column in known]
     found = found or [column for column in columns if column in kinds]
@@ -412,7 +415,7 @@ def _no_unit(column: str) -> str:
 
 
 def _csv_time(row: Row, column: str, unit: str) -> float:
-    """Read a time in its column's unit; if the column has no unit, read date and time [s]."""
+    """Read a time in the column's unit; if the column names no unit, read date and time [s]."""
     text = row.text(column)
     if not unit:
         try:
@@ -428,7 +431,7 @@ def _csv_time(row: Row, column: str, unit: str) -> float:
 
 
 def _csv_delay(row: Row, column: str, loss: str | None) -> float | None:
-    """Read a delay in its column's unit; None if the row says that the packet was lost."""
+    """Read a delay in the column's unit; return None for a lost packet."""
     if loss is not None:
         flag = row.number(loss)
         known = {0.0: False, 1.0: True}.get(flag) if flag is not None else None
@@ -447,9 +450,9 @@ def _csv_delay(row: Row, column: str, loss: str | None) -> float | None:
 
 
 def _without_marks(raw: list[Entry], column: str, decimals: int, log: Log) -> list[Entry]:
-    """Replace the delays that mark lost packets by None, and count these packets.
+    """Replace numbers that mark lost packets, such as -1, by None, and count these packets.
 
-    `decimals` is the largest number of decimals in the column; -1 if a column `loss` tells losses.
+    `decimals` is the largest number of decimals in the column; -1 if a column `loss` marks losses.
     """
     values = {value for _, value in raw if value is not None}
     below = {value for value in values if value < 0.0}
@@ -471,7 +474,7 @@ _STAMP = re.compile(
     r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"
     r"|(?P<date>\d{4}-\d\d-\d\d)?[T ]?(?P<hour>\d\d):(?P<minute>\d\d):(?P<second>\d\d\.\d+)\S* +"
 )
-"""Time stamp of a line: from `ping -D`, `ts '[%.s]'` or `ping --apple-time`, or date and time."""
+"""Time stamp at the start of a line, from `ping -D`, `ts '[%.s]'` or `ping --apple-time`."""
 _NUMBER = re.compile(r"\b(?:icmp6?_)?(?:seq|req)[= ](\d{1,12})\b|(?<= : )\[(\d{1,12})\], ")
 _ROUND_TRIP = re.compile(r"(?:[=<] ?|, )(\d+(?:[.,]\d+)?) ?(?:ms|msec|msek|мс|毫秒|ミリ秒)(?=\W|$)")
 _REPLY = re.compile(r"ttl=|hlim=|bytes from", re.IGNORECASE)
@@ -486,7 +489,7 @@ _NO_STAMPS = {
     r"\], \d+ bytes": "run fping with -D",
     "": "run ping with -D",
 }
-"""Pattern in a log without time stamps -> remedy for this kind of ping; the first match counts."""
+"""Pattern of a kind of ping -> how to get time stamps from it; the first pattern found counts."""
 
 
 def is_ping(lines: list[str]) -> bool:
@@ -497,13 +500,13 @@ def is_ping(lines: list[str]) -> bool:
 def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     """Read the output of `ping -D` or of a similar program, in any language.
 
-    These packets count as lost: sequence numbers that are missing between replies, packets with a
-    line such as "no answer yet", and packets that only the summary counts. Without a summary,
-    packets after the last line are unknown, because their replies may have been under way.
+    Packets count as lost if their sequence number is missing between replies, if a line such as "no
+    answer yet" reports them, or if only the summary counts them. Without a summary, packets after
+    the last line are unknown, because their replies may have been under way.
 
     Raises:
-        BadInputError: If `halve` is false, if the log `name` has no replies, no time stamps, too
-            many packets or several sessions, or if it contradicts its summary.
+        BadInputError: If `halve` is false; if the log `name` has no replies, no time stamps, too
+            many packets or several sessions; or if it contradicts its summary.
     """
     log = Log(name, halved=True, gap=GAP_OF_PING)
     if not halve:
@@ -516,7 +519,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     known = np.array(sorted(ping.replies))
     sent = np.array([ping.replies[number][0] for number in known])
     numbers = np.arange(first, last + 1)
-    # Without a reply, the time of sending lies on a straight line between the replies around.
+    # Without a reply, the time of sending is interpolated between the neighbouring replies.
     outside = np.minimum(numbers - known[0], 0) + np.maximum(numbers - known[-1], 0)
     times = np.interp(numbers, known, sent) + outside * ping.period()
     for number, at in zip(numbers.tolist(), times.tolist(), strict=True):
@@ -526,17 +529,17 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
 
 
 class _Ping:
-    """Collects the packets of a log of ping; a number is the sequence number of a packet.
+    """Collects the packets of a log of ping by their sequence numbers.
 
     Attributes:
-        replies: Number -> time of sending and round trip [s].
+        replies: Sequence number -> time of sending and round trip [s].
     """
 
     def __init__(self, lines: list[str], log: Log) -> None:
         self.replies: dict[int, tuple[float, float]] = {}
         self._log, self._text = log, "\n".join(lines[:1000])
-        self._told: dict[int, float] = {}  # number -> time stamp of its line, 0 without one [s]
-        self._trips: list[float] = []  # with those of duplicates [s]
+        self._told: dict[int, float] = {}  # number -> time stamp of its line, or 0 [s]
+        self._trips: list[float] = []  # round trips, including duplicates [s]
         self._summaries: list[tuple[int, int]] = []  # packets sent and received
         self._headers, self._base = 0, 1  # lines that begin a log; first number of this ping
         self._wraps = self._newest = 0
@@ -574,9 +577,9 @@ class _Ping:
         self._newest = max(self._newest, count)
 
     def _unwrap(self, number: int) -> int:
-        """Continue the count after 65535, where ping begins again with 0.
+        """Return the sequence number without wrap-around: ping continues with 0 after 65535.
 
-        A late reply may belong to the numbers before 65535.
+        A late reply just after a wrap-around may have a number from before the wrap-around.
         """
         count = number + self._wraps * _WRAP
         if self._newest - count > _WRAP // 2:
@@ -585,7 +588,7 @@ class _Ping:
         return count - _WRAP if count - self._newest > _WRAP // 2 and self._wraps else count
 
     def _time(self, stamp: re.Match[str]) -> float:
-        """Convert a time stamp to the time since 1970, or since the midnight before the log [s]."""
+        """Convert a time stamp to the time since 1970 or, without a date, since midnight [s]."""
         if stamp["unix"]:
             return float(stamp["unix"])
         clock = int(stamp["hour"]) * 3600 + int(stamp["minute"]) * 60 + float(stamp["second"])
@@ -597,7 +600,6 @@ class _Ping:
         return self._midnight + clock
 
     def _read_other(self, line: str) -> None:
-        """Read a line without a sequence number: header, summary, or another line."""
         log, summary, mean = self._log, _SUMMARY.search(line), _MEAN.search(line)
         if line.startswith(("PING ", "PING6(")):
             self._headers += 1
@@ -616,7 +618,7 @@ class _Ping:
             log.counts["other lines left out"] += 1
 
     def check_range(self) -> tuple[int, int]:
-        """Return the first and the last sequence number; compare the log with its own summary."""
+        """Return the first and last sequence number; raise an error if the summary disagrees."""
         beginnings = max(self._headers, len(self._summaries))
         if beginnings > 1:
             self._refuse_sessions(f"{beginnings} beginnings or ends")

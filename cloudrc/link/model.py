@@ -1,7 +1,7 @@
-"""Model a link direction: compute when each packet arrives, and statistics of many packets.
+"""Compute when each packet arrives in one direction of a link, and statistics of many packets.
 
-The model has no clock, no socket and no stateful random generator. The virtual driver and the relay
-use the same model, so both get the same delays and losses.
+The model has no clock, no socket and no stateful random generator. Runs in virtual time and the
+relay use the same model, so both get the same delays and losses.
 """
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ HEADER_BYTES = 28
 Source: RFC 791, RFC 768.
 """
 _TABLES = 64
-"""Number of blocks of impairments that stay in memory."""
+"""Number of blocks of impairments that are kept in memory."""
 
 
 class LinkDirection:
-    """One direction of the link.
+    """Model of one direction of the link.
 
-    The random impairment of a packet depends only on seed, direction, epoch, kind and counter, not
-    on the order of calls, the mode or other kinds of datagram. Packets with the same counter get
-    the same impairment. Two effects depend on earlier packets: the queue of a bottleneck (`rate`)
-    and `keep_order`. If the profile uses one of them, call `send` in the order of sending.
+    The random impairment of a packet depends only on seed, direction, epoch, kind and counter. The
+    order of calls and other kinds of datagram have no effect.
+
+    With the settings `rate` (the queue of the bottleneck) and `keep_order`, the arrival also
+    depends on earlier packets. Then call `send` in the order of sending.
 
     Attributes:
-        corrupts: Whether the link may damage datagrams; if true, `corrupted` must be called.
+        corrupts: Whether the link may damage datagrams; if true, call `corrupted` for each.
     """
 
     def __init__(
         self, profile: DirectionProfile, seed: int, uplink: bool, origin_ns: int = 0
     ) -> None:
-        """Create the direction; `uplink` is True for world to cloud.
+        """Create the model; `uplink` is True for world to cloud.
 
-        The time line counts from `origin_ns`, when the link came up, on the clock of `send`.
+        The time line starts at `origin_ns` [ns], when the link came up, on the clock of `send`.
         """
         self._seed, self._uplink = seed, uplink
         self._origin_ns: int | None = origin_ns
@@ -54,11 +55,11 @@ class LinkDirection:
         self.replace_profile(profile)
 
     def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Replace the conditions from the next packet on.
+        """Replace the profile from the next packet on.
 
-        Seed, counts and the bottleneck's queue stay. The random draws are the same as if the link
-        had used this profile from the start. With `restart`, the new time line begins at the next
-        packet; otherwise the origin of the old time line stays.
+        Seed, counts and the bottleneck's queue are kept. The random draws are the same as if the
+        link had used this profile from the start. With `restart`, the new time line starts at the
+        next packet; otherwise it starts where the old time line started.
         """
         if restart:
             self._origin_ns = None
@@ -70,14 +71,14 @@ class LinkDirection:
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
-        """Send one packet of `size` bytes of UDP payload at `now_ns` [ns].
+        """Send one packet of `size` bytes of UDP payload at `now_ns` [ns]; compute when it arrives.
 
-        As in tc-netem, a packet is lost before the bottleneck, and a reordered packet skips the
-        bottleneck.
+        As in tc-netem, packets are lost before they reach the bottleneck, and reordered packets
+        skip the bottleneck.
 
         Returns:
-            Times of arrival [ns], never before `now_ns`: no time for a lost packet, two times for a
-            duplicated packet. The second time is that of the copy; it may be the earlier one.
+            Times of arrival [ns], at or after `now_ns`: none for a lost packet, two for a
+            duplicated packet. The second time is that of the copy, which may arrive first.
         """
         if self._origin_ns is None:
             self._origin_ns = now_ns
@@ -100,13 +101,13 @@ class LinkDirection:
         return found
 
     def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
-        """Return a datagram as it arrives, perhaps with one bit flipped.
+        """Return the content of a datagram as it arrives: unchanged, or with one bit flipped.
 
         Call this method only if `corrupts` is true. All copies of a packet have the same damage.
 
         Source: tc-netem(8), `corrupt`. Deviation: netem flips a bit anywhere in the frame, so the
-        receiving kernel drops most damaged frames by their checksums. This model flips a bit of
-        the datagram.
+        receiving kernel drops most damaged frames because their checksums are wrong. This model
+        flips a bit of the datagram.
         """
         block, index = divmod(counter, BLOCK)
         key = stream_key(self._seed, self._uplink, epoch, kind)
@@ -120,10 +121,11 @@ class LinkDirection:
         return bytes(damaged)
 
     def counts(self) -> dict[str, int]:
-        """Return the number of packets by outcome so far.
+        """Return the number of packets by outcome, since the start.
 
-        The outcomes: `passed` (at least one copy arrives); `duplicated` (two copies arrive);
-        `lost`, `blackout`, `queue` (no copy arrives, by cause); `corrupted` (a bit is flipped).
+        The outcomes are `passed` (at least one copy arrives), `duplicated` (two copies arrive),
+        `corrupted` (a bit is flipped), and by cause of the loss: `lost` (at random), `blackout`,
+        `queue` (full).
         """
         return dict(self._counts)
 
@@ -152,7 +154,7 @@ class LinkDirection:
         return True
 
     def _draw(self, key: tuple[int, int, int, float, Loss]) -> list[Fate]:
-        """Draw the impairments of a block for one jitter and one loss; keep the latest blocks."""
+        """Draw the impairments of a block, and keep them for its other packets."""
         epoch, kind, block, jitter, loss = key
         stream = stream_key(self._seed, self._uplink, epoch, kind)
         if len(self._fates) >= _TABLES:
@@ -166,12 +168,12 @@ Array: TypeAlias = NDArray[Any]
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """The n packets of one direction in the order of sending.
+    """n packets of one direction in the order of sending.
 
     Attributes:
         sent: Times of sending, since the link came up [s], shape (n,).
-        delays: One-way delays of the first copy to arrive [s], NaN for lost packets, shape (n,).
-        copies: Number of arrived copies of each packet [1], shape (n,).
+        delays: One-way delay of the copy that arrives first [s], NaN for lost packets, shape (n,).
+        copies: Number of copies of each packet that arrived [1], shape (n,).
     """
 
     sent: Array
@@ -188,9 +190,9 @@ class Numbers:
         correlation: Correlation of the delays of successive packets [1].
         loss: Share of packets that did not arrive, in [0, 1].
         runs: Length of each run of successive losses.
-        overtaken: Share of arrived packets that arrived after a later sent packet, in [0, 1].
-            Source: RFC 4737, section 3.
-        duplicated: Share of packets with two arrived copies, in [0, 1].
+        overtaken: Share of arrived packets that a later packet overtook, in [0, 1]. Source: RFC
+            4737, section 3.
+        duplicated: Share of packets of which two copies arrived, in [0, 1].
     """
 
     mean: float
@@ -207,7 +209,7 @@ class Numbers:
 
 
 def sample(link: LinkDirection, kind: int, sent_ns: Sequence[int], size: int) -> Stream:
-    """Send packets of `size` bytes at rising times [ns] through a new direction with origin 0."""
+    """Send packets of `size` bytes at rising times [ns] through a new link that came up at 0."""
     delays = np.full(len(sent_ns), np.nan)
     copies = np.zeros(len(sent_ns), dtype=np.int64)
     for n, now_ns in enumerate(sent_ns):
@@ -248,7 +250,7 @@ def numbers(stream: Stream) -> Numbers:
 
 
 def loss_runs(stream: Stream) -> tuple[int, ...]:
-    """Return the length of each run of successive losses, in order."""
+    """Return the length of each run of successive losses, in the order of sending."""
     lost = np.concatenate(([0], np.isnan(stream.delays).astype(np.int8), [0]))
     edges = np.flatnonzero(np.diff(lost))
     return tuple((edges[1::2] - edges[::2]).tolist())

@@ -1,16 +1,18 @@
-"""Shape one direction of the link in the kernel, by `tc` on the pod's egress.
+"""Shape one direction of the link in the kernel: `tc` configures the pod's outgoing interface.
 
     interface > prio 7400: --+-- bands 1-3: everything else, as before
                              +-- band 4 > netem 7401: datagrams that the filter selects:
                                           only UDP to the peer's tunnel port
 
-After a restart `Netem` finds its qdiscs by their handles. In flight it changes the qdiscs by `tc
-qdisc change`, which keeps the queued packets but does not reset what it does not name; so every
-call names all options. `Netem` never touches a root qdisc of another program. If another program
-removes or changes the qdiscs of `Netem`, the log says so and a metric counts the case.
+After a restart, `Netem` finds its qdiscs by their handles. In flight it changes them with `tc qdisc
+change`, which keeps queued packets. That command leaves options unchanged that it does not name, so
+every call names all options.
 
-netem draws jitter from a table of at most 16,384 integers of 16 bits; the entry 8192 means one
-times the jitter. The tables that come with tc differ from the model's distributions.
+`Netem` never touches a root qdisc of another program. If another program removes or changes the
+qdiscs of `Netem`, `Netem` logs an error and counts it in a metric.
+
+netem draws jitter from a table of at most 16,384 integers of 16 bits, in which 8192 stands for one
+times the jitter. The tables that come with tc differ from the distributions of the link's model.
 
 Source: tc-prio(8), tc-netem(8), tc-u32(8); iproute2 netem/README.distribution; Linux,
 net/sched/sch_netem.c (tabledist).
@@ -38,41 +40,42 @@ from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, L
 from cloudrc.link.relay import Address
 
 NOT_FOUND = 127
-"""Exit code when the program does not exist."""
+"""Exit code that stands for a program that does not exist."""
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
-"""Handles of the root qdisc, of its band for the tunnel's flow, and of the netem there."""
+"""Handles of the root qdisc, of its band for the tunnel's datagrams, and of the netem in that
+band."""
 PERIOD_NS = 1_000_000_000
 """Time between two checks of the qdiscs [ns]."""
 STEP_NS = 5_000_000
-"""Shortest time between two changes of the qdisc along a time line [ns]. If the changes of a time
-line follow each other sooner, some are skipped."""
+"""Shortest time between two changes of the qdisc that a time line makes [ns]. Changes that follow
+sooner are skipped."""
 LIMIT = 10_000
-"""Limit of packets in a qdisc without a bottleneck, as in the relay."""
+"""Largest number of packets in a qdisc without a bottleneck, as in the relay."""
 DELAY_MAX_MS = 274_000
-"""Longest delay that tc accepts [ms]: ticks of 64 ns in 32 bits."""
+"""Longest delay that tc accepts [ms]: 2^32 ticks of 64 ns."""
 ENTRIES = 4096
 """Number of entries in a table of a delay distribution."""
 STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
-"""Distribution -> factor that divides the table's entries, so that the tail fits in 16 bits. The
-jitter that tc gets is multiplied by the same factor."""
+"""Distribution -> divisor of the table's entries, so that the tail fits in 16 bits. To compensate,
+tc gets the jitter multiplied by the same factor."""
 _ONE = 8192
 _END_OF_TABLE = 32_767 / _ONE
-"""Largest 16-bit entry, in units of the jitter."""
+"""Largest 16-bit entry of a table, as a multiple of the jitter."""
 _KEPT = 10_000
-"""Number of the most recent changes whose lateness counts in the percentiles."""
+"""Number of recent changes from which the percentiles of the lateness are computed."""
 _IN_ORDER = "100gbit"
-"""Rate that has no effect except that netem keeps the order of packets."""
+"""A rate that limits nothing. With any rate, netem keeps the order of packets."""
 _ETHERNET_BYTES = 14
 """Length of the Ethernet header, which netem counts and the model does not [bytes]."""
 _RATE_MIN = 8.0
-"""Lowest rate [bit/s]: tc turns less than 1 byte/s into no limit, without a message."""
+"""Lowest rate [bit/s]: tc treats less than 1 byte/s as no limit, without a message."""
 _CHANCE_MIN = 2.0**-32
-"""Lowest probability above 0: tc turns less into 0, without a message."""
+"""Lowest probability above 0: tc rounds smaller values to 0, without a message."""
 _PACKET_BITS = 8 * 116
 """Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
 _PACKETS = 1_000
-"""Assumed packet rate without a bottleneck [1/s], higher than the rate of tunnel or probes."""
-# The kernel's own default for three bands: nothing falls into the fourth by its type of service.
+"""Assumed packet rate if there is no bottleneck [1/s]; tunnel and probes send fewer packets."""
+# The kernel's default for three bands: no type of service selects the fourth band.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
 _INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
 
@@ -86,11 +89,11 @@ class Answer(NamedTuple):
 
 
 Run: TypeAlias = Callable[[Sequence[str]], Answer]
-"""Function that runs a program to its end."""
+"""Function that runs a program and waits for its end."""
 
 
 class Iproute2:
-    """Runs `tc` and `ip`; raises the error that `explain` makes if a call fails."""
+    """Runs `tc` and `ip`; if a call fails, raises an error with cause and remedy."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -100,11 +103,11 @@ class Iproute2:
         return self._checked("tc", words)
 
     def show(self, *words: str) -> list[dict[str, Any]]:
-        """Run `tc -s -j` with these words and return the objects that it prints."""
+        """Run `tc -s -j` with these arguments and return the objects that it prints."""
         return list(json.loads(self._checked("tc", ("-s", "-j", *words)) or "[]"))
 
     def device(self, host: str) -> str:
-        """Return the interface that leads to an address."""
+        """Return the interface through which packets to a host leave."""
         return str(json.loads(self._checked("ip", ("-j", "route", "get", host)))[0]["dev"])
 
     def _checked(self, program: str, words: Sequence[str]) -> str:
@@ -115,7 +118,7 @@ class Iproute2:
 
 
 def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
-    """Turn the failed call of a program into an error with cause and remedy."""
+    """Convert the failed call of a program into an error with cause and remedy."""
     text = " ".join((answer.error or answer.output).split())
     unknown = "kind is unknown", "classifier not found", "answers: No such file"
     if answer.code == NOT_FOUND:
@@ -138,7 +141,7 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
 
 
 def may_shape(status: str) -> bool:
-    """Return whether a process is root with NET_ADMIN, from the text of its /proc/PID/status.
+    """Check the text of a process's /proc/PID/status: is the process root with NET_ADMIN?
 
     Source: Linux, include/uapi/linux/capability.h: CAP_NET_ADMIN is bit 12.
     """
@@ -155,11 +158,11 @@ _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
 
 
 def table(distribution: str) -> list[int]:
-    """Make netem's table for the distribution "uniform", "normal" or "pareto".
+    """Compute netem's table for the distribution "uniform", "normal" or "pareto".
 
     Returns:
-        Quantiles at the probabilities (n + 0.5) / 4096, in units of the jitter, times
-        8192 / STRETCH, rounded, rising, shape (4096,).
+        Rounded quantiles at the probabilities (n + 0.5) / 4096, rising, shape (4096,). A value of
+        8192 / STRETCH stands for one times the jitter.
     """
     values = _QUANTILES[distribution]((np.arange(ENTRIES) + 0.5) / ENTRIES)
     if distribution != "uniform":  # mean 0, standard deviation 1
@@ -169,28 +172,28 @@ def table(distribution: str) -> list[int]:
 
 
 def stretch(profile: DirectionProfile) -> int:
-    """Return the factor that multiplies the profile's jitter for tc, as in `STRETCH`."""
+    """Return the factor by which tc's jitter is larger than the profile's, as in `STRETCH`."""
     if profile.distribution != "table":
         return STRETCH[profile.distribution]
     return ceil(max(map(abs, profile.table)) / _END_OF_TABLE) or 1
 
 
 def distribution_name(profile: DirectionProfile) -> str:
-    """Return the name by which tc finds the table of a profile's distribution."""
+    """Return the name under which tc finds the table of a profile's distribution."""
     if profile.distribution != "table":
         return profile.distribution
-    # tc makes a file name of it, so only letters and digits; another table is another file.
+    # tc makes a file name of it: only letters and digits, and another name for each table.
     return "table" + blake2b(repr(profile.table).encode(), digest_size=8).hexdigest()
 
 
 def write_tables(folder: Path) -> None:
-    """Write the tables for `STRETCH` to a folder; tc reads them if TC_LIB_DIR names the folder."""
+    """Write the tables of all distributions to a folder; TC_LIB_DIR tells tc the folder."""
     for distribution in STRETCH:
         _write(folder, distribution, table(distribution))
 
 
 def write_measured(folder: Path, profile: DirectionProfile) -> None:
-    """Write the table of a profile with a measured distribution; do nothing for other profiles."""
+    """Write the table of a profile with a measured distribution; ignore other profiles."""
     if profile.distribution == "table":
         unit, values = _ONE / stretch(profile), sorted(profile.table)
         picked = [values[(2 * i + 1) * len(values) // (2 * ENTRIES)] for i in range(ENTRIES)]
@@ -202,7 +205,7 @@ def _write(folder: Path, name: str, entries: Sequence[int]) -> None:
 
 
 def check(profile: DirectionProfile) -> None:
-    """Raise a BadInputError if netem cannot realise a profile; the text names the reason."""
+    """Raise a BadInputError with the reason if netem cannot realise a profile."""
     pieces = Timeline(profile).pieces
     losses = [piece.loss for piece in pieces]
     chances = [chance for loss in losses for chance in _chances(loss)]
@@ -232,7 +235,7 @@ def check(profile: DirectionProfile) -> None:
 
 
 def notes(profile: DirectionProfile) -> list[str]:
-    """Return notes about the parts of a profile that netem realises differently."""
+    """Describe the parts of a profile that netem realises differently than the relay."""
     said = []
     if profile.jitter and profile.correlation:
         said.append(f"netem realises next to nothing of correlation {profile.correlation:g}")
@@ -251,19 +254,19 @@ def notes(profile: DirectionProfile) -> list[str]:
 
 
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
-    """Translate the conditions at one instant into arguments of `tc qdisc add|change ... netem`.
+    """Convert the conditions at one instant to arguments of `tc qdisc add|change ... netem`.
 
-    The profile has passed `check`; `room` is the limit of the qdisc [packets].
+    Call `check` for the profile first; `room` is the limit of the qdisc [packets].
     """
     words = ["limit", str(room), "delay", _microseconds(conditions.delay_ns)]
     if conditions.jitter:
         words += [_microseconds(conditions.jitter * 1e9 * stretch(profile))]
         words += [_percent(profile.correlation), "distribution", distribution_name(profile)]
     words += ["loss", *_loss(1.0 if conditions.blackout else conditions.loss)]
-    # Of a packet that is doubled and lost one copy arrives: in a blackout none may.
+    # netem delivers one copy of a packet that is both duplicated and lost; a blackout must not.
     copied = 0.0 if conditions.blackout else profile.duplicate
     words += ["duplicate", _percent(copied), "corrupt", _percent(profile.corrupt)]
-    # tc refuses it without a delay, where there is nothing to overtake.
+    # tc rejects it without a delay, as no packet can then be overtaken.
     if profile.reorder and conditions.delay_ns and not profile.keep_order:
         words += ["reorder", _percent(profile.reorder)]
     if conditions.rate is not None:
@@ -272,10 +275,10 @@ def options(profile: DirectionProfile, conditions: Conditions, room: int) -> lis
 
 
 def limit(profile: DirectionProfile) -> int:
-    """Return the limit of the qdisc: packets under way plus the queue of a bottleneck [packets].
+    """Return the limit of the qdisc [packets]: packets under way plus the bottleneck's queue.
 
-    The limit is the same along the whole time line, since a step to a shorter delay must not drop
-    packets that are under way with the longer one.
+    The limit is constant along a time line: when the delay becomes shorter, packets that are under
+    way with the longer delay must not be dropped.
     """
     pieces = Timeline(profile).pieces
     if all(piece.rate is None for piece in pieces):
@@ -295,7 +298,7 @@ def _loss(loss: Loss) -> list[str]:
 
 
 def _chances(loss: Loss) -> tuple[float, ...]:
-    """Return the probabilities of a loss [1], in the order of tc's arguments."""
+    """Return the loss probabilities in the order of tc's arguments, in [0, 1]."""
     if isinstance(loss, GilbertElliott):
         return loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good
     return (loss,)
@@ -310,7 +313,7 @@ def _percent(share: float) -> str:
 
 
 def leaf_of(qdiscs: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Find the netem qdisc of `Netem` among the qdiscs of an interface; None if it is missing."""
+    """Find the netem qdisc of `Netem` among an interface's qdiscs; return None if it is missing."""
     found = (one for one in qdiscs if one.get("handle") == LEAF and one.get("kind") == "netem")
     return next(found, None) if _is_ours(_root_of(qdiscs)) else None
 
@@ -324,11 +327,11 @@ def _is_ours(root: dict[str, Any]) -> bool:
 
 
 def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
-    """Read netem's counts from the objects of `tc -s -j qdisc show`; empty without `Netem`'s qdisc.
+    """Read netem's counts from the objects of `tc -s -j qdisc show`; empty if the qdisc is missing.
 
     Returns:
-        Numbers of datagrams: `forwarded` (copies included), `lost` (dropped at random or by a full
-        queue), and `held` (queued now).
+        Numbers of datagrams: `forwarded` (including copies), `lost` (dropped at random or because
+        the queue was full), and `held` (in the queue now).
     """
     leaf = leaf_of(qdiscs)
     if leaf is None:
@@ -337,11 +340,11 @@ def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
 
 
 class Steps:
-    """Counts the changes that a time line makes to a qdisc, and their lateness.
+    """Records the changes that a time line makes to a qdisc, and how late each change is.
 
     Attributes:
         applied: Number of changes made.
-        passed_over: Number of changes that were skipped, because the next change was due.
+        passed_over: Number of changes skipped because the next change was already due.
     """
 
     def __init__(self) -> None:
@@ -349,23 +352,23 @@ class Steps:
         self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
 
     def note(self, lateness_ns: int, passed_over: int) -> None:
-        """Count one change, and the changes that were skipped just before.
+        """Count one change, and the skipped changes just before it.
 
-        The lateness [ns] is the time from the due instant until tc reports the change in force.
+        `lateness_ns` [ns] is the time from the due time until tc has made the change.
         """
         self.applied += 1
         self.passed_over += passed_over
         self._lateness_ns.append(lateness_ns)
 
     def counts(self) -> dict[str, int]:
-        """Return the median and the 99th percentile of the lateness [ns]; {} before a change."""
+        """Return median and 99th percentile of the lateness [ns]; {} if there was no change."""
         if not self._lateness_ns:
             return {}
         found = np.quantile(self._lateness_ns, (0.5, 0.99), method="inverted_cdf").tolist()
         return {"step_lateness_p50_ns": found[0], "step_lateness_p99_ns": found[1]}
 
     def in_words(self) -> str:
-        """Describe how late the changes of the time line were; needs at least one change."""
+        """Describe how late the changes were, for the log; needs at least one change."""
         median_ns, worst_ns = self.counts().values()
         return (
             f"{self.applied} steps of the time line, late by {median_ns * 1e-6:.2f} ms in the "
@@ -375,10 +378,10 @@ class Steps:
 
 
 class Netem:
-    """Shapes one direction of the link in the kernel.
+    """Shapes one direction of the link with the kernel's netem.
 
     Attributes:
-        steps: Counts and lateness of the changes that the time line has made so far.
+        steps: Number and lateness of the changes that the time line has made.
     """
 
     name = "netem"
@@ -394,10 +397,10 @@ class Netem:
         tables: Path | None = None,
         log: Callable[[str], None] = lambda line: None,
     ) -> None:
-        """Set up; do not touch the network yet.
+        """Prepare, without changing the network yet.
 
         `origin_ns` is when the link came up [ns], on `clock`; `wait` sleeps for a time [s];
-        `tables` is the folder of tc's tables, for a profile's measured distribution.
+        `tables` is the folder for the table of a measured distribution.
         """
         self._iproute2 = Iproute2(run)
         self._clock, self._wait = clock, wait
@@ -420,7 +423,7 @@ class Netem:
         """Shape datagrams to this peer from now on, on the interface that leads to the peer.
 
         Returns:
-            The route: the address to which this pod's tunnel end has to send.
+            The route: the address to which this pod's end of the tunnel has to send.
 
         Raises:
             CloudrcError: If netem cannot realise the profile, or the kernel refuses.
@@ -440,10 +443,10 @@ class Netem:
         return peer
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on; its time line starts now (`restart`) or continues.
+        """Use this profile from now on; its time line starts now (`restart`) or continues.
 
         Datagrams in flight are not lost. If netem cannot realise the profile, the old profile stays
-        in force, and a CloudrcError is raised.
+        in force and the method raises a CloudrcError.
         """
         check(profile)
         qdiscs = self._look()
@@ -451,7 +454,7 @@ class Netem:
             raise MissingPrerequisiteError(self._damage)
         before, room = (self._profile, self._origin_ns), self._room
         self._take(profile, self._clock() if restart else self._origin_ns)
-        if self._room < room:  # netem takes nothing in while it holds more than its limit
+        if self._room < room:  # netem drops all packets while it holds more than its limit
             self._room += counters(qdiscs).get("held", 0)
         try:
             self._apply("change")
@@ -461,10 +464,10 @@ class Netem:
             raise
 
     def step(self, timeout: float) -> None:
-        """Make the changes of the time line that fall due within the next `timeout` [s]."""
+        """Make the changes of the time line that are due within the next `timeout` [s]."""
         until_ns = self._clock() + round(timeout * 1e9)
         if self._clock() - self._looked_ns >= PERIOD_NS:
-            # The limit is as asked again once what was under way at a change has left.
+            # Restore the limit when packets from before the change have left.
             if counters(self._look()).get("held", 0) < self._least_room:
                 self._room = self._least_room
         while True:
@@ -475,25 +478,25 @@ class Netem:
                 return
 
     def counts(self) -> dict[str, int]:
-        """Return `counters`, the counts of `steps`, and `restored`.
+        """Return the values of `counters` and `Steps.counts`, and the count `restored`.
 
-        `restored` is how often another program has removed or changed the qdiscs. The name comes
-        from an older metric; nothing is restored.
+        `restored` is the number of times that another program removed or changed the qdiscs. The
+        name is historical: `Netem` does not restore them.
         """
         return counters(self._look()) | self.steps.counts() | {"restored": self._damages}
 
     def released(self) -> dict[str, int]:
-        """Return an empty dict: the kernel does not tell when queued datagrams have left."""
+        """Return an empty dict: the kernel does not report when datagrams leave the queue."""
         return {}
 
     def close(self) -> None:
-        """Remove the qdiscs that `Netem` has set; queued datagrams are lost."""
+        """Remove the qdiscs of `Netem`; queued datagrams are lost."""
         if self._device and _is_ours(_root_of(self._qdiscs())):
             self._iproute2.tc("qdisc", "del", "dev", self._device, "root")
         self._device, self._applied = "", []
 
     def _look(self) -> list[dict[str, Any]]:
-        """Read the qdiscs; log and count what another program has changed."""
+        """Read the qdiscs; log and count changes by other programs."""
         self._looked_ns, qdiscs = self._clock(), self._qdiscs()
         leaf = leaf_of(qdiscs)
         found = leaf and leaf.get("options")
@@ -525,7 +528,7 @@ class Netem:
         self._apply("add" if leaf_of(qdiscs) is None else "change")
 
     def _step(self) -> None:
-        """Apply the present conditions; tolerate that another program has removed the qdisc."""
+        """Apply the present conditions; do not fail if another program has removed the qdisc."""
         try:
             self._apply("change")
         except CloudrcError:
@@ -534,7 +537,7 @@ class Netem:
                 raise
 
     def _apply(self, verb: str) -> None:
-        """Put the present conditions of the time line into force, if they are not in force yet."""
+        """Apply the present conditions of the time line if they differ from those in force."""
         elapsed_ns, starts_ns = self._clock() - self._origin_ns, self._timeline.pass_ns
         before, self._piece = self._piece, max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
         wanted = options(self._profile, self._timeline.pieces[self._piece], self._room)
@@ -542,7 +545,7 @@ class Netem:
             place = ("dev", self._device, "parent", BAND, "handle", LEAF)
             self._iproute2.tc("qdisc", verb, *place, "netem", *wanted)
             self._applied, self._listed = wanted, None
-        if 0 <= before < self._piece:  # the first piece of a time line is no step
+        if 0 <= before < self._piece:  # the first piece of a time line is no change
             self._stepped_ns = self._clock()
             due_ns = self._origin_ns + starts_ns[self._piece]
             self.steps.note(self._stepped_ns - due_ns, self._piece - before - 1)
@@ -550,7 +553,7 @@ class Netem:
                 self._log(self.steps.in_words())
 
     def _next_ns(self) -> float:
-        """Return when the next change may be made [ns] on `clock`; infinite after the last one."""
+        """Return the time of the next change on `clock` [ns]; infinite after the last change."""
         following = self._piece + 1
         if following >= len(self._timeline.pass_ns):
             return inf
@@ -558,7 +561,7 @@ class Netem:
         return max(due_ns, self._stepped_ns + STEP_NS)
 
     def _select(self, peer: Address) -> None:
-        """Direct the tunnel's flow to netem: add the new filter, then remove the old filters."""
+        """Direct the tunnel's datagrams to netem: add the new filter, then remove old filters."""
         listed = self._iproute2.show("filter", "show", "dev", self._device, "parent", ROOT)
         old = sorted({int(one["pref"]) for one in listed})
         new = next(number for number in range(1, len(old) + 2) if number not in old)

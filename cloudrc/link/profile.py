@@ -35,11 +35,11 @@ class GilbertElliott:
 
 
 Loss: TypeAlias = float | GilbertElliott
-"""Probability of an independent loss in [0, 1], or loss in bursts."""
+"""Probability of an independent loss in [0, 1], or model of loss in bursts."""
 
 
 def mean_loss(loss: Loss) -> float:
-    """Return the share of packets that is lost in the long run, in [0, 1]."""
+    """Return the share of packets lost in the long run, in [0, 1]."""
     if not isinstance(loss, GilbertElliott):
         return loss
     bad = loss.bad_start / (loss.bad_start + loss.bad_end) if loss.bad_start else 0.0
@@ -50,7 +50,7 @@ def mean_loss(loss: Loss) -> float:
 class Change:
     """A change of the conditions at one instant; None leaves a value unchanged."""
 
-    at: float  # since the link came up [s]
+    at: float  # time since the link came up [s]
     delay: float | None = None  # mean one-way delay [s]
     jitter: float | None = None  # [s]
     loss: Loss | None = None
@@ -59,7 +59,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Blackout:
-    """An interval in which all packets are lost; `start` counts since the link came up [s]."""
+    """An interval in which all packets are lost; `start` is the time since the link came up [s]."""
 
     start: float
     duration: float  # [s]
@@ -69,15 +69,15 @@ class Blackout:
 class Trace:
     """Measured conditions over time: each row holds until the next row; the last row holds forever.
 
-    The delays replace the profile's `delay`; jitter is added to them. The losses, if there are any,
-    replace the profile's `loss`. If the trace loops, its last row lasts as long as the mean of the
-    other rows; then the trace begins again.
+    The delays replace the profile's `delay`; the profile's jitter is added to them. If the trace
+    has losses, they replace the profile's `loss`. In a trace that loops, the last row lasts as long
+    as the other rows on average; then the trace begins again.
 
     Attributes:
         times: Time since the link came up, strictly rising [s], shape (n,), n >= 1. The first row
             also holds before its time.
-        delays: One way [s], shape (n,).
-        losses: In [0, 1], shape (n,), or None.
+        delays: One-way delay of each row [s], shape (n,).
+        losses: Loss of each row in [0, 1], shape (n,), or None.
         loop: Whether the trace begins again after its end.
     """
 
@@ -88,7 +88,7 @@ class Trace:
 
     @property
     def period(self) -> float | None:
-        """Return the length of one pass of a looping trace [s]; None if the trace does not loop."""
+        """Return the duration of one pass [s]; None if the trace does not loop."""
         if not self.loop or len(self.times) < 2:
             return None
         return self.times[-1] + (self.times[-1] - self.times[0]) / (len(self.times) - 1)
@@ -96,19 +96,19 @@ class Trace:
 
 @dataclass(frozen=True, slots=True)
 class DirectionProfile:
-    """Conditions of one direction.
+    """Requested conditions of one direction.
 
     Attributes:
-        delay: Mean delay, one way [s].
-        jitter: Half width (uniform) or standard deviation (normal, pareto, table) of the delay
-            [s]. A delay below 0 becomes 0.
+        delay: Mean one-way delay [s].
+        jitter: Half width (uniform) or standard deviation (normal, pareto, table) of the delay [s].
+            A negative sum of delay and jitter counts as 0.
         distribution: Distribution of the delay about its mean.
         correlation: Correlation of the jitter of successive packets, in [0, 1].
-        loss: Probability of an independent loss, or loss in bursts.
+        loss: Probability of an independent loss, or model of loss in bursts.
         duplicate: Probability in [0, 1] that a packet arrives twice; the copy has its own delay.
         reorder: Probability in [0, 1] that a packet skips both queue and delay.
         corrupt: Probability in [0, 1] that one bit of the datagram is flipped, in all its copies.
-        keep_order: Whether packets keep their order (this disables `reorder`).
+        keep_order: Whether packets arrive in the order of sending (this disables `reorder`).
         rate: Rate of the bottleneck [bit/s]; None without a bottleneck.
         queue_packets: Capacity of the bottleneck [packets], including the packet on the wire; a
             packet that finds the queue full is dropped.
@@ -137,7 +137,7 @@ class DirectionProfile:
 
 
 class Conditions(NamedTuple):
-    """The conditions during one piece of a time line."""
+    """The constant conditions during one piece of a time line."""
 
     delay_ns: int  # mean one-way delay [ns]
     jitter: float  # [s]
@@ -147,13 +147,12 @@ class Conditions(NamedTuple):
 
 
 class Timeline:
-    """The conditions of one direction over time: its changes, trace and blackouts.
+    """The conditions of one direction over time, from its changes, trace and blackouts.
 
     Attributes:
-        pieces: The pieces of the time line; of a looping time line, those of one pass.
-        pass_ns: Start of each of these pieces, as time since the link came up, rising [ns].
-        period_ns: Length of one pass of a looping time line [ns]; None if the time line does not
-            loop.
+        pieces: The pieces of the time line; if the time line loops, the pieces of one pass.
+        pass_ns: Start of each piece, as time since the link came up, rising [ns].
+        period_ns: Duration of one pass of a looping time line [ns]; None if there is no loop.
     """
 
     def __init__(self, profile: DirectionProfile) -> None:
@@ -169,14 +168,14 @@ class Timeline:
         self.pieces = [_conditions(profile, instant) for instant in ordered]
 
     def at(self, elapsed_ns: int) -> Conditions:
-        """Return the conditions `elapsed_ns` [ns] after the link came up."""
+        """Return the conditions at the time `elapsed_ns` [ns] after the link came up."""
         if self.period_ns is not None and elapsed_ns > 0:
             elapsed_ns %= self.period_ns
         return self.pieces[max(bisect_right(self.pass_ns, elapsed_ns) - 1, 0)]
 
     @property
     def last_ns(self) -> float:
-        """Time of the last change since the link came up [ns]; infinite for a looping time line."""
+        """Time of the last change since the link came up [ns]; infinite if the time line loops."""
         return self.pass_ns[-1] if self.period_ns is None else inf
 
     def only(self) -> Conditions | None:
@@ -185,7 +184,7 @@ class Timeline:
 
 
 def settled(profile: DirectionProfile) -> DirectionProfile:
-    """Return a constant profile: the conditions after the end of a profile's time line."""
+    """Return a profile with constant conditions: those after the end of the profile's time line."""
     last = Timeline(profile).pieces[-1]
     return replace(
         profile,
@@ -200,7 +199,7 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
 
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
-    """Compute the conditions from `instant` [s] until the next instant of the time line."""
+    """Compute the conditions from the time `instant` [s] until the next change."""
     delay, jitter, loss, rate = profile.delay, profile.jitter, profile.loss, profile.rate
     for change in profile.changes:
         if change.at > instant:

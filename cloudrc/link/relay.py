@@ -1,15 +1,16 @@
-"""Forward datagrams in real time, each delayed, lost or copied as the link's model says.
+"""Forward datagrams in real time, and delay, lose or copy each one as the link's model computes.
 
-Local mode runs `Relay`, with both directions. In a pod, `RelayShaper` shapes what the pod sends:
+In local mode one process runs `Relay`, with both directions. In a pod, `RelayShaper` shapes the
+datagrams that the pod sends:
 
     world <-> [world side]  Relay  [cloud side] <-> cloud
     tunnel end > [listen]  RelayShaper  [any port] > the other pod's tunnel end
 
-Due time of a datagram = time of arrival at the kernel + delay that the model draws. A datagram
-never leaves before it is due. The relay sleeps in `select` until shortly before the next datagram
-is due, then reads the clock in a loop, since a sleeping thread wakes 15 to 50 us late.
+A datagram is due at its time of arrival at the kernel plus the delay from the model. It never
+leaves before it is due. The relay sleeps in `select` until shortly before the next datagram is due,
+then reads the clock in a loop, because a sleeping thread wakes 15 to 50 us late.
 
-Each socket is connected to one tunnel end, so the kernel drops datagrams from other senders.
+Each socket is connected to one end of the tunnel, so the kernel drops datagrams from other senders.
 """
 
 from __future__ import annotations
@@ -33,45 +34,45 @@ from cloudrc.link.profile import DirectionProfile
 
 Address: TypeAlias = tuple[str, int]
 Peek: TypeAlias = Callable[[bytes], tuple[int, int, int]]
-"""Function that returns kind, epoch and counter of a datagram; else it raises a ValueError."""
+"""Function that returns kind, epoch and counter of a datagram, or raises a ValueError."""
 Send: TypeAlias = Callable[[bytes], object]
-"""Function that sends a datagram; it raises an OSError if the kernel refuses."""
+"""Function that sends a datagram; raises an OSError if the kernel refuses."""
 
 IN_FLIGHT_MAX = 10_000
-"""Limit of datagrams that one direction holds at once; more datagrams are dropped and counted."""
+"""Largest number of datagrams in flight in one direction; more are dropped and counted."""
 DATAGRAM_MAX = 2_048
-"""Limit of a datagram's length [bytes], so that the memory of a lane is bounded."""
+"""Largest length of a datagram [bytes], to limit the memory that a lane uses."""
 BATCH = 32
-"""Limit of datagrams that a lane takes in or releases before the next lane's turn."""
+"""Largest number of datagrams that a lane reads or sends before the next lane's turn."""
 SPIN_NS = 60_000
-"""How long before a due time the relay starts to read the clock in a loop [ns]."""
+"""Time before a datagram is due at which the relay starts to read the clock in a loop [ns]."""
 STOP_PERIOD = 0.1
 """Longest time between two calls of `stop` [s]."""
 ANCILLARY_SIZE = 64
-"""Size of the buffer for the kernel's time stamp and its count of drops [bytes]."""
+"""Size of the buffer for the kernel's time stamp and its count of dropped datagrams [bytes]."""
 AGE_MAX_NS = 50_000_000
-"""Limit of a datagram's age when it is read [ns]; an older datagram counts as this old."""
+"""Largest time between arrival and reading of a datagram for which the relay compensates [ns]."""
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-"""Name -> probability of each percentile of the lateness that is reported."""
+"""Name -> probability of each percentile of the lateness in reports."""
 
 _BITS = 7
-"""How many significant bits of a lateness select its bucket: buckets are 1.6 % wide."""
+"""Number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide."""
 _EARLY = -1
 """Bucket of the datagrams that left before they were due."""
 _RECENT = 10
-"""Number of calls of `Lanes.recent` that its percentiles cover."""
+"""Number of calls of `Lanes.recent` over which its percentiles are computed."""
 _FIFO_PRIORITY = 10
-"""Real-time priority: above ordinary processes, below the kernel's own threads (50)."""
+"""Real-time priority, higher than ordinary processes, lower than the kernel's threads (50)."""
 _SWITCH_INTERVAL = 0.0002
-"""Longest time for which another thread of this process keeps the interpreter [s]."""
+"""Longest time for which another thread of this process can block the relay's thread [s]."""
 _COLLECT_AFTER = 50_000
-"""Number of new objects that triggers a garbage collection: most are datagrams in flight."""
+"""Number of new objects that starts a garbage collection; most objects are datagrams in flight."""
 # Source: Linux, include/uapi/asm-generic/socket.h, prctl.h; Python has no names for them.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 
 
 class ReleaseErrors(Counter[int]):
-    """Histogram of the lateness: bucket -> number of datagrams that left this long after due."""
+    """Histogram of how late datagrams left: bucket -> number of datagrams."""
 
     def observe(self, error_ns: int) -> None:
         """Count one datagram that left `error_ns` [ns] after it was due."""
@@ -79,11 +80,12 @@ class ReleaseErrors(Counter[int]):
         self[_EARLY if error_ns < 0 else (shift << _BITS) + (error_ns >> shift)] += 1
 
     def in_ns(self) -> dict[str, int]:
-        """Return the lateness in whole nanoseconds; another thread may count meanwhile.
+        """Return counts and percentiles of the lateness; safe while another thread counts.
 
         Returns:
-            `released`; `released_early`: left before they were due, which is a fault; and
-            `release_error_p50_ns`, `_p99_ns` and `_p999_ns` [ns]. Empty before the first datagram.
+            `released`, the number of datagrams; `released_early`, those that left before they were
+            due, which is a fault; and the percentiles `release_error_p50_ns`, `_p99_ns` and
+            `_p999_ns` [ns]. Empty before the first datagram.
         """
         counts, below = sorted(self.copy().items()), 0
         whole = sum(number for _, number in counts)
@@ -98,28 +100,26 @@ class ReleaseErrors(Counter[int]):
 
 
 def ask_for_stamps(one: socket.socket) -> None:
-    """Ask the kernel to stamp arriving datagrams and to count dropped ones, if it can."""
+    """Let the kernel record arrival times and count dropped datagrams, if it supports that."""
     for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():
-        with suppress(OSError):  # without stamps a datagram arrives when it is read
+        with suppress(OSError):  # without a stamp, the time of reading counts as arrival
             one.setsockopt(socket.SOL_SOCKET, option, 1)
 
 
 class Stamps:
-    """Reads the kernel's time stamps and drop counts for the datagrams of one socket.
+    """Reads the kernel's arrival times and counts of dropped datagrams for one socket.
 
     Attributes:
-        dropped: Number of datagrams that found the socket's buffer full, as last reported by the
-            kernel.
+        dropped: Number of datagrams dropped because the socket's buffer was full.
     """
 
     def __init__(self) -> None:
-        """Start before the first datagram."""
         self.dropped = 0
 
     def wall_ns(self, ancillary: Sequence[tuple[int, int, bytes]]) -> int | None:
-        """Return when a datagram arrived by the wall clock [ns]; None without a stamp.
+        """Return when a datagram arrived, wall clock [ns]; None if the kernel gave no time stamp.
 
-        `ancillary` are the ancillary data that `recvmsg` returns; the call also updates `dropped`.
+        `ancillary` is the ancillary data from `recvmsg`. The method also updates `dropped`.
         """
         wall_ns = None
         for _, kind, data in ancillary:
@@ -132,23 +132,23 @@ class Stamps:
         return wall_ns
 
     def age_ns(self, ancillary: Sequence[tuple[int, int, bytes]], now_ns: int) -> int:
-        """Return how long ago a datagram arrived, in [0, AGE_MAX_NS]; 0 without a stamp.
+        """Return the time since a datagram arrived [ns]; 0 if the kernel gave no time stamp.
 
-        `now_ns` is the wall clock [ns]. People and NTP may set this clock, hence the limits.
+        `now_ns` is the wall clock [ns]. The result is limited to 0 ... AGE_MAX_NS, because users
+        and NTP can set the wall clock.
         """
         wall_ns = self.wall_ns(ancillary)
         return 0 if wall_ns is None else min(max(0, now_ns - wall_ns), AGE_MAX_NS)
 
 
 class Lane:
-    """One direction of the relay: takes datagrams in, asks the model, sends them when they are due.
+    """One direction of the relay: reads datagrams, and sends them when they are due.
 
     Attributes:
         source: Bound UDP socket at which the datagrams arrive; the caller closes it.
         direction: Model of this direction of the link.
-        origin_ns: Start of the model's time [ns], monotonic clock; None before the first datagram,
-            which sets it.
-        errors: How late datagrams have left.
+        origin_ns: Start of the model's time [ns], monotonic; None until the first datagram sets it.
+        errors: Histogram of how late datagrams left.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class Lane:
         self.origin_ns: int | None = None
         self.errors = ReleaseErrors()
         self._output, self._peek = send, peek
-        # Due instant [ns], a number that keeps equal instants in order, data.
+        # Due time [ns], a number that keeps the order of equal times, data.
         self._in_flight: list[tuple[int, int, bytes]] = []
         self._numbers = count()
         self._stamps = Stamps()
@@ -168,21 +168,21 @@ class Lane:
         self._counts, self._stalled = dict.fromkeys(outcomes, 0), 0
 
     def due_ns(self) -> int | None:
-        """Return when the next datagram is due [ns], monotonic clock; None if none is held."""
+        """Return when the next datagram is due [ns], monotonic clock; None without a datagram."""
         return self._in_flight[0][0] if self._in_flight else None
 
     def take_in(self) -> None:
-        """Read waiting datagrams from the socket into the model, at most `BATCH`."""
+        """Read up to `BATCH` datagrams from the socket, and compute when each is due."""
         for _ in range(BATCH):
             try:
                 data, beside, flags, _ = self.source.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
-            except ConnectionRefusedError:  # an earlier datagram found nobody at this end
+            except ConnectionRefusedError:  # an earlier datagram had no receiver
                 continue
-            except OSError:  # nothing waits
+            except OSError:  # no datagram waits
                 return
             self._counts["received"] += 1
             age_ns = self._stamps.age_ns(beside, time_ns())
-            # The wall clock first: a pause between both makes a datagram later, never earlier.
+            # The wall clock first: a pause between the two makes a datagram late, never early.
             received_ns = monotonic_ns() - age_ns
             self._stalled += age_ns >= AGE_MAX_NS
             try:
@@ -195,7 +195,7 @@ class Lane:
                 self._put_on_link(data, *header, received_ns)
 
     def release(self) -> None:
-        """Send the datagrams that are due, at most `BATCH`."""
+        """Send up to `BATCH` datagrams that are due."""
         for _ in range(BATCH):
             now_ns = monotonic_ns()
             if not self._in_flight or self._in_flight[0][0] > now_ns:
@@ -208,16 +208,16 @@ class Lane:
                 self._counts["unsent"] += 1
 
     def counts(self) -> dict[str, int]:
-        """Return the number of datagrams by outcome; `Lanes.outcomes` explains the names."""
+        """Return the number of datagrams by outcome; `Lanes.outcomes` explains the outcomes."""
         return {**self._counts, "unread": self._stamps.dropped}
 
     def released(self) -> dict[str, int]:
-        """Return by how much datagrams left too late; any thread may call this.
+        """Return how late datagrams left; any thread may call this method.
 
         Returns:
-            The values of `ReleaseErrors.in_ns`, and two counts of datagrams: `overflow`, for which
-            there was no room, and `stalled`, which waited `AGE_MAX_NS` or longer for this process.
-            Empty before the first datagram.
+            The values of `ReleaseErrors.in_ns`, and the numbers of datagrams that were dropped
+            because too many were in flight (`overflow`), or that waited `AGE_MAX_NS` or longer to
+            be read (`stalled`). Empty before the first datagram.
         """
         told = self.errors.in_ns()
         more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
@@ -226,7 +226,7 @@ class Lane:
     def _put_on_link(
         self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
     ) -> None:
-        """Draw the impairment of a datagram, and hold each copy until it is due."""
+        """Compute when each copy of a datagram is due, and keep the copies until then."""
         if self.origin_ns is None:
             self.origin_ns = received_ns
         elapsed_ns = received_ns - self.origin_ns
@@ -243,11 +243,10 @@ class Lane:
                 heapq.heappush(self._in_flight, (due_ns, next(self._numbers), data))
 
     def _send(self, data: bytes) -> bool:
-        """Send one datagram; return whether the kernel accepted the datagram."""
         for _ in range(2):
             try:
                 self._output(data)
-            except ConnectionRefusedError:  # of an earlier datagram: this one was not sent
+            except ConnectionRefusedError:  # reports an earlier datagram; this one was not sent
                 continue
             except OSError:
                 return False
@@ -257,10 +256,10 @@ class Lane:
 
 
 class Lanes:
-    """Runs several lanes in one thread.
+    """Runs several `Lane` objects in one thread.
 
-    The time of the models starts at `origin_ns` [ns], monotonic clock. If `origin_ns` is None, the
-    time starts at the first datagram on any lane, as in virtual time.
+    The models' time starts at `origin_ns` [ns], monotonic clock. With None, it starts when the
+    first datagram arrives on any lane, as in virtual time.
     """
 
     def __init__(self, lanes: Sequence[Lane], origin_ns: int | None) -> None:
@@ -270,13 +269,13 @@ class Lanes:
             lane.origin_ns = origin_ns
 
     def step(self, timeout: float) -> None:
-        """Forward datagrams for `timeout` [s], or a little longer."""
+        """Forward datagrams for `timeout` [s] or slightly longer."""
         until_ns = monotonic_ns() + round(timeout * 1e9)
         while (rest_ns := until_ns - monotonic_ns()) > 0:
             self._step_once(rest_ns * 1e-9)
 
     def _step_once(self, timeout: float) -> None:
-        """Wait at most `timeout` [s] for an arrival or a due time; read and release datagrams."""
+        """Wait at most `timeout` [s] until datagrams arrive or are due; read and send them."""
         due_ns = min((due for lane in self._lanes if (due := lane.due_ns()) is not None), default=0)
         if due_ns:
             timeout = min(timeout, max(0.0, (due_ns - SPIN_NS - monotonic_ns()) * 1e-9))
@@ -285,16 +284,16 @@ class Lanes:
         if due_ns and due_ns - monotonic_ns() <= SPIN_NS:
             while monotonic_ns() < due_ns:
                 pass
-            for lane in self._lanes:  # first: new datagrams have a time stamp and can wait
+            for lane in self._lanes:  # before reading: new datagrams have a time stamp and can wait
                 lane.release()
         self.take_in(readable)
-        for lane in self._lanes:  # what has no delay
+        for lane in self._lanes:  # datagrams without delay
             lane.release()
 
     def take_in(self, readable: Collection[socket.socket] | None = None) -> None:
-        """Read waiting datagrams from these sockets into the models, by default from all sockets.
+        """Read waiting datagrams from the `readable` sockets, by default from all sockets.
 
-        Call this method before the profile of a direction changes.
+        Call this method before a profile changes: waiting datagrams get the old conditions.
         """
         for lane in self._lanes:
             if readable is None or lane.source in readable:
@@ -307,9 +306,9 @@ class Lanes:
     def outcomes(self) -> dict[str, int]:
         """Return the number of datagrams of all lanes by outcome.
 
-        The outcomes: `received`; `forwarded` (copies included); `lost` on the link; `malformed`
-        (not from the tunnel); `overflow` (`IN_FLIGHT_MAX` were held); `unread` (the socket's buffer
-        was full); `unsent` (the other end is unknown or the kernel refused).
+        The outcomes are `received`; `forwarded` (including copies); `lost` on the link; `malformed`
+        (not from the tunnel); `overflow` (too many in flight, see `IN_FLIGHT_MAX`); `unread` (the
+        socket's buffer was full); `unsent` (the receiver is unknown or the kernel refused).
         """
         outcomes: Counter[str] = Counter()
         for lane in self._lanes:
@@ -317,7 +316,7 @@ class Lanes:
         return dict(outcomes)
 
     def recent(self) -> dict[str, int]:
-        """Return the total `released_early`, and the recent percentiles of the lateness [ns].
+        """Return percentiles of the recent lateness [ns], and `released_early` since the start.
 
         Call this method once a second: the percentiles cover the time since the tenth call before.
         """
@@ -328,7 +327,7 @@ class Lanes:
         return {**recent, "released_early": errors[_EARLY]}
 
     def errors(self) -> ReleaseErrors:
-        """Add up how late the datagrams of all lanes have left."""
+        """Return the sum of the lateness histograms of all lanes."""
         whole = ReleaseErrors()
         for lane in self._lanes:
             whole.update(lane.errors.copy())
@@ -349,12 +348,13 @@ class Relay(Lanes):
         world_peer: Address,
         cloud_peer: Address,
     ) -> None:
-        """Connect the bound UDP sockets of both sides to their ends; the caller closes the sockets.
+        """Connect the sockets of both sides to world and cloud.
 
-        The origin of both models is 0. Each end sends from the address at which it receives.
+        The caller has bound the sockets and closes them. Both models must have the origin 0. World
+        and cloud must send from the address at which they receive.
 
         Raises:
-            OSError: If an end cannot be reached from its socket's address.
+            OSError: If world or cloud cannot be reached from its socket's address.
         """
         world_side.connect(world_peer)
         cloud_side.connect(cloud_peer)
@@ -365,35 +365,35 @@ class Relay(Lanes):
         super().__init__(tuple(self._ways.values()), origin_ns=None)
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Forward datagrams until `stop` returns True; call `stop` at least every 0.1 s."""
+        """Forward datagrams until `stop` returns True; `stop` is called at least every 0.1 s."""
         tighten_slack()
         while not stop():
             self.step(STOP_PERIOD)
 
     def counts(self) -> dict[str, int]:
-        """Return `outcomes`, and the lateness since the beginning as from `ReleaseErrors.in_ns`."""
+        """Return `Lanes.outcomes`, and the lateness since the start (`ReleaseErrors.in_ns`)."""
         return {**self.outcomes(), **self.errors().in_ns()}
 
     def released(self, way: str) -> dict[str, int]:
-        """Return `Lane.released` of "uplink" or "downlink"."""
+        """Return `Lane.released` of one direction, "uplink" or "downlink"."""
         return self._ways[way].released()
 
 
 class RelayShaper(Lanes):
-    """Shapes one direction of the link in userspace, with the same methods as `Netem`."""
+    """Shapes one direction of the link without the kernel's netem; same methods as `Netem`."""
 
     name = "relay"
 
     def __init__(
         self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
     ) -> None:
-        """Open the two sockets; the origin of the model is on the machine's monotonic clock.
+        """Open the two sockets. The model's origin is on the machine's monotonic clock.
 
         Args:
-            listen: Address to which this pod's tunnel end sends; port 0 lets the kernel choose.
+            listen: Address to which this pod's end of the tunnel sends; port 0: the kernel chooses.
             direction: Model of the link.
-            peek: Reads kind, epoch and counter of a datagram.
-            end: Address from which this pod's tunnel end sends. None accepts any sender.
+            peek: Function that reads kind, epoch and counter of a datagram.
+            end: Address from which this pod's end of the tunnel sends. None accepts any sender.
 
         Raises:
             OSError: If `listen` is in use, or cannot be reached from `end`.
@@ -411,22 +411,22 @@ class RelayShaper(Lanes):
         tighten_slack()
 
     def follow_peer(self, peer: Address) -> Address:
-        """Send to this peer from now on, including the datagrams in flight.
+        """Send all datagrams to this peer from now on, including those in flight.
 
         Returns:
-            The route: the address to which this pod's tunnel end has to send.
+            The route: the address to which this pod's end of the tunnel has to send.
         """
         self._peer = peer
         host, port = self._inside.getsockname()
         return host, port
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Shape by this profile from now on; its time line starts now (`restart`) or continues."""
-        self.take_in()  # what has arrived until now belongs to the old profile
+        """Use this profile from now on; its time line starts now (`restart`) or continues."""
+        self.take_in()  # datagrams that have arrived belong to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
 
     def counts(self) -> dict[str, int]:
-        """Return `outcomes` and `recent`."""
+        """Return `Lanes.outcomes` and `Lanes.recent`."""
         return self.outcomes() | self.recent()
 
     def released(self) -> dict[str, int]:
@@ -445,7 +445,7 @@ class RelayShaper(Lanes):
 
 
 def settle() -> None:
-    """Make garbage collections rare and cheap; shorten the turns of other threads."""
+    """Make garbage collections rare and cheap, and let other threads block the interpreter less."""
     sys.setswitchinterval(_SWITCH_INTERVAL)
     gc.collect()
     gc.freeze()
@@ -453,19 +453,16 @@ def settle() -> None:
 
 
 def tighten_slack() -> None:
-    """Let sleeps of the calling thread end on time, not up to 50 us late (Linux only).
-
-    Source: PR_SET_TIMERSLACK, prctl(2).
-    """
+    """Let the calling thread wake on time after a sleep, not up to 50 us late (Linux only)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
 
 
 def ask_for_fifo() -> str:
-    """Give the calling thread SCHED_FIFO, if permitted; child processes do not inherit it.
+    """Give the calling thread the real-time class SCHED_FIFO, but not its child processes.
 
     Returns:
-        "" if the thread now has SCHED_FIFO, else the reason why not.
+        "" if the thread now has SCHED_FIFO, otherwise the reason why not.
     """
     if not hasattr(os, "SCHED_FIFO"):
         return "this system has no SCHED_FIFO"

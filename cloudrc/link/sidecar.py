@@ -1,7 +1,7 @@
-"""Run the `link` container of a pod: choose a shaper, follow changes of profile and peer.
+"""Run a pod's `link` container: choose relay or netem, and follow changes of profile and peer.
 
-The route file holds the address to which this pod's tunnel end has to send. Other threads set the
-attributes `peer` and `profile` of the `Sidecar`; only the thread in `run` uses the shaper.
+The route file contains the address to which this pod's end of the tunnel has to send. Other threads
+set the attributes `peer` and `profile` of the `Sidecar`. Only the thread in `run` uses the shaper.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ from cloudrc.link.state import (
 from cloudrc.records import Counted
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
-"""Setting `link.mode`: "relay" and "netem" are strict, "auto" uses netem if possible."""
+"""Setting `link.mode`: "relay" and "netem" allow no other shaper; "auto" uses netem if possible."""
 COUNT_PERIOD_NS = 1_000_000_000
-"""Time between two updates of the metrics, and of the file with the lateness of datagrams [ns]."""
+"""Time between two updates of the metrics and of the file that reports the lateness [ns]."""
 STEP = 0.05
-"""Longest time until the thread in `run` sees a new peer or profile [s]."""
+"""Longest time until `run` reacts to a new peer or profile [s]."""
 
 Shaper: TypeAlias = RelayShaper | Netem
-"""Shapes the datagrams from this pod's tunnel end to the other pod's."""
+"""Shapes the datagrams that this pod's end of the tunnel sends."""
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
-"""Function that makes a shaper from a profile and the origin of its time line [ns], monotonic."""
+"""Function that makes a shaper from a profile and the start of its time line [ns], monotonic."""
 
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """The netem qdiscs of a network namespace, including those of other programs.
+    """All netem qdiscs of a pod, including those of other programs.
 
     Attributes:
-        interface: Interface through which the tunnel's flow leaves.
+        interface: Interface through which the tunnel's datagrams leave.
         netems: Interface -> its netem qdiscs, if any, as objects of `tc -s -j qdisc show`.
     """
 
@@ -60,13 +60,13 @@ class Near:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """Report of a `link` container: the shaper and the conditions in force.
+    """Report of a `link` container about its shaper and the conditions in force.
 
     Attributes:
         shaper: "relay" or "netem".
         why: Why this shaper was chosen, in words.
-        applied: The constant conditions in force; None while a time line runs.
-        near: The netem qdiscs that the kernel lists; None if the kernel cannot be asked.
+        applied: The conditions in force; None while a time line still changes them.
+        near: The pod's netem qdiscs; None if the kernel did not report them.
     """
 
     shaper: str
@@ -76,7 +76,7 @@ class Told:
 
 
 def look_near(run: Run, host: str) -> Near | None:
-    """Ask the kernel for its netem qdiscs and for the interface to a host; None if that fails."""
+    """List the netem qdiscs and find the interface to a host; return None if that fails."""
     iproute2, netems = Iproute2(run), dict[str, list[dict[str, Any]]]()
     try:
         interface = iproute2.device(host)
@@ -89,21 +89,21 @@ def look_near(run: Run, host: str) -> Near | None:
 
 
 def write_told(told: Told) -> str:
-    """Format a `Told` as JSON."""
+    """Format a report as JSON."""
     return TypeAdapter(Told).dump_json(told, indent=2).decode() + "\n"
 
 
 def read_told(text: str) -> Told:
-    """Parse the JSON of a `Told`; raise a ValueError if the text is something else."""
+    """Parse a report; raise a ValueError if the text is no report."""
     return TypeAdapter(Told).validate_json(text)
 
 
 class Machine(NamedTuple):
-    """Functions and facts of the machine that a sidecar needs.
+    """Functions and facts of the machine that a sidecar uses.
 
     Attributes:
-        relay: Makes the relay.
-        netem: Makes the `Netem`, without touching the network yet.
+        relay: Makes a `RelayShaper`.
+        netem: Makes a `Netem`, without changing the network yet.
         may_shape: Whether this process is root with NET_ADMIN.
         clock: Returns the time on the monotonic clock [ns].
         wait: Sleeps for a time [s].
@@ -122,24 +122,24 @@ class Metrics(Protocol):
     """Exports the metrics of a sidecar."""
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Export which shaper a direction uses from now on."""
+        """Export the shaper that a direction uses from now on."""
 
     def ready(self, ready: bool) -> None:
         """Export whether the route file exists."""
 
     def asked(self, direction: str, delay: float) -> None:
-        """Export the mean one-way delay [s] that the profile in force requests."""
+        """Export `delay` [s], the mean one-way delay that the profile requests."""
 
     def see(self, records: Iterable[Counted]) -> None:
-        """Export the number of datagrams so far by outcome; called once a second."""
+        """Export the number of datagrams by outcome; called once a second."""
 
 
 class Sidecar:
-    """Shapes the datagrams from this pod's tunnel end to the other pod's.
+    """Shapes the datagrams that this pod's end of the tunnel sends.
 
     Attributes:
-        peer: Address of the other pod's tunnel end; another thread sets this attribute.
-        profile: The requested profile; another thread sets this attribute.
+        peer: Address of the other pod's end of the tunnel; set by another thread.
+        profile: The requested profile; set by another thread.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class Sidecar:
         route: Path,
         metrics: Metrics | None = None,
     ) -> None:
-        """Set up; `route` is the path of the route file, and the state file is in the same folder.
+        """Prepare; `route` is the path of the route file, whose folder also holds the state file.
 
         `direction` is "uplink" or "downlink".
         """
@@ -167,10 +167,10 @@ class Sidecar:
         self._published: LinkState | None = None
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Wait for the peer, then shape, until `stop` returns True.
+        """Wait until the peer is known, then shape until `stop` returns True.
 
         Raises:
-            CloudrcError: If the mode is strict and its shaper cannot realise the profile.
+            CloudrcError: If the mode is not "auto" and its shaper cannot realise the profile.
         """
         self._route.unlink(missing_ok=True)  # an earlier process may have left one
         while self.peer is None:
@@ -186,7 +186,7 @@ class Sidecar:
                 file.unlink(missing_ok=True)
 
     def told(self) -> Told | None:
-        """Return shaper and conditions in force; None before the first shaper.
+        """Return the report about shaper and conditions; None before the first shaper.
 
         Any thread may call this method.
         """
@@ -198,7 +198,7 @@ class Sidecar:
         return Told(state.shaper, state.reason, settled(profile) if over else None)
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
-        """Shape with one shaper until `stop`, or until a new profile needs another shaper."""
+        """Shape with one shaper until `stop`, or until a new profile needs the other shaper."""
         profile, machine = self.profile, self._machine
         if self._in_force and self._change_of(profile).restart:
             self._origin_ns = machine.clock()
@@ -227,7 +227,7 @@ class Sidecar:
             shaper.close()
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
-        """Choose the shaper and store the reason; in mode "auto" try netem, then use the relay."""
+        """Choose the shaper and store the reason; "auto" tries netem first, then uses the relay."""
         machine, mode = self._machine, self._mode
         self._reason = f"link.mode={mode}"
         if mode != "relay":
@@ -247,7 +247,7 @@ class Sidecar:
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
-        """Apply a new profile; return False if the profile needs another shaper."""
+        """Apply a new profile; return False if the profile needs the other shaper."""
         change = self._change_of(profile)
         try:
             shaper.follow_profile(profile.direction, restart=change.restart)
@@ -269,11 +269,11 @@ class Sidecar:
         return True
 
     def _change_of(self, profile: Loaded) -> Change:
-        """Return the change that led to a profile; an unknown change if the number is not new."""
+        """Return the change that led to a profile; an empty change if its number is not new."""
         return profile.change if profile.change.number != self._number else Change()
 
     def _tell(self, shaper: Shaper, profile: Loaded) -> None:
-        """Publish shaper and profile in force from now on, for ends, users and reports."""
+        """Write the new state to the state file, and export it as metrics."""
         change, asked = self._change_of(profile), summary(profile.direction)
         before = self._in_force[0] if self._in_force else None
         for note in notes(profile.direction) if shaper.name == "netem" else ():
@@ -298,27 +298,25 @@ class Sidecar:
             self._metrics.asked(self._direction, asked["delay"] or 0.0)
 
     def _count(self, shaper: Shaper, now_ns: int) -> None:
-        """Update the metrics, and tell this pod's end how late datagrams left."""
+        """Update the metrics, and write how late datagrams left to a file for this pod's end."""
         if self._metrics:
             counts = shaper.counts().items()
             self._metrics.see([Counted(now_ns, "link", name, number) for name, number in counts])
         self._publish()
         if released := shaper.released():
-            with suppress(OSError):  # a full disk is no reason to stop shaping
+            with suppress(OSError):  # shaping continues even if the disk is full
                 publish(self._released_file, json.dumps(released))
 
     def _publish(self) -> None:
-        """Write a new state; if the disk is full, the next attempt follows a second later."""
+        """Write the state file if the state is new; if the disk is full, try again after 1 s."""
         if self._in_force is not None and self._in_force[0] is not self._published:
             with suppress(OSError):
                 publish(self._state_file, to_text(self._in_force[0]))
                 self._published = self._in_force[0]
 
     def _publish_route(self, route: Address) -> None:
-        """Write the route file for this pod's tunnel end: one line HOST:PORT."""
         publish(self._route, f"{route[0]}:{route[1]}\n")
 
 
 def _cause(error: CloudrcError) -> str:
-    """Return the cause from an error's text, without the remedy."""
     return str(error).partition("; ")[0]

@@ -1,8 +1,8 @@
-"""Publish the state of a link direction in a file: its shaper, profile and last change.
+"""Publish the state of one direction of the link in a file: its shaper, profile and last change.
 
-The state file is in the folder of the route file. The tunnel's end on the same machine follows the
-state file and records its changes. `cloudrc link set` reads the file to see whether a change is in
-force. All files are written atomically, since other processes may read them at the same time.
+The state file is in the folder of the route file. World or cloud on the same machine reads the
+state file and records its changes. `cloudrc link set` reads it to see whether a change has taken
+effect. All files are written atomically, because other processes may read them at the same time.
 """
 
 from __future__ import annotations
@@ -18,31 +18,30 @@ from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 STATE_FILE = "link.json"
 """Name of the state file, in the folder of the route file."""
 PROFILE_FILE = "profile.json"
-"""Name of the profile file that a local run's relay follows, in the folder of its state files."""
+"""Name of the profile file for the relay of a local run, in the folder of the state files."""
 STATE_MAX = 1 << 16
-"""Size limit of a state file that an end of the tunnel reads [bytes]: room for about 800 changes. A
-file of 1 MiB could block the loop for 2 s."""
+"""Size limit of a state file that world or cloud reads [bytes]: room for a time line of about 800
+changes. Reading a file of 1 MiB could block the control loop for 2 s."""
 RELEASED_SUFFIX = ".released"
-"""Suffix of the file that tells how late a relay's datagrams left so far: names and integers as
-JSON."""
+"""Suffix of the file in which a relay reports how late datagrams left: JSON, name -> integer."""
 RELEASED = frozenset(
     {"released", "released_early", "overflow", "stalled"}
     | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}
 )
-"""Names in the file with `RELEASED_SUFFIX`."""
+"""Names in the file with the suffix `RELEASED_SUFFIX`."""
 CHANGE_FILE = "change.json"
-"""Name of the file with the last `Change` of a profile, in the folder of the profile."""
+"""Name of the file with the last `Change` of a profile, in the profile's folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of a profile, as `cloudrc link set` writes it to `CHANGE_FILE`.
+    """Number and cause of a profile's change, as `cloudrc link set` writes them to `CHANGE_FILE`.
 
     Attributes:
-        number: Identity of the change; "" if unknown.
-        cause: Reason, in words.
-        restart: True: the time line restarts when the profile takes effect. False: the time line
-            continues.
+        number: Identifies the change; "" if unknown.
+        cause: Why the profile was changed, in words.
+        restart: True: the time line starts again when the profile takes effect. False: the time
+            line continues.
     """
 
     number: str = ""
@@ -52,24 +51,24 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """The shaper and the profile in force of one direction.
+    """Shaper, profile and last change of one direction.
 
     Attributes:
         shaper: "relay" or "netem".
         reason: Why this shaper was chosen, in words.
-        mode: Shaper that the user asked for: "auto", "relay" or "netem".
+        mode: Requested shaper: "auto", "relay" or "netem".
         direction: "uplink" or "downlink".
         profile: Both directions, as in a profile's file, without defaults.
-        since: When the profile took effect, UTC, for people.
-        since_ns: The same instant on the machine's monotonic clock [ns].
+        since: When the profile took effect, UTC, to show to users.
+        since_ns: When the profile took effect, on the machine's monotonic clock [ns].
         changes: Number of changes since the link came up.
-        change: Identity of the last change that took effect; "" if unknown.
-        cause: Reason of this change, in words; "" before the first change.
-        asked: Conditions at the start of the time line, as `summary` returns them.
+        change: Number of the last change that took effect; "" if unknown.
+        cause: Why the profile was changed, in words; "" before the first change.
+        asked: Requested conditions at the start of the time line, as from `summary`.
         origin_ns: Start of the time line on the monotonic clock [ns]; None if the change did not
             restart the time line.
-        refused: Identity of the last refused change; "" if no change was refused.
-        refusal: Why that change was refused, in words.
+        refused: Number of the last refused change; "" if no change was refused.
+        refusal: Why the last refused change was refused, in words.
     """
 
     shaper: str
@@ -94,7 +93,7 @@ def to_text(state: LinkState) -> str:
 
 
 def from_text(text: str) -> LinkState:
-    """Parse a state; raise a ValueError if the text is not valid."""
+    """Parse a state; raise a ValueError if the text is invalid."""
     found = json.loads(text)
     names = {item.name for item in fields(LinkState)}
     try:
@@ -104,7 +103,7 @@ def from_text(text: str) -> LinkState:
 
 
 def read_change(text: str) -> Change:
-    """Parse the change of a profile; return a change without a number if the text is invalid."""
+    """Parse a profile's change; return a change without a number if the text is invalid."""
     try:
         found = json.loads(text)
         return Change(str(found["number"]), str(found["cause"]), bool(found["restart"]))
@@ -113,11 +112,11 @@ def read_change(text: str) -> Change:
 
 
 def summary(profile: DirectionProfile) -> dict[str, float | None]:
-    """Summarise the conditions at the start of a direction's time line.
+    """Summarise a direction's conditions at the start of its time line.
 
     Returns:
-        `delay` and `jitter` [s], `loss` (long-run share in [0, 1]), and `rate` [bit/s] (None
-        without a bottleneck).
+        `delay` and `jitter` [s]; `loss`, the long-run share in [0, 1]; and `rate` [bit/s], which is
+        None without a bottleneck.
     """
     first = Timeline(profile).at(0)
     loss = 1.0 if first.blackout else mean_loss(first.loss)
@@ -126,5 +125,5 @@ def summary(profile: DirectionProfile) -> dict[str, float | None]:
 
 
 def publish(path: Path, text: str) -> None:
-    """Write a text file in one step."""
+    """Write a text file atomically."""
     write_atomically(path, text.encode("utf-8"))

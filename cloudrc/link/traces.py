@@ -1,8 +1,8 @@
-"""Read and write traces: delay and loss over time as CSV, for `trace` and `table` of a profile.
+"""Read and write traces: CSV files of delay and loss over time, which link profiles use.
 
-A trace has the header `time_s,delay_ms` or `time_s,delay_ms,loss` and one row per instant, in
-rising order of time; `delay_us` may replace `delay_ms`. Delays are one way. `link/logs.py` turns
-the logs of other tools into traces.
+A trace has the header `time_s,delay_ms` or `time_s,delay_ms,loss`, and one row per instant in
+rising order of time; `delay_us` may replace `delay_ms`. Delays are one way. `link/logs.py` converts
+the logs of other tools to traces.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ from cloudrc.link.profile import Trace
 SIZE_MAX = 64 << 20
 """Size limit of a file [bytes]: half a day at 100 packets a second."""
 START_MAX = 600.0
-"""Latest time of a trace's first row [s]; until then a flight would see only this row."""
+"""Latest time of a trace's first row [s]; with a later start a flight might use only this row."""
 UNIX_TIME = 1e8
-"""If the first row has this time or a later one, times are Unix times [s] (1e8 is March 1973), and
-the first time is subtracted."""
+"""If the time of the first row is at least this large, all times are Unix times [s] (1e8 is in
+March 1973). Then the time of the first row is subtracted."""
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _ROWS_TO_JUDGE = 10
-"""Only in traces of at least this many rows a delay of 0 may mark a loss; shorter traces are
+"""Smallest number of rows with which a delay of 0 may mark a lost packet. Shorter traces are
 probably typed by hand."""
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
-    """Read a trace from a CSV file of at most `size_max` [bytes].
+    """Read a trace from a CSV file of at most `size_max` bytes.
 
     Raises:
-        BadInputError: If the file cannot be read or is not a trace; the text names file, line,
-            value and remedy.
+        BadInputError: If the file cannot be read or is no trace; names file, line, value and
+            remedy.
     """
     remedy = "give a CSV file with the columns time_s,delay_ms"
     return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
@@ -53,10 +53,10 @@ def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> 
 
 
 def decode(data: bytes) -> list[str]:
-    """Decode the lines of a text; raise a ValueError if the data are not text.
+    """Decode text to lines; raise a ValueError if the data are not text.
 
-    Accepted encodings: UTF-8, UTF-16 with byte order mark (redirected output on Windows), and
-    encodings with one byte per character.
+    Accepted encodings are UTF-8, UTF-16 with a byte order mark (Windows writes it if output is
+    redirected), and encodings with one byte per character.
     """
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16", "replace").splitlines()
@@ -69,7 +69,7 @@ def decode(data: bytes) -> list[str]:
 
 
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
-    """Read the distribution of a trace's delays; ignore lost packets; raise as `read_trace`.
+    """Read the distribution of a trace's delays, without lost packets; raise as `read_trace`.
 
     Returns:
         The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,) [1].
@@ -88,7 +88,7 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
 
 
 def parse_trace(lines: Iterable[str], name: str) -> Trace:
-    """Read a trace from the lines of the file `name`; raise the errors of `read_trace`.
+    """Parse the lines of the trace file `name`; raise the errors of `read_trace`.
 
     If the times are Unix times, time 0 is the first row.
     """
@@ -114,10 +114,10 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
 
 
 def write_trace(trace: Trace) -> str:
-    """Format a trace as the CSV that `read_trace` reads.
+    """Format a trace as a CSV text that `read_trace` can read.
 
-    If all delays are below 1 ms, the column is `delay_us`: the reader would take milliseconds below
-    1 for seconds and reject them.
+    If all delays are below 1 ms, the column is `delay_us`. In `delay_ms` the reader would take such
+    values for seconds and reject them.
     """
     short = 0.0 < max(trace.delays) < 1e-3
     unit, scale = ("us", 1e6) if short else ("ms", 1e3)
@@ -129,7 +129,6 @@ def write_trace(trace: Trace) -> str:
 
 
 def _short(value: float, digits: int) -> str:
-    """Format a number with at most `digits` decimals, without trailing zeros."""
     return f"{value:.{digits}f}".rstrip("0").rstrip(".")
 
 
@@ -138,8 +137,8 @@ class Row(NamedTuple):
 
     Attributes:
         where: File and line of the row, for messages.
-        cells: Column -> text, stripped; the last columns may be missing.
-        decimal: "." or ",", between semicolons or tabs.
+        cells: Column -> text without blanks at its ends; the last columns may be missing.
+        decimal: Decimal sign: "." or, if semicolons or tabs separate the cells, ",".
     """
 
     where: str
@@ -153,20 +152,20 @@ class Row(NamedTuple):
         return self.cells[column]
 
     def number(self, column: str) -> float | None:
-        """Parse a cell; None if it is not a number."""
+        """Parse a cell as a number; None if it is not a number."""
         return _parse(self.text(column).replace(self.decimal, "."))
 
     def no_number(self, column: str, wanted: str = "a number") -> BadInputError:
-        """Make the error for a cell that is not as `wanted`."""
+        """Make the error for a cell that does not contain what is `wanted`."""
         text = self.text(column)
         shown = repr(text[:40]) if text else "nothing"
         return BadInputError(f"{self.where}: {column} is {shown}; give {wanted}")
 
 
 def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]]:
-    """Read a CSV file with a header, separated by commas, or by semicolons or tabs.
+    """Read a CSV file with a header; commas, semicolons or tabs separate the cells.
 
-    Blank lines and comments are skipped. A file without a header is refused, and so is a row with
+    Blank lines and comments are skipped. A file without a header is rejected, and so is a row with
     more cells than the header.
 
     Returns:
@@ -205,7 +204,7 @@ def _cells(line: str, separator: str, where: str) -> list[str]:
 
 
 def _bare_numbers(lines: list[str], name: str) -> BadInputError:
-    """Make the error for one number per line: a rate trace of mahimahi, or delays without times."""
+    """Make the error for a file with one number per line, such as a rate trace of mahimahi."""
     values = [value for value in map(_parse, lines) if value is not None]
     rising = all(before <= after for before, after in pairwise(values))
     if len(values) > 1 and rising and all(value.is_integer() for value in values):
@@ -221,16 +220,17 @@ def _bare_numbers(lines: list[str], name: str) -> BadInputError:
 
 
 def looks_lost(values: Collection[float], decimals: int) -> bool:
-    """Return whether zeros among delays mark lost packets: all other delays are far from 0.
+    """Return whether delays of 0 mark lost packets: all other delays are far from 0.
 
-    `decimals` is the largest number of decimals in the file, because a zero may be a rounded delay.
+    `decimals` is the largest number of decimals of any delay: with few decimals, a short delay may
+    be rounded to 0.
     """
     shortest = min((value for value in values if value > 0.0), default=0.0)
     return 0.0 in values and shortest > 2 * 10.0**-decimals
 
 
 def decimals_of(text: str) -> int:
-    """Count the decimals of a number's text."""
+    """Count the decimals of a number in text form."""
     return len(re.sub(r"[eE].*", "", text).replace(",", ".").partition(".")[2])
 
 
@@ -247,7 +247,7 @@ def _column(text: str) -> str:
 
 
 def _delay_column(columns: list[str], place: str) -> str:
-    """Reject missing, unknown and repeated columns; return the name of the delay column."""
+    """Return the name of the delay column; reject missing, unknown or repeated columns."""
     given = next((column for column in columns if column in _SCALES), "delay_ms")
     needed = [column for column in columns if column != "loss"]
     if sorted(needed) != sorted([given, "time_s"]) or columns.count("loss") > 1:
@@ -259,7 +259,7 @@ def _delay_column(columns: list[str], place: str) -> str:
 
 
 def _number(row: Row, column: str, maximum: float = inf) -> float:
-    """Parse a value of a trace that is finite, at least 0 and at most `maximum`."""
+    """Parse a number of a trace; raise an error if it is not in [0, `maximum`]."""
     value = row.number(column)
     if value is None:
         raise row.no_number(column)
@@ -272,7 +272,7 @@ def _number(row: Row, column: str, maximum: float = inf) -> float:
 
 
 def _from_start(times: list[float], name: str) -> tuple[float, ...]:
-    """Shift Unix times so that the first row is at 0; refuse other times that begin too late."""
+    """Convert Unix times to times since the first row; reject other times that start too late."""
     start = times[0]
     if start > START_MAX * 1e9:
         raise BadInputError(f"trace {name}: time_s begins at {start:.15g}, which is not in seconds")
@@ -287,7 +287,7 @@ def _from_start(times: list[float], name: str) -> tuple[float, ...]:
 
 
 def _check_delays(delays: list[float], column: str, place: str, *, may_be_lost: bool) -> None:
-    """Reject delays that seem to be in seconds (a common mistake), and zeros that mark losses."""
+    """Reject delays that are probably in seconds, and delays of 0 that mark lost packets."""
     longest = max(delays)
     if column == "delay_ms" and 0.0 < longest < 1.0:
         raise BadInputError(

@@ -1,7 +1,7 @@
-"""Compute metrics of a recorded flight: each is one number with a unit.
+"""Compute the metrics of a recorded flight; each metric is one number with a unit.
 
-A shipped metric is a row of the table in `flight`, `control`, `link` or `mission`. docs/plugins.md
-describes metrics of your own.
+The metrics of cloudrc are rows of tables in `flight`, `control`, `link` and `mission`.
+docs/plugins.md explains how to add your own metrics.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from cloudrc.metrics.flight import SHIPPED, Flight, Metric
 __all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission"]
 
 METRIC_NOTE = "metric "
-"""Beginning of a note on a metric."""
+"""Beginning of a note about a metric."""
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """One measured number."""
+    """The value of a metric with its unit."""
 
     value: float  # finite
     unit: str  # SI unit as text; "1" for counts and shares
@@ -36,7 +36,7 @@ def find(choice: str) -> Metric:
     """Find a metric by its name, or by the path of a Python file, which is executed.
 
     Raises:
-        BadInputError: If `choice` does not exist, or is not a metric.
+        BadInputError: If the metric does not exist, or if the file defines no metric.
     """
     if choice in SHIPPED:
         return SHIPPED[choice]
@@ -56,15 +56,15 @@ def find(choice: str) -> Metric:
 
 
 def name_of(choice: str) -> str:
-    """Return the name of a metric in report.json; for a file, the file name without `.py`."""
+    """Return a metric's name in report.json; for a file, the file name without `.py`."""
     return Path(choice).stem if plugins.is_path(choice) else choice
 
 
 def check(own: Iterable[str]) -> None:
-    """Check the user's metrics, names or paths as for `find`, before the flight.
+    """Check the user's metrics before the flight; `own` contains names or paths as for `find`.
 
     Raises:
-        BadInputError: For the first invalid metric, or if two have the same name.
+        BadInputError: If a metric is invalid, or if two metrics have the same name.
     """
     found: dict[str, str] = {}
     for choice in own:
@@ -75,7 +75,7 @@ def check(own: Iterable[str]) -> None:
 
 
 def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
-    """Write a note for each metric file that the experiment names and `own` does not contain."""
+    """Write a note for each metric file that the experiment lists but `own` does not contain."""
     names = set(map(name_of, own))
     return [
         f"{METRIC_NOTE}{name_of(choice)} is not measured: name its file with --metric"
@@ -85,11 +85,11 @@ def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
 
 
 def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Number], list[str]]:
-    """Measure all shipped and installed metrics, and the user's own, as for `find`.
+    """Compute the metrics of cloudrc, of installed packages and of the user (`own`, as for `find`).
 
     Returns:
-        Known numbers by name, sorted; and a note for each metric that failed. After an exception
-        in a user's metric only the number of that metric is missing.
+        Numbers by name, sorted, without unknown values; and a note for each metric that failed. An
+        exception in a user's metric affects only this metric.
     """
     numbers: dict[str, Number] = {}
     notes: list[str] = []

@@ -1,4 +1,4 @@
-"""Metrics of the control loop: estimation, prediction, tracking, round trips, and real time."""
+"""Metrics of the control loop: estimation, prediction, tracking, round trips and timing."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentil
 
 
 def round_trips(flight: Flight) -> Columns:
-    """Select the control periods with a new echo: world reports the newest command it applied.
+    """Select the control periods in which cloud measured a new round trip.
 
-    A period without a new echo repeats the previous values. Counting such periods would give too
-    much weight to a silent link, during which the last echo repeats for seconds.
+    In all other periods the values of the last round trip are repeated. If they counted, a silent
+    link would get too much weight, because the last values then repeat for seconds.
     """
     control = flight.control
     pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)
@@ -21,14 +21,14 @@ def round_trips(flight: Flight) -> Columns:
 
 
 def _age_of_information(flight: Flight) -> float | None:
-    """Average the age of the odometry [s]; None unless both ends prove that they share a clock."""
+    """Average the age of the odometry that cloud used [s]; None if the clocks may differ."""
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
     return mean((flight.control["stamp_ns"] - flight.control["basis_stamp_ns"]) * 1e-9)
 
 
 def _prediction_error(flight: Flight) -> float | None:
-    """Compare with the truth when a command is applied: errors of the delay estimate count, too.
+    """Compare prediction and truth when the command is applied: includes delay estimation errors.
 
     Source: docs/reference/control.md, "Predictors".
     """
@@ -37,19 +37,21 @@ def _prediction_error(flight: Flight) -> float | None:
 
 
 def _estimate_error(flight: Flight) -> float | None:
-    """Compare with the truth at the predicted instant: only errors of the predictor count."""
+    """Compare prediction and truth at the predicted time: errors of the predictor alone."""
     control = flight.control
     target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return rms(control["position"] - flight.true_position(target_ns))
 
 
 def _delay_error(flight: Flight) -> float | None:
+    """Compare the horizon with the true delay; before the first echo there is no estimate."""
     applied = flight.applied
-    return rms(applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9)
+    errors = applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9
+    return rms(errors[np.isfinite(applied["rtt"])])
 
 
 def wakes(flight: Flight, end: str) -> Columns:
-    """Select the rows of /lateness that "world" or "cloud" recorded; none in virtual time."""
+    """Select the rows of /lateness from `end` ("world" or "cloud"); none in virtual time."""
     columns = flight.during("/lateness")
     rows = columns["end"] == end
     return {name: column[rows] for name, column in columns.items()}
@@ -90,7 +92,7 @@ add_metrics(
     ("estimate_error_rms", "m", "RMS distance from the predicted to the true position at the "
      "instant of the prediction.", _estimate_error),
     ("delay_estimate_error_rms", "s", "RMS difference between the horizon and the true delay from "
-     "odometry to applied command.", _delay_error),
+     "odometry to applied command, from the first echo on.", _delay_error),
     ("tracking_rms_measured", "m", "RMS distance between the setpoint and the measured position "
      "that cloud used.",
      lambda flight: rms(flight.control["setpoint"] - flight.control["measured"])),

@@ -1,7 +1,7 @@
-"""Define `Flight`, a recording cut to its mission, and the metrics of the robot's motion.
+"""Define `Flight`, a recording of one mission, and the metrics of the robot's motion.
 
-Time zero is the guard's first change to TRACK; the robot does not move before. The flight ends with
-the event that ends the mission or, without such an event, at the end of the recording.
+A flight begins when the guard first changes to TRACK, because the robot does not move before. It
+ends with the event that ends the mission or, without such an event, with the recording.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ CONTROL_TOPICS = (
     *("/estimated_odometry", "/setpoint_position", "/cmd_vel"),
     *("/delay_estimate", "/pid"),
 )
-"""Topics that together record the periods of the control loop."""
+"""Topics that the control loop writes in every period."""
 
 
 @dataclass(frozen=True)
 class Flight:
-    """A recorded flight, its criteria and its scene."""
+    """A recorded flight with the success criteria and the scene."""
 
     recording: Recording  # all topics; cloud's stamps are shifted to world's clock
     criteria: Criteria
@@ -42,14 +42,14 @@ class Flight:
 
     @cached_property
     def start_ns(self) -> int | None:
-        """Time zero [ns], world's clock; None if the robot never flew."""
+        """Start of the flight [ns], world's clock; None if the robot never flew."""
         guard = self.recording["/guard"]
         tracking = guard["stamp_ns"][guard["state"] == GuardState.TRACK]
         return int(tracking[0]) if len(tracking) else None
 
     @cached_property
     def end_ns(self) -> int | None:
-        """Stamp of the end [ns], world's clock; None if the robot never flew."""
+        """End of the flight [ns], world's clock; None if the robot never flew."""
         if self.start_ns is None or self.ending is not None:
             return self.ending[0] if self.ending else None
         stamps = self.recording["/ground_truth"]["stamp_ns"]
@@ -57,7 +57,7 @@ class Flight:
 
     @cached_property
     def ending(self) -> tuple[int, str, str] | None:
-        """Stamp [ns], name and text of the event that ended the mission; None without an end."""
+        """Event that ended the mission: stamp [ns], name, text; None if there is no such event."""
         mission = self.recording["/mission"]
         rows = zip(mission["stamp_ns"], mission["event"], mission["text"], strict=True)
         for stamp, event, text in rows:
@@ -66,18 +66,18 @@ class Flight:
         return None
 
     def seconds(self, stamp_ns: Any) -> Any:
-        """Convert stamps on world's clock [ns] to time since the start [s]."""
+        """Convert stamps on world's clock [ns] to times since the start of the flight [s]."""
         return (stamp_ns - (self.start_ns or 0)) * 1e-9
 
     def during(self, topic: str) -> Columns:
-        """Select the rows of a topic from the start to the end of the flight, both included."""
+        """Select the rows of a topic during the flight, including its first and last instant."""
         return self._within(_columns(self.recording[topic]))
 
     def true_position(self, stamp_ns: Array) -> Array:
-        """Interpolate the true position of the base at `stamp_ns` [ns], world's clock, shape (n,).
+        """Interpolate the base's true position at `stamp_ns` [ns], world's clock, shape (n,).
 
         Returns:
-            Positions [m], shape (n, 3); NaN outside the recording.
+            Positions [m], shape (n, 3); NaN before and after the recording.
         """
         truth = self.recording["/ground_truth"]
         stamps, positions = truth["stamp_ns"], truth["position"]
@@ -95,7 +95,7 @@ class Flight:
 
     @cached_property
     def control(self) -> Columns:
-        """Periods of the control loop during the flight, joined from their topics."""
+        """Control periods during the flight; one row has the values of all `CONTROL_TOPICS`."""
         return self._within(self._control)
 
     @cached_property
@@ -111,46 +111,46 @@ class Flight:
 
     @cached_property
     def clearance(self) -> Array:
-        """Distance to the nearest pipe wall [m] per row of `truth`; empty without pipes."""
+        """Distance to the nearest pipe wall [m], per row of `truth`; empty without pipes."""
         if not self.scene.pipes or not len(self.truth["stamp_ns"]):
             return np.zeros(0)
         return clearance(self.scene, self.truth["position"], self.truth["orientation_wxyz"])
 
     @cached_property
     def inside(self) -> Array:
-        """Whether the base is inside a pipe, per row of `truth`; empty without pipes."""
+        """Whether the robot's base is inside a pipe, per row of `truth`; empty without pipes."""
         if not len(self.clearance):
             return np.zeros(0, dtype=bool)
         return pipe_index(self.scene, self.truth["position"]) >= 0
 
     def count(self, number: int) -> float | None:
-        """Return a number of events [1]; None if the robot never flew."""
+        """Return `number`, a number of events [1], as a metric; None if the robot never flew."""
         return None if self.start_ns is None else float(number)
 
     def last_total(self, name: str) -> float | None:
-        """Return the last total of a count of the ends or of the relay [1]; None without one."""
+        """Return the last recorded value of a counter [1]; None if it was never recorded."""
         count = self.recording["/count"]
         totals = count["total"][count["name"] == name]
         return float(totals[-1]) if len(totals) else None
 
     @cached_property
     def pipes_flown(self) -> int:
-        """Number of different pipes in which the base has been."""
+        """Number of different pipes that the robot's base has entered."""
         return int((np.unique(pipe_index(self.scene, self.truth["position"])) >= 0).sum())
 
     @cached_property
     def applied(self) -> Columns:
-        """Commands applied during the flight, joined with their control periods.
+        """Commands that world applied during the flight, with the values of their control periods.
 
-        `stamp_ns` is the instant of application [ns], `position` the predicted one [m].
+        `stamp_ns` is the time of application [ns], `position` the predicted position [m].
         """
         return self.join_control(self.during("/command_applied"))
 
     def join_control(self, commands: Columns) -> Columns:
-        """Join commands, rows with `epoch` and `counter`, with their control periods.
+        """Add to each command (`epoch`, `counter`) the values of its control period.
 
-        Commands without a recorded control period are left out. A column that both have keeps the
-        value of the command.
+        Commands without a recorded control period are left out. If both have a column of the same
+        name, the value of the command is kept.
         """
         keys = zip(self._control["epoch"], self._control["counter"], strict=True)
         rows = {key: row for row, key in enumerate(keys)}
@@ -161,7 +161,6 @@ class Flight:
         return periods | {name: column[known] for name, column in commands.items()}
 
     def _within(self, columns: Columns) -> Columns:
-        """Select the rows from start to end, both included; none without a start."""
         stamps = columns["stamp_ns"]
         if self.start_ns is None or self.end_ns is None:
             rows = np.zeros(len(stamps), dtype=bool)
@@ -188,11 +187,11 @@ class Metric:
 
 
 SHIPPED: dict[str, Metric] = {}
-"""Shipped metrics by name; complete once `cloudrc.metrics` is imported."""
+"""The metrics of cloudrc by name; complete once `cloudrc.metrics` is imported."""
 
 
 def add_metrics(*rows: tuple[str, str, str, Measure]) -> None:
-    """Add shipped metrics; each row has the attributes of a `Metric`."""
+    """Add metrics of cloudrc; each row has the attributes of a `Metric`."""
     SHIPPED.update({row[0]: Metric(*row) for row in rows})
 
 
@@ -203,15 +202,15 @@ def mean(values: Array) -> float | None:
 
 
 def percentile(values: Array, percent: float) -> float | None:
-    """Compute the `percent` [%] percentile of the finite `values`, shape (n,); None without any."""
+    """Compute a percentile (`percent` [%]) of the finite `values`, shape (n,); None without any."""
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, percent)) if len(finite) else None
 
 
 def rms(errors: Array) -> float | None:
-    """Compute the RMS length of vectors `errors`, shape (n,) or (n, 3), any unit.
+    """Compute the root mean square length of the vectors `errors`, shape (n,) or (n, 3), any unit.
 
-    Only finite rows count; without any, return None.
+    Rows with NaN or infinity are left out; without other rows, return None.
     """
     squares = np.square(errors) if errors.ndim == 1 else np.square(errors).sum(axis=1)
     square = mean(squares)

@@ -1,6 +1,6 @@
-"""Metrics of each direction of the link: delay, loss, late datagrams, and the relay's own counts.
+"""Metrics of each direction of the link: delays, losses, late datagrams, and the relay's counters.
 
-The metrics include late datagrams, because the datagrams that the loop uses are only the fast ones.
+The delay includes late datagrams. Without them, only the fast datagrams would count.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 from cloudrc.metrics.flight import Flight, add_metrics, mean
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
-"""Direction -> description of the direction in the meaning of a metric."""
+"""Direction -> words for the direction in the description of a metric."""
 SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
-"""Direction -> topic with one row per datagram sent that way."""
+"""Direction -> topic with one row for each datagram that is sent in this direction."""
 SETTLING_NS = 2_000_000_000
-"""Time after which a datagram that has not arrived counts as lost [ns]."""
+"""Time after sending at which a datagram that has not arrived counts as lost [ns]."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
 COUNTS = {
     "relay_overflow": "that the relay dropped because its queue was full.",
@@ -27,7 +27,7 @@ COUNTS = {
 
 
 def _delay_mean(flight: Flight, way: str) -> float | None:
-    """Average the delay; None if the two ends could not prove that they share a clock."""
+    """Average the delay; None if world and cloud may have different clocks."""
     return mean(flight.during(f"/{way}_delay")["delay"])
 
 
@@ -39,8 +39,7 @@ def _late(flight: Flight, way: str) -> float | None:
 def loss(flight: Flight, way: str) -> float | None:
     """Compute the share of the datagrams sent during the flight that never arrived [1].
 
-    Epoch and counter identify a datagram. Datagrams sent in the last SETTLING_NS of the recording
-    may still arrive and do not count.
+    Datagrams of the last SETTLING_NS of the recording may still arrive and are left out.
     """
     sent, arrivals = flight.during(SENT[way]), flight.recording[f"/{way}_delay"]
     world = flight.recording["/telemetry"]["stamp_ns"]
@@ -53,7 +52,7 @@ def loss(flight: Flight, way: str) -> float | None:
 
 
 def _add_direction(way: str, words: str) -> None:
-    """Add the metrics of one direction; without a relay its counts are unknown."""
+    """Add the metrics of one direction; without a relay, the relay's counters are unknown."""
 
     def seconds(name: str, flight: Flight) -> float | None:
         total = flight.last_total(f"{way}_release_error_{name}_ns")

@@ -1,4 +1,4 @@
-"""Metrics of the mission: waypoints, contacts, steady error, holds of the guard, and faults."""
+"""Metrics of the mission: waypoints, contacts, steady error, time in HOLD, and faults."""
 
 from __future__ import annotations
 
@@ -10,29 +10,31 @@ from cloudrc.messages import GuardState
 from cloudrc.metrics.flight import Array, Flight, add_metrics, mean
 
 BOARD = "board"
-"""Name of the scene's body that the arm must touch."""
+"""Name of the board, which the arm must touch, in the scene."""
+IMPACT_NS = 100_000_000
+"""Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
 PRESSING_NS = 2_000_000_000
-"""Length of the last part of the mission, over which the steady contact force is averaged [ns]."""
+"""Last part of the mission, over which the steady contact force is averaged [ns]."""
 RESTING_NS = 5_000_000_000
-"""Length of the last part of the flight, over which the steady error is averaged [ns]."""
+"""Last part of the flight, over which the steady error is averaged [ns]."""
 SETTLING_NS = 10_000_000_000
-"""Time before the last RESTING_NS in which the setpoint must not move [ns]; otherwise there is no
-steady error.
+"""Time before the last RESTING_NS in which the setpoint must be constant [ns]. If it moved, there
+is no steady error.
 Source: docs/reference/control.md, "Steady state": the slowest variant that settles needs 8 to 15 s
 to stay within 1 cm."""
 FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizon_clamped")
-"""Names of cloud's counters whose values are added to the number of faults."""
+"""Counters of cloud that are included in the number of faults."""
 
 
 def first_touch(flight: Flight) -> dict[str, Array] | None:
-    """Find the row of /contact at which the arm first touched the board; None without a touch."""
+    """Find the row of /contact for the arm's first touch of the board; None without a touch."""
     contact = flight.during("/contact")
     touches = np.flatnonzero((contact["body"] == BOARD) & contact["tip"].astype(bool))
     return {name: column[touches[0]] for name, column in contact.items()} if len(touches) else None
 
 
 def holds(flight: Flight) -> list[tuple[int, int]]:
-    """List start and end [ns], world's clock, of each interval in which the guard was in HOLD."""
+    """List start and end of each interval in which the guard was in HOLD [ns], world's clock."""
     if flight.end_ns is None:
         return []
     guard = flight.during("/guard")
@@ -60,13 +62,25 @@ def _tip_speed(flight: Flight) -> float | None:
 
 
 def _peak_force(flight: Flight) -> float | None:
-    """Find the largest force [N], which depends on the simulator's contact parameters."""
-    force = flight.during("/contact_force")["tip_force"]
+    """Find the largest contact force [N]; it depends on the simulator's contact parameters."""
+    force = flight.during("/contact_force")["tip_force_peak"]
     return None if first_touch(flight) is None or not len(force) else float(force.max())
 
 
+def _impulse(flight: Flight) -> float | None:
+    """Integrate the force of the impact [N s]; the simulator's contact parameters do not change it.
+
+    Source: docs/reference/plant.md, "Contact".
+    """
+    touch, force = first_touch(flight), flight.during("/contact_force")
+    if touch is None:
+        return None
+    since_ns = force["stamp_ns"] - touch["stamp_ns"]
+    return float(force["tip_impulse"][(since_ns >= 0) & (since_ns < IMPACT_NS)].sum())
+
+
 def _steady_force(flight: Flight) -> float | None:
-    """Average the force at the end [N]; the simulator's contact parameters do not change it."""
+    """Average the final contact force [N]; the simulator's contact parameters do not matter."""
     touch = first_touch(flight)
     if touch is None or flight.ending is None or flight.ending[1] != "done":
         return None
@@ -85,10 +99,10 @@ def _pipe_contacts(flight: Flight) -> float | None:
 
 
 def _steady_error(flight: Flight, axis: int) -> float | None:
-    """Average the distance from setpoint to true position along x, y or z (`axis` 0, 1 or 2) [m].
+    """Average the distance from setpoint to true position [m] along x, y or z (`axis` 0, 1 or 2).
 
-    None if the setpoint moved or the arm touched something in the last 15 s, or if the flight is
-    shorter.
+    None if the flight is shorter than 15 s, or if in its last 15 s the setpoint moved or the arm
+    touched something.
     """
     control, force = flight.control, flight.during("/contact_force")
     if flight.end_ns is None or flight.start_ns is None:
@@ -111,7 +125,7 @@ def _hold_time(flight: Flight) -> float | None:
 
 
 def _fault_count(flight: Flight) -> float | None:
-    """Count the faults; a fault that repeats has one record, its counter has every repetition."""
+    """Count the faults. Repetitions are in the fault's counter; the fault is recorded only once."""
     totals, count = dict.fromkeys(flight.recording["/fault"]["code"], 1), flight.recording["/count"]
     for name, total in zip(count["name"], count["total"], strict=True):
         if name in FAILURES:  # the largest total: a cloud that restarts counts from 0
@@ -133,8 +147,9 @@ add_metrics(
      "board.", _contact_time),
     ("tip_speed", "m/s", "Speed of the arm's tip just before it first touches the board.",
      _tip_speed),
-    ("peak_contact_force", "N", "Largest force on the arm's tip, as sampled at 100 Hz.",
-     _peak_force),
+    ("peak_contact_force", "N", "Largest force on the arm's tip in any physics step.", _peak_force),
+    ("contact_impulse", "N s", "Force on the arm's tip times time, over the first 0.1 s of the "
+     "first touch.", _impulse),
     ("steady_contact_force", "N", "Mean force on the arm's tip over the last 2 s of the mission.",
      _steady_force),
     ("pipe_contacts", "1", "Number of contacts with a pipe.", _pipe_contacts),

@@ -1,15 +1,16 @@
-"""Judge a mission by one set of rules, from the operator's telemetry or from the recorded truth.
+"""Judge a mission: success, failure, invalid or interrupted.
 
-The verdict is the first of these that applies:
+The first matching outcome of this list is the verdict:
 
-- `interrupted`: the run was stopped or the mission was cancelled before its end;
-- `invalid`: the run did not keep real time although it had to, so its numbers mean nothing;
-- `failure`: at least one criterion of success is not met; each is listed with time and place;
+- `interrupted`: the run was stopped or the mission was cancelled before its end.
+- `invalid`: the run had to keep real time but did not, so its numbers mean nothing.
+- `failure`: at least one criterion of success is not met. Each such criterion is listed with time
+  and place.
 - `success`: all waypoints were reached within the time limit, the board was touched slowly enough,
   no pipe was touched, the guard was only in TRACK or HOLD, and world never restarted.
 
-The rules judge `Evidence`, by the recorded truth (`flight_evidence`, for the report) or by
-telemetry (`Observations`, for teleop), which arrives late and shows less.
+The same rules apply to two kinds of evidence. The report uses the recorded truth
+(`flight_evidence`). Teleop uses telemetry (`Observations`), which arrives late and contains less.
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ from cloudrc.records import REAL_TIME_FACTOR_MIN
 
 SLIP_MAX = 0.25
 """Largest time that world's clock may lose in a valid flight [s]: the guard's default limit on the
-age of a command. With a larger loss, a slow machine instead of the network could decide what the
-guard does."""
+age of a command. With a larger loss, the guard might react to a slow machine."""
 EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 """Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
+PLUGIN_FAILURES_MAX = 0.01
+"""Largest share of periods in which a plug-in may fail in a valid flight, in [0, 1]."""
 ADVICE = "close other programs or give the run more cores"
 
 Outcome = Literal["success", "failure", "invalid", "interrupted"]
@@ -43,26 +45,26 @@ class Failure:
 
     code: str  # one word, for programs
     text: str  # for people
-    time: float | None = None  # since the start of the mission [s]; None without an instant
+    time: float | None = None  # time since the start of the mission [s]; None if unknown
     place: Vector | None = None  # true position of the base at that time [m]; None if unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Verdict on a mission: the outcome and all failures, the earliest first."""
+    """Outcome of a mission and all failures, the earliest failure first."""
 
     outcome: Outcome
     failures: tuple[Failure, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """Return the verdict for the API, without times and places."""
+        """Return outcome, exit code and failures for the API; times and places are left out."""
         failures = [{"code": each.code, "text": each.text} for each in self.failures]
         code = EXIT_CODES[self.outcome]
         return {"outcome": self.outcome, "exit_code": code, "failures": failures}
 
 
 class Moment(NamedTuple):
-    """The `time` [s] and the `place` [m] of an event, as in `Failure`."""
+    """`time` since the mission's start [s], and `place`, the true position of the base [m]."""
 
     time: float | None = None
     place: Vector | None = None
@@ -72,7 +74,7 @@ UNKNOWN = Moment()
 
 
 class Ending(NamedTuple):
-    """How a mission ended: one word for programs, and a text for people."""
+    """How a mission ended: one word for programs, and a text for users."""
 
     code: str
     text: str
@@ -80,7 +82,7 @@ class Ending(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Facts about a finished mission, from which the verdict follows."""
+    """Facts about a finished mission, on which the verdict is based."""
 
     waypoints: int
     reached: int  # number of waypoints reached
@@ -91,11 +93,11 @@ class Evidence:
     time_limit: float = inf  # limit of the time of `end` [s]
     touch: tuple[float, Moment] | None = None  # speed of the first touch of the board [m/s]
     violations: tuple[Failure, ...] = ()  # other events that must not happen
-    slow: str = ""  # why the run did not keep real time; "" if it did or did not have to
+    slow: str = ""  # why the run failed to keep real time; "" if it did not fail
 
 
 def judge(evidence: Evidence) -> Verdict:
-    """Judge a mission."""
+    """Apply the rules to the evidence of a mission."""
     violations, limit = evidence.violations, evidence.contact_speed_max
     if evidence.contact and evidence.touch is not None and evidence.touch[0] >= limit:
         speed, moment = evidence.touch
@@ -112,7 +114,6 @@ def judge(evidence: Evidence) -> Verdict:
 
 
 def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
-    """Yield the goals that the mission did not reach."""
     ending, end = evidence.ending, evidence.end
     if ending.code != "done":
         yield Failure(*ending, *end)
@@ -142,13 +143,13 @@ def _too_slow(factor: float) -> str:
 def flight_evidence(
     flight: Flight, numbers: Mapping[str, Number], *, real_time: bool, interrupted: bool
 ) -> Evidence:
-    """Take the evidence from the recorded truth of a flight, and from its numbers.
+    """Collect the evidence from the recorded truth and from the metrics of a flight.
 
     Args:
         flight: The recorded flight.
-        numbers: Its measured numbers.
-        real_time: True if the run had to keep real time: any mode except virtual.
-        interrupted: True if the run was stopped, or if its recording is torn.
+        numbers: The metrics of the flight.
+        real_time: True if the run had to keep real time: in all modes except virtual.
+        interrupted: True if the run was stopped, or if its recording has no end.
     """
     criteria, end_ns = flight.criteria, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None
@@ -164,9 +165,17 @@ def flight_evidence(
         end=UNKNOWN if end_ns is None else _moment(flight, end_ns),
         time_limit=criteria.time_limit_s,
         touch=touch,
-        violations=(*_pipes(flight), *_interventions(flight), *_restarts(flight)),
+        violations=tuple(_violations(flight)),
         slow=_not_real_time(numbers) if real_time else "",
     )
+
+
+def _violations(flight: Flight) -> Iterator[Failure]:
+    """Yield all events in the recording that must not happen."""
+    yield from _pipes(flight)
+    yield from _interventions(flight)
+    yield from _restarts(flight)
+    yield from _plugins(flight)
 
 
 def _ending(flight: Flight, interrupted: bool) -> Ending:
@@ -182,14 +191,13 @@ def _ending(flight: Flight, interrupted: bool) -> Ending:
 
 
 def _moment(flight: Flight, stamp_ns: int) -> Moment:
-    """Return time and place of an instant [ns]."""
     x, y, z = flight.true_position(np.array([stamp_ns]))[0]
     place = (float(x), float(y), float(z)) if np.isfinite((x, y, z)).all() else None
     return Moment(float(flight.seconds(stamp_ns)), place)
 
 
 def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
-    """Yield the touches of pipes up to an instant [ns], one failure for each pipe."""
+    """Yield a failure for each pipe that the robot touched up to a stamp [ns]."""
     contact = flight.during("/contact")
     for body in sorted({str(body) for body in contact["body"] if str(body).startswith("pipe")}):
         stamps = contact["stamp_ns"][contact["body"] == body]
@@ -199,7 +207,7 @@ def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
 
 
 def _interventions(flight: Flight) -> Iterator[Failure]:
-    """Yield the guard's changes to a state beyond HOLD."""
+    """Yield a failure for each change of the guard to another state than TRACK or HOLD."""
     guard, before = flight.during("/guard"), None
     rows = zip(guard["stamp_ns"], guard["state"], guard["cause"], strict=True)
     for stamp_ns, state, cause in rows:
@@ -210,7 +218,6 @@ def _interventions(flight: Flight) -> Iterator[Failure]:
 
 
 def _restarts(flight: Flight) -> Iterator[Failure]:
-    """Yield the sessions that world opened in flight."""
     session = flight.during("/session")
     rows = zip(session["stamp_ns"], session["end"], session["cause"], strict=True)
     for stamp_ns, end, cause in rows:
@@ -218,6 +225,21 @@ def _restarts(flight: Flight) -> Iterator[Failure]:
         if end == "world" and stamp_ns > (flight.start_ns or 0):
             text = f"world opened a new session in flight: {cause}"
             yield Failure("world_restarted", text, *_moment(flight, int(stamp_ns)))
+
+
+def _plugins(flight: Flight) -> Iterator[Failure]:
+    """Yield the plug-ins that failed so often that the numbers are those of other plug-ins."""
+    periods, faults = len(flight.recording["/delay_estimate"]), flight.recording["/fault"]
+    for kind in ("estimator", "predictor", "controller"):
+        share = (flight.last_total(f"{kind}_failed") or 0.0) / max(periods, 1)
+        if share > PLUGIN_FAILURES_MAX:
+            first = faults["text"][faults["code"] == f"{kind}_failed"]
+            why = f": {first[0]}" if len(first) else ""
+            limit = f"{PLUGIN_FAILURES_MAX:.0%}"
+            text = (
+                f"cloud.{kind} failed in {min(share, 1.0):.0%} of its periods, above {limit}{why}"
+            )
+            yield Failure("plugin_failed", text)
 
 
 def _not_real_time(numbers: Mapping[str, Number]) -> str:
@@ -232,7 +254,7 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
 
 
 def _why_grounded(flight: Flight) -> str:
-    """Describe why the guard never applied a command in a flight that did not start."""
+    """Describe why the guard applied no command, so that the flight never started."""
     arrivals = flight.recording["/downlink_delay"]
     if not len(flight.recording["/delay_estimate"]):
         return "its telemetry or cloud's answers were lost, so cloud computed no command"
@@ -254,10 +276,11 @@ def _why_grounded(flight: Flight) -> str:
 
 
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
-    """Judge a recorded mission as the operator does at its end, with the report's `evidence`.
+    """Judge a recorded mission with only what the operator knows when the mission ends.
 
-    The operator knows only the contacts in telemetry that has arrived by the end of the mission,
-    not the time limit of the report, and of the timing only the real-time factor.
+    Contacts that telemetry reports only after the end do not count. The operator does not know the
+    report's time limit, and judges timing only by the real-time factor. All other facts are those
+    of the report's `evidence`.
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0
@@ -273,18 +296,18 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
 
 
 AWAY = -1
-"""Value for an unknown slip [ns]: after a restart of teleop, until the first telemetry."""
+"""Value for an unknown slip of world's clock [ns]: after a restart of teleop, before telemetry."""
 
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Contacts, and the slip of world's clock, during a mission, as telemetry shows them."""
+    """Contacts and slip of world's clock during a mission, as telemetry reports them."""
 
     pipe_contacts: int = 0  # last count in telemetry
     pipe_touches: int = 0  # contacts since the mission began
     touch_before: float | None = None  # speed of an earlier mission's touch [m/s]
     touch_speed: float | None = None  # speed of this mission's touch of the board [m/s]
-    slip_began_ns: int = 0  # slip before the mission and during a restart of teleop: not counted
+    slip_began_ns: int = 0  # slip that does not count: before the mission, in restarts of teleop
     slip_ns: int = 0  # world's slip in the last telemetry; AWAY after a restart of teleop
 
     @classmethod
@@ -293,11 +316,11 @@ class Observations:
         return cls(pipe_contacts, 0, finite_or_none(touch_speed), None, slip_ns, slip_ns)
 
     def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Process new telemetry.
+        """Take the values of new telemetry.
 
         Args:
             pipe_contacts: Number of contacts with pipes since the robot was reset.
-            touch_speed: Speed at which the tip touched the board [m/s]; NaN before the touch.
+            touch_speed: Speed of the arm's tip at the touch of the board [m/s]; NaN before.
             slip_ns: Lag of world's clock behind its machine's clock [ns].
         """
         touch = finite_or_none(touch_speed)
@@ -316,11 +339,11 @@ class Observations:
         )
 
     def after_restart(self) -> Observations:
-        """Continue after a restart of teleop; the slip during the restart does not count."""
+        """Continue after a restart of teleop; slip during the restart is not counted."""
         return replace(self, slip_began_ns=self.slip_began_ns - self.slip_ns, slip_ns=AWAY)
 
     def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
-        """Yield event and text of each contact since `before`, at `elapsed` [s] of the mission."""
+        """Yield event and text of each contact since `before`, at mission time `elapsed` [s]."""
         if self.pipe_touches > before.pipe_touches:
             yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
         if self.touch_speed != before.touch_speed:
@@ -328,7 +351,7 @@ class Observations:
             yield "board_touched", text
 
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
-        """Return the evidence of a mission that ended after `elapsed` [s]."""
+        """Return the evidence of a mission that ended at mission time `elapsed` [s]."""
         slipped = (self.slip_ns - self.slip_began_ns) * 1e-9
         return Evidence(
             ending=ending,
@@ -341,5 +364,5 @@ class Observations:
 
 
 def finite_or_none(value: float) -> float | None:
-    """Return `value`, any unit; return None for NaN and infinity, which JSON does not have."""
+    """Return `value`, any unit, but None instead of NaN and infinity, which JSON lacks."""
     return value if isfinite(value) else None

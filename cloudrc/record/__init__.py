@@ -1,6 +1,6 @@
-"""Record flights in MCAP files and read them back as arrays.
+"""Record flights in MCAP files, and read the files as arrays.
 
-Only `ros`, `writer` and `reader` import the packages that `cloudrc[record]` installs.
+Only the modules `ros`, `writer` and `reader` need the packages of `cloudrc[record]`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from cloudrc.errors import MissingPrerequisiteError
 
 
 def missing(error: ImportError) -> MissingPrerequisiteError:
-    """Make an error that names a missing package and the command that installs the package."""
+    """Make an error that names a missing package and the command to install it."""
     name = (error.name or str(error)).partition(".")[0]
     return MissingPrerequisiteError(
         f"recording needs the package {name}, which is not installed;"

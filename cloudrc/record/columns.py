@@ -1,11 +1,13 @@
-"""Read a recording, from a file or from records in memory, as one table of arrays per topic.
+"""Read a recording as one table per topic, with one array per column.
 
     recording = Recording.read(path)
     recording["/odometry"]["position"]  # shape (n, 3)
 
-A topic without records is a table without rows. The log time of a row is its stamp, or the previous
-row's log time if that is later. So log times never decrease within one end, and both ends can be
-merged by log time. Files and records in memory give the same tables.
+A recording comes from a file or from records in memory; both give the same tables. A topic without
+records has a table without rows.
+
+The log time of a row is its stamp, or the previous row's log time if that is later. So log times
+never decrease within world's rows or within cloud's rows, which can then be merged.
 """
 
 from __future__ import annotations
@@ -41,11 +43,11 @@ _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
 def merged(
     world_records: Iterable[Record], cloud_records: Iterable[Record], offset_ns: int = 0
 ) -> Iterator[tuple[int, Row]]:
-    """Merge the records of both ends, oldest first, into one sequence of rows on world's clock.
+    """Merge the records of world and cloud, each oldest first, into rows on world's clock.
 
-    Yield log time [ns] and row; of equal log times, world's rows come first. `offset_ns` is world's
-    clock minus cloud's clock [ns]. Only the stamp of each row is converted; other times in a row
-    stay on the clock that their description names.
+    Yield the log time [ns] and the row, in order of log time. If two log times are equal, world's
+    row comes first. `offset_ns` is world's clock minus cloud's clock [ns]. Only the stamp of a
+    cloud row is converted; other times in the row stay on the clock that their description names.
     """
     world, cloud = _logged(world_records, 0), _logged(cloud_records, offset_ns)
     return heapq.merge(world, cloud, key=itemgetter(0))
@@ -61,15 +63,14 @@ def _logged(records: Iterable[Record], offset_ns: int) -> Iterator[tuple[int, Ro
 
 
 class Table:
-    """The columns of one topic; its length is the number of rows n.
+    """The n rows of one topic as columns.
 
-    The types of the arrays are int64 for integers, float64 for floats and vectors, bool for truth
-    values, object for strings. Vectors have shape (n, 3), quaternions (n, 4), all other columns
-    (n,).
+    Integers are stored as int64, floats and vectors as float64, truth values as bool, strings as
+    object. The shape is (n, 3) for vectors, (n, 4) for quaternions, and (n,) for other columns.
     """
 
     def __init__(self, topic: Topic, rows: list[tuple[int, Values]]) -> None:
-        """Convert the stamp [ns] and values of each row to columns."""
+        """Convert rows, each with a stamp [ns] and values, to columns."""
         columns = zip(*[values for _, values in rows], strict=True) if rows else repeat(())
         self._columns = {"stamp_ns": _column("int", [stamp_ns for stamp_ns, _ in rows])}
         for field, values in zip(topic.fields, columns, strict=False):
@@ -78,7 +79,7 @@ class Table:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names of the columns, `stamp_ns` first."""
+        """Names of the columns, `stamp_ns` first."""
         return tuple(self._columns)
 
     def __len__(self) -> int:
@@ -97,9 +98,9 @@ class Recording:
 
     Attributes:
         metadata: The file's metadata, such as its clock; empty if made from records.
-        attachments: Name -> attached file.
+        attachments: Name -> content of an attached file.
         note: What is missing, in words; "" if nothing is missing.
-        lacking: The part of `note` that a killed process cannot explain; "" if there is none.
+        lacking: The part of `note` that a killed process does not explain; "" if there is none.
         remarks: What was ignored or sorted, as in `Contents`.
     """
 
@@ -115,7 +116,7 @@ class Recording:
 
     @property
     def complete(self) -> bool:
-        """True if nothing is missing."""
+        """Whether nothing is missing."""
         return not self.note
 
     @classmethod
@@ -125,7 +126,7 @@ class Recording:
         cloud_records: Iterable[Record] = (),
         offset_ns: int = 0,
     ) -> Self:
-        """Make a recording in memory, as if read from a file of rows that are `merged`."""
+        """Make a recording from records in memory; `offset_ns` [ns] is as for `merged`."""
         rows: _Rows = {name: [] for name in TOPICS}
         for _, (topic, stamp_ns, values) in merged(world_records, cloud_records, offset_ns):
             rows[topic].append((stamp_ns, values))
@@ -133,10 +134,10 @@ class Recording:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read an MCAP file up to its end or its first damaged part.
+        """Read an MCAP file up to its end or to its first damaged part.
 
         Raises:
-            BadInputError: If nothing in the file is readable.
+            BadInputError: If nothing in the file can be read.
             MissingPrerequisiteError: If `cloudrc[record]` is not installed.
         """
         from cloudrc.record.reader import read_contents

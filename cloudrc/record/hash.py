@@ -1,9 +1,13 @@
-"""Identify a run by one SHA-256 over all its records.
+"""Compute one SHA-256 over all records of a run, to compare runs.
 
-The bytes of a record are little-endian and the same in every process. They consist of length and
-name of the record's type; numbers (integers with 64 bits, floats as IEEE 754 doubles, truth values
-with one byte); vectors; and strings as UTF-8, each after its 32-bit length. The numbers
-keep the order of the fields; so do the vectors and the strings. A field that holds a record is
+A record is hashed as little-endian bytes, equal in every process. They contain in this order:
+
+- the length and the name of the record's type;
+- the numbers: integers with 64 bits, floats as IEEE 754 doubles, truth values with one byte;
+- the vectors;
+- the strings as UTF-8, each after its 32-bit length.
+
+Within each group the order is that of the record's fields. A field that holds another record is
 replaced by the fields of that record.
 """
 
@@ -25,7 +29,7 @@ _CODES = {int: "q", float: "d", bool: "?", str: "s"}
 
 
 class RecordHash:
-    """SHA-256 over records in their order; the division into batches does not matter."""
+    """SHA-256 over records in their order, no matter how many records each `update` gets."""
 
     def __init__(self) -> None:
         self._sha256 = hashlib.sha256()
@@ -42,9 +46,9 @@ class RecordHash:
 
 
 def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
-    """Hash topic, log time [ns] and CDR bytes of the messages of a file, in the file's order.
+    """Hash topic, log time [ns] and CDR bytes of a file's messages, in the order of the file.
 
-    This is for real-time runs, which have no records in memory.
+    Real-time runs use this hash, because their records are not kept in memory.
     """
     sha256 = hashlib.sha256()
     for message in messages:
@@ -53,7 +57,7 @@ def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
 
 
 def add_message(sha256: hashlib._Hash, topic: str, log_time_ns: int, data: bytes) -> None:
-    """Add a message to a hash as `messages_sha256` does."""
+    """Add one message to the hash of `messages_sha256`."""
     sha256.update(b"%s %d %d " % (topic.encode(), log_time_ns, len(data)))
     sha256.update(data)
 
@@ -76,7 +80,7 @@ def _packer(cls: type) -> _Pack:
 
 
 def _leaves(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
-    """Yield the path of each plain value of a record and its `struct` code."""
+    """Yield the dotted path and the `struct` code of each plain value of a record."""
     for name, kind in get_type_hints(cls).items():
         path = prefix + name
         if hasattr(kind, "_fields"):

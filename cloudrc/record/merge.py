@@ -1,13 +1,14 @@
-"""Merge the recordings of both ends into one mission on world's clock.
+"""Merge the recordings of world and cloud into one recording of a mission, on world's clock.
 
 Only the stamp of a cloud message is converted; other times in the message stay on the clock that
 their description names.
 
-The clock offset follows from the packets, since no packet arrives before it was sent. Each
-telemetry datagram shows that world's clock is ahead of cloud's by at least (sent - arrived). Each
-command datagram shows that world's clock is ahead by at most (arrived - sent). The fastest packets
-of both directions give the narrowest interval; its width is the sum of both delays. After a stall,
-world's clock also lags the clock of world's machine.
+The offset between the clocks is estimated from the packets, because no packet arrives before it was
+sent. Each telemetry datagram shows that world's clock is ahead of cloud's by at least (sent -
+arrived). Each command datagram shows that world's clock is ahead by at most (arrived - sent). The
+fastest packet of each direction gives the narrowest interval: as wide as the sum of both delays.
+
+World's clock is also behind the clock of world's machine if world's process was stalled.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from cloudrc.record.writer import MISSING
 from cloudrc.records import UNDER_WAY
 
 BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
-"""Times before a mission's start and after its end that are kept [ns]. The session and the guard's
-first change are before the start."""
+"""Durations before a mission's start and after its end that are kept [ns]. The beginning of the
+session and the guard's first change are before the start."""
 CUT_SHORT = "cut short"
-"""Start of the reader's note about a file without an end."""
+"""Beginning of the reader's note about a file whose end is missing."""
 
 
 class ClockOffset(NamedTuple):
@@ -44,7 +45,7 @@ class ClockOffset(NamedTuple):
     method: Literal["same clock", "packets", "first records"]
 
     def metadata(self) -> dict[str, str]:
-        """Format the offset for a file's metadata; leave the uncertainty out if it is unknown."""
+        """Format the offset for a file's metadata; an unknown uncertainty is left out."""
         noted = {"clock_offset_ns": str(self.offset_ns), "clock_offset_method": self.method}
         if self.uncertainty_ns is not None:
             noted["clock_offset_uncertainty_ns"] = str(self.uncertainty_ns)
@@ -55,15 +56,15 @@ SAME_CLOCK = ClockOffset(0, 0, "same clock")
 
 
 def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
-    """Estimate the offset that puts cloud's stamps on world's clock.
+    """Estimate world's clock minus cloud's clock.
 
-    It is the centre of the interval that the packets allow; without packets in both directions, the
-    difference of the first stamps.
+    The estimate is the centre of the interval that the packets allow. Without packets in both
+    directions, it is the difference of the first stamps.
 
     Source: the clock filter of RFC 5905 (NTP), section 10: it uses the sample with the smallest
-        round trip, and half of this round trip bounds the error.
-    Deviation: each direction uses its own fastest packet. Clock drift is not modelled (50 ppm are
-        3 ms per minute).
+    round trip, and half of this round trip bounds the error.
+    Deviation: each direction uses its own fastest packet. Clock drift is not modelled (50 ppm are 3
+    ms per minute).
     """
     uplink = _smallest_difference(world["/telemetry"], cloud["/uplink_delay"])
     downlink = _smallest_difference(cloud["/delay_estimate"], world["/downlink_delay"])
@@ -80,7 +81,7 @@ def _share_clock(world: Contents, cloud: Contents) -> bool:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest (arrival - departure) [ns]; each time is on the clock of its end."""
+    """Return the smallest difference of arrival and departure [ns], including the clock offset."""
 
     def packets(table: Table) -> list[tuple[tuple[int, int], int]]:
         epochs, counters, stamps_ns = (
@@ -99,10 +100,10 @@ def _first_ns(recording: Recording) -> int:
 
 
 def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Convert instants [ns], shape (n,), from the clock of world's machine to world's clock.
+    """Convert times [ns], shape (n,), from the clock of world's machine to world's clock.
 
-    World's clock lags the machine's after a stall. The lag is known at each stamp of the telemetry
-    and interpolated linearly between the stamps; rising order is kept.
+    World's clock is behind the machine's clock after a stall. Telemetry states this lag; between
+    two telemetry stamps it is interpolated linearly. The order of the times is kept.
     """
     lag_ns = telemetry["slip_ns"]
     if not lag_ns.any():
@@ -116,10 +117,10 @@ def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np
 
 
 def merge(world: Path, cloud: Path) -> Contents:
-    """Merge the files of both ends, complete or torn, into one mission on world's clock.
+    """Merge the files of world and cloud, complete or torn, into one mission on world's clock.
 
-    If one file cannot be read, the mission contains only the other file, on that file's own clock,
-    and the note of the mission says so.
+    If one file cannot be read, the result contains only the other file, on that file's own clock.
+    The note of the result says so.
 
     Raises:
         BadInputError: If neither file can be read.
@@ -167,10 +168,11 @@ def _join(world: Contents, cloud: Contents) -> Contents:
 
 
 def cut_to_last_mission(mission: Contents) -> bool:
-    """Cut a pod's recording, which may hold several missions, down to the last that was started.
+    """Reduce a pod's recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If so, the mission is complete,
-    even if the end of the file is missing: a pod still writes its file while the file is copied.
+    Return whether the recording contains the end of that mission. If so, the mission counts as
+    complete although the end of the file is missing, because a pod still writes to its file while
+    the file is copied.
     """
     began, ended = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0
@@ -184,7 +186,7 @@ def cut_to_last_mission(mission: Contents) -> bool:
 
 
 def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
-    """Find the stamps [ns] of the last mission's start and end; None for a missing stamp."""
+    """Find the stamps [ns] of the last mission's start and end; None if a stamp is missing."""
     table = _table(contents, "/mission")
     began = ended = None
     for stamp_ns, event in zip(table["stamp_ns"].tolist(), table["event"].tolist(), strict=True):
@@ -198,6 +200,6 @@ def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
 
 
 def _table(contents: Contents, topic: str) -> Table:
-    """Decode the messages of one topic; to decode all topics takes as long as to read the file."""
+    """Decode one topic only: decoding all topics takes as long as reading the file."""
     messages = [message for message in contents.messages if message[0] == topic]
     return Contents(messages).recording()[topic]

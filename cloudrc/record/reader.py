@@ -1,9 +1,11 @@
-"""Read or repair an MCAP file, from its start to its end or to its first damaged part.
+"""Read or repair an MCAP file, up to its end or to its first damaged part.
 
 A killed process leaves a file without an end; such a file is read up to its last complete chunk.
-`Records` yields the records of any MCAP file; `read_contents` collects the topics of cloudrc, and
-`recover` writes a complete copy. The package `mcap` parses the format. This module limits the
-unpacked size of a file, and says in words what is missing.
+`Records` yields the records of any MCAP file. `read_contents` collects the topics of cloudrc.
+`recover` writes a complete copy.
+
+The package `mcap` parses the format. This module adds a limit to the unpacked size of a file and a
+description of what is missing.
 """
 
 from __future__ import annotations
@@ -40,29 +42,29 @@ except ImportError as error:
     raise missing(error) from error
 
 UNPACKED_MAX = 64
-"""Largest size of a recording in memory, as a multiple of its size in the file. A file below
-1 MiB counts as 1 MiB. Recordings of flights need a factor of 10, recordings of an idle robot 30."""
+"""Largest ratio between a recording's size in memory and in the file; files below 1 MiB count as 1
+MiB. Recordings of flights need a ratio of 10, recordings of an idle robot 30."""
 MESSAGE_COST = 128
-"""Memory of a message's Python objects, in addition to the message's bytes [bytes]."""
+"""Memory for a message's Python objects, in addition to its content [bytes]."""
 LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
 LOSSY_SHARE_MAX = 0.999
-"""Largest value of `Recovery.share` if anything is missing."""
+"""Largest value of `Recovery.share` if something is missing."""
 _MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
 KINDS = {
     b"": "is empty; name a recording (.mcap)",
     b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
     b"SQLite format 3": "is an SQLite file, not MCAP; convert it with: ros2 bag convert",
 }
-"""First bytes of files that are not MCAP, and the text of the error about them."""
+"""First bytes of a file that is not MCAP -> text of the error about the file."""
 
 
 class NothingReadableError(BadInputError):
-    """Report a file without any readable message, such as after a kill at the start."""
+    """The file contains no readable message, for example because the process was killed early."""
 
 
 class _StopError(Exception):
-    """Report, in words, why a file that may be intact is not read further."""
+    """Reading stops for this reason, although the file may be intact."""
 
 
 _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
@@ -72,23 +74,23 @@ _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
     ),
     "lz4": lambda data, size: lz4.frame.LZ4FrameDecompressor().decompress(data, size),
 }
-"""Compression -> function that unpacks at most a given size [bytes]. The library's own functions
-allocate what the compressed data states, without a bound."""
+"""Compression -> function that unpacks up to a given size [bytes]. The functions of `mcap` are not
+used, because they allocate whatever size the file claims."""
 
 
 class Records:
-    """The records of one MCAP file: chunks are unpacked, so no chunk is among the records.
+    """Yields the records of one MCAP file; the records inside chunks are unpacked.
 
     Attributes:
         path: The file, for messages.
         size: Size of the file [bytes].
-        position: Position behind the last intact record [bytes].
+        position: End of the last intact record in the file [bytes].
         schemas: The schemas so far, by their number.
         channels: The channels so far, by their number.
-        data_ended: Whether reading has reached the end of the data; only the index follows.
-        ended: Whether reading has reached the end of the file.
+        data_ended: Whether all data were read; only the index follows.
+        ended: Whether the whole file was read.
         fault: Why reading stopped or what is wrong, in words; "" if nothing is wrong.
-        cut: Whether the fault is at the end of the file, as after a kill of the process.
+        cut: Whether the file breaks off at the fault, for example because the process was killed.
         stated: Number of messages according to the index; None if the index was not reached.
     """
 
@@ -123,7 +125,7 @@ class Records:
         self._stream.close()
 
     def __iter__(self) -> Iterator[mcap.McapRecord]:
-        """Yield the records up to the file's end or its first damaged part.
+        """Yield the records up to the file's end or to its first damaged part.
 
         Raises:
             BadInputError: If the file is not MCAP.
@@ -138,11 +140,11 @@ class Records:
             yield from self._read()
         except CRCValidationError as error:
             self.fault = "damaged: a checksum is wrong"
-            if isinstance(error.record, mcap.DataEnd):  # all was read
+            if isinstance(error.record, mcap.DataEnd):  # everything was read
                 self.data_ended = self.ended = True
                 self.position = self.size
                 self.fault = "damaged: a byte outside the chunks is wrong"
-        except (EndOfFile, RecordLengthLimitExceeded):  # a record that ends behind the file
+        except (EndOfFile, RecordLengthLimitExceeded):  # a record longer than the rest of the file
             self.fault, self.cut = "cut short", True
         except _StopError as error:
             self.fault = str(error)
@@ -161,7 +163,7 @@ class Records:
                 raise ValueError("the first record, and only the first, must be a header")
             if isinstance(record, mcap.Chunk):
                 yield from map(self._check, self._unpack(record))
-            elif not self.data_ended:  # what follows repeats the definitions
+            elif not self.data_ended:  # records after the data repeat the definitions
                 yield self._check(record)
             if isinstance(record, mcap.Statistics):
                 self.stated = record.message_count
@@ -174,7 +176,7 @@ class Records:
 
     @property
     def unread(self) -> int:
-        """Return the size of the part that was not read [bytes]; a torn index does not count."""
+        """Size of the part that was not read [bytes]; 0 if only the index is damaged."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
     def _take_room(self, size: int) -> None:
@@ -184,7 +186,7 @@ class Records:
             raise _StopError(text)
 
     def _check(self, record: mcap.McapRecord) -> mcap.McapRecord:
-        """Note definitions, and check that each number has one definition, before its messages."""
+        """Store definitions of schemas and channels; check that each number is defined once."""
         if isinstance(record, mcap.Message):
             self._take_room(MESSAGE_COST)
             if record.channel_id not in self.channels:
@@ -209,7 +211,7 @@ class Records:
         if chunk.uncompressed_crc not in (0, checksum := zlib.crc32(data)):
             raise CRCValidationError(chunk.uncompressed_crc, checksum, chunk)
         stream = BytesIO(data)
-        # `emit_chunks`: the library would unpack a chunk in a chunk without a bound.
+        # `emit_chunks`: the library would unpack a chunk inside a chunk without a limit.
         records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
         try:
             while stream.tell() < size:  # one at a time: a chunk may hold millions
@@ -225,12 +227,12 @@ class Contents:
     Attributes:
         messages: Topic, log time [ns] and CDR bytes of each message, in the order of log times.
         metadata: All metadata of the file; later values of a key replace earlier values.
-        attachments: Name -> attached file.
+        attachments: Name -> content of an attached file.
         note: What is missing, in words; "" if nothing is missing.
-        lacking: The part of `note` that a killed process cannot explain: damaged, filtered or
-            foreign parts; "" if there is none.
-        remarks: What was ignored or sorted, although nothing is missing: sentences without their
-            subject, which is the recording.
+        lacking: The part of `note` that a killed process does not explain, such as damaged or
+            removed messages; "" if there is none.
+        remarks: What was ignored or sorted, although nothing is missing. Each remark continues "The
+            recording ...".
     """
 
     messages: list[tuple[str, int, bytes]] = field(default_factory=list)
@@ -241,11 +243,11 @@ class Contents:
     remarks: tuple[str, ...] = ()
 
     def recording(self) -> Recording:
-        """Decode the messages to tables."""
+        """Convert the messages to tables."""
         return Recording.from_contents(self)
 
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
-        """Write the contents and further `attachments` to an MCAP file, which is replaced at once.
+        """Write the contents and further `attachments` to an MCAP file, atomically.
 
         Raises:
             OSError: If the file cannot be written.
@@ -264,16 +266,16 @@ class Contents:
 
 
 def read_contents(path: Path) -> Contents:
-    """Read the topics that cloudrc records, up to the end of a file or its first damaged part.
+    """Read cloudrc's topics from a file, up to its end or to its first damaged part.
 
     Raises:
-        BadInputError: If nothing in the file is readable.
+        BadInputError: If nothing in the file can be read.
     """
     return _read(path)[0]
 
 
 def _read(path: Path) -> tuple[Contents, Records, int]:
-    """Read a file; return also the number of messages that are known to be missing."""
+    """Read a file; return its contents, its records, and the number of missing messages."""
     contents, sequences, total = Contents(), array("L"), 0
     ours: dict[int, bool] = {}  # whether cloudrc records the topic of a channel, in this layout
     with Records(path) as records:
@@ -303,7 +305,7 @@ def _read(path: Path) -> tuple[Contents, Records, int]:
 
 
 def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
-    """Check whether cloudrc records a channel's topic, and in the same layout."""
+    """Check whether a channel's topic and layout are those that cloudrc records."""
     topic = TOPICS.get(channel.topic)
     if schema is None or topic is None or schema.name != topic.ros_type:
         return False
@@ -311,10 +313,10 @@ def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
 
 
 def _note(contents: Contents, records: Records, ours: dict[int, bool], total: int) -> None:
-    """Note what is missing.
+    """Describe what is missing in the contents.
 
-    `ours` has each channel with messages, and whether cloudrc records it; `total` is the number of
-    these messages.
+    `ours` maps the number of each channel with messages to whether cloudrc records it. `total` is
+    the number of messages on all channels.
     """
     faults, changed, metadata = list[str](), list[str](), contents.metadata
     if records.data_ended and records.cut:
@@ -339,7 +341,7 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool], total: in
     if records.ended and records.stated not in (None, total):
         changed.append(f"the index states {records.stated} messages, {total} were read")
     changed += _changed(contents) if records.data_ended else ()
-    if before := to_one_line(metadata.get(CHANGED, "")):  # by an earlier reader of the file
+    if before := to_one_line(metadata.get(CHANGED, "")):  # noted by an earlier reader of the file
         changed.append(before)
     if changed:
         metadata[CHANGED] = "; ".join(changed)
@@ -350,7 +352,7 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool], total: in
 
 
 def _changed(contents: Contents) -> Iterator[str]:
-    """Compare a file that was read to its end with what its writer has counted."""
+    """Describe how the messages of a complete file differ from the counts of its writer."""
     metadata, read = contents.metadata, Counter(message[0] for message in contents.messages)
     counts: dict[str, int] = {}
     with suppress(ValueError):
@@ -363,32 +365,31 @@ def _changed(contents: Contents) -> Iterator[str]:
 
 
 def _list(topics: list[str]) -> str:
-    """List the first topics, and give the number of the others."""
     more = len(topics) - LISTED_MAX
     return ", ".join(topics[:LISTED_MAX]) + f" and {more} more topics" * (more > 0)
 
 
 @dataclass(slots=True)
 class Recovery:
-    """The result of a recovery."""
+    """The result of `recover`."""
 
-    size: int  # of the damaged file [bytes]
+    size: int  # size of the damaged file [bytes]
     kept: dict[str, int]  # number of objects in the new file, by kind
     dropped: dict[str, int]  # number of objects that are known to be lost (only "messages")
-    bytes_lost: int  # behind the last intact record [bytes]
+    bytes_lost: int  # number of bytes after the last intact record
     notes: list[str]  # what is missing or doubtful, in words
     index_is_new: bool  # whether the old file had no readable index
 
     @property
     def complete(self) -> bool:
-        """Return whether nothing is missing or doubtful."""
+        """Whether nothing is missing or doubtful."""
         return not self.notes
 
     @property
     def share(self) -> float:
-        """Return the share of the messages that were kept, in [0, 1].
+        """Share of the messages that were kept, in [0, 1].
 
-        If the number of messages is unknown, return the share of the bytes. The share is below 1 if
+        If the number of messages is unknown, it is the share of the bytes. The share is below 1 if
         anything is missing.
         """
         if self.complete:
@@ -399,13 +400,13 @@ class Recovery:
 
 
 def recover(source: Path, target: Path) -> Recovery:
-    """Write a complete copy of a recording that may be torn, up to its first damaged part.
+    """Write a complete copy of a recording that may be torn or damaged.
 
-    The copy has the topics that cloudrc records, the attachments and the metadata, and a note about
-    what is missing. It replaces `target` atomically.
+    The copy contains the topics that cloudrc records, the attachments, the metadata, and a note
+    about what is missing. It ends before the first damaged part. It replaces `target` atomically.
 
     Raises:
-        BadInputError: If the file holds no readable message.
+        BadInputError: If the file contains no readable message.
         OSError: If the new file cannot be written.
     """
     contents, records, lost = _read(source)

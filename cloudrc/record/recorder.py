@@ -1,8 +1,8 @@
-"""Record a real-time process into a file without blocking its loop.
+"""Record the flight of a real-time process without delaying its control loop.
 
-The loop puts records into a bounded queue; a thread (`cloudrc/drivers/recording.py`) writes the
-records. If the queue is full, the oldest record is dropped and counted. An error of the file never
-stops the flight: no method raises an exception.
+The loop puts records into a queue of limited length, and a thread (`cloudrc/drivers/recording.py`)
+writes them to the file. If the queue is full, the oldest record is dropped and counted. A file
+error must not stop the flight, so no method raises an exception.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ TROUBLE = {
     errno.EROFS: "disk is read-only",
 }
 CAPACITY = 20_000
-"""Number of records that the queue holds; world or cloud makes as many in about 30 s."""
+"""Number of records in the queue: world or cloud makes as many in about 30 s."""
 
 
 class Recorder:
-    """A queue between a thread that puts records and one that drains them; a third may call `sync`.
+    """Queue of records: one thread calls `put`, another calls `drain`, and a third may call `sync`.
 
     Attributes:
-        error: Why records are missing from the file, in words; "" without an error.
+        error: Why records are missing from the file, in words; "" if there was no error.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Recorder:
     ) -> None:
         """Create the queue of `capacity` records; the first `drain` opens the file.
 
-        At `size_max` [bytes] the file is ended; None for no limit.
+        When the file reaches `size_max` [bytes], recording ends; None means no limit.
         """
         self.error = ""
         self._path = path
@@ -59,7 +59,7 @@ class Recorder:
 
     @property
     def dropped(self) -> int:
-        """Return the number of records that did not reach the file."""
+        """Number of records that did not reach the file."""
         return self._overflowed + self._unwritten
 
     def put(self, records: Iterable[Record]) -> None:
@@ -73,7 +73,7 @@ class Recorder:
                 self._overflowed += 1
 
     def drain(self, max_records: int = 64) -> int:
-        """Write at most `max_records` records, which delays the loop; return their number."""
+        """Write up to `max_records` records and return their number; more would delay the loop."""
         if self._sink is None and not self._ended:
             try:
                 self._sink = self._open_sink(self._path)
@@ -88,7 +88,7 @@ class Recorder:
         return taken
 
     def flush(self, *, sync: bool = True) -> None:
-        """Hand the written data to the operating system; `sync` them to the disk, too."""
+        """Pass the written data to the operating system; with `sync`, also to the disk."""
         if self._sink and not self._ended:
             try:
                 self._sink.flush()
@@ -102,7 +102,7 @@ class Recorder:
                 self._stop(error)
 
     def sync(self) -> bool:
-        """Sync the flushed data to the disk, however long that takes; return whether it worked."""
+        """Write flushed data to the disk, however long that takes; return whether it worked."""
         sink = self._sink
         if sink is not None and not self._ended:
             try:

@@ -1,12 +1,12 @@
-"""Convert rows of topics to ROS 2 messages in CDR and back.
+"""Convert rows of topics to ROS 2 messages in CDR encoding, and back.
 
-Only this module converts quaternions from `wxyz` to `xyzw`, and an odometry's velocity from the
-world frame to the body frame. Every message begins with a `std_msgs/Header` that has the row's
-stamp; the frames are `world` and `base_link`.
+ROS writes quaternions as `xyzw` and the velocity of an odometry in the body frame. Only this module
+converts them from and to cloudrc's `wxyz` and world frame. Every message begins with a
+`std_msgs/Header`, which contains the row's stamp; the frames are `world` and `base_link`.
 
 The message types in `cloudrc_msgs` are generated from `cloudrc/record/topics.py`, with a comment
-and a unit for each field; the other types are standard ROS types. rosbags parses, encodes and
-hashes all types.
+and a unit for each field. All other types are standard ROS types. The package rosbags parses,
+encodes and hashes all types.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _ROS_NAMES: dict[Kind, str] = {
     "quaternion": "geometry_msgs/Quaternion",
 }
 TEXT_MAX = 1 << 16
-"""Longest definition that is parsed [characters]; those of cloudrc and ROS have a few thousand."""
+"""Longest type definition that is parsed [characters]; those of cloudrc and ROS are shorter."""
 STORE = get_typestore(Stores.ROS2_JAZZY)
-"""The message types of rosbags, including those of cloudrc."""
+"""All message types that rosbags can encode: those of ROS 2 Jazzy and of cloudrc."""
 
 
 def _own_definition(ros_type: str) -> str:
@@ -73,18 +73,18 @@ for _name in _NAMES:
 
 
 def definition(ros_type: str) -> str:
-    """Return the definition, as `ros2msg`, of a topic's type and of the types that it uses."""
+    """Return a message type's definition as `ros2msg`, including the types that it uses."""
     return _DEFINITIONS[ros_type]
 
 
 def type_hash(ros_type: str) -> str:
-    """Return the RIHS01 hash by which ROS 2 identifies the type of a topic."""
+    """Return the RIHS01 hash by which ROS 2 identifies a message type."""
     return _HASHES[ros_type]
 
 
 @lru_cache(maxsize=256)
 def is_known(ros_type: str, text: str) -> bool:
-    """Check whether a type's definition from a file has the layout that `decode` expects."""
+    """Check whether a definition from a file has the layout that `decode` expects of the type."""
     if text == definition(ros_type):
         return True
     if len(text) > TEXT_MAX:  # its parser is slow
@@ -99,8 +99,7 @@ def is_known(ros_type: str, text: str) -> bool:
 
 _SECOND_NS = 1_000_000_000
 _ENCAPSULATION = 4
-"""Size of the encapsulation header before the message [bytes]; its second byte is 1 if the message
-is little-endian."""
+"""Size of the encapsulation header [bytes]; its second byte is 1 in little-endian messages."""
 
 _type: dict[str, Any] = dict(STORE.types)
 _Time, _Header = _type["builtin_interfaces/msg/Time"], _type["std_msgs/msg/Header"]
@@ -114,21 +113,21 @@ _NO_COVARIANCE = np.zeros(36)
 
 
 def encode(topic: Topic, stamp_ns: int, values: Values) -> bytes:
-    """Encode stamp [ns] and values of a row as little-endian CDR bytes with their header."""
+    """Encode stamp [ns] and values of a row as little-endian CDR with encapsulation header."""
     header = _Header(_Time(*divmod(stamp_ns, _SECOND_NS)), "world")
     message = _CODECS[topic.name][0](header, values)
     return bytes(STORE.serialize_cdr(message, topic.ros_type, little_endian=True))
 
 
 def decode(topic: Topic, data: bytes) -> tuple[int, Values]:
-    """Decode CDR bytes with their header to the stamp [ns] and the values of a row."""
+    """Decode CDR bytes with encapsulation header to stamp [ns] and values of a row."""
     message: Any = STORE.deserialize_cdr(data, topic.ros_type)
     stamp = message.header.stamp
     return stamp.sec * _SECOND_NS + stamp.nanosec, _CODECS[topic.name][1](message)
 
 
 def shifted(data: bytes, offset_ns: int) -> bytes:
-    """Shift a message's stamp by `offset_ns` [ns] without decoding the rest of the message."""
+    """Add `offset_ns` [ns] to a message's stamp, without decoding the other values."""
     if offset_ns == 0:
         return data
     stamp = struct.Struct("<iI" if data[1] else ">iI")
@@ -188,7 +187,7 @@ _STANDARD: dict[str, _Codec] = {
         lambda message: (_xyz(message.point),),
     ),
 }
-"""Type -> its codec; a topic may have fewer fields than the type."""
+"""Standard ROS type -> functions to encode and decode it; topics may use a part of its fields."""
 _TO_ROS: dict[Kind, Callable[[Any], Any]] = {
     "int": int,
     "float": float,

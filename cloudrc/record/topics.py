@@ -1,8 +1,8 @@
-"""Define the topics of a recording and convert records to their rows.
+"""Define the topics of a recording, and convert records to rows of topics.
 
-A record gives a row in one or more topics. A topic is a table with the column `stamp_ns` and the
-fields below, which are named as in `cloudrc/records.py`. In these tables quaternions are `wxyz` and
-velocities are in the world frame; `cloudrc/record/ros.py` converts both for ROS.
+Each record gives a row in one or more topics. A topic is a table with the column `stamp_ns` and the
+fields below, which are named as in `cloudrc/records.py`. Quaternions are `wxyz` and velocities are
+in the world frame; `cloudrc/record/ros.py` converts both for ROS.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from cloudrc.records import Record
 Kind: TypeAlias = Literal["int", "float", "bool", "string", "vector", "quaternion"]
 Values: TypeAlias = tuple[Any, ...]
 Row: TypeAlias = tuple[str, int, Values]
-"""Topic, stamp [ns] on the clock of the end that records, values in the order of the fields."""
+"""Topic, stamp [ns] on the clock of the recording end (world or cloud), values of the fields."""
 
 
 class Field(NamedTuple):
     """A column of a topic."""
 
-    name: str  # of the column and of the ROS field
-    kind: Kind  # of a value; vectors have shape (3,), quaternions shape (4,)
-    unit: str  # of the values; "" without a unit
+    name: str  # name of the column and of the ROS field
+    kind: Kind  # kind of a value; vectors have shape (3,), quaternions (4,)
+    unit: str  # unit of the values; "" without a unit
     text: str  # meaning of the values
     path: str = ""  # dotted path of the value in the record; "" if it follows from the name
 
@@ -34,14 +34,14 @@ class Field(NamedTuple):
 class Topic(NamedTuple):
     """A table of the recording."""
 
-    name: str  # in the MCAP file, with its slash
+    name: str  # name in the MCAP file, with its slash
     ros_type: str  # a type of `cloudrc_msgs` is defined by `fields`
     source: type[Record]  # class of the records
-    end: Literal["world", "cloud", "either"]  # that records the topic
+    end: Literal["world", "cloud", "either"]  # end that records the topic
     text: str  # meaning of a row
     fields: tuple[Field, ...]  # the columns after `stamp_ns`
     stamp_path: str = "stamp_ns"  # dotted path of the row's stamp in the record
-    part: str = ""  # path to a nested record, with a dot at its end; it has what the record has not
+    part: str = ""  # path of a nested record with the other fields, with a dot at its end
 
     def paths(self) -> list[str]:
         """Return the dotted path of each field's value in the record."""
@@ -62,7 +62,7 @@ _WAY = Field("uplink", "bool", "", "true for the uplink, false for the downlink"
 _EPOCH = Field("epoch", "int", "", "epoch of its session")
 _COUNTER = Field("counter", "int", "", "counter in the datagram's header")
 _BASIS = Field("basis_stamp_ns", "int", "ns", "stamp of the odometry used, world's clock")
-_END = Field("end", "string", "", "who recorded it: world, cloud or link")
+_END = Field("end", "string", "", "process that recorded the row: world, cloud or link")
 _SLIP = Field("slip_ns", "int", "ns", "lag of world's clock behind the machine's monotonic clock")
 _GUARD = "0 GROUND, 1 TRACK, 2 HOLD, 3 LAND, 4 ESTOP"
 _CAUSES = "of the guard's state: " + "; ".join(f"{cause:d} {cause.words}" for cause in Cause)
@@ -90,11 +90,11 @@ _ARRIVAL = (
 # fmt: off
 _TABLE = (
     Topic("/odometry", "nav_msgs/msg/Odometry", rec.TelemetrySent, "world",
-        "Measured pose and twist as sent, at the instant of the measurement, world's clock",
+        "Measured pose and twist, as sent to cloud, world's clock",
         _POSE_AND_TWIST,
         stamp_path="telemetry.odometry.stamp_ns", part="telemetry.odometry."),
     Topic("/telemetry", "cloudrc_msgs/msg/Telemetry", rec.TelemetrySent, "world",
-        "The other fields of the telemetry sent, world's clock", (
+        "Telemetry sent to cloud, without the pose and twist, world's clock", (
         _EPOCH,
         _COUNTER,
         Field("odometry_stamp_ns", "int", "ns", _ODOMETRY, "telemetry.stamp_ns"),
@@ -102,10 +102,10 @@ _TABLE = (
         Field("echo_stamp_ns", "int", "ns", _ECHO),
         Field("echo_hold_ns", "int", "ns", "time since world applied that command; 0 if none"),
         Field("slip_ns", "int", "ns", _SLIP.text),
-        Field("mission", "int", "", "last request of the operator that world acted on"),
+        Field("mission", "int", "", "number of the last operator's request that world obeyed"),
         Field("guard", "int", "", _GUARD),
         Field("pipe_contacts", "int", "", "contacts with a pipe that began in this mission"),
-        Field("touch_speed", "float", "m/s", "of the tip's first touch of the board; NaN before"),
+        Field("touch_speed", "float", "m/s", "of the tip's first contact with the board, or NaN"),
         Field("mission_id", "int", "", "identity of the mission started last; 0 if none"),
         Field("reached", "int", "", f"waypoints reached; {MISSION_OVER} if the mission is over"),
         Field("cause", "int", "", _CAUSES)),
@@ -115,19 +115,21 @@ _TABLE = (
         _POSE_AND_TWIST,
         stamp_path="odometry.stamp_ns", part="odometry."),
     Topic("/contact_force", "cloudrc_msgs/msg/ContactForce", rec.GroundTruth, "world",
-        "Force on the touch sensor, world's clock", (
-        Field("tip_force", "float", "N", "on the arm's tip"),)),
+        "Force on the touch sensor at the tip of the arm, world's clock", (
+        Field("tip_force", "float", "N", "on the arm's tip"),
+        Field("tip_force_peak", "float", "N", "largest of all physics steps since the row before"),
+        Field("tip_impulse", "float", "N s", "force times time since the row before"))),
     Topic("/reference", "geometry_msgs/msg/TwistStamped", rec.GroundTruth, "world",
         "Velocity that the guard lets the low-level controller follow, world's clock", (
         Field("reference", "vector", "m/s", "after the guard's caps, world frame"),)),
     Topic("/uplink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "cloud",
-        "Telemetry arrived at cloud, including late ones, cloud's clock",
+        "A telemetry datagram arrived at cloud, in time or late, cloud's clock",
         _ARRIVAL),
     Topic("/downlink_delay", "cloudrc_msgs/msg/Arrival", rec.Arrival, "world",
-        "A command arrived at world, including late ones, world's clock",
+        "A command arrived at world, in time or late, world's clock",
         _ARRIVAL),
     Topic("/command_applied", "cloudrc_msgs/msg/CommandApplied", rec.CommandApplied, "world",
-        "A command was applied for the first time, world's clock", (
+        "The robot began to follow a command, world's clock", (
         *(_EPOCH, _COUNTER, _BASIS),
         Field("velocity", "vector", "m/s", "before the guard's caps, world frame"))),
     Topic("/guard", "cloudrc_msgs/msg/GuardChange", rec.GuardChange, "world",
@@ -135,36 +137,36 @@ _TABLE = (
         Field("state", "int", "", _GUARD), Field("cause", "string", "", "why, in words"))),
     Topic("/contact", "cloudrc_msgs/msg/Contact", rec.Contact, "world",
         "The robot touched something, world's clock", (
-        Field("body", "string", "", "the scene's body: pipe_1, board, floor"),
+        Field("body", "string", "", "touched body of the scene: pipe_1, board, floor"),
         Field("position", "vector", "m", "of the base, world frame"),
-        Field("velocity", "vector", "m/s", "of the base just before, world frame"),
-        Field("tip_velocity", "vector", "m/s", "of the arm's tip just before, world frame"),
+        Field("velocity", "vector", "m/s", "of the base just before the contact, world frame"),
+        Field("tip_velocity", "vector", "m/s", "of the tip just before the contact, world frame"),
         Field("tip", "bool", "", "true if the arm's tip touched, false for any other part"))),
     Topic("/session", "cloudrc_msgs/msg/SessionOpened", rec.SessionOpened, "either",
         "A session began under a new epoch, clock of its end", (
         _END, _EPOCH, Field("cause", "string", "", "why, in words"))),
     Topic("/estimated_odometry", "nav_msgs/msg/Odometry", rec.Control, "cloud",
-        "Prediction that the controller used, of the state at basis_stamp_ns + horizon (both in"
-        " /delay_estimate); its stamp is that of the command, cloud's clock",
+        "Predicted pose and twist that the controller used; the prediction is for the instant"
+        " basis_stamp_ns + horizon (both in /delay_estimate), cloud's clock",
         _POSE_AND_TWIST[:3]),
     Topic("/setpoint_position", "geometry_msgs/msg/PointStamped", rec.Control, "cloud",
-        "What the controller tracks, cloud's clock", (
+        "Position that the controller tracks, cloud's clock", (
         Field("setpoint", "vector", "m", "position to fly to, world frame"),)),
     Topic("/cmd_vel", "geometry_msgs/msg/TwistStamped", rec.Control, "cloud",
-        "Velocity commanded, cloud's clock", (
+        "Velocity command that cloud sent, cloud's clock", (
         Field("command", "vector", "m/s", "world frame"),
         Field("yaw_rate", "float", "rad/s", "about the world's z axis"))),
     Topic("/delay_estimate", "cloudrc_msgs/msg/DelayEstimate", rec.Control, "cloud",
-        "The delay that the prediction bridged, cloud's clock", (
+        "Estimated delay, over which the odometry was predicted, cloud's clock", (
         _EPOCH,
         _COUNTER,
         _BASIS,
         Field("horizon", "float", "s", "time by which the odometry was predicted ahead"),
-        Field("rtt", "float", "s", "last round trip without the hold; NaN before the first"),
-        Field("loop_delay", "float", "s", "last round trip with the hold: tau_n of the paper"),
+        Field("rtt", "float", "s", "last round trip without the time in world, or NaN"),
+        Field("loop_delay", "float", "s", "round trip with the time in world: the paper's tau_n"),
         Field("measured", "vector", "m", "position in the odometry used, world frame"))),
     Topic("/pid", "cloudrc_msgs/msg/Pid", rec.Control, "cloud",
-        "Terms of the controller, cloud's clock", (
+        "Terms of the controller's velocity command, cloud's clock", (
         Field("waypoint", "int", "", "index of the waypoint flown to; -1 if none"),
         Field("proportional", "vector", "m/s", "term per axis, world frame"),
         Field("integral", "vector", "m/s", "term per axis, world frame"),
@@ -177,42 +179,42 @@ _TABLE = (
     Topic("/fault", "cloudrc_msgs/msg/Fault", rec.Fault, "either",
         "A fault that did not stop the flight, clock of its end", (
         Field("code", "string", "", _CODES),
-        Field("text", "string", "", "what, where, what to do"))),
+        Field("text", "string", "", "what is wrong, where, what to do"),
+        Field("traceback", "string", "", "of a plug-in's first failure, else empty"))),
     Topic("/count", "cloudrc_msgs/msg/Counted", rec.Counted, "either",
-        "A counter, clock of its end", (
+        "Value of a counter, clock of its end", (
         _END,
         Field("name", "string", "", _COUNTED),
         Field("total", "int", "", "count since the start"))),
     Topic("/link", "cloudrc_msgs/msg/LinkChanged", rec.LinkChanged, "either",
-        "The emulated link of this end was first seen, has changed or is repeated, in real time"
-        " only, clock of its end", (
+        "Conditions of the emulated link towards this end, in real time only, clock of its end", (
         _WAY,
         Field("shaper", "string", "", "relay or netem"),
         Field("cause", "string", "", "why it changed; empty before the first change"),
         Field("age", "float", "s", "time since these conditions took effect"),
-        Field("time_line", "float", "s", "since the time line began; NaN: not restarted"),
+        Field("time_line", "float", "s", "time since the time line began; NaN: not restarted"),
         Field("delay", "float", "s", "profile's delay at the start of the time line, one way"),
         Field("jitter", "float", "s", "profile's jitter at the start of the time line"),
         Field("loss", "float", "1", "profile's mean loss at the start of the time line"),
-        Field("rate", "float", "bit/s", "profile's rate at that instant; NaN without one"),
+        Field("rate", "float", "bit/s", "profile's rate at the start of the time line, or NaN"),
         Field("conditions", "string", "", "the profile as JSON"))),
     Topic("/link_check", "cloudrc_msgs/msg/LinkChecked", rec.LinkChecked, "either",
-        "A measured quantity of the link to the end that writes this, and whether it is as asked;"
-        " only in `local` and `cluster` mode, clock of its end", (
+        "A measured quantity of the link towards this end, compared with its profile, in real time"
+        " only, clock of its end", (
         _WAY,
-        Field("quantity", "string", "", "mean, deviation, round_trip, loss..."),
-        Field("asked", "float", "s or 1", "expected from the profile: a delay or a share"),
-        Field("measured", "float", "s or 1", "measured: a delay or a share"),
+        Field("quantity", "string", "", "mean, deviation, round_trip, loss, ..."),
+        Field("asked", "float", "s or 1", "value expected from the profile: a delay or a share"),
+        Field("measured", "float", "s or 1", "measured value: a delay or a share"),
         Field("low", "float", "s or 1", "lowest accepted value"),
         Field("high", "float", "s or 1", "highest accepted value"),
         Field("verdict", "string", "",
-            "ok, off, or open with too few datagrams; told is not judged"),
+            "ok, off, or open (undecided); told: not judged"),
         Field("datagrams", "int", "", "number of datagrams measured"))),
     Topic("/lateness", "cloudrc_msgs/msg/Lateness", rec.Lateness, "either",
-        "The lateness of a wake, in real time only, clock of its end", (
+        "Lateness of one period of the loop, in real time only, clock of its end", (
         _END,
-        Field("lateness", "float", "s", "now minus the deadline"),
-        Field("busy", "float", "s", "time to handle it"),
+        Field("lateness", "float", "s", "time from the deadline to its handling"),
+        Field("busy", "float", "s", "duration of the handling"),
         _SLIP)),
 )
 # fmt: on
@@ -224,7 +226,7 @@ _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Val
 
 
 def values_getter(paths: list[str]) -> Callable[[Any], Values]:
-    """Make a function that reads the values at dotted paths from a record, always as a tuple."""
+    """Make a function that returns the values at dotted paths in a record, as a tuple."""
     if not paths:
         return lambda record: ()
     get = attrgetter(*paths)
@@ -243,7 +245,7 @@ _UPLINK, _DOWNLINK = _EXTRACT.pop(rec.Arrival)
 
 
 def rows(record: Record) -> list[Row]:
-    """Convert a record to one row for each of its topics, in the order of `TOPICS`."""
+    """Convert a record to one row for each topic that it belongs to, in the order of `TOPICS`."""
     if isinstance(record, rec.Arrival):
         name, stamp, values = _UPLINK if record.uplink else _DOWNLINK
         return [(name, stamp(record), values(record))]

@@ -1,9 +1,9 @@
 """Write records to an MCAP file that ROS 2 tools can read.
 
-The MCAP profile is `ros2`, schemas are `ros2msg`, messages are `cdr`, and zstd compresses the
-chunks. A chunk goes to the operating system after at most half a second of recording, so a killed
-process loses at most half a second. Chunks, the data section and the index have checksums, so a
-reader detects every wrong byte. A complete file also holds the number and the hash of its messages.
+The file has the MCAP profile `ros2`, schemas in `ros2msg`, messages in `cdr`, and chunks compressed
+with zstd. A chunk goes to the operating system after at most half a second of recording, so a
+killed process loses at most half a second. Chunks, the data section and the index have checksums,
+so a reader detects every wrong byte. A complete file contains the number and hash of its messages.
 """
 
 from __future__ import annotations
@@ -42,25 +42,25 @@ CHUNK_NS = 500_000_000
 METADATA = "cloudrc"
 """Name of the file's metadata record."""
 CLOCK = "clock"
-"""Metadata key: the end ("world" or "cloud") whose clock the stamps use."""
+"""Metadata key: whose clock the stamps use, "world" or "cloud"."""
 MISSING = "missing"
 """Metadata key: what is missing from the file, in words."""
 CHANGED = "changed"
-"""Metadata key: what another program has removed from the file or added to it, in words."""
+"""Metadata key: what another program removed from the file or added to the file, in words."""
 COUNTS, SHA256 = "counts", "messages_sha256"
-"""Metadata keys of a complete file: number of messages by topic as JSON, and hash of the messages
-by `record.hash`. The values show whether another program has changed the recording. The value of
-`COUNTS` is "" until the file is complete."""
+"""Metadata keys: number of messages by topic as JSON, and hash of the messages as from
+`messages_sha256`. With them a reader detects messages that were removed, added or changed. The
+value of `COUNTS` is "" until the file is complete."""
 
 
 class McapWriter:
-    """Writes the rows of one end, or of a whole mission, to one MCAP file."""
+    """Writes the rows of world, of cloud, or of a whole mission to one MCAP file."""
 
     def __init__(self, target: Path | IO[bytes], *, clock: str, clock_id: str = "") -> None:
-        """Open a file, or use a stream that the caller closes; any method may raise an OSError.
+        """Open a file, or use a stream that the caller closes; every method may raise an OSError.
 
-        The stamps use the clock of the end `clock`, "world" or "cloud". `clock_id` identifies the
-        machine's clock ("" if unknown); files with the same `clock_id` need no clock offset.
+        `clock` is "world" or "cloud", the clock of the stamps. `clock_id` identifies the machine's
+        clock ("" if unknown); files with the same `clock_id` need no clock offset.
         """
         self._owned = isinstance(target, Path)
         # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.
@@ -78,7 +78,7 @@ class McapWriter:
         self._noted: dict[str, str] = {}
         self._latest_ns = 0
         self._chunk_start_ns: int | None = None
-        self._number = 0  # of the last message
+        self._number = 0  # log time of the last message [ns]
         self._counts: Counter[str] = Counter()
         self._sha256 = hashlib.sha256()
         self._mcap._Writer__chunk_indices = _ChunkIndexes()  # type: ignore[attr-defined]
@@ -86,22 +86,22 @@ class McapWriter:
         self.note({CLOCK: clock, "clock_id": clock_id, "version": __version__, COUNTS: ""})
 
     def write(self, records: Iterable[Record]) -> None:
-        """Write all rows of one end's records, oldest first."""
+        """Write all rows of records from world or from cloud, oldest first."""
         for record in records:
             for row in rows(record):
                 self.write_row(row, row[1])
             self._open_records += 1
 
     def write_row(self, row: Row, log_time_ns: int) -> None:
-        """Write one row; `log_time_ns` [ns] is as in `write_message`."""
+        """Write one row; `log_time_ns` [ns] is as for `write_message`."""
         topic, stamp_ns, values = row
         self.write_message(topic, log_time_ns, encode(TOPICS[topic], stamp_ns, values))
 
     def write_message(self, topic: str, log_time_ns: int, data: bytes) -> None:
-        """Write the CDR bytes of a message of a topic.
+        """Write the CDR bytes of one message.
 
-        If `log_time_ns` [ns] is negative or less than that of the previous message, the message
-        gets the previous log time.
+        If `log_time_ns` [ns] is negative or less than that of the previous message, the previous
+        log time is used.
         """
         now_ns = self._latest_ns = max(self._latest_ns, log_time_ns)
         if self._chunk_start_ns is None:
@@ -122,18 +122,18 @@ class McapWriter:
         self._mcap.add_metadata(METADATA, dict(self._noted))
 
     def attach(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
-        """Attach the bytes of a file, such as report.json, to the recording."""
+        """Attach a file, such as report.json, to the recording."""
         self._mcap.add_attachment(0, self._latest_ns, name, media_type, data)
 
     def flush(self) -> None:
-        """Close the present chunk and hand it to the operating system."""
+        """Complete the present chunk and pass it to the operating system."""
         self._chunk_start_ns = None
         self._mcap.flush()
         self._whole = self._stream.tell()
         self._open_records = 0
 
     def sync(self) -> None:
-        """Sync the flushed data to the disk, which may take seconds."""
+        """Write flushed data to the disk, which may take seconds."""
         if self._owned:
             try:
                 os.fsync(self._stream.fileno())
@@ -142,9 +142,9 @@ class McapWriter:
                     raise
 
     def abandon(self, reason: str) -> int:
-        """Cut off the torn end after an error, and note the reason if there is space.
+        """After an error, cut off the incomplete end of the file; if possible, note the reason.
 
-        Return the number of records that were written but are lost.
+        Return the number of records that were passed to `write` but are not in the file.
         """
         note: Any = RecordBuilder()  # without type annotations
         end: Any = RecordBuilder()
@@ -165,7 +165,7 @@ class McapWriter:
         return self._open_records
 
     def close(self) -> None:
-        """Write the index and close the file. After an error the caller calls `abandon` instead."""
+        """Write the index and close the file. After an error, call `abandon` instead."""
         self.flush()  # keeps the last chunk even if there is no space for the index
         self.note({COUNTS: json.dumps(self._counts), SHA256: self._sha256.hexdigest()})
         self._mcap.finish()
@@ -198,10 +198,10 @@ class McapWriter:
 
 
 class _ChunkIndexes:
-    """The writer's list of the chunks so far, compressed.
+    """List of the chunks written so far, compressed in memory.
 
-    The list of mcap takes 12 MB for an hour of recording. This list takes a third of a megabyte,
-    because its offsets count from the end of their chunk, so most bytes repeat.
+    mcap's own list takes 12 MB for an hour of recording, this list a third of a megabyte. It stores
+    offsets relative to the end of their chunk, so most bytes repeat and compress well.
     """
 
     def __init__(self) -> None:
@@ -209,7 +209,6 @@ class _ChunkIndexes:
         self._compress = zlib.compressobj()
 
     def append(self, index: ChunkIndex) -> None:
-        """Add the index of a chunk."""
         row: Any = RecordBuilder()
         _moved(index, -1).write(row)
         if block := self._compress.compress(row.end()):
@@ -224,10 +223,9 @@ class _ChunkIndexes:
 
 
 def _moved(index: ChunkIndex, sign: int) -> ChunkIndex:
-    """Add to the offsets of a chunk's index, or subtract from them, the end of the chunk.
+    """Add `sign` times the end of the chunk to the offsets in a chunk's index, modulo 2^64.
 
-    The offsets are counted modulo 2^64: in a file without positions, such as /dev/null, every
-    offset is 0.
+    In a file without positions, such as /dev/null, every offset is 0, so the sum may be negative.
     """
     end = sign * (index.chunk_start_offset + index.chunk_length)
     offsets = {name: (at + end) % 2**64 for name, at in index.message_index_offsets.items()}

@@ -1,1 +1,1 @@
-"""Judge and measure a recorded flight; write its report with numbers, figures and one page."""
+"""Measure and judge a recorded flight; write a report with numbers, figures and an HTML page."""

@@ -21,39 +21,39 @@ PACKAGES = (
     *("cloudrc", "mujoco", "numpy", "pydantic", "pyyaml", "cryptography", "mcap", "rosbags"),
     "matplotlib",
 )
-"""Packages whose version can change the results of a run or its report."""
+"""Packages whose versions can change the results of a run or a report."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
     """Facts about a run that are not in its recording.
 
-    `records_sha256` is the hash by `record.hash`: of all records of a run in virtual time, of all
-    messages of a run in real time. It is None if the recording is incomplete.
+    `records_sha256` is a hash from `cloudrc.record.hash`: of all records of a run in virtual time,
+    or of all recorded messages of a run in real time. It is None if the recording is incomplete.
     """
 
     mode: str  # "virtual", "local" or "cluster"
     shaper: str  # what emulated the link: "virtual", "relay" or "netem"
     records_sha256: str | None = None
-    interrupted: bool = False  # whether the run was stopped
-    notes: tuple[str, ...] = ()  # for the reader, a sentence each
+    interrupted: bool = False  # whether the user stopped the run
+    notes: tuple[str, ...] = ()  # sentences for the reader of the report
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """A run, measured and judged."""
+    """A run with its measurements and its verdict."""
 
     run: Run
     experiment: ResolvedExperiment
     flight: Flight
-    numbers: dict[str, Number]  # without unknown numbers
+    numbers: dict[str, Number]  # metric -> value, for metrics with a known value
     verdict: Verdict
-    operator: Verdict | None  # the operator's verdict if it differs
-    notes: tuple[str, ...]  # for the reader, a sentence each
+    operator: Verdict | None  # verdict at the end of the mission, if it differs
+    notes: tuple[str, ...]  # sentences for the reader of the report
 
     @property
     def document(self) -> dict[str, Any]:
-        """Content of report.json."""
+        """The content of report.json."""
         recording, numbers = self.flight.recording, self.numbers.items()
         values = {name: {"value": number.value, "unit": number.unit} for name, number in numbers}
         return _known(
@@ -70,13 +70,14 @@ class Assessment:
                 "numbers": values,
                 "clock_offset": clock_offset_document(recording.metadata),
                 "complete": recording.complete,
+                "traceback": next(filter(None, recording["/fault"]["traceback"]), None),
                 "notes": list(self.notes),
             }
         )
 
 
 def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
-    """Describe the clock offset in a recording's metadata; None if no stamps were shifted."""
+    """Describe how the stamps of cloud were shifted to world's clock; None if they were not."""
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
         return None
@@ -86,7 +87,7 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
 
 
 def environment_document() -> dict[str, Any]:
-    """Describe the software and hardware that made the report, without user or host names."""
+    """Describe the software and hardware of this machine, without names of users and hosts."""
     packages = {}
     for name in PACKAGES:
         try:
@@ -105,7 +106,6 @@ def environment_document() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """Read the processor's model from /proc/cpuinfo; if that fails, ask Python."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -129,5 +129,5 @@ def _verdict_document(verdict: Verdict) -> dict[str, Any]:
 
 
 def _known(entries: dict[str, Any]) -> dict[str, Any]:
-    """Remove entries that are None: an unknown value is absent, never zero or null."""
+    """Remove unknown values, which are None: a document does not contain them."""
     return {name: value for name, value in entries.items() if value is not None}

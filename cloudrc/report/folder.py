@@ -1,7 +1,7 @@
 """Read the folder of a recorded run, and refuse a recording that is not sufficient for a report.
 
-A new report of an old run is made from `mission.mcap`. Other programs may have filtered, cut,
-renamed or replaced that file. Then no report is written, and the earlier one stays unchanged.
+A new report of an old run is made from `mission.mcap`. If another program has filtered, cut or
+replaced this file, no report is written, and the old report stays unchanged.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from cloudrc.report.document import Run
 from cloudrc.report.write import DIFFERS, RECORDING_NOTE
 
 REPORT_BYTES_MAX = 16 << 20
-"""Largest report.json that is read [bytes]; a report may have many notes."""
+"""Largest size of a report.json that is read [bytes]; large enough for many notes."""
 JUDGEMENT = ("criteria", "description", "name", "report")
-"""Keys of an experiment that change the report, but not the flight."""
+"""Keys of an experiment that affect the report, but not the flight."""
 
 
 class _EarlierReport(BaseModel):
-    """Content of an earlier report.json that a new report keeps."""
+    """Values of an earlier report.json that a new report repeats."""
 
     mode: Literal["virtual", "local", "cluster"]
     shaper: str
@@ -46,13 +46,13 @@ class _EarlierReport(BaseModel):
 
 
 def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
-    """Read the folder of a run, complete or torn, as arguments for `write_report`.
+    """Read the folder of a run; return arguments for `write_report`.
 
-    If the run ended before it merged the recordings of both ends, this function merges them.
+    The run may be incomplete. If the recordings of world and cloud are not merged yet, merge them.
 
     Raises:
-        BadInputError: If the folder has no experiment or no readable recording, or if the
-            recording lacks what a report needs.
+        BadInputError: If the folder has no experiment or no readable recording, or if data that a
+            report needs is missing from the recording.
     """
     config, merged = folder / "config.yaml", folder / "mission.mcap"
     if not config.is_file():
@@ -71,7 +71,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
 
 
 def _read_merged(folder: Path) -> Contents | None:
-    """Read mission.mcap. Return None if it is absent or torn and the ends' recordings exist."""
+    """Read mission.mcap; return None if the recordings of world and cloud have to be merged."""
     ends = [(folder / f"{end}.mcap").is_file() for end in ("world", "cloud")]
     if not (folder / "mission.mcap").exists():
         if not any(ends):
@@ -88,10 +88,10 @@ def _read_merged(folder: Path) -> Contents | None:
 
 
 def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str]:
-    """Yield the reasons why a recording is not sufficient for a report, the plainest reason first.
+    """Yield the reasons why a recording is not sufficient for a report, the clearest first.
 
-    `config` is the configuration in the folder of the run. `whole` says that the earlier report was
-    of a complete recording.
+    `config` is the path of config.yaml. `whole` tells whether the earlier report was made from a
+    complete recording.
     """
     if not any(len(recording[topic]) for topic in TOPICS):
         yield "; ".join(["holds no message of cloudrc", *recording.remarks])
@@ -114,7 +114,7 @@ def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str
 
 
 def _flown(data: bytes, name: str) -> dict[str, Any]:
-    """Parse the part of a configuration that determines a flight."""
+    """Parse a configuration; return only the keys that affect the flight."""
     document, _ = parse_yaml(data.decode("utf-8", "replace"), name)
     values = document if isinstance(document, dict) else {}
     return {key: value for key, value in values.items() if key not in JUDGEMENT}
@@ -129,19 +129,19 @@ def _earlier_report(source: Path | bytes | None) -> _EarlierReport | None:
 
 
 def _describe(recording: Recording, earlier: _EarlierReport | None, contents: Contents) -> Run:
-    """Describe a run by its earlier report.
+    """Describe a run, with values from its earlier report.
 
-    Without an earlier report, guess mode and shaper: a run that recorded lateness was in real time.
+    Without an earlier report, infer mode and shaper: only runs in real time record lateness.
     """
     if earlier is None:
         real_time = len(recording["/lateness"]) > 0
         mode, shaper = ("local", "relay") if real_time else ("virtual", "virtual")
         earlier = _EarlierReport.model_validate({"mode": mode, "shaper": shaper})
-    # Each report writes these notes anew.
+    # A new report writes its own notes of these kinds.
     anew = (METRIC_NOTE, RECORDING_NOTE, DIFFERS)
     notes = [note for note in earlier.notes if not note.startswith(anew)]
     digest: str | None = messages_sha256(contents.messages)
-    if earlier.mode == "virtual":  # its hash is of all records, and is in the recording
+    if earlier.mode == "virtual":  # the report in the recording has the hash of all records
         unchanged = recording.metadata.get(SHA256, digest) == digest
         kept = _earlier_report(recording.attachments.get("report.json"))
         digest = kept.records_sha256 if kept and unchanged else None

@@ -1,6 +1,6 @@
-"""Make the page report.html: verdict, a summary in words, numbers and figures in one file.
+"""Make the page report.html with the verdict, a summary, numbers and figures.
 
-The page embeds its pictures, uses the reader's fonts and sends no request to the network.
+The page is one file with all pictures. It uses the reader's fonts and loads nothing from a network.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ HEADLINES = {
     "invalid": ("The run is invalid: it did not keep real time.", "#7a5200"),
     "interrupted": ("The run was interrupted.", "#7a5200"),
 }
-"""Outcome -> headline and colour of the page."""
+"""Outcome of the verdict -> headline and colour of the page."""
 REPEAT = {
     True: "Run this in the folder of the report; the records will be identical:",
     False: "Run this in the folder of the report. The random numbers of the link come from the "
     "same seed. The timing of the machine differs between runs, so the numbers will be close but "
     "not identical:",
 }
-"""Whether the run was in virtual time -> how to repeat it."""
+"""Whether the run was in virtual time -> text about how to repeat the run."""
 GROUPS = {
     "Mission": "duration waypoints_reached distance_flown speed_max contact_time tip_speed "
     "peak_contact_force steady_contact_force steady_error_x steady_error_y steady_error_z",
@@ -45,13 +45,14 @@ GROUPS = {
     "Guard and faults": "hold_count hold_time fault_count recorder_dropped",
     "Real time": "real_time_factor world_slip world_lateness_p99 cloud_lateness_p99 missed_periods",
 }
-"""Groups of the table, in order; metrics in no group come last, under "Others"."""
+"""Title of a group in the table of numbers -> names of its metrics. Other metrics are under
+"Others"."""
 SHARES = ("loss_", "late_")
-"""Prefixes of the names of numbers that are shown in per cent."""
+"""Prefixes of the names of metrics that the page shows in per cent."""
 
 
 def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:
-    """Summarize the flight in a few sentences, with the known numbers."""
+    """Summarize the flight in a few sentences, from the known values of metrics."""
     if flight.start_ns is None:
         return "The robot never left the ground."
     known = {name: number.value for name, number in numbers.items()}
@@ -115,7 +116,7 @@ SENTENCES = (_waypoints, _pipes, _contact, _link, _guard)
 def render(
     assessment: Assessment, pictures: Sequence[Picture], environment: Mapping[str, Any]
 ) -> str:
-    """Fill in the page; `environment` is the content of environment.json."""
+    """Return the HTML of the page; `environment` is the content of environment.json."""
     run, experiment, verdict = assessment.run, assessment.experiment, assessment.verdict
     headline, accent = HEADLINES[verdict.outcome]
     digest = run.records_sha256
@@ -180,7 +181,6 @@ def _figure(number: int, picture: Picture) -> str:
 
 
 def _table_rows(numbers: Mapping[str, Number]) -> str:
-    """Lay out the table's body as HTML, a `tbody` for each group that has numbers."""
     groups = {title: names.split() for title, names in GROUPS.items()}
     grouped = {name for names in groups.values() for name in names}
     groups["Others"] = [name for name in numbers if name not in grouped]
@@ -195,7 +195,7 @@ def _table_rows(numbers: Mapping[str, Number]) -> str:
 
 
 def readable(name: str, number: Number) -> tuple[str, str]:
-    """Format a number in a readable unit; return the digits and the unit."""
+    """Convert a value to a readable unit; return the digits and the unit as text."""
     value, unit = number.value, number.unit
     if value == 0:
         return "0", "" if unit == "1" else unit
@@ -209,7 +209,7 @@ def readable(name: str, number: Number) -> tuple[str, str]:
 
 
 def _digits(value: float) -> str:
-    """Format with four significant digits, at most three decimals: 27.60, 0.237, 16.99."""
+    """Format with four significant digits, but at most three decimals: 27.60, 0.237, 16.99."""
     places = 3 if abs(value) < 1 else 4 - len(str(int(abs(value))))
     return f"{value:.{max(places, 0)}f}"
 

@@ -16,9 +16,9 @@ from cloudrc.record.columns import Recording
 from cloudrc.report.document import Assessment, Run, environment_document, write_json
 
 DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
-"""Beginning of the note on an operator's verdict that differs."""
+"""Start of the note that the verdict at the end of the mission differs from the report's."""
 RECORDING_NOTE = "The recording "
-"""Beginning of the notes on a recording; a new report replaces the old notes."""
+"""Start of the notes about a recording, by which a new report recognises and drops old notes."""
 
 
 def assess(
@@ -26,8 +26,8 @@ def assess(
 ) -> Assessment:
     """Measure and judge a run without writing files or drawing figures.
 
-    `own` are the user's own metrics, names or paths; files are executed. Metric files named in the
-    experiment are not executed, because the experiment may come from somebody else.
+    `own` are names or paths of the user's own metrics; files are executed. Metric files that the
+    experiment names are not executed: the experiment may come from somebody else.
     """
     mission = experiment.mission
     waypoints = mission.steps.count if mission.steps else len(mission.waypoints)
@@ -62,8 +62,8 @@ def write_report(
 ) -> dict[str, Any]:
     """Write report.json and environment.json and, if `page`, report.html with its figures.
 
-    `folder` is the folder of the run; files of an earlier report are replaced. The other arguments
-    are as in `assess`.
+    `folder` is the folder of the run, in which files of an earlier report are replaced. For the
+    other arguments see `assess`.
 
     Returns:
         Content of report.json.
@@ -95,13 +95,13 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
     link = assessment.experiment.uplink, assessment.experiment.downlink
     try:
         pictures = draw_all(Subject(assessment.flight, *link))
-    except ValueError as error:  # from matplotlib, for values that no flight has
+    except ValueError as error:  # matplotlib cannot draw impossible values
         raise BadInputError(
             f"{folder}: the recorded values cannot be drawn ({describe_error(error)}); "
             "report.json is written, check the recording"
         ) from error
     figures = folder / "figures"
-    if figures.is_symlink():  # a run from somebody else may contain a link to anywhere
+    if figures.is_symlink():  # in a folder from somebody else it may point anywhere
         raise BadInputError(f"{figures}: is a link; remove it, figures are kept with their run")
     figures.mkdir(exist_ok=True)
     for picture in pictures:
@@ -112,6 +112,6 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
 
 
 def attachments(folder: Path) -> dict[str, bytes]:
-    """Read the attachments of the recording: the configuration and the report."""
+    """Read the files to attach to a recording: name -> content of config.yaml and report.json."""
     paths = (folder / "config.yaml", folder / "report.json")
     return {path.name: path.read_bytes() for path in paths if path.exists()}

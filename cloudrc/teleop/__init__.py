@@ -1,1 +1,1 @@
-"""Teleop: turn the operator's verbs into missions, setpoints and requests to the robot."""
+"""Teleop: turn the operator's commands into missions, setpoints and requests to the robot."""

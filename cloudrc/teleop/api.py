@@ -1,7 +1,7 @@
-"""Serve teleop's API over HTTP: carry requests to the mission service, and answer in JSON.
+"""Serve teleop's HTTP API: pass requests to the mission service, and answer in JSON.
 
-Only the thread of teleop's loop may use the service. The API queues a call on the `Bridge`, and the
-loop makes the call between two deadlines.
+Only the thread of teleop's loop may call the mission service. The API therefore queues each call on
+the `Bridge`, and the loop makes the call.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ from cloudrc.teleop.store import (
 from cloudrc.teleop.wire import Leg
 
 LOOK_PERIOD = 0.1
-"""Time between two checks for new events [s]."""
+"""Time between two checks for new events, for the stream of events [s]."""
 ALIVE_PERIOD = 10.0
-"""Time without an event after which a stream sends a comment [s], so that no proxy closes it."""
+"""Time without an event after which the event stream sends a comment to the client [s]."""
 ANSWER_LIMIT = 2.0
 """Time limit for the mission service to answer [s]."""
 BODY_MAX = 256 * 1024
 """Longest body of a request [bytes]."""
 STOP_LIMIT = 1
-"""Time limit for open requests when the server stops [s]."""
+"""Time limit for open requests to end when the server stops [s]."""
 STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, UnavailableError: 503}
-"""Error -> HTTP status of the answer."""
+"""Class of an error -> HTTP status of the answer."""
 REASONS = {
     **{status: text for status, (_, text) in REFUSED.items()},
     404: "There is no such mission",
@@ -76,19 +76,19 @@ operator's token may also command. `POST /v1/estop` stops the rotors at once. Te
 """
 STARTING = "teleop is starting"
 Call: TypeAlias = Callable[[MissionService, int], Any]
-"""Function that takes the service and the time [ns] and returns the answer, or a mission."""
+"""Function of the service and the time [ns] that makes a call and returns the answer."""
 Urgent: TypeAlias = Literal["stop", "hold", ""]
 Address: TypeAlias = tuple[str, int] | Path
 """Host and port, or the path of a Unix socket."""
 
 
 class Bridge:
-    """Queue the API's calls for teleop's loop.
+    """Queue the API's calls of the mission service for teleop's loop.
 
     Attributes:
-        closed: Why no call is accepted, in words; "" if calls are accepted.
-        alarm: Function that sends an emergency stop to cloud at once, past teleop's loop.
-        overtakings: Number of stops and holds so far.
+        closed: Why the bridge refuses calls, in words; "" while it accepts calls.
+        alarm: Function that sends an emergency stop to cloud at once, without teleop's loop.
+        overtakings: Number of stops and holds so far; they overtake all other calls.
     """
 
     def __init__(self) -> None:
@@ -104,15 +104,15 @@ class Bridge:
         self._service, self.closed = service, ""
 
     def close(self, why: str) -> None:
-        """Refuse all calls from now on, and an emergency stop that still waits for its answer."""
+        """Refuse all calls from now on; answer the waiting emergency stops with an error."""
         self.closed, stops = why, self._lanes["stop"]
         while stops:
             stops.popleft()[1].set_exception(UnavailableError(why))
 
     def submit(self, call: Call, urgent: Urgent = "") -> Future[Any]:
-        """Queue a call for teleop's loop, which makes urgent calls before other calls.
+        """Queue a call for teleop's loop; the loop makes urgent calls ("stop", "hold") first.
 
-        While teleop starts, the bridge accepts only a stop.
+        While teleop starts, the bridge accepts emergency stops only.
 
         Raises:
             UnavailableError: If the bridge is closed.
@@ -125,13 +125,13 @@ class Bridge:
         return future
 
     async def ask(self, call: Call, urgent: Urgent = "") -> Any:
-        """Queue a call and return its result; a stop also sends the alarm.
+        """Queue a call and return its result; for a stop, also send the alarm at once.
 
         Raises:
             UnavailableError: If the bridge is closed, or if the loop does not answer within
-                `ANSWER_LIMIT`. Then an urgent call stays queued; any other call is withdrawn.
+                `ANSWER_LIMIT`. An urgent call then stays queued; any other call is withdrawn.
         """
-        try:  # a stop is queued before the robot can be seen to have stopped
+        try:  # queue the stop first: later, telemetry may show it already
             asked = asyncio.wrap_future(self.submit(call, urgent))
         finally:
             if urgent == "stop":
@@ -154,11 +154,11 @@ class Bridge:
         return await self.ask(checked)
 
     def take(self) -> list[Callable[[int], None]]:
-        """Return all queued calls for the loop: first stops, then holds, then the others."""
+        """Remove and return all queued calls: first stops, then holds, then all others."""
         return [call for lane in self._lanes for call in self._take(lane)]
 
     def take_stops(self) -> list[Callable[[int], None]]:
-        """Return the queued stops, which the loop makes before it processes new telemetry."""
+        """Remove and return the queued stops, which the loop makes before it reads telemetry."""
         return self._take("stop")
 
     def _take(self, lane: str) -> list[Callable[[int], None]]:
@@ -171,7 +171,7 @@ class Bridge:
             try:
                 result = call(self._service, now_ns)
                 future.set_result(result.as_json() if isinstance(result, Mission) else result)
-            except Exception as error:  # the client has to get it
+            except Exception as error:  # the client gets the error
                 future.set_exception(error)
 
 
@@ -181,19 +181,19 @@ def create_app(
     read_goto: Callable[[bytes], Leg],
     complain: Callable[[str], None],
 ) -> FastAPI:
-    """Make the ASGI application; it must run behind a `Gate`.
+    """Make the ASGI application of the API; run it behind a `Gate`, which checks the tokens.
 
     Args:
         bridge: Bridge to the mission service.
-        read_order: Reads and checks the body of a mission.
-        read_goto: Reads and checks the body of a point.
+        read_order: Reads and checks the body of a request that orders a mission.
+        read_goto: Reads and checks the body of a request to fly to a point.
         complain: Receives one line about each internal error.
     """
     app = FastAPI(
         title="cloudrc teleop",
         version=__version__,
         description=ABOUT,
-        docs_url=None,  # the pages load scripts from elsewhere
+        docs_url=None,  # its page loads scripts from other sites
         redoc_url=None,
         redirect_slashes=False,
     )
@@ -224,7 +224,6 @@ def _bridge(request: Request) -> Any:
 
 
 async def _body(request: Request) -> bytes:
-    """Read the body of a request; stop reading if the body is too long."""
     body = b""
     async for chunk in request.stream():
         body += chunk
@@ -305,7 +304,7 @@ async def resume(bridge: Bridged) -> Any:
 
 @router.post("/goto", response_model=models.MissionView, openapi_extra=_takes(models.GoToRequest))
 async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
-    """Fly straight to a point, during a held mission or as a new one; 409 as for `resume`."""
+    """Fly straight to a point, during a held mission or as a new mission."""
     leg = await run_in_threadpool(request.app.state.read_goto, body)
     return await bridge.move(lambda service, now_ns: service.go_to(leg, now_ns))
 
@@ -338,18 +337,18 @@ async def show_state(bridge: Bridged) -> Any:
 async def stream_events(
     request: Request, bridge: Bridged, after: After = 0, last_event_id: LastEvent = 0
 ) -> StreamingResponse:
-    """Stream the events of all missions after number `after` as server-sent events.
+    """Stream the events of all missions after event number `after` as server-sent events.
 
-    A browser that connects again sends the number as the header Last-Event-ID.
+    A browser that connects again sends the number of its last event as the header Last-Event-ID.
     """
     after = max(after, last_event_id)
-    await bridge.ask(lambda service, now_ns: None)  # refuse now what cannot be served
+    await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
     stream, headers = _stream(request, bridge, after), {"Cache-Control": "no-store"}
     return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
 
 
 async def _stream(request: Request, bridge: Bridge, number: int) -> AsyncIterator[str]:
-    """Yield events after `number` until the client leaves, the token is invalid or teleop ends."""
+    """Yield new events until the client disconnects, its token becomes invalid, or teleop ends."""
 
     def call(service: MissionService, now_ns: int) -> list[Event]:
         return service.book.events_after(number)
@@ -376,16 +375,15 @@ class ApiServer(uvicorn.Server):
 
     Attributes:
         url: "http://HOST:PORT", or "unix:PATH" for a Unix socket.
-        gate: Application that the server serves.
+        gate: Application that the server serves: the API behind the check of tokens.
         bridge: Queue of calls to teleop's loop.
     """
 
     def __init__(self, gate: Gate, bridge: Bridge, address: Address) -> None:
-        """Bind the address; port 0 lets the kernel choose.
+        """Bind the address; with port 0 the kernel chooses a port.
 
         Raises:
-            BadInputError: If the address cannot be bound, or if there are no tokens and the address
-                is not a socket file: then everybody could command.
+            BadInputError: If the address cannot be bound, or if a TCP address has no tokens.
         """
         if gate.tokens is None and not isinstance(address, Path):
             raise BadInputError(
@@ -401,7 +399,7 @@ class ApiServer(uvicorn.Server):
                 log_level="critical",  # a flood does not fill the log
                 access_log=False,  # the audit log has the commands
                 server_header=False,
-                proxy_headers=False,  # the audit log names whoever connects
+                proxy_headers=False,  # the audit log has the true address
                 # No limit_concurrency: uvicorn would refuse an emergency stop, too.
                 timeout_graceful_shutdown=STOP_LIMIT,
             )
@@ -413,7 +411,7 @@ class ApiServer(uvicorn.Server):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of requests by outcome, and number of lost lines of the audit log."""
+        """Number of requests by outcome, and number of lost lines of the audit log, by name."""
         lost = 0 if self.gate.audit is None else self.gate.audit.dropped
         return {f"api_{name}": n for name, n in {**self.gate.counts, "audit_dropped": lost}.items()}
 
@@ -422,7 +420,7 @@ class ApiServer(uvicorn.Server):
         self._thread.start()
 
     def stop(self) -> None:
-        """Answer the open requests, end the streams, and stop."""
+        """Answer the open requests, end the streams, and stop the server."""
         self.bridge.closed = "teleop ends"
         self.should_exit = True
         self._thread.join(STOP_LIMIT)
@@ -432,7 +430,6 @@ class ApiServer(uvicorn.Server):
 
 
 def _bind(address: Address) -> tuple[socket.socket, str]:
-    """Listen at an address; return socket and URL."""
     unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     url = f"unix:{address}"
     try:
@@ -448,7 +445,7 @@ def _bind(address: Address) -> tuple[socket.socket, str]:
         url = f"http://[{host}]:{port}" if is_6 else f"http://{host}:{port}"
         family = socket.AF_INET6 if is_6 else socket.AF_INET
         server = socket.create_server((host, port), family=family, dualstack_ipv6=is_6)
-    except (OSError, UnicodeError) as error:  # no host has a name with an empty label
+    except (OSError, UnicodeError) as error:  # UnicodeError: the host has an invalid name
         unix.close()
         reason = getattr(error, "strerror", None) or error
         raise BadInputError(f"--api {url}: {reason}; choose another address") from error

@@ -1,4 +1,4 @@
-"""Admit callers to the API by bearer token, count their requests, and log their commands.
+"""Check the bearer token of every API request, count requests, and log commands.
 
 A caller with an operator's token may do everything; a caller with a reader's token may only read.
 """
@@ -30,50 +30,50 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import read, readable_by_others, version
 
 OPERATOR, READER = "operator", "reader"
-"""Roles of callers; each role has a token file of this name."""
+"""Roles of callers; the token of a role is in a file with the name of the role."""
 BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a reader's for GET")
 TOKEN_SIZE_MAX = 4096
-"""Largest token file [bytes], including white space around the token."""
+"""Largest size of a token file [bytes], including white space around the token."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 READS = ("GET", "HEAD")
 URGENT = ("/v1/estop", "/v1/hold")
-"""Commands that the limit on simultaneous requests never refuses."""
+"""Paths of commands that are never refused as too many requests."""
 ORDERS = ("/v1/missions", "/v1/goto")
-"""Commands whose refusals are counted: orders to fly a mission or to fly to a point."""
+"""Paths of orders (to fly a mission, to fly to a point); refused orders are counted by reason."""
 COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
-"""HTTP status of a refused order -> name under which it is counted."""
+"""HTTP status of a refused order -> name of the counter."""
 REFUSED = {
     401: ("token", "a valid token is needed: Authorization: Bearer TOKEN"),
     403: ("role", "this token may look, not command: an operator's is needed"),
     429: ("busy", "too many requests; try again in a second"),
 }
-"""HTTP status of a refused request -> name under which it is counted, and text."""
+"""HTTP status of a refused request -> name of the counter, and text of the answer."""
 HEADERS = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}}
 IN_FLIGHT_MAX = 32
-"""Limit of the requests of one role that are answered at the same time, including streams."""
+"""Largest number of requests of one role that are answered at the same time, streams included."""
 AUDIT_MAX = 8 << 20
-"""Largest audit log [bytes]; then the log is renamed to NAME.1, and a new log begins."""
+"""Largest size of the audit log [bytes]. A full log is renamed to NAME.1, and a new log begins."""
 
 
 class Caller(NamedTuple):
-    """A known caller: the role, and a name that does not reveal the token."""
+    """An authenticated caller: the role, and a name that does not reveal the token."""
 
     role: str
     name: str
 
 
 LOCAL = Caller(OPERATOR, "local")
-"""Caller that connects through a socket file, which only the file's owner can open."""
+"""Caller that connects through a Unix socket, which only the owner of its file can open."""
 
 
 class Tokens:
-    """Digests of the tokens in a folder: the file `operator` and, if it exists, `reader`."""
+    """Hashes of the tokens in a folder: file `operator`, and file `reader` if it exists."""
 
     def __init__(self, folder: Path, warn: Callable[[str], None] = lambda text: None) -> None:
         """Read the tokens; `warn` receives one line for each file that other users can read.
 
         Raises:
-            BadInputError: If a file cannot be used; the message does not contain the token.
+            BadInputError: If a file has no valid token; the message does not contain the token.
         """
         self._folder, self._paths = folder, [folder / role for role in (READER, OPERATOR)]
         self._versions = [version(path) for path in self._paths]
@@ -82,9 +82,9 @@ class Tokens:
             warn(f"warning: {path} can be read by others: chmod 600 {path}")
 
     def caller(self, token: str) -> Caller | None:
-        """Return the caller with this token, or None.
+        """Return the caller with this token; None if the token is not valid.
 
-        A changed file counts at once. While a file is unusable, no token is valid.
+        A changed file counts at once. While a file has no valid token, no token is valid.
         """
         versions = [version(path) for path in self._paths]
         if versions != self._versions:
@@ -98,7 +98,7 @@ class Tokens:
         for path in self._paths:
             if path.name == OPERATOR or path.exists():
                 digest = hashlib.sha256(_read_token(path)).digest()
-                if digest in known:  # readers would command
+                if digest in known:  # then a reader's token would allow commands
                     raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
                 known[digest] = Caller(path.name, f"{path.name}-{digest.hex()[:8]}")
         return known
@@ -117,7 +117,7 @@ def _read_token(path: Path) -> bytes:
 
 
 class Audit(RotatingFileHandler):
-    """Log commands as lines of JSON in a separate thread; only the files' owner can read them.
+    """Log commands as lines of JSON, in a separate thread. Only the owner can read the files.
 
     Attributes:
         dropped: Number of lines that could not be written.
@@ -132,7 +132,7 @@ class Audit(RotatingFileHandler):
         self._listener.start()
 
     def note(self, caller: Caller, scope: Mapping[str, Any], answer: Mapping[str, Any]) -> None:
-        """Queue a log line about a command and its answer."""
+        """Queue a log line about a command and the answer to the command."""
         said = json.loads(answer.get("body") or b"{}")
         line = {
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -154,7 +154,7 @@ class Audit(RotatingFileHandler):
             self.close()
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
-        """Count a lost line."""
+        """Count a line that could not be written; report the first such line."""
         if not self.dropped:
             reason = sys.exception()
             self._complain(f"the audit log {self.baseFilename} cannot be written: {reason}")
@@ -166,22 +166,22 @@ class Audit(RotatingFileHandler):
 
 
 class Gate:
-    """Check the token and the role of every request before the application gets the request.
+    """Check token and role of every request before the application gets the request.
 
     Attributes:
-        tokens: The known tokens; None if everybody who can connect may command.
-        audit: Logs operators' commands; None without a log.
-        counts: Number of requests by outcome; "served" means that the application has answered.
+        tokens: The valid tokens; None if everybody who can connect may command.
+        audit: Log of the operators' commands; None without a log.
+        counts: Number of requests by outcome; "served" counts those that the application answered.
     """
 
     def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
-        """Create a gate in front of an application."""
+        """Put a gate in front of the application `app`."""
         self._app, self.tokens, self.audit = app, tokens, audit
         self._in_flight: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse a request or pass it on; ignore a slash at the end of its path."""
+        """Refuse a request or pass it to the application, without a slash at its path's end."""
         scope["path"] = scope["path"].rstrip("/") or "/"
         # An event stream calls `caller` again, because the stream can outlast its token.
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)
@@ -210,14 +210,14 @@ class Gate:
                 self.audit.note(caller, scope, answer)
 
     async def caller(self, scope: Scope) -> Caller | None:
-        """Return the caller of a request; None if the caller is unknown."""
+        """Return the caller of a request; None without a valid token."""
         if self.tokens is None:
             return LOCAL
         sent = await BEARER(Request(scope))
         return None if sent is None else self.tokens.caller(sent.credentials)
 
     def _refusal(self, caller: Caller | None, scope: Scope) -> int:
-        """Return the status with which a request is refused; 0 if it is served."""
+        """Return the HTTP status with which to refuse a request; 0 to serve the request."""
         is_command = scope["method"] not in READS
         if caller is None:
             return 401

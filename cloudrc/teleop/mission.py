@@ -1,4 +1,4 @@
-"""Fly missions: turn the operator's verbs and telemetry into setpoints, requests and events.
+"""Fly missions: turn the operator's commands and telemetry into setpoints, requests and events.
 
               start                    start seen             every waypoint reached
         IDLE -------------> STARTING -------------> FLYING --------------------------> DONE
@@ -6,9 +6,10 @@
                                                      v |
                                                      HELD
 
-Cancel leads from STARTING, FLYING and HELD to CANCELLED. A time limit, a restart of world, a guard
-in LAND or an emergency stop lead to FAILED. At the end of a mission teleop asks the robot to hold,
-and makes the robot's position the setpoint, because an armed robot flies to the last setpoint.
+The command cancel leads from STARTING, FLYING and HELD to CANCELLED. A time limit, a restart of
+world, a guard in LAND or an emergency stop leads to FAILED. At the end of a mission teleop asks the
+robot to hold. Until the robot gets this request, it flies to the setpoint; therefore teleop also
+makes the robot's position the setpoint.
 """
 
 from __future__ import annotations
@@ -39,25 +40,25 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
 
 HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
-"""Lowest z at which teleop holds the robot [m], world frame; the floor is at 0. At a lower z the
-robot would scrape along the floor.
+"""Lowest z at which teleop holds the robot [m], world frame; lower, the robot would scrape along
+the floor at z = 0.
 Source: docs/safety.md, "The guard"."""
 NO_WAYPOINT = -1
-"""Waypoint index of a setpoint or event without a waypoint."""
+"""Waypoint index in a setpoint or event that belongs to no waypoint."""
 UNDER_WAY = FLYING, STARTING, HELD
-"""States of a mission that has begun and not ended."""
+"""States of a mission that has begun and has not ended."""
 GAP_MAX_NS = 500_000_000
-"""Of a longer gap between two telemetry messages, only this much is time of flight [ns]."""
+"""Largest part of a gap between two telemetry messages that counts as time of flight [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
-"""Time without telemetry after which the dwell time starts again [ns]."""
-# Looking up an enum's member is slow, and these are used in every period.
+"""Time without telemetry after which the dwell time at a waypoint starts again [ns]."""
+# Looking up a member of an enum is slow.
 GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
 
 
 class LegWatch:
-    """Measure the flight time of one leg, and detect when the robot has reached the waypoint.
+    """Measure the time of flight to a waypoint, and detect when the robot has reached the waypoint.
 
-    Only time in which the robot follows cloud's commands counts.
+    Only time in which the robot follows cloud's commands counts as time of flight.
     """
 
     def __init__(self) -> None:
@@ -65,22 +66,22 @@ class LegWatch:
         self.pause()
 
     def pause(self) -> None:
-        """Interrupt the leg: keep the time of flight, but restart the dwell time."""
+        """Interrupt the flight to the waypoint: keep the time of flight, restart the dwell time."""
         self._seen_ns = self._near_since_ns = NEVER_NS
 
     @property
     def flown(self) -> float:
-        """Time of flight of this leg [s]."""
+        """Time of flight to the waypoint so far [s]."""
         return self._flown_ns * 1e-9
 
     def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
-        """Return whether the robot, seen at `now_ns` [ns], has stayed for the dwell time."""
+        """Tell whether the robot has stayed at the waypoint for the dwell time by `now_ns` [ns]."""
         before_ns, self._seen_ns = self._seen_ns, now_ns
         if seen.guard is HOLD:
             self._near_since_ns = NEVER_NS
             return False
         if before_ns >= 0:
-            if seen.guard is not GROUND:  # where the robot waits for take-off
+            if seen.guard is not GROUND:  # in GROUND the robot waits
                 self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
             if now_ns - before_ns > UNSEEN_MAX_NS:
                 self._near_since_ns = NEVER_NS  # the robot's path in the gap is unknown
@@ -96,8 +97,8 @@ class Teleop:
     """State machine that flies missions one after the other.
 
     Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, and another method for each
-    command of the operator. After each of these calls, call `take_outputs`. A setpoint is valid
-    until the next setpoint or the next session. All times `now_ns` are of the caller's clock [ns].
+    command of the operator. After each call, send the messages of `take_outputs`. A setpoint is
+    valid until the next setpoint or session. All times `now_ns` are on the caller's clock [ns].
 
     Attributes:
         state: State of the mission; "idle" before the first mission.
@@ -105,12 +106,12 @@ class Teleop:
         outcome: Last event of the mission; None before the first mission and during a mission.
         seen: The newest telemetry; None before the first telemetry.
         requests: Sender of the requests to the robot.
-        stopping: Whether an emergency stop is on its way: telemetry does not show ESTOP yet.
+        stopping: Whether an emergency stop was requested, and telemetry does not show ESTOP yet.
         outputs: Messages since the last `take_outputs`.
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission; `ended` returns whether the mission with this number is over."""
+        """Begin without a mission; `ended` tells whether a mission (by its number) has ended."""
         self.state, self.leg = "idle", 0
         self.outcome: MissionEvent | None = None
         self.outputs: list[Output] = []
@@ -119,8 +120,8 @@ class Teleop:
         self._is_ended = ended
         self.seen: RobotStatus | None = None
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
-        self._continued = self._was_held = False  # whether an earlier teleop began it or held it
-        self._world = ""  # in which the mission started; "": any
+        self._continued = self._was_held = False  # by an earlier teleop
+        self._world = ""  # process of world in which the mission started; "": any
         self._expected: tuple[int, ...] = ()  # missions that the robot may report; empty: any
         self._watch = LegWatch()
         self._setpoint: Setpoint | None = None
@@ -162,7 +163,7 @@ class Teleop:
         self.requests.ask(Request.START, Start.HERE)
         self._is_pending = not self._was_held
         if self.seen:
-            self.see(self.seen, now_ns)  # the mission may be over, or the world another one
+            self.see(self.seen, now_ns)  # the mission may be over, or world restarted
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
         """Fly to a point during a held mission; raise BadInputError unless the mission is held."""
@@ -172,7 +173,7 @@ class Teleop:
         self._select(Setpoint(leg.position, leg.yaw, NO_WAYPOINT))
 
     def hold(self, now_ns: int) -> None:
-        """Hold the robot at its position; raise BadInputError unless it flies a mission."""
+        """Hold the robot at its position; raise BadInputError unless a mission flies."""
         self._check("hold", FLYING)
         self._hold(now_ns)
 
@@ -190,8 +191,8 @@ class Teleop:
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once in any state, and drop all earlier requests to the robot.
 
-        Teleop sends `ALARM` to cloud now, and repeats `ALARM` until telemetry shows ESTOP. Cloud
-        repeats the stop until the robot has acted on it, even if the robot was stopped before.
+        Teleop sends `ALARM` to cloud until telemetry shows ESTOP. Cloud repeats the stop to the
+        robot until the robot has carried out this stop.
         """
         if self.state in UNDER_WAY:
             self._end("emergency_stopped", "emergency stop", now_ns, where=True)
@@ -219,7 +220,7 @@ class Teleop:
         last, onboard, legs = self._setpoint, self._onboard, self._plan.legs
         started = self.requests.see(seen, now_ns) is Request.START and self.state == STARTING
         if self.state == STARTING and not self._expected and self._plan.start is Start.HERE:
-            # The order came before the first telemetry.
+            # The mission was ordered before the first telemetry.
             self._expected = (seen.mission_id, self._mission_id)
         if self.state not in UNDER_WAY:
             if new_session or (before and before.mission_id != seen.mission_id):
@@ -231,7 +232,7 @@ class Teleop:
         elif self._is_pending:
             self._select_early()
         while self.leg < onboard and self.state in (FLYING, HELD):
-            self._advance("reached, as the robot reports,", now_ns)  # teleop lost it
+            self._advance("reached, as the robot reports,", now_ns)  # the event was lost
         while self.state == FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
         if new_session and last is self._setpoint:
@@ -253,7 +254,7 @@ class Teleop:
             raise BadInputError(f"{verb}: the mission is {self.state}; it must be {needed}")
 
     def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
-        """Find a failure in telemetry that ends the mission; return its code and its text."""
+        """Find in telemetry a reason why the mission fails; return the event's code and text."""
         if self._world not in ("", seen.world):
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
@@ -267,7 +268,6 @@ class Teleop:
         return None
 
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
-        """Find an exceeded time limit; return its code and its text."""
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
         if self.elapsed(now_ns) >= limit and self.state == STARTING:
             return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
@@ -280,8 +280,8 @@ class Teleop:
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
         """Keep the robot from flying a mission that this teleop does not fly.
 
-        The setpoint becomes the robot's position. If the robot stands on the ground, or if its
-        mission has ended, teleop also asks the robot to end the mission.
+        The robot's position becomes the setpoint. If the robot stands on the ground, or if the
+        foreign mission has ended, teleop also asks the robot to end that mission.
         """
         mission_id = seen.mission_id
         over = self._is_ended(mission_id) or (seen.guard is GROUND and mission_id != 0)
@@ -290,13 +290,12 @@ class Teleop:
         self._select_here()
 
     def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
-        """Store a new mission: its plan, its number, and the start of its time [ns]."""
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
         self._continued = self._was_held = False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
-        """Begin the mission after telemetry shows its start; measure its time from now on."""
+        """Begin the mission and its time, once telemetry shows the start."""
         self._world, self._expected = seen.world, (self._mission_id,)
         self._watch = LegWatch()
         if not self._continued:
@@ -314,14 +313,13 @@ class Teleop:
             self._report("resumed", self.leg, text, now_ns)
 
     def _advance(self, how: str, now_ns: int) -> None:
-        """Go on to the next waypoint, or end the mission."""
         text = f"{self._leg_name} {how} at {self.elapsed(now_ns):.2f} s"
         self._report("reached", self.leg, text, now_ns)
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
             self._watch = LegWatch()
-            if self.state == FLYING and self.leg >= self._onboard:  # not back to earlier waypoints
+            if self.state == FLYING and self.leg >= self._onboard:  # never fly back
                 self._select_leg(self.leg)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
@@ -331,39 +329,38 @@ class Teleop:
         self._report("held", self.leg, f"held {self.where}", now_ns)
 
     def _end(self, code: str, text: str, now_ns: int, *, where: bool = False) -> None:
-        """End the mission, and ask the robot to hold; `where` adds the waypoint to the text."""
+        """End the mission, and ask the robot to hold; with `where`, the text names the waypoint."""
         text = f"{text} {self.where}" if where else text
         waypoint = min(self.leg, len(self._plan.legs) - 1)
         if code != "done" and self._mission_id:
             self.requests.report(self._mission_id, MISSION_OVER)
         on_ground = self.seen is not None and self.seen.guard is GROUND
-        if code != "taken_over" or on_ground:  # on the ground it would scrape along the floor
+        if code != "taken_over" or on_ground:  # commands would drag a robot along the ground
             self.requests.ask(Request.END)
         else:
-            self.requests.forget()  # another teleop's mission must not be ended
+            self.requests.forget()  # the new mission must not end
         self._select_here()
         self.outcome = self._report(code, waypoint, text, now_ns)
 
     @property
     def _onboard(self) -> int:
-        """Number of waypoints of the mission that the robot has stored as reached."""
+        """Number of waypoints of this mission that the robot has stored as reached."""
         seen = self.seen
         return seen.reached if seen and seen.mission_id == self._mission_id != 0 else 0
 
     @property
     def _from_spawn(self) -> bool:
-        """Whether the mission begins at the spawn."""
         return self._plan.start is Start.SPAWN and not self._continued
 
     @property
     def _may_move(self) -> bool:
-        """Whether the robot may still fly an earlier mission when this mission begins."""
+        """Whether the robot may still fly an earlier mission while this mission has not begun."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self) -> None:
-        """Select the first waypoint already before telemetry shows the start of the mission.
+        """Select the first waypoint before telemetry shows the start, to save a round trip.
 
-        Select nothing while the robot may move, because the robot would fly there at once.
+        While the robot may move, select nothing, because the robot would fly there at once.
         """
         if not self._is_pending or self.seen is None or self._may_move:
             return
@@ -373,9 +370,9 @@ class Teleop:
             self._select_leg(leg)
 
     def _repeat_setpoint(self) -> None:
-        """Send the setpoint again in a new session, because cloud keeps none from the old session.
+        """Send the setpoint again in a new session, because cloud has forgotten it.
 
-        If the mission has not started and the robot may move, select the robot's position.
+        If the mission has not started and the robot may move, the setpoint is the robot's position.
         """
         if self.state == STARTING and self._may_move:
             self._is_pending = True
@@ -389,7 +386,6 @@ class Teleop:
             self._select(Setpoint(to.position, to.yaw, leg))
 
     def _select_here(self) -> None:
-        """Select the robot's position, if telemetry has arrived."""
         if self.seen is not None:
             x, y, z = self.seen.position
             yaw = 0.0 if self._setpoint is None else self._setpoint.yaw
@@ -408,7 +404,7 @@ class Teleop:
 
     @property
     def where(self) -> str:
-        """Current waypoint in words, for events."""
+        """The way to the current waypoint in words, for events."""
         return f"on the way to {self._leg_name}"
 
     @property

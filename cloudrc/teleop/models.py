@@ -1,4 +1,4 @@
-"""Define requests and answers of the API, and check the orders in requests.
+"""Define the requests and answers of the API, and check the orders in requests.
 
 The OpenAPI document comes from these models. An order has the form of a section of a configuration
 file, so that the same code checks both and describes the problems.
@@ -26,11 +26,11 @@ from cloudrc.teleop.store import SHOWN, Order
 from cloudrc.teleop.wire import Leg, Plan
 
 PROBLEMS_MAX = 50
-"""Largest number of problems that the answer to a request lists."""
+"""Largest number of problems that one answer lists."""
 
 
 def _printable(text: str) -> str:
-    """Refuse control characters, which change the terminal of a user who lists the missions."""
+    """Refuse control characters, which could change the terminal of a user who lists missions."""
     if not text.isprintable():
         raise PydanticCustomError("unprintable", "must be one line of printable characters")
     return text
@@ -82,7 +82,6 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
 
 
 def _field(text: str) -> Any:
-    """Describe a field of an answer in the OpenAPI document."""
     return Field(description=text)
 
 
@@ -217,7 +216,7 @@ class Refusal(_Answer):
 
 
 class RefusedError(BadInputError):
-    """Report a request that cannot be used; `problems` lists the reasons."""
+    """Report that a request is not valid; `problems` lists all reasons."""
 
     def __init__(self, problems: list[ConfigProblem]) -> None:
         super().__init__("; ".join(map(str, problems[:3])))
@@ -235,10 +234,11 @@ def read_order(
     contact: bool,
     plan: Callable[[Mission, float], Plan],
 ) -> Order:
-    """Read a mission, check it, and plan it; raise RefusedError with all its problems.
+    """Read, check and plan the mission in the body of a request.
 
-    `time_limit` [s] and `contact` are defaults. If the default `contact` is true, the arm has to
-    touch the board if a waypoint is there. `plan` makes a plan from a mission and a time limit [s].
+    `time_limit` [s] and `contact` are defaults. The default `contact` tells whether the arm has to
+    touch the board in missions with a waypoint at the board. `plan` makes a plan from a mission and
+    a time limit [s]. Raise a RefusedError that lists all problems.
     """
     with suppress(ValueError, TypeError, KeyError):  # `_parse` describes these errors
         count = len(from_json(body)["waypoints"])
@@ -246,7 +246,7 @@ def read_order(
             reason = f"at most {MAX_WAYPOINTS}; split the mission"
             raise RefusedError([ConfigProblem(("waypoints",), str(count), reason)])
     request = _parse(body, MissionRequest)
-    if not request.waypoints:  # an experiment's mission may have steps in their place
+    if not request.waypoints:  # only an experiment may have steps instead
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
     mission = Mission(start=request.start, waypoints=request.waypoints)
     if problems := check_mission(mission, scene):
@@ -258,7 +258,7 @@ def read_order(
 
 
 def read_goto(body: bytes, scene: Scene) -> Leg:
-    """Read a point and check it; raise RefusedError with all its problems."""
+    """Read and check a point in a request's body; raise a RefusedError that lists all problems."""
     request = _parse(body, GoToRequest)
     waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
     problems = check_mission(Mission(start="here", waypoints=(waypoint,)), scene)
@@ -268,7 +268,7 @@ def read_goto(body: bytes, scene: Scene) -> Leg:
 
 
 def leads_to_board(mission: Mission, scene: Scene) -> bool:
-    """Return whether the arm's tip is at the board, or behind its face, at any waypoint."""
+    """Return whether the arm's tip reaches the board's face, or beyond, at any waypoint."""
     board = scene.board
     if board is None:
         return False
@@ -281,7 +281,7 @@ def leads_to_board(mission: Mission, scene: Scene) -> bool:
 
 
 def as_json(problem: ConfigProblem) -> dict[str, str | int | None]:
-    """Return a problem as the API shows it."""
+    """Return a problem in the form of the API's model `Problem`."""
     path = problem.path
     index = int(path[1]) if path[:1] == ("waypoints",) and len(path) > 1 else None
     shown = {"path": ".".join(path), "index": index}

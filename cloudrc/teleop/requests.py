@@ -1,4 +1,4 @@
-"""Send operator requests over a lossy link by repeating them until the robot acts on them."""
+"""Send operator requests over a lossy link: repeat a request until the robot has carried it out."""
 
 from __future__ import annotations
 
@@ -8,58 +8,58 @@ from cloudrc.teleop.wire import RobotStatus
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
 UNNUMBERED = 0
-"""Number of a request before it gets its final number."""
+"""Number of a request that has no number yet."""
 NOT_ENDED = (-1, 0)
-"""Epoch and number of a request that does not exist: the robot has ended no mission."""
+"""Epoch and request number that mean: the robot has not ended a mission."""
 IDLE_NS = 3_000_000_000
-"""Longest time for which a robot holds its position or stands after its start [ns]. Then teleop
-sends the start again, because another sender has probably stopped the robot."""
+"""Longest time for which a robot may hold or stand during a mission [ns]. After this time teleop
+sends the start again, because somebody else has probably stopped the robot."""
 PREDECESSORS = 1_000
-"""Distance from the newest request number in telemetry to the first number of a new teleop process.
-Between them is room for requests of the earlier process that telemetry does not show yet."""
+"""Gap between the newest request number in telemetry and the first number of a new teleop process,
+for requests of the earlier process that telemetry does not show yet."""
 CLOCK_MAX = 65_536
-"""Limit of a second part of the first number. This part rises by 1 every 100 ms on the machine's
-clock, so that the numbers of two new processes differ."""
+"""The first number of a new teleop process also contains the time in units of 100 ms, modulo this
+value, so that two new processes have different numbers."""
 
 
 class RequestSender:
-    """Repeat the newest request at 10 Hz until telemetry shows that the robot has acted on it.
+    """Repeat the newest request at 10 Hz until telemetry shows that the robot has carried it out.
 
-    A new request replaces the previous request and has a higher number, because the robot acts only
-    on rising numbers. The sender is silent before the first telemetry. While no request is pending,
-    the sender repeats the progress of the mission until the robot has stored the progress. Cloud
-    repeats the emergency stop.
+    A new request replaces the previous request. It gets a higher number, because the robot carries
+    out requests with rising numbers only. Before the first telemetry, nothing is sent. While no
+    request is pending, the sender repeats the mission's progress until the robot has stored the
+    progress. Emergency stops are not sent here: cloud numbers and repeats them.
     """
 
     def __init__(self) -> None:
         self._seen: RobotStatus | None = None
         self._pending: OperatorRequest | None = None
-        self._next: OperatorRequest | None = None  # sent after the pending one
+        self._next: OperatorRequest | None = None  # sent after the pending request
         self._progress = OperatorRequest(UNNUMBERED, Request.PROGRESS)
         self._number = UNNUMBERED
         self._asked_epoch = 0
-        self._ended = NOT_ENDED  # epoch and number of the last END acted on, unless a START follows
-        self._is_started = False  # whether the robot has acted on a START as the last request
+        self._ended = NOT_ENDED  # epoch and number of an END; NOT_ENDED after a START
+        self._is_started = False  # whether the last request carried out is a START
         self._flies_ns = 0  # when the robot last flew its mission
         self._due_ns = 0
 
     @property
     def settled(self) -> bool:
-        """Whether no request is pending."""
+        """Whether the robot has carried out all requests."""
         return self._pending is None
 
     @property
     def waits(self) -> bool:
-        """Whether the robot ignores commands, on the ground or after the end of its mission."""
+        """Whether the robot ignores commands: on the ground, or after the end of its mission."""
         seen = self._seen
         if seen is None or self._next is not None:
             return False
         return seen.guard is GuardState.GROUND or (seen.epoch, seen.mission) == self._ended
 
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
-        """Begin to repeat a request, which replaces the pending request.
+        """Begin to repeat a request; it replaces the pending request.
 
-        With `after`, the new request waits until the robot has acted on the pending request.
+        With `after`, the new request waits until the robot has carried out the pending request.
         """
         asked = self._progress._replace(request=request, start=start)
         if self._pending is None or not after:
@@ -68,18 +68,18 @@ class RequestSender:
             self._next = asked
 
     def forget(self) -> None:
-        """Drop all requests, because another sender controls the robot or the robot is stopped."""
+        """Drop all requests: somebody else controls the robot, or the robot is stopped."""
         self._is_started = False
         self._pending = self._next = None
 
     def report(self, mission_id: int, reached: int) -> None:
-        """Set the mission and its number of reached waypoints, which every request carries."""
+        """Set the mission and its number of reached waypoints, which every request contains."""
         self._progress = self._progress._replace(mission_id=mission_id, reached=reached)
         if self._pending is None:
             self._due_ns = 0
 
     def see(self, seen: RobotStatus, now_ns: int) -> Request | None:
-        """Process telemetry of `now_ns` [ns]; return a request that the robot has now acted on."""
+        """Process telemetry of `now_ns` [ns]; return the request that the telemetry confirms."""
         self._seen, pending = seen, self._pending
         if pending is None:
             self._repeat_start_if_lost(seen, now_ns)
@@ -91,19 +91,19 @@ class RequestSender:
         self._is_started = pending.request is Request.START and self._pending is None
         if pending.request is Request.START:
             self._ended = NOT_ENDED
-        elif pending.request is not Request.ACKNOWLEDGE:  # which ends no mission
+        elif pending.request is not Request.ACKNOWLEDGE:  # an acknowledgement ends no mission
             self._ended = seen.epoch, seen.mission
         return pending.request
 
     def due(self, now_ns: int) -> OperatorRequest | None:
-        """Return the request to send at `now_ns` [ns], or None."""
+        """Return the request to send at `now_ns` [ns]; None if no request is due."""
         pending, seen = self._pending, self._seen
         if seen is None:
             return None
         if pending is None:
             return self._progress_due(seen, now_ns)
-        # Telemetry shows a higher number, for example of an emergency stop, or the same number of
-        # an earlier teleop: ours would be acknowledged by now.
+        # A new number is needed if telemetry shows a higher number (of an emergency stop), or the
+        # same number (of an earlier teleop; `see` would have removed this teleop's request).
         if pending.number == UNNUMBERED or seen.mission >= pending.number:
             rise = 1 if self._number else PREDECESSORS + now_ns // REPEAT_NS % CLOCK_MAX
             self._number = max(self._number, seen.mission) + rise
@@ -115,7 +115,7 @@ class RequestSender:
         return pending._replace(epoch=seen.epoch)
 
     def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
-        """Send the start again if a request of another teleop or cloud has replaced the start."""
+        """Send the start again if another teleop or cloud has stopped the mission."""
         ours = self._is_started and seen.mission_id == self._progress.mission_id
         if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
             self._flies_ns = now_ns
@@ -124,7 +124,7 @@ class RequestSender:
                 self.ask(Request.START, Start.HERE)
 
     def _progress_due(self, seen: RobotStatus, now_ns: int) -> OperatorRequest | None:
-        """Return the progress of the mission if the robot flies it and lacks this progress."""
+        """Return the mission's progress if the robot flies the mission and has not stored it."""
         progress = self._progress
         same = seen.mission_id == progress.mission_id != 0
         if not same or seen.reached >= progress.reached or now_ns < self._due_ns:
@@ -135,6 +135,6 @@ class RequestSender:
     def _is_acknowledged(self, pending: OperatorRequest, seen: RobotStatus) -> bool:
         if pending.number == UNNUMBERED or seen.mission != pending.number:
             return False
-        # Until the epoch changes, telemetry is from before the reset to the spawn.
+        # Telemetry of the old epoch was sent before the reset to the spawn.
         from_spawn = pending.request is Request.START and pending.start is Start.SPAWN
         return not from_spawn or seen.epoch != self._asked_epoch

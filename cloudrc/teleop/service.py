@@ -1,8 +1,8 @@
 """Queue and fly missions, carry out the operator's commands, and report the robot's state.
 
-After a restart of teleop, a mission under way continues at the same waypoint, if world has not
-restarted. If an emergency stop has ended the last mission, but the robot still flies that mission,
-the new teleop sends the stop again.
+When teleop restarts, the new process continues the mission under way at the same waypoint, unless
+world has restarted, too. If an emergency stop has ended the mission but has not reached the robot,
+the new process sends the stop again.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
 """States of the guard that only an acknowledgement ends, and states in which rotors may turn."""
 SILENCE = 1.0
-"""Age above which telemetry or the last message of cloud counts as too old [s]."""
+"""Age from which on telemetry, or the last message from cloud, is too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
-"""Time between two copies of the setpoint [ns]; a cloud that has restarted needs the copies."""
+"""Time between two copies of the setpoint [ns]; a restarted cloud needs the copies."""
 QUEUE_MAX = 16
-"""Limit of the missions that wait for the one under way."""
+"""Largest number of missions that wait while another mission flies."""
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
 RESTARTED = "teleop has restarted; the robot is asked to go on"
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
@@ -44,7 +44,7 @@ ALONE = {
     LAND: "the robot lands; find the cause, then: cloudrc mission acknowledge",
     ESTOP: "the rotors are stopped; find the cause, then: cloudrc mission acknowledge",
 }
-"""State of the guard -> next step while no mission is under way."""
+"""State of the guard -> what happens next, while no mission is under way."""
 IN_MISSION = {
     **ALONE,
     GROUND: f"the robot takes off with the mission's first commands, {REST}; if no command comes "
@@ -53,14 +53,14 @@ IN_MISSION = {
     HOLD: "the robot gets no fresh commands: it continues by itself when they arrive, and lands if "
     "none arrive within guard.hold_max_s",
 }
-"""State of the guard -> next step while a mission is under way."""
+"""State of the guard -> what happens next, while a mission is under way."""
 
 
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
     """Describe what the robot does next, or what the operator has to do.
 
-    `age` is that of the telemetry [s], `cloud_age` that of cloud's last message [s]; `mission` is
-    the state of the mission under way, or None.
+    `age` is the age of the telemetry [s], `cloud_age` the age of the last message from cloud [s],
+    and `mission` the state of the mission under way, or None.
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
@@ -70,23 +70,23 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 
 
 class MissionService:
-    """Keep and fly all missions of one robot, one after the other.
+    """Store and fly all missions of one robot, one after the other.
 
-    All times `now_ns` are of this process's monotonic clock [ns]. An operator's command raises
-    ConflictError if the state of mission or robot forbids the command, and UnavailableError if the
-    disk refuses it or this process ends.
+    All times `now_ns` are on this process's monotonic clock [ns]. The methods for the operator's
+    commands raise ConflictError if the state of mission or robot forbids the command. They raise
+    UnavailableError if the disk refuses the mission, or if this process ends.
 
     Attributes:
-        book: The missions.
+        book: Store of all missions.
     """
 
     def __init__(
         self, contact_speed_max: float, book: MissionStore, scene: Scene | None = None
     ) -> None:
-        """Begin with the missions of a store; nothing flies before the first `handle_deadline`.
+        """Begin with the missions of a store; the first `handle_deadline` starts or continues one.
 
-        `contact_speed_max` limits the speed of the arm's tip at the board [m/s]. With a `scene`,
-        the service refuses straight ways through the walls of pipes.
+        `contact_speed_max` limits the speed of the arm's tip when it touches the board [m/s]. With
+        a `scene`, the service refuses straight ways through the walls of pipes.
         """
         self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
@@ -96,8 +96,8 @@ class MissionService:
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
-        self._ends = False  # whether this process ends; the next one starts the queued missions
-        self._trouble = ""  # of the store, as last reported
+        self._ends = False  # whether this process ends; the next process starts the queue
+        self._trouble = ""  # trouble of the store that was last reported
 
     @property
     def seen(self) -> RobotStatus | None:
@@ -106,7 +106,7 @@ class MissionService:
 
     @property
     def over(self) -> bool:
-        """Whether at least one mission is known, all have ended, and no request is pending."""
+        """Whether there are missions, all have ended, and all requests are carried out."""
         return bool(self.book.missions) and not self.book.open() and self.settled
 
     @property
@@ -115,9 +115,9 @@ class MissionService:
         return self._teleop.settled
 
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
-        """Create a mission, which starts at once or waits; return the mission, and if it is new.
+        """Create a mission that starts at once or waits; return it, and whether it is new.
 
-        An order with a known key returns the known mission.
+        If a mission has the order's key already, return that mission.
         """
         known = self.book.with_key(order.key)
         if known is not None:
@@ -145,7 +145,7 @@ class MissionService:
         mission = self.book.find(mission_id)
         if not mission.ended and mission is self._start_next(now_ns):
             return self._operate(self._teleop.cancel, now_ns)
-        if mission.ended:  # also if it has just failed, because world restarted
+        if mission.ended:  # maybe just now, because world has restarted
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
         self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
@@ -155,11 +155,11 @@ class MissionService:
         return mission
 
     def hold(self, now_ns: int) -> Mission:
-        """Hold the robot, which must fly a mission, at its position."""
+        """Interrupt the mission under way: the robot holds its position."""
         return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
-        """Continue the held mission, straight to its next waypoint."""
+        """Continue the held mission, straight to the next waypoint."""
         self._check_can_fly()
         if (mission := self._current) is not None and mission.state == HELD:
             self._check_way(mission.order.plan.legs[mission.waypoint])
@@ -178,21 +178,21 @@ class MissionService:
         return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
-        """Stop the rotors at once in any state; return the mission that the stop ends."""
+        """Stop the rotors at once in any state; return the mission that the stop ends, if any."""
         mission = self._start_next(now_ns)
         self._teleop.stop(now_ns)
         self._collect(now_ns)
         return mission
 
     def acknowledge(self, now_ns: int) -> None:
-        """Allow the robot to fly again after a landing or a stop; no mission may be under way."""
+        """Let the robot fly again after a landing or a stop, if no mission is under way."""
         if self._current is not None:
             raise _busy(self._current, "there is nothing to acknowledge")
         self._teleop.acknowledge(now_ns)
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
-        """Pause the mission under way before this process ends; the next process continues it."""
+        """Pause the mission under way, because this process ends; the next process continues it."""
         self._ends = True
         if self._start_next(now_ns) is not None:
             self._operate(self._teleop.pause, now_ns)
@@ -205,7 +205,7 @@ class MissionService:
         """Process telemetry that has arrived at `now_ns`."""
         before, mission = self.seen, self._current
         if self._inherits_stop and seen.mission_id == self._inherits_stop.number:
-            if seen.guard in AIRBORNE:  # the robot has not heard of the stop
+            if seen.guard in AIRBORNE:  # the stop has not reached the robot
                 self._teleop.stop(now_ns)
         self._heard_ns = self._seen_ns = now_ns
         if before is None or (before.world, before.guard) != (seen.world, seen.guard):
@@ -235,12 +235,12 @@ class MissionService:
             self._outputs.append(self._setpoint)
 
     def take_outputs(self) -> list[Output | Fault]:
-        """Return the messages since the last call, oldest first; faults are for teleop's log."""
+        """Return the messages for cloud and the faults for teleop's log, oldest first."""
         outputs, self._outputs = self._outputs, []
         return outputs
 
     def state(self, now_ns: int) -> dict[str, Any]:
-        """Return the state of missions and robot for the API."""
+        """Return the state of missions and robot in the form of the API's `StateView`."""
         mission, seen, heard_ns = self._current, self.seen, self._heard_ns
         cloud_age = None if heard_ns is None else (now_ns - heard_ns) * 1e-9
         shown: dict[str, Any] = {
@@ -271,7 +271,7 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """The last mission if an earlier process stopped it; None once telemetry has arrived."""
+        """Mission that an earlier process stopped, until telemetry arrives; else None."""
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 
@@ -294,7 +294,7 @@ class MissionService:
             )
 
     def _check_way(self, leg: Leg) -> None:
-        """Raise ConflictError if the straight way from the robot to a leg crosses a pipe's wall."""
+        """Raise ConflictError if the straight way from the robot to `leg` crosses a pipe's wall."""
         seen, scene = self.seen, self._scene
         if seen is None or scene is None:
             return
@@ -322,8 +322,8 @@ class MissionService:
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
         """Fly the first mission that has not ended; return the mission under way, if any.
 
-        A mission that has begun continues. A waiting mission starts only with `queued`, and only
-        after the disk has stored its start.
+        A mission that has begun continues. A mission in the queue starts only with `queued`, and
+        only after the disk has stored its start.
         """
         waiting = self.book.open()
         if self._current is not None or not waiting:

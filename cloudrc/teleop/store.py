@@ -1,10 +1,10 @@
-"""Store missions and their progress in an SQLite file; read them after a restart.
+"""Store missions and their progress in an SQLite file; read them after a restart of teleop.
 
-A mission is one row with an order and a status; each event changes the status. Each reached
-waypoint is one more row, with mission and index as its key, so that no waypoint is stored twice.
-The data of a transaction is on the disk when the transaction returns. A killed process therefore
-loses at most the newest event. If the disk refuses, flights continue, no new mission starts, and
-the events stay in memory until the disk works again.
+One row holds the order and the status of a mission; each event changes the status. One more row
+holds each reached waypoint, with mission and index as the key, so that no waypoint is stored twice.
+A transaction returns after its data is on the disk, so a killed process loses at most the newest
+event. While the disk refuses to write, flights continue, no new mission starts, and the events stay
+in memory.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from cloudrc.metrics.verdict import Observations
 from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
-"""An event of a mission, as the API shows it."""
+"""An event of a mission, in the form of the API's model `Event`."""
 MAGIC = b"SQLite format 3\0"
 """First bytes of a database file of SQLite."""
 SHOWN = 100
-"""Number of the newest events that the store keeps for each mission."""
+"""Largest number of events that the store keeps for each mission: the newest events."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Order:
 
     plan: Plan
     name: str = ""  # shown to people
-    key: str = ""  # a second order with the same key, unless "", makes no second mission
+    key: str = ""  # orders with the same key make one mission; "": no key
     contact: bool = False  # whether the arm has to touch the board
     queue: bool = False  # whether the order waits for the mission under way; else it is refused
 
@@ -50,13 +50,13 @@ class Mission:
 
     id: str  # such as "m1"
     order: Order
-    number: int  # of the mission on board; below 2^63
+    number: int  # identifies the mission on board; below 2^63
     state: str = QUEUED  # one of the values of `STATES`
-    world: str = ""  # in which the mission was started; "" before the start
+    world: str = ""  # world's process in which the mission started; "" before
     elapsed: float = 0.0  # duration of the mission at its last event [s]
     reached: list[dict[str, Any]] = field(default_factory=list)  # waypoints with their times [s]
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=SHOWN))  # the newest
-    happened: Counter[str] = field(default_factory=Counter)  # number of events of each kind, ever
+    happened: Counter[str] = field(default_factory=Counter)  # all events, by kind
     witness: Observations = field(default_factory=Observations)  # what the robot has touched
     verdict: dict[str, Any] | None = None  # as the API shows it; None until the mission has ended
 
@@ -67,7 +67,7 @@ class Mission:
 
     @property
     def waypoint(self) -> int:
-        """Index of the current waypoint; at the end, index of the last waypoint."""
+        """Index of the current waypoint; at the mission's end, index of the last waypoint."""
         return min(len(self.reached), len(self.order.plan.legs) - 1)
 
     def apply(
@@ -75,7 +75,8 @@ class Mission:
     ) -> None:
         """Update the mission with an event; `changed` has new values of the mission's attributes.
 
-        `number` counts the events of all missions. `waypoint` is an index, by default the current.
+        `number` is the number of the event among those of all missions. `waypoint` is an index; the
+        default is the current waypoint.
         """
         waypoint = self.waypoint if waypoint is None else waypoint
         for name, value in changed.items():
@@ -111,15 +112,15 @@ class UnknownMissionError(CloudrcError):
 
 
 class UnavailableError(CloudrcError):
-    """Report that teleop cannot serve now: the journal is locked or read-only, or teleop ends."""
+    """Report that teleop cannot act now: its journal is locked or read-only, or teleop ends."""
 
 
 class StoreLockedError(CloudrcError):
-    """Report that another process has locked the file."""
+    """Report that another process has locked the file of missions."""
 
 
 class ConflictError(CloudrcError):
-    """Report that the present state forbids a request; `mission` is the id in conflict, or ""."""
+    """Report that the present state forbids a request; `mission` is the conflicting id or ""."""
 
     exit_code = 5
 
@@ -129,7 +130,7 @@ class ConflictError(CloudrcError):
 
 
 APPLICATION, VERSION = 0x43524A32, 1
-"""Numbers in the head of the file: one for all files of cloudrc, and the version of the tables."""
+"""Numbers in the file's header: one for the program cloudrc, and the version of the tables."""
 SCHEMA = f"""
 BEGIN;
 CREATE TABLE mission (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL);
@@ -142,14 +143,13 @@ COMMIT;
 
 
 def open_store(path: Path, salt: bytes) -> MissionStore:
-    """Open the file of missions and lock it; make a new file if there is none.
+    """Open and lock the file of missions; make a new file if there is none.
 
-    The function renames a damaged file, and `MissionStore.notice` says so.
+    A damaged file is renamed and replaced by a new file; then `MissionStore.notice` tells the user.
 
     Raises:
         StoreLockedError: If another process has locked the file.
-        BadInputError: If the file is not a file of missions, has another version, or cannot be
-            made.
+        BadInputError: If the file has another content or version, or cannot be made.
     """
     if path.exists() and not path.is_file():
         raise BadInputError(f"--journal {path}: is not a file; name another one")
@@ -159,13 +159,13 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
         return MissionStore(connect(path), salt)
     except sqlite3.DatabaseError as error:
         reason = " ".join(str(error).split())
-        code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # without its extension
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # without the extended code
         if code == sqlite3.SQLITE_BUSY:
             text = f"{path}: another teleop has this journal open; waiting until it ends"
             raise StoreLockedError(text) from None
         with path.open("rb") as file:
             is_sqlite = file.read(len(MAGIC)) == MAGIC
-        if code == sqlite3.SQLITE_NOTADB and not is_sqlite:  # else its head is damaged
+        if code == sqlite3.SQLITE_NOTADB and not is_sqlite:  # else the header is damaged
             text = "is no journal; move it away, or name another file"
             raise BadInputError(f"--journal {path}: {text}") from None
         if isinstance(error, sqlite3.OperationalError):  # the disk fails; the content is intact
@@ -180,11 +180,11 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
 
 
 def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqlite3.Connection:
-    """Connect to a file of missions, or to memory, and lock it.
+    """Open and lock a database of missions, in a file or, without a path, in memory.
 
     Raises:
         BadInputError: If the file has another version.
-        sqlite3.OperationalError: If the file is locked or its volume fails.
+        sqlite3.OperationalError: If the file is locked, or if its volume fails.
         sqlite3.DatabaseError: If the file is damaged.
     """
     # One thread opens the file; another thread may serve the missions.
@@ -211,12 +211,12 @@ def _value(db: sqlite3.Connection, pragma: str) -> Any:
 
 
 KEPT = 100
-"""Limit of the ended missions that the store keeps."""
+"""Largest number of ended missions that the store keeps."""
 KEEP_PERIOD_NS = 1_000_000_000
 """Time between two attempts to write events that the disk has refused [ns]."""
 _ORDER, _MISSION = TypeAdapter(Order), TypeAdapter(Mission)
 _STATUS = {"state", "world", "elapsed", "events", "happened", "witness", "verdict"}
-"""Attributes of a mission that change with its events; waypoints have a table of their own."""
+"""Attributes of a mission that its events change; reached waypoints have a table of their own."""
 
 
 class MissionStore:
@@ -224,16 +224,16 @@ class MissionStore:
 
     Attributes:
         missions: Missions by id, oldest first.
-        trouble: Why the disk has refused the last transaction; "" if everything is on the disk.
-        dropped: Number of events that a reader has requested too late, after their removal.
-        notice: What was wrong with an earlier file and where it is now; "" if nothing was wrong.
+        trouble: Why the disk refuses to write; "" if everything is on the disk.
+        dropped: Number of events that the store had removed before a reader requested them.
+        notice: Where a damaged earlier file is now, and what was wrong; "" without such a file.
     """
 
     def __init__(self, db: sqlite3.Connection, salt: bytes, notice: str = "") -> None:
         """Read all missions of `db`; if that fails, close `db` and raise DatabaseError.
 
-        A new file begins with the id "m1" again. The random bytes `salt` make the numbers that the
-        robot stores differ from those of an earlier file.
+        The ids of every new file begin with "m1". The random bytes `salt` make the numbers under
+        which the robot stores progress differ from those of an earlier file.
         """
         self._db, self._salt, self.notice = db, salt, notice
         self.missions: dict[str, Mission] = {}
@@ -253,7 +253,7 @@ class MissionStore:
         return [mission for mission in self.missions.values() if not mission.ended]
 
     def stopped(self) -> Mission | None:
-        """Return the mission that was flown last, if it ended by an emergency stop."""
+        """Return the mission that was flown last if an emergency stop ended it, else None."""
         events = {"started", "emergency_stopped"}
         flown = [each for each in self.missions.values() if each.happened.keys() & events]
         return flown[-1] if flown and "emergency_stopped" in flown[-1].happened else None
@@ -265,18 +265,18 @@ class MissionStore:
         return self.missions[mission_id]
 
     def has_ended(self, number: int) -> bool:
-        """Return whether the mission to which the robot gives this number has ended."""
+        """Return whether a mission has ended, by the number that the robot knows."""
         return any(mission.number == number and mission.ended for mission in self.missions.values())
 
     def with_key(self, key: str) -> Mission | None:
-        """Return the mission whose order has this key, if any."""
+        """Return the mission whose order has this key; None if there is none, or for the key ""."""
         return next((m for m in self.missions.values() if key and m.order.key == key), None)
 
     def add(self, order: Order) -> Mission:
         """Store a new mission; delete the oldest ended missions if there are more than `KEPT`.
 
         Raises:
-            UnavailableError: If the disk refuses; then there is no new mission.
+            UnavailableError: If the disk refuses to write; then there is no new mission.
         """
         mission_id = f"m{int(next(reversed(self.missions), 'm0')[1:]) + 1}"
         digest = hashlib.sha256(self._salt + mission_id.encode()).digest()
@@ -291,7 +291,7 @@ class MissionStore:
         return mission
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Store an event, at once or as soon as the disk works again; see `Mission.apply`."""
+        """Store an event, as in `Mission.apply`; if the disk refuses, keep the event in memory."""
         if event == "reached" and changed["waypoint"] < len(mission.reached):
             return  # an earlier teleop has stored it
         self._events += 1
@@ -301,21 +301,21 @@ class MissionStore:
             self._commit()
 
     def catch_up(self, now_ns: int) -> None:
-        """Try again to write events that the disk has refused, if due at `now_ns` [ns]."""
+        """Try again at `now_ns` [ns] to write events that the disk has refused, if that is due."""
         if self.trouble and now_ns >= self._keep_ns:
             self._keep_ns = now_ns + KEEP_PERIOD_NS
             with suppress(UnavailableError):
                 self._commit()
 
     def events_after(self, number: int) -> list[Event]:
-        """Return the events of all missions after the event with this number, oldest first."""
-        if number > self._events:  # the reader knows an earlier file
+        """Return the events of all missions after the event `number`, oldest first."""
+        if number > self._events:  # the reader has a number of an earlier file
             number = 0
         if number == self._events:
             return []
         kept = (event for mission in self.missions.values() for event in mission.events)
         found = sorted((e for e in kept if e["id"] > number), key=lambda event: event["id"])
-        if number:  # a new reader has missed nothing
+        if number:  # 0 is a new reader, who has missed nothing
             self.dropped += self._events - number - len(found)
         return found
 
@@ -324,11 +324,7 @@ class MissionStore:
         self._db.close()
 
     def _commit(self, new: Mission | None = None, old: Sequence[str] = ()) -> None:
-        """Write all events that are not on the disk yet, and a new mission; delete old missions.
-
-        Raises:
-            UnavailableError: If the disk refuses the transaction.
-        """
+        """Write all events that are not on the disk, and a new mission; delete old missions."""
         db = self._db
         try:
             db.execute("BEGIN")
@@ -349,7 +345,6 @@ class MissionStore:
         self.trouble = ""
 
     def _write(self, mission: Mission) -> None:
-        """Write the status of a mission and its waypoints."""
         db, row = self._db, int(mission.id[1:])
         db.execute("UPDATE mission SET status = ? WHERE n = ?", (_status(mission), row))
         (there,) = db.execute("SELECT count(*) FROM reached WHERE mission = ?", (row,)).fetchone()

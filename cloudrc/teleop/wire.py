@@ -1,6 +1,6 @@
-"""Define teleop's plans and messages; encode messages between the processes of cloud and teleop.
+"""Define teleop's plans and messages, and encode the messages between cloud and teleop.
 
-Each datagram is a JSON list: the name of the message's type and its fields in order.
+Each datagram is a JSON list: the name of the message's type, then its fields in order.
 """
 
 from __future__ import annotations
@@ -27,26 +27,25 @@ from cloudrc.records import FAILURES, MissionEvent
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One waypoint and the conditions for reaching it.
+    """A waypoint, and the conditions under which it counts as reached.
 
-    If `tolerance` is infinite, the leg ends after the time `dwell`, wherever the robot is. Missions
-    of random steps use such legs.
+    With an infinite `tolerance` (for random steps) the waypoint is reached after the time `dwell`.
     """
 
     position: Vector  # [m], world frame, shape (3,)
     yaw: float = 0.0  # heading to hold [rad]
     tolerance: float = 0.10  # largest distance from the waypoint that counts as reached [m]
     dwell: float = 0.5  # time to stay within the tolerance without interruption [s]
-    time_limit: float = 60.0  # of the leg, without the time in which it is held [s]
+    time_limit: float = 60.0  # for reaching the waypoint, without holds [s]
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Waypoints of a mission, with start and time limit."""
+    """Waypoints of a mission, with the place of the start and the time limit."""
 
     legs: tuple[Leg, ...]  # in order; at least one
     start: Start = Start.SPAWN  # the spawn (world is reset), or the robot's position
-    time_limit: float = 60.0  # of the mission, including the time in which it is held [s]
+    time_limit: float = 60.0  # of the mission, with holds [s]
 
 
 NO_PLAN = Plan((Leg(ZERO),))
@@ -54,7 +53,7 @@ NO_PLAN = Plan((Leg(ZERO),))
 
 
 class RobotStatus(NamedTuple):
-    """The robot's status from the newest telemetry, sent from cloud to teleop.
+    """The robot's status from the newest telemetry, which cloud sends to teleop.
 
     Numbers that are not known yet are NaN.
     """
@@ -84,14 +83,14 @@ STATES = {
     **dict.fromkeys(("started", "resumed"), FLYING),
     **dict.fromkeys(FAILURES, "failed"),
 }
-"""State of a mission after an event; other events do not change the state."""
+"""Event -> state of the mission after the event; all other events leave the state as it is."""
 
 
 Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 """Messages from teleop to cloud."""
 Message: TypeAlias = RobotStatus | Output
 ALARM = OperatorRequest(0, Request.ESTOP)
-"""Emergency stop. It can bypass teleop's state machine, and cloud gives the stop a number."""
+"""Emergency stop without a number. Cloud adds the number, so every part of teleop can send this."""
 _KINDS: dict[str, TypeAdapter[Message]] = {
     kind.__name__: TypeAdapter(kind)
     for kind in (RobotStatus, Setpoint, OperatorRequest, MissionEvent)

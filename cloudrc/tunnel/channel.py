@@ -1,9 +1,9 @@
-"""Classify the datagrams of one stream by their counters: used, late or repeated."""
+"""Classify the datagrams of one stream by their counters as used, late or repeated."""
 
 from __future__ import annotations
 
 WINDOW = 1024
-"""Number of counters below the newest that a channel remembers [datagrams]."""
+"""Number of counters before the newest counter that a channel remembers."""
 _MASK = (1 << WINDOW) - 1
 
 # Outcomes of a datagram, which name the counts.
@@ -11,26 +11,26 @@ USED, LATE, REPEATED = "used", "late", "repeated"
 
 
 class Channel:
-    """Track the received counters of one stream in one epoch."""
+    """Classify the datagrams of one kind and direction in one session."""
 
     def __init__(self, newest_wins: bool) -> None:
         """Start without counters; with `newest_wins`, a datagram older than the newest is late.
 
-        Otherwise the last datagram to arrive is used, even if an earlier datagram is newer (the
-        published code's policy). Repeated datagrams are dropped in both cases.
+        Without `newest_wins`, every datagram that arrives for the first time is used, as in the
+        published code. A repeated datagram is never used.
         """
         self._newest_wins = newest_wins
         self.reset()
 
     def reset(self) -> None:
-        """Forget all counters at the start of an epoch."""
+        """Forget all counters, because a new session restarts the counters."""
         self._newest = -1
         self._seen = 0  # bit k: newest - k has arrived
         self._repeats = 0
 
     @property
     def is_flooded(self) -> bool:
-        """Whether more datagrams were repeated than sent; no link repeats so many."""
+        """Whether an attacker repeats datagrams: more were repeated than sent."""
         return self._repeats > self._newest + 1
 
     def take(self, counter: int) -> str:

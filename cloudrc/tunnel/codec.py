@@ -1,13 +1,13 @@
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
 A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body with a fixed
-length for each kind, and a 16-byte tag; `session` seals and opens datagrams. The functions raise
-no exception except DecodeError.
+length for each kind, and a 16-byte authentication tag, which `session` adds and verifies. The epoch
+is the number of the session. The functions raise no exception except DecodeError.
 
 The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
 nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
 
-Deviation: the paper's tunnel sends pickled ROS messages. They have 1 kB and can execute code.
+Deviation: the paper's tunnel sends pickled ROS messages, which have 1 kB and can execute code.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from cloudrc.messages import (
 VERSION = 6
 """Version of the wire format. Each release of cloudrc uses one version and refuses all others."""
 DATAGRAM_MAX = 512
-"""Size of the receive buffer [bytes]: every valid datagram is shorter, longer ones are refused."""
+"""Size of the receive buffer [bytes]; every valid datagram is shorter."""
 NUMBER_MAX = 2**32 - 1
 """Highest number of an operator request."""
 
 
 class Kind(IntEnum):
-    """Kind of a datagram's content; every kind has its own counter in each direction.
+    """Kind of a datagram's content. In each direction, every kind has a counter of its own.
 
-    Kinds up to LAST_GREETING open a session and are authenticated with the pre-shared key. The
-    other kinds belong to a session and are sealed with the session's keys.
+    Kinds up to LAST_GREETING belong to the handshake and are authenticated with the pre-shared key.
+    The other kinds belong to a session and are encrypted with the session's keys.
     """
 
     HELLO = 1
@@ -54,26 +54,26 @@ class Kind(IntEnum):
 
 
 class Direction(IntEnum):
-    """Direction of a datagram: uplink is world to cloud, downlink is cloud to world."""
+    """Direction of a datagram: the uplink is world to cloud, the downlink is cloud to world."""
 
     UPLINK = 0
     DOWNLINK = 1
 
 
 class DecodeError(ValueError):
-    """Report an invalid datagram; the text is the outcome under which the datagram is counted."""
+    """Report an invalid datagram; the text is the name of the counter for such datagrams."""
 
 
 Header: TypeAlias = tuple[int, int, int, int, int]
-"""Version, direction, epoch, kind and counter."""
+"""Version, direction, epoch, kind and counter of a datagram."""
 
 
 class Hello(NamedTuple):
     """Cloud's request for a session.
 
-    It names the session and cloud's monotonic clock by 16 random bytes each. The cookie of 13 bytes
-    is that of world's challenge, or zeros. World continues from `epoch`, the newest
-    epoch that cloud knows.
+    `nonce` identifies the cloud and `clock` its monotonic clock, each by 16 random bytes. `cookie`
+    has the 13 bytes of world's challenge, or zeros. World counts on from `epoch`, the newest
+    session number that cloud knows.
     """
 
     nonce: bytes
@@ -83,7 +83,11 @@ class Hello(NamedTuple):
 
 
 class Accept(NamedTuple):
-    """World's acceptance: the hello's nonce, 16 bytes for world's process, 16 for its clock."""
+    """World's answer that opens a session.
+
+    `nonce` is that of the answered hello. `world_nonce` and `clock` identify world's process and
+    monotonic clock by 16 random bytes each.
+    """
 
     nonce: bytes
     world_nonce: bytes
@@ -121,9 +125,9 @@ def encode_header(kind: int, direction: int, epoch: int, counter: int) -> bytes:
 
 
 def check(data: bytes) -> Header:
-    """Decode a datagram's header, which is not authenticated yet.
+    """Decode the header of a datagram, before the datagram is authenticated.
 
-    Raise the DecodeError "version", or "malformed" for a wrong direction, kind or length.
+    Raise the DecodeError "version", or "malformed" for an invalid direction, kind or length.
     """
     size = len(data)
     if size < HEADER_SIZE:
@@ -137,7 +141,7 @@ def check(data: bytes) -> Header:
 
 
 def peek(data: bytes) -> tuple[int, int, int]:
-    """Read kind, epoch and counter of a datagram in transit, without checks.
+    """Read kind, epoch and counter of a datagram without any check, for the link and for logs.
 
     Raise the DecodeError "malformed" if the datagram is shorter than a header.
     """
@@ -197,7 +201,7 @@ def decode_command(body: bytes) -> Command:
 
 
 def encode_operator(request: OperatorRequest) -> bytes:
-    """Encode the body of an OPERATOR datagram; the header holds the request's epoch."""
+    """Encode the body of an OPERATOR datagram; the header has the request's epoch."""
     return _OPERATOR.pack(*request[:-1])
 
 
@@ -231,9 +235,9 @@ def decode_accept(body: bytes) -> Accept:
 
 
 encode_challenge: Callable[[bytes], bytes] = _CHALLENGE.pack
-"""Encode the body of a CHALLENGE datagram: a cookie, then zeros."""
+"""Encode the body of a CHALLENGE datagram from a cookie; zeros follow the cookie."""
 encode_busy: Callable[[bytes], bytes] = _BUSY.pack
-"""Encode the body of a BUSY datagram: the nonce of the answered hello."""
+"""Encode the body of a BUSY datagram from the nonce of the answered hello."""
 
 
 def decode_challenge(body: bytes) -> bytes:

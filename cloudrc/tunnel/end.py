@@ -1,4 +1,4 @@
-"""What both ends of the tunnel have in common: identity, session, outgoing datagrams, records."""
+"""The common part of both ends of the tunnel: identity, session, outgoing datagrams, records."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from cloudrc.tunnel.session import Session
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The identity of an end, fixed at its start.
+    """The identity of one end, fixed when the end's process starts.
 
     Attributes:
-        clock_id: 16 bytes that identify this machine's monotonic clock.
-        nonce: 16 bytes that identify this process; new at every start.
+        clock_id: 16 bytes that identify the monotonic clock of this machine.
+        nonce: 16 random bytes that identify this process.
         ring: The pre-shared keys; None if both ends are in one process.
     """
 
@@ -43,21 +43,21 @@ class TunnelEnd:
 
     @property
     def epoch(self) -> int:
-        """Epoch of the session; 0 for none."""
+        """Number of the present session; 0 without a session."""
         return self._session.epoch
 
     @property
     def sealed(self) -> bool:
-        """Whether the datagrams are authenticated."""
+        """Whether the datagrams are encrypted and authenticated."""
         return self._session.sealed
 
     def take_datagrams(self) -> list[bytes]:
-        """Return the datagrams to send."""
+        """Return the datagrams to send that were made since the last call."""
         datagrams, self._datagrams = self._datagrams, []
         return datagrams
 
     def take_records(self) -> list[Record]:
-        """Return the records since the last call."""
+        """Return the records made since the last call."""
         records, self._records = self._records, []
         return records
 

@@ -1,4 +1,4 @@
-"""The handshake of a session: world's side, cloud's side, and the log of why it fails.
+"""The handshake that opens a session: world's side, cloud's side, and the log of failures.
 
     cloud                                      world
       HELLO (nonce, clock, no cookie)   -->
@@ -7,15 +7,15 @@
                                         <--    ACCEPT (nonce, world's nonce, clock), a new epoch
                                             or BUSY (nonce)
 
-Every greeting has a tag by a pre-shared key; world authenticates its answer with the key of the
-hello. No answer is longer than its hello. The cookie is a MAC over a time slot, so world stores
-nothing for a hello without a cookie, and a captured hello is useless after two slots. A hello with
-a cookie is answered once per counter. World sends at most ten challenges per second, which name no
-receiver: the true cloud can use those that somebody else has provoked.
+A pre-shared key authenticates each of these datagrams by a tag; world answers with the key of the
+hello. No answer is longer than its hello. The cookie is a MAC over a time slot: world stores
+nothing for a hello without a cookie, and a captured hello is useless after two slots. World answers
+a hello with a cookie once per counter. World sends at most ten challenges per second. A challenge
+names no receiver, so the true cloud can also use a challenge to a forger.
 
-The cloud with the session keeps it while world hears this cloud: at least one new sealed datagram
-per `command_age_max`. Otherwise another cloud can get a session under the next epoch. Epochs rise
-even if world restarts, because each hello contains the newest epoch of its cloud.
+A cloud keeps its session while world receives at least one new encrypted datagram from this cloud
+per `command_age_max`. Otherwise another cloud can get a session. Each session has a higher number,
+the epoch, even after a restart of world: each hello contains the newest epoch that its cloud knows.
 
 Deviation: WireGuard also derives session keys by Diffie-Hellman. In this tunnel the pre-shared key
 is enough: one owner has both ends, and anybody with the key can command the robot anyway.
@@ -35,34 +35,34 @@ from cloudrc.tunnel.codec import Accept, DecodeError, Hello, Kind
 from cloudrc.tunnel.session import NO_EPOCH, Session
 
 EPOCH_MAX = 2**32 - 1
-"""Last epoch that the header can hold; the next epoch is 1."""
+"""Largest session number that the header can hold; the next number is 1."""
 CHALLENGE_NS = 100_000_000
 """Shortest time between two challenges [ns]."""
 COOKIE_NS = 2_000_000_000
-"""Length of a cookie's time slot [ns]; a cookie is valid in its slot and in the next slot."""
+"""Length of the time slot of a cookie [ns]. A cookie is valid in its slot and in the next slot."""
 GRACE_NS = 1_000_000_000
-"""Time for which a cloud keeps a new session although world has not heard that cloud yet [ns]."""
+"""Time for which a cloud keeps a new session without having sent an encrypted datagram [ns]."""
 REPEATS_MAX = 3
-"""How often world repeats its acceptance to a cloud that world does not hear."""
+"""How often world repeats its ACCEPT to a cloud that sends hellos but no encrypted datagrams."""
 CLOUDS_MAX = 64
-"""Number of nonces of which world remembers the newest counter."""
+"""Number of cloud processes of which world remembers the newest hello's counter."""
 NO_COOKIE = bytes(codec.COOKIE_SIZE)
 """Cookie of the first hello."""
 REPLIES_MAX = 3
-"""Largest number of challenges that cloud answers between two periodic hellos."""
+"""Largest number of challenges that cloud answers per periodic hello."""
 COOKIES_MAX = 4096
-"""Number of cookies that cloud remembers, one per time slot, for more than two hours in total."""
+"""Number of cookies that cloud remembers: one per time slot of 2 s, for more than two hours."""
 WORLDS_MAX = 64
-"""Number of earlier world processes that cloud remembers."""
+"""Number of earlier world processes that cloud remembers, whose late answers it ignores."""
 
 
 def is_newer(epoch: int, than: int) -> bool:
-    """Return whether `epoch` is ahead of `than` by less than half of all epochs."""
+    """Return whether `epoch` is later than `than`; session numbers start again after the last."""
     return 0 < (epoch - than) % (EPOCH_MAX + 1) <= EPOCH_MAX // 2
 
 
 class HelloAnswer(NamedTuple):
-    """World's answer to a hello: name of its count, datagrams, and whether it opened a session."""
+    """World's answer to a hello: name of the counter, datagrams, whether a session was opened."""
 
     outcome: str
     datagrams: list[bytes]
@@ -70,16 +70,16 @@ class HelloAnswer(NamedTuple):
 
 
 class ServerHandshake:
-    """World's side of the handshake: decide which cloud has authority, and under which epoch."""
+    """World's side of the handshake: decide which cloud gets a session, and number sessions."""
 
     def __init__(self, session: Session, nonce: bytes, clock: bytes, age_max_ns: int) -> None:
         """Begin without a session.
 
         Args:
-            session: World's session; this class begins the epochs of the session.
+            session: Keys and counters of world's session; this class begins the sessions.
             nonce: 16 bytes that identify this process, new at every start.
-            clock: 16 bytes that identify the monotonic clock of this process.
-            age_max_ns: Silence after which another cloud can take the session [ns].
+            clock: 16 bytes that identify the monotonic clock of this machine.
+            age_max_ns: Silence of a cloud after which another cloud can get a session [ns].
         """
         self._session = session
         self._nonce, self._clock, self._epoch = nonce, clock, NO_EPOCH
@@ -87,7 +87,7 @@ class ServerHandshake:
         self._age_max_ns = age_max_ns
         self._fresh_until_ns = -1
         self._incumbent = Hello(b"", b"", b"", NO_EPOCH)
-        self._repeated = 0  # acceptances of this epoch since its cloud was last heard
+        self._repeated = 0  # repeated ACCEPTs since the last encrypted datagram
         self._challenged_ns = -CHALLENGE_NS
         self._counters: dict[bytes, int] = {}  # newest counter answered, by nonce
         self._windows = {
@@ -95,14 +95,14 @@ class ServerHandshake:
         }
 
     def hear(self, now_ns: int) -> None:
-        """Note a new datagram of the session at `now_ns` [ns]: its cloud is alive."""
+        """Note at `now_ns` [ns] a new datagram of the session: its cloud keeps the session."""
         self._fresh_until_ns = now_ns + self._age_max_ns
         self._repeated = 0
 
     def accept_once(self, kind: int, counter: int, now_ns: int) -> None:
-        """Accept an ALIVE or OPERATOR datagram of the session once, at `now_ns` [ns].
+        """Check an ALIVE or OPERATOR datagram of the session at `now_ns` [ns] for repetition.
 
-        Raise the DecodeError "malformed" for other kinds, "repeated" for a counter that is not new.
+        Raise the DecodeError "repeated" for a known counter, "malformed" for another kind.
         """
         window = self._windows.get(kind)
         if window is None:
@@ -112,7 +112,7 @@ class ServerHandshake:
         self.hear(now_ns)
 
     def receive_hello(self, hello: Hello, counter: int, now_ns: int) -> HelloAnswer:
-        """Answer at `now_ns` [ns] the hello that `Session.open` has just verified."""
+        """Answer a hello at `now_ns` [ns], after `Session.open` has verified the hello."""
         session, key = self._session, self._session.greeting_key
         if not self._has_cookie(hello, now_ns):
             if now_ns - self._challenged_ns < CHALLENGE_NS:
@@ -122,12 +122,12 @@ class ServerHandshake:
             return HelloAnswer("hello", [session.greet(Kind.CHALLENGE, challenge, key)])
         if counter <= self._counters.get(hello.nonce, -1):
             return HelloAnswer(REPEATED, [])
-        self._counters.pop(hello.nonce, None)  # so that the nonce answered last is forgotten last
+        self._counters.pop(hello.nonce, None)  # the nonce answered last comes last
         self._counters[hello.nonce] = counter
         if len(self._counters) > CLOUDS_MAX:
             del self._counters[next(iter(self._counters))]
         if hello.nonce == self._incumbent.nonce:
-            if self._keeps_epoch(now_ns):  # cloud takes the answer's key as the key of the epoch
+            if self._keeps_epoch(now_ns):  # with the epoch's key
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
             return HelloAnswer(
@@ -141,16 +141,17 @@ class ServerHandshake:
         return HelloAnswer("hello", [self._accept()], opened=True)
 
     def begin_next_epoch(self, now_ns: int) -> bytes:
-        """Begin the next epoch of the session at `now_ns` [ns]; return the datagram for cloud."""
+        """Begin a new session with the same cloud at `now_ns` [ns]; return the ACCEPT for it."""
         self._begin(now_ns)
         self._session.begin(self._epoch)
         return self._accept()
 
     def _keeps_epoch(self, now_ns: int) -> bool:
-        """Decide whether the cloud with the session keeps its epoch or gets the next epoch.
+        """Decide whether the cloud with the session keeps its epoch, or gets the next epoch.
 
-        It gets the next epoch if the epoch has ended or has an older key than the hello's, or if it
-        has asked often although world does not hear it or its hello has another key than the epoch.
+        The cloud gets the next epoch if the epoch has ended, or if the hello has a newer key. It
+        also gets the next epoch after more than REPEATS_MAX hellos if world has received no
+        encrypted datagram since the first of them, or if hello and epoch have different keys.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -181,13 +182,13 @@ class ServerHandshake:
 
 
 class ClientHandshake:
-    """Cloud's side of the handshake: make hellos and decide which answers are valid."""
+    """Cloud's side of the handshake: make hellos, and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes) -> None:
         """Begin without a session; `nonce` and `clock` are as in `ServerHandshake`."""
         self._seed, self._clock = nonce, clock
         self._nonce, self._nonces = nonce, 0
-        self._epoch = NO_EPOCH  # the newest one
+        self._epoch = NO_EPOCH  # the newest known epoch
         self._cookie = NO_COOKIE
         self._replies = 0
         self._cookies: dict[bytes, None] = {}  # received so far, oldest first
@@ -195,14 +196,14 @@ class ClientHandshake:
         self._old_worlds: deque[bytes] = deque(maxlen=WORLDS_MAX)
 
     def make_hello(self) -> bytes:
-        """Make the body of a periodic hello."""
+        """Make the body of a periodic HELLO."""
         self._replies = REPLIES_MAX
         return self._hello()
 
     def answer_challenge(self, cookie: bytes) -> bytes | None:
-        """Make the body of the hello that answers a challenge; None if no answer is needed.
+        """Make the body of the HELLO that answers a challenge; None for no answer.
 
-        A repeated cookie is ignored, because an older cookie must not replace the newest.
+        A repeated cookie gets no answer, because an old cookie must not replace the newest cookie.
         """
         if self._replies == 0 or cookie in self._cookies:
             return None
@@ -214,15 +215,16 @@ class ClientHandshake:
         return self._hello()
 
     def is_refused(self, nonce: bytes) -> bool:
-        """Return whether a refusal with this nonce answers a hello of this process."""
+        """Return whether a BUSY with this nonce answers a hello of this process."""
         return nonce == self._nonce
 
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
-        """Handle an acceptance; return cloud's and world's nonce for the new epoch, or None.
+        """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
-        Cloud accepts another world process only while cloud asks for a session (`asks`), because a
-        late datagram of a dead process may arrive. If cloud has accepted a dead process even so,
-        the living process counts as old; when it answers again, cloud asks under a new nonce.
+        Cloud accepts another world process only while cloud asks for a session (`asks`), because
+        the ACCEPT may be a late datagram of an ended process. If cloud has joined an ended process
+        anyway, the running process counts as ended; when it answers again, cloud asks under a new
+        nonce.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):
@@ -235,7 +237,7 @@ class ClientHandshake:
         if known and not is_newer(epoch, self._epoch):
             return None
         if self._world and not known:
-            self._old_worlds.append(self._world)  # a dead process does not come back
+            self._old_worlds.append(self._world)  # an ended process does not come back
         self._world, self._epoch = accept.world_nonce, epoch
         return accept.nonce + accept.world_nonce
 
@@ -252,7 +254,7 @@ SILENCE_TEXT = (
 
 
 class HandshakeLog:
-    """Log why there is no session: each reason once, until the next session begins."""
+    """Log why there is no session, each reason once until the next session begins."""
 
     def __init__(self) -> None:
         self._logged: set[str] = set()
@@ -262,7 +264,7 @@ class HandshakeLog:
         self._logged.clear()
 
     def about(self, outcome: str, data: bytes, now_ns: int) -> list[Fault]:
-        """Log at `now_ns` [ns] why a datagram was refused; `outcome` is the DecodeError's text."""
+        """Log at `now_ns` [ns] why a datagram was refused; `outcome` is its DecodeError's text."""
         if outcome == "version":
             return self.say("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)
         if outcome == "tag" and codec.peek(data)[0] <= codec.LAST_GREETING:
@@ -270,9 +272,10 @@ class HandshakeLog:
         return []
 
     def say(self, code: str, text: str, now_ns: int) -> list[Fault]:
-        """Log a fault at `now_ns` [ns] unless the same text has been logged.
+        """Log a fault at `now_ns` [ns] unless the log already has the same text.
 
-        The text counts, not the code: a forged datagram must not hide the true peer's version.
+        A new text with a known code is logged: otherwise a forged datagram with a wrong version
+        would hide the version of the true peer.
         """
         if text in self._logged:
             return []

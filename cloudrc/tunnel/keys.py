@@ -1,7 +1,7 @@
-"""Pre-shared keys, and the text of a key file.
+"""Pre-shared keys, and the format of a key file.
 
-The text form of a `Key` hides the secret. The tunnel uses keys that HKDF-SHA256 (RFC 5869) derives
-from the pre-shared key, each bound to the wire version and one use.
+`repr` of a `Key` hides the secret. The tunnel uses keys that HKDF-SHA256 (RFC 5869) derives from
+the pre-shared key; each derived key is for one wire version and one use.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from cloudrc.tunnel.codec import TAG_SIZE, VERSION
 
 KEY_SIZE = 32
-"""Size of a pre-shared key and of derived keys [bytes]."""
+"""Size of a pre-shared key and of a derived key [bytes]."""
 _LABEL = b"cloudrc %d " % VERSION
 
 
@@ -26,10 +26,10 @@ class Key:
     """A secret pre-shared key of 32 bytes.
 
     Attributes:
-        name: Short public name that distinguishes two keys.
+        name: Short public name, which tells keys apart in logs.
 
     Raises:
-        ValueError: If the secret is not 32 bytes long, or if all bytes are zero; the message does
+        ValueError: If the secret is not 32 bytes long, or if all bytes are zero. The message does
             not contain the secret.
     """
 
@@ -46,15 +46,15 @@ class Key:
         object.__setattr__(self, "name", self.derive(b"", b"name")[:4].hex())
 
     def derive(self, salt: bytes, use: bytes) -> bytes:
-        """Derive 32 bytes for one use."""
+        """Derive a key of 32 bytes for one use, as the label `use` names it."""
         return HKDF(SHA256(), KEY_SIZE, salt, _LABEL + use).derive(self._secret)
 
     def tag(self, data: bytes) -> bytes:
-        """Compute the tag of a greeting: HMAC-SHA256, cut to 16 bytes."""
+        """Compute the authentication tag of a handshake datagram: HMAC-SHA256, cut to 16 bytes."""
         return hmac.digest(self._tag_key, data, hashlib.sha256)[:TAG_SIZE]
 
     def verifies(self, data: bytes, tag: bytes) -> bool:
-        """Check the tag of a greeting in constant time."""
+        """Return whether `tag` is the tag of `data`; the comparison takes constant time."""
         return hmac.compare_digest(self.tag(data), tag)
 
     def text(self) -> str:
@@ -66,20 +66,20 @@ class Key:
 
 
 class KeySet(NamedTuple):
-    """The content of a key file: the key in use, and perhaps an older key, still accepted."""
+    """The keys in a key file: the current key and, during a rotation, the previous key."""
 
     current: Key
     previous: Key | None = None
 
     @property
     def accepted(self) -> tuple[Key, ...]:
-        """The keys that an end accepts; the first is the current key."""
+        """The keys that an end accepts in a handshake; the first is the current key."""
         return (self.current,) if self.previous is None else (self.current, self.previous)
 
 
 @dataclass
 class KeyRing:
-    """The keys of one end; the driver replaces the attribute `keys` in flight."""
+    """The keys of one end. The driver replaces `keys` when the key file changes, also in flight."""
 
     keys: KeySet
 
@@ -87,7 +87,7 @@ class KeyRing:
 def parse(data: bytes) -> KeySet:
     """Parse a key file: 32 bytes, or the lines `current HEX` and optionally `previous HEX`.
 
-    Raise a ValueError if the file is invalid. The message quotes no part of the file.
+    Raise a ValueError if the file is invalid. The message contains no part of the file.
     """
     if len(data) == KEY_SIZE:
         return KeySet(Key(data))

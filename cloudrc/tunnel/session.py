@@ -1,15 +1,16 @@
-"""Seal outgoing datagrams and open incoming ones under the keys of one end's session.
+"""Encrypt outgoing datagrams and verify incoming datagrams with the keys of a session.
 
-Each direction of an epoch has one key, derived by HKDF from a pre-shared key, both ends' nonces and
-the epoch. One key is enough for an epoch: 2^32 datagrams take over a year. A datagram changes no
-state before its tag is verified.
+Each direction of a session has one key. HKDF derives this key from a pre-shared key, the nonces of
+both ends, and the epoch (session number). One key is enough for a session: 2^32 datagrams take over
+a year. A datagram changes no state before its tag is verified.
 
-Counters restart with every epoch. Greetings have no epoch yet, so they keep counting: the link
-draws impairments by epoch and counter, and would lose a greeting with a repeated counter each time.
+Counters restart with every session. The handshake comes before the session, so its counters
+continue: the link decides the loss of a datagram by epoch and counter, and would lose a handshake
+datagram with a repeated counter each time.
 
-Two ends in one process need no keys: virtual time has no wire to protect, and sealing would take a
-twentieth of the flight's time. Drivers with a socket refuse such a session (`Endpoint.sealed`), so
-a missing key never leads to plaintext on a wire.
+Two ends in one process need no keys: their datagrams reach no network, and encryption would take a
+twentieth of the flight's time. Drivers with a socket refuse a session without keys
+(`Endpoint.sealed`), so a missing key never leads to plaintext in a network.
 """
 
 from __future__ import annotations
@@ -30,41 +31,41 @@ from cloudrc.tunnel.codec import (
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
 NO_EPOCH = 0
-"""Epoch of an end without a session, and of every hello, challenge and refusal."""
+"""Epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram."""
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}
-"""Kinds of datagram that belong to no epoch: all greetings except ACCEPT."""
+"""Kinds of handshake datagrams that belong to no session: all except ACCEPT."""
 _PUBLIC_KEY = b"nothing is secret in one process"
 _NO_TAG = bytes(TAG_SIZE)
 
 
 class NoCipher:
-    """Replace the cipher between two ends in one process: the tag is zeros."""
+    """Stand in for the cipher if both ends are in one process: the tag is zeros."""
 
     def encrypt(self, nonce: bytes, body: bytes, header: bytes) -> bytes:
-        """Append zeros."""
+        """Return the body with a tag of zeros, not encrypted."""
         return body + _NO_TAG
 
     def decrypt(self, nonce: bytes, data: bytes, header: bytes) -> bytes:
-        """Remove the zeros."""
+        """Return the body without the tag."""
         return data[:-TAG_SIZE]
 
 
 class Session:
-    """Keys and counters of one end under the current epoch.
+    """Keys and counters of one end in the present session.
 
     Attributes:
-        epoch: Current epoch; `NO_EPOCH` without a session.
+        epoch: Number of the session; `NO_EPOCH` without a session.
         sealed: Whether datagrams of the session are encrypted and authenticated.
         ring: The pre-shared keys; `follow_keys` adopts changes.
-        greeting_key: Pre-shared key of the last opened greeting.
-        epoch_key: Pre-shared key of the epoch.
-        is_outdated: Whether the key file has a newer key than the epoch.
+        greeting_key: Pre-shared key that verified the last handshake datagram.
+        epoch_key: Pre-shared key of the session.
+        is_outdated: Whether the key file has a newer key than the session.
     """
 
     def __init__(self, sends: Direction, ring: KeyRing | None) -> None:
         """Start without a session; this end sends in the direction `sends`.
 
-        `ring` holds the pre-shared keys; it is None if both ends are in one process.
+        `ring` has the pre-shared keys; it is None if both ends are in one process.
         """
         self.epoch, self.sealed = NO_EPOCH, ring is not None
         self.ring = ring or KeyRing(KeySet(Key(_PUBLIC_KEY)))
@@ -76,10 +77,10 @@ class Session:
         self._nonces = b""
 
     def begin(self, epoch: int, nonces: bytes = b"", key: Key | None = None) -> None:
-        """Begin an epoch: derive new keys and restart the counters.
+        """Begin a session with the number `epoch`: derive its keys and restart its counters.
 
-        `nonces` are cloud's nonce, then world's; `key` is the pre-shared key of the handshake.
-        A value that is missing stays as in the previous epoch.
+        `nonces` is cloud's nonce followed by world's nonce; `key` is the pre-shared key of the
+        handshake. A missing value stays as in the previous session.
         """
         self.epoch = epoch
         self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)
@@ -89,7 +90,7 @@ class Session:
         self._sealing, self._opening = self._derive(self._sends), self._derive(self._opens)
 
     def seal(self, kind: int, body: bytes) -> bytes:
-        """Seal `body` as the next datagram of this kind."""
+        """Encrypt `body` as the next datagram of this kind; return the datagram."""
         counters = self._counters
         counter = counters[kind]
         counters[kind] = counter + 1
@@ -97,7 +98,7 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def greet(self, kind: int, body: bytes, key: Key | None = None) -> bytes:
-        """Make a greeting with a tag by a pre-shared key, by default the key of the epoch."""
+        """Make a handshake datagram with the tag of a pre-shared key, by default the session's."""
         counter = self._counters[kind]
         self._counters[kind] = counter + 1
         epoch = NO_EPOCH if kind in TIMELESS else self.epoch
@@ -105,11 +106,11 @@ class Session:
         return data + (key or self.epoch_key).tag(data)
 
     def open(self, data: bytes) -> tuple[int, int, int, bytes]:
-        """Verify a datagram; return its kind, epoch and counter, and its body.
+        """Verify a datagram; return its kind, epoch, counter and decrypted body.
 
         Raises:
-            DecodeError: "malformed", "version", "direction" (the direction in which this end
-                sends), "old_epoch" (an epoch other than the current one) or "tag".
+            DecodeError: "malformed", "version", "direction" (a datagram in the direction in which
+                this end itself sends), "old_epoch" (another session), or "tag".
         """
         _, direction, epoch, kind, counter = check(data)
         if direction != self._opens:
@@ -132,7 +133,7 @@ class Session:
         return self._counters[kind]
 
     def follow_keys(self) -> None:
-        """Adopt a new key file; end the session if the file does not contain the session's key."""
+        """Adopt a changed key file; end the session if the file no longer has the session's key."""
         if (keys := self.ring.keys) is self._keys:
             return
         self._keys = keys
@@ -157,7 +158,7 @@ class Session:
 
 
 def pair(epoch: int = 1, secret: bytes | None = b"p" * 32) -> tuple[Session, Session]:
-    """Make both ends of a session, world's first, for tests; None makes unsealed ends."""
+    """Make world's and cloud's end of a session for tests; no encryption if `secret` is None."""
     ring = None if secret is None else KeyRing(KeySet(Key(secret)))
     ends = Session(Direction.UPLINK, ring), Session(Direction.DOWNLINK, ring)
     for end in ends:

@@ -1,8 +1,8 @@
-"""The robot's end of the loop: physics, sensors, guard and low-level controller.
+"""The robot's end of the tunnel: physics, sensors, guard and low-level controller.
 
     tunnel > guard > low_level > rotor speeds > simulator > readings > sensors > tunnel
 
-`readings` is the interface between the physics and the onboard part. Only `scene` imports MuJoCo.
-Robots and scenes are MJCF files in `robots/` and `scenes/`; the file name of each is its
-configuration name.
+`readings` is the interface between the physics and the onboard controller. Only `scene` imports
+MuJoCo. Robots and scenes are MJCF files in the folders `robots` and `scenes`; a file's name is the
+name in the configuration.
 """

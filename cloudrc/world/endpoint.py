@@ -1,14 +1,14 @@
-"""World's end of the tunnel: it receives commands, flies the robot and sends telemetry.
+"""World's end of the tunnel: receive commands, fly the robot and send telemetry.
 
-Time advances in `_advance` only. All ticks before a datagram's arrival run before the datagram has
-any effect, so the result does not depend on when the driver wakes up.
+A datagram takes effect after all steps of the simulation that are due before its arrival. The
+result therefore does not depend on when the driver (the program that calls this class) wakes up.
 
-World's clock follows the machine's monotonic clock and may fall behind: after a stall the robot
-catches up by at most 50 ms per wake. The rest of the stall is slip, by which world's clock lags
-from then on. So the guard never skips a tick, and world's clock never jumps.
+World's clock follows the machine's monotonic clock, but may fall behind. After a stall of the
+process, world simulates at most 50 ms of the lost time; the rest is a permanent lag, the slip. So
+the guard runs in every step, and world's clock never jumps.
 
-World alone assigns epochs. A new epoch begins when a cloud takes control, and when a mission starts
-from the spawn.
+World numbers the sessions: a session's number is its epoch. A new epoch begins when a cloud takes
+control, and when a mission starts from the spawn.
 """
 
 from __future__ import annotations
@@ -47,28 +47,28 @@ from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
 START_AGE_MAX_NS = 1_000_000_000
-"""Largest age of the telemetry on which a start request is based [ns]. If the experiment allows
-older commands, the age limit of commands applies to start requests, too."""
+"""Largest accepted age of a start request [ns], counted from cloud's newest odometry when cloud
+sent the request. A larger age limit for commands replaces this limit."""
 
 
 class Orders:
-    """Carries out the operator's requests in the order of their numbers.
+    """Carry out the operator's requests in the order of their numbers.
 
     Attributes:
-        number: Number of the newest request that was carried out in this session.
-        mission_id: The mission that was started last, in any session.
-        reached: Number of waypoints of that mission known to be reached; the number never falls.
-        pipes: Number of contacts with pipes in that mission.
-        touch_speed: Speed of the tip at its first contact with the board in that mission [m/s]; NaN
-            before the first contact.
+        number: Number of the newest request carried out in this session.
+        mission_id: Number of the mission that was started last, in this or an earlier session.
+        reached: Number of waypoints of that mission that requests have reported as reached.
+        pipes: Number of contacts with pipes since that mission started.
+        touch_speed: Speed of the arm's tip when it first touched the board in that mission [m/s];
+            NaN before the contact.
     """
 
     def __init__(
         self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
     ) -> None:
-        """Begin without a request; `command_age_max_ns` is the largest age of a command [ns].
+        """Begin without a request; count refused starts in `counts` as "start_refused".
 
-        Refused starts are counted in `counts` as "start_refused".
+        `command_age_max_ns` is the largest accepted age of a command [ns].
         """
         self._guard, self._counts = guard, counts
         self._age_max_ns = max(START_AGE_MAX_NS, command_age_max_ns)
@@ -76,7 +76,7 @@ class Orders:
         self.touch_speed = nan
 
     def note_touch(self, touch: Contact) -> None:
-        """Count a contact that has begun."""
+        """Count a contact with a pipe; store the tip's speed at the first touch of the board."""
         if touch.body.startswith("pipe"):
             self.pipes += 1
         elif touch.body == "board" and touch.tip and isnan(self.touch_speed):
@@ -85,8 +85,8 @@ class Orders:
     def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
         """Carry out a request at `now_ns` [ns], world's clock; return whether a mission begins.
 
-        `waited`: the request may have waited in the socket during a stall. Raise a
-        DecodeError if the stamp of a start request is too old ("stale") or in the future.
+        `waited` tells whether the request may have waited in the socket during a stall. Raise the
+        DecodeError "stale" for a start that waited or is too old, "future" for a later stamp.
         """
         kind, guard = request.request, self._guard
         starts = kind is Request.START
@@ -95,7 +95,7 @@ class Orders:
                 return False
             if starts:
                 self._refuse_old(now_ns - request.basis_stamp_ns, waited)
-                # Not carried out, so not confirmed either: the operator must acknowledge first.
+                # Telemetry does not confirm this request: the operator has to acknowledge first.
                 if guard.latched:
                     self._counts["start_refused"] += 1
                     return False
@@ -103,7 +103,7 @@ class Orders:
         if starts and (request.mission_id != self.mission_id or request.start is Start.SPAWN):
             self.mission_id, self.reached = request.mission_id, 0
             self.pipes, self.touch_speed = 0, nan
-        if request.mission_id == self.mission_id:  # kept on board, for a cloud that restarts
+        if request.mission_id == self.mission_id:  # stored on board for a restarted cloud
             self.reached = max(self.reached, request.reached)
         if kind is Request.END:
             guard.end_mission(now_ns)
@@ -121,19 +121,19 @@ class Orders:
 
 
 REPORT_AGAIN_NS = 10_000_000_000
-"""Time without a slowdown after which world reports the next slowdown as a new fault [ns]."""
+"""World reports a slowdown as a new fault only after this time without a slowdown [ns]."""
 
 
 class PaceMonitor:
-    """Reports that simulated time passes too slowly; otherwise users would blame the network."""
+    """Report that simulated time runs slower than real time, which looks like a slow network."""
 
     def __init__(self) -> None:
         self._checked_ns = self._slip_ns = self._slow_ns = NEVER_NS
 
     def check(self, now_ns: int, slip_ns: int) -> list[Fault]:
-        """Return a fault if world fell behind since the last call, about a second ago.
+        """Return a fault if simulated time ran too slowly since the last call, about a second ago.
 
-        `now_ns` is world's clock, `slip_ns` its lag behind the machine's clock [ns].
+        `now_ns` is world's clock [ns], `slip_ns` its lag behind the machine's monotonic clock [ns].
         """
         passed_ns, slipped_ns = now_ns - self._checked_ns, slip_ns - self._slip_ns
         is_first = self._checked_ns == NEVER_NS
@@ -153,15 +153,15 @@ class PaceMonitor:
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
 CATCH_UP_NS = 50_000_000
-"""Longest simulated time by which world catches up in one wake of its loop [ns]."""
+"""Largest lag of world's clock that world makes up after a stall [ns]; any further lag stays."""
 COUNT_PERIOD_NS = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # looking up a member of an enum is slow
-COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # used in every period
+COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 _new = tuple.__new__  # makes a named tuple in half the time of its own constructor
 
 
 class WorldEndpoint(TunnelEnd):
-    """The robot's end of the tunnel; an `Endpoint`."""
+    """The robot's end of the tunnel: an `Endpoint` that flies the robot by cloud's commands."""
 
     def __init__(
         self,
@@ -173,11 +173,10 @@ class WorldEndpoint(TunnelEnd):
         command_age_max_ns: int,
         start_ns: int = 0,
     ) -> None:
-        """Connect the robot, whose guard is in GROUND, with the tunnel.
+        """Connect a robot with stopped rotors to the tunnel; there is no session yet.
 
-        `newest_wins` tells whether late commands are dropped. A datagram that may have waited in
-        the socket for longer than `command_age_max_ns` [ns] is stale. `start_ns` is the monotonic
-        clock now [ns].
+        With `newest_wins`, a command that arrives after a newer command is dropped. A command may
+        be `command_age_max_ns` old [ns]. `start_ns` is the monotonic clock now [ns].
         """
         super().__init__(identity, Direction.UPLINK, newest_wins)
         self.robot, self._sensors = robot, sensors
@@ -196,25 +195,25 @@ class WorldEndpoint(TunnelEnd):
 
     @property
     def counts(self) -> Counter[str]:
-        """A copy of the counters: how often each event has happened so far."""
+        """Copy of the counters: name of an event -> how often the event has happened."""
         return Counter(self._counts | self.robot.guard.counts)
 
     @property
     def slip_ns(self) -> int:
-        """Lag of world's clock behind the monotonic clock [ns]."""
+        """Lag of world's clock behind the machine's monotonic clock [ns]."""
         return self._slip_ns
 
     def next_deadline_ns(self) -> int:
-        """Return when the next odometry is due [ns], monotonic clock."""
+        """Return when the next odometry sample is due [ns], monotonic clock."""
         return self._odometry_ns + self._slip_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Run every tick up to and including `now_ns`, and send the telemetry that becomes due."""
+        """Simulate up to and including `now_ns` [ns]; send the telemetry that is due."""
         self._session.follow_keys()
         self._advance(self._follow(now_ns) + 1)
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Handle one datagram. Count and drop an invalid datagram."""
+        """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
         world_ns = self._follow(now_ns)
         try:
             kind, epoch, counter, body = self._session.open(data)
@@ -234,9 +233,9 @@ class WorldEndpoint(TunnelEnd):
                 self._records += self._complaints.about(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
-        """Return world's time at a wake, and note whether the wake follows a stall.
+        """Return the time on world's clock [ns]; note whether a stall has just ended.
 
-        Datagrams that arrive at a wake after a stall may have waited in the socket.
+        Datagrams that arrive in the first call after a stall may have waited in the socket.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns
@@ -249,7 +248,7 @@ class WorldEndpoint(TunnelEnd):
         return now_ns - self._slip_ns
 
     def _advance(self, until_ns: int) -> None:
-        """Run all ticks before `until_ns` [ns], world's clock."""
+        """Simulate all steps that begin before `until_ns` [ns], world's clock."""
         tick_ns = self._tick_ns
         if tick_ns < until_ns and self._waiting is not None:
             self._apply(tick_ns)
@@ -261,24 +260,23 @@ class WorldEndpoint(TunnelEnd):
             tick_ns = self._tick_ns = self.robot.run(tick_ns, stop_ns)
 
     def _apply(self, now_ns: int) -> None:
-        """Record that the waiting command takes effect at this tick."""
         assert self._waiting is not None
         epoch, counter, command = self._waiting
         self._waiting = None
-        if self.robot.guard.state is not TRACK:  # the mission ended or stopped in the same wake
+        if self.robot.guard.state is not TRACK:  # the mission has just ended or stopped
             return
         echo_ns, basis_ns, _, velocity, _ = command
         self._echo_stamp_ns, self._applied_ns = echo_ns, now_ns
         self._records.append(_new(CommandApplied, (now_ns, epoch, counter, basis_ns, velocity)))
 
     def _send_telemetry(self, now_ns: int) -> None:
-        """Measure, send telemetry, and record the ground truth."""
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
         orders = self._orders
         tip_force = simulator.tip_force()
         position, orientation, velocity, rate, _ = simulator.readings
         truth = _new(Odometry, (now_ns, position, orientation, velocity, rate))
-        records.append(_new(GroundTruth, (now_ns, truth, tip_force, guard.reference)))
+        forces = (tip_force, *simulator.take_tip_force())
+        records.append(_new(GroundTruth, (now_ns, truth, *forces, guard.reference)))
         if guard.changes:
             records += guard.take_changes()
         if simulator.touches:
@@ -314,7 +312,6 @@ class WorldEndpoint(TunnelEnd):
         self._odometry_ns += ODOMETRY_PERIOD_NS
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
-        """Answer a hello; a hello that waited during a stall is stale."""
         if now_ns == self._stalled_wake_ns:
             raise DecodeError("stale")
         answer = self._door.receive_hello(hello, counter, now_ns)
@@ -326,7 +323,6 @@ class WorldEndpoint(TunnelEnd):
         self._queue(answer.datagrams)
 
     def _begin_epoch(self, cause: str) -> None:
-        """Forget everything that belongs to the old epoch."""
         self._channel.reset()
         self.robot.guard.forget_commands()
         self._waiting = None
@@ -338,7 +334,6 @@ class WorldEndpoint(TunnelEnd):
             observer.see_session(now_ns)
 
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
-        """Carry out an operator request; a mission from the spawn begins a new epoch."""
         tick_ns, waited = self._tick_ns, now_ns == self._stalled_wake_ns
         number = self._orders.number
         starts = self._orders.obey(request, tick_ns, waited=waited)
@@ -355,7 +350,6 @@ class WorldEndpoint(TunnelEnd):
     def _receive_command(
         self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
     ) -> None:
-        """Record a command of this epoch; if it is the newest command, give it to the guard."""
         command, guard = codec.decode_command(body), self.robot.guard
         outcome = self._channel.take(counter)
         if outcome != REPEATED:

@@ -1,12 +1,12 @@
-"""The onboard low-level controller, which makes the robot follow a velocity at 500 Hz.
+"""The onboard low-level controller: it makes the robot follow a velocity reference at 500 Hz.
 
-A velocity PID gives the force that the robot needs. Geometric attitude control turns the thrust
-axis towards that force. The allocation splits thrust and torque over four rotors. Vectors and
-torques are plain floats, because this runs in every physics step.
+A velocity PID computes the force that the robot needs. Geometric attitude control turns the thrust
+axis towards this force. The allocation distributes thrust and torque over the four rotors. Vectors
+are tuples of floats, because arrays would be too slow in every physics step.
 
 Source: docs/reference/plant.md, "Low-level controller".
-Deviation: the published code assumes dt = 10 ms but runs every 2 ms. This module uses the true
-step, and its gains are converted so that the effect is the same.
+Deviation: the published code assumes a step of 10 ms but runs every 2 ms. This module uses the true
+step; its gains are converted so that the effect is the same.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ GRAVITY = 9.81
 """Gravity that the controller assumes [m/s^2]; the physics uses 9.8066 m/s^2.
 Source: docs/reference/plant.md, "Gravity"."""
 TILT_GAIN, YAW_GAIN = 1.0, 0.035
-"""Attitude gains (k_R) about x and y, and about z: torque per attitude error [N m]."""
+"""Attitude gains k_R: torque per attitude error about x and y, and about z [N m]."""
 TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
-"""Rate gains (k_w) about x and y, and about z: torque per angular velocity [N m s]."""
+"""Rate gains k_w: torque per angular velocity about x and y, and about z [N m s]."""
 THRUST_MAX = THRUST_COEFFICIENT * SPEED_MAX**2
 """Largest thrust of one rotor [N]."""
 TINY = 1e-9
@@ -40,12 +40,12 @@ _HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
 _TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
 
 NOSE_COSINE_MIN, YAW_SINE_MAX = 0.5, 0.3
-"""Limits of the published attitude error: smallest cosine of the error about the nose, and largest
-sine of the yaw error. Beyond either limit the published error uses wrong axes."""
+"""Largest errors for which the controller uses the published attitude error [1], as the cosine of
+the roll error and the sine of the yaw error. For larger errors the published formula is wrong."""
 
 
 class LowLevel:
-    """Makes the robot follow a velocity; holds the yaw at 0, as the published controller does."""
+    """Make the robot follow a velocity with the yaw at 0, as the published controller does."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class LowLevel:
             dt: Time between two updates [s].
         """
         dx, dy, dz = gain_d
-        # Gains of the error, its integral and its change per tick; one tuple unpacks fastest.
+        # Gains of the error, its integral and its change per step; one tuple unpacks fastest.
         self._gains = (*gain_p, *gain_i, dx / dt, dy / dt, dz / dt)
         self._limits = (integral_limit_xy, integral_limit_z, dt)
         self.reset()
@@ -78,7 +78,7 @@ class LowLevel:
         self._error: Vector | None = None
 
     def update(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
-        """Compute the rotor speeds that make the robot follow a velocity; call it every `dt`.
+        """Compute the rotor speeds that make the robot follow a velocity; call once per `dt`.
 
         `velocity_reference` is the wanted velocity [m/s], world frame, shape (3,).
         """
@@ -100,7 +100,7 @@ class LowLevel:
         """Compute the force that the robot needs [N], and advance the integral by `dt`.
 
         e = v - v_ref;  F = -(Kp · e + Ki · int(e dt) + Kd · de/dt) + (0, 0, m · g), with a clamped
-        integral; `velocity` v and `reference` v_ref are in [m/s]; the frame is the world.
+        integral. `velocity` is v, `reference` is v_ref, both in [m/s]; all are in the world frame.
         """
         px, py, pz, ix, iy, iz, dx, dy, dz = self._gains
         limit_xy, limit_z, dt = self._limits
@@ -128,21 +128,22 @@ class LowLevel:
 
 
 def attitude(force: Vector, readings: Readings) -> Effort:
-    """Turn the thrust axis towards `force` [N], world frame, nose along +x.
+    """Return the thrust and torque that turn the thrust axis towards `force` and the nose to +x.
 
-    z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
-    e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R · e_R + k_w · w);
-    thrust = F · (R z).
+    `force` is F [N], world frame, shape (3,); R is the body's orientation and w its rate.
+        z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
+        e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R · e_R + k_w · w);
+        thrust = F · (R z).
     The code works in the body frame, where the wanted axes are the rows of Q.
-    Deviation: if a collision has turned the robot beyond NOSE_COSINE_MIN or YAW_SINE_MAX (yaw error
-    above 17 degrees), the tilt is corrected about the body's present axes. With e_R the correction
-    would be off by half the yaw error, and would point the wrong way beyond 90 degrees.
+    Deviation: a collision may turn the robot beyond NOSE_COSINE_MIN or YAW_SINE_MAX (a yaw error
+    above 17 degrees). Then the code corrects the tilt about the body's present axes. The correction
+    by e_R would be off by half the yaw error, and would have the wrong sign beyond 90 degrees.
     """
     fx, fy, fz = force
     _, _, _, (p, q, r), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings
     thrust = fx * zx + fy * zy + fz * zz
 
-    # A zero force, or one along the nose, leaves an axis undefined and causes no torque there.
+    # A zero force, or a force along the nose, leaves an axis undefined, without torque about it.
     across = fy * fy + fz * fz
     scale = 1.0 / (sqrt(fx * fx + across) or TINY)
     z0 = scale * (fx * xx + fy * xy + fz * xz)
@@ -166,10 +167,10 @@ def attitude(force: Vector, readings: Readings) -> Effort:
 
 
 def allocate(effort: Effort) -> RotorSpeeds:
-    """Split thrust and torque over the rotors.
+    """Distribute thrust T and torque (tx, ty, tz) over the rotors; return their speeds w [rad/s].
 
     f = T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km) for front, left,
-    back, right; w = sqrt(f/kf), limited to [0, 1838 rad/s].
+    back, right, with l = ARM and km = TORQUE_RATIO; w = sqrt(f/kf), limited to [0, 1838 rad/s].
     """
     thrust, roll, pitch, yaw = effort
     roll, pitch, yaw = roll / _TWO_ARMS, pitch / _TWO_ARMS, yaw / _FOUR_RATIOS
@@ -178,12 +179,11 @@ def allocate(effort: Effort) -> RotorSpeeds:
     front, back = with_yaw - pitch, with_yaw + pitch
     left, right = against_yaw + roll, against_yaw - roll
     if thrust <= THRUST_MAX and front >= 0.0 and left >= 0.0 and back >= 0.0 and right >= 0.0:
-        # None is negative and their sum is the thrust, so none exceeds the limit.
+        # No share is negative and their sum is the thrust, so no share exceeds the limit.
         k = THRUST_COEFFICIENT
         return sqrt(front / k), sqrt(left / k), sqrt(back / k), sqrt(right / k)
     return _speed(front), _speed(left), _speed(back), _speed(right)
 
 
 def _speed(thrust: float) -> float:
-    """Return the rotor speed [rad/s] for a thrust [N], limited to [0, THRUST_MAX]."""
     return sqrt(min(max(thrust, 0.0), THRUST_MAX) / THRUST_COEFFICIENT)

@@ -1,7 +1,7 @@
 """The interface between the physics and the onboard part: sensor readings and rotor speeds.
 
-Nothing else passes between the physics (`simulator`) and the onboard part (`low_level`, `guard`,
-`sensors`).
+The physics (`simulator`) and the onboard part (`low_level`, `guard`, `sensors`) exchange nothing
+else.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Readings(NamedTuple):
         orientation_wxyz: Orientation, body to world, unit quaternion, shape (4,).
         velocity: Velocity of the base's origin [m/s], world frame, shape (3,).
         angular_velocity_body: Angular velocity [rad/s], body frame, shape (3,).
-        axes: The body's x, y and z axes in the world frame, shape (9,): the orientation again,
-            because drag and low-level controller need the axes in every step.
+        axes: The body's x, y and z axes in the world frame, shape (9,), computed once per step from
+            the orientation because several modules need the axes.
     """
 
     position: Vector

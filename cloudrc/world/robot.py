@@ -1,4 +1,4 @@
-"""The robot: in every tick, guard and low-level controller turn readings into rotor speeds."""
+"""The robot: in every step, guard and low-level controller turn readings into rotor speeds."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from cloudrc.world.rotors import STOPPED
 from cloudrc.world.simulator import Simulator
 
 STEP_NS = 2_000_000
-"""Duration of a tick of physics, low-level controller and guard [ns].
+"""Duration of one step of physics, low-level controller and guard [ns].
 Source: docs/reference/plant.md, "Physics step"."""
 STEP = STEP_NS * 1e-9
-"""Duration of a tick [s]."""
+"""Duration of one step [s]."""
 TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 
 
 class Observer(Protocol):
-    """Sees what a robot receives and does, and changes nothing. Times are on world's clock [ns]."""
+    """Observes what a robot receives and does. Times are on world's clock [ns]."""
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
         """Observe a physics step that begins at `now_ns` with these readings and rotor speeds."""
@@ -29,14 +29,14 @@ class Observer(Protocol):
         """Observe a command and the guard's answer; `rejection` is None if the guard accepts it."""
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """Observe an operator request after it was carried out."""
+        """Observe an operator request that the robot has carried out."""
 
     def see_session(self, now_ns: int) -> None:
         """Observe that a new session begins: earlier commands no longer count."""
 
 
 class Robot:
-    """Runs the ticks of physics, guard and low-level controller, and informs its `observers`."""
+    """Run physics, guard and low-level controller step by step, and inform the `observers`."""
 
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         self.simulator = simulator
@@ -45,13 +45,13 @@ class Robot:
         self._low_level = low_level
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Reset the robot to its spawn, with its rotors stopped."""
+        """Reset the robot to its spawn with stopped rotors, and record the reason `cause`."""
         self.simulator.reset()
         self._low_level.reset()
         self.guard.put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run all ticks from `tick_ns` to before `until_ns`; return the next tick, all [ns]."""
+        """Run the steps that begin before `until_ns`; return the time of the next step [ns]."""
         simulator, guard, low_level = self.simulator, self.guard, self._low_level
         observers = self.observers
         ticks = range(tick_ns, until_ns, STEP_NS)

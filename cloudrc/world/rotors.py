@@ -15,13 +15,13 @@ from cloudrc.world.readings import Readings, RotorSpeeds
 THRUST_COEFFICIENT = 9.9865e-6
 """kf: thrust per speed squared [N s^2]."""
 TORQUE_RATIO = 0.016
-"""Reaction torque about the rotor's axis per thrust [m]; km in the published model."""
+"""km: reaction torque about the rotor's axis per thrust [m]."""
 SPEED_MAX = 1838.0
 """Largest rotor speed [rad/s]."""
 TIME_CONSTANT_UP, TIME_CONSTANT_DOWN = 0.0125, 0.025
-"""Time constants of a rotor that speeds up and of one that slows down [s]."""
+"""Time constants with which a rotor speeds up and slows down [s]."""
 DRAG_COEFFICIENT = 8.06428e-5
-"""Drag per rotor speed and per velocity across the axis [N s^2/m]."""
+"""Drag force per rotor speed and per velocity across the rotor's axis [N s^2/m]."""
 ARM = 0.21
 """Distance of a rotor's axis from the base's z axis [m]."""
 HEIGHT = 0.05
@@ -33,30 +33,29 @@ _DRAG_ARM = DRAG_COEFFICIENT * ARM
 _ARM_SQUARED = ARM * ARM
 
 Controls: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
-"""Input to MuJoCo: four thrusts [N], and the drag as a wrench at the base's origin. MuJoCo's free
-joint requires the wrench's force in the world frame [N] and its torque in the body frame [N m]."""
+"""Input to MuJoCo: four thrusts [N], then the drag at the base's origin as a force in the world
+frame [N] and a torque in the body frame [N m], as MuJoCo's free joint requires."""
 
 
 class Rotors:
     """Four rotors with lag, thrust and drag; `speeds` are front, left, back, right [rad/s]."""
 
     def __init__(self, dt: float) -> None:
-        """Set the duration of a step, `dt` [s]; the rotors are stopped."""
+        """Begin with stopped rotors; `dt` is the duration of a step [s]."""
         self._up = 1.0 - exp(-dt / TIME_CONSTANT_UP)
         self._down = 1.0 - exp(-dt / TIME_CONSTANT_DOWN)
         self.speeds = STOPPED
 
     def step(self, commands: RotorSpeeds, readings: Readings) -> Controls:
-        """Advance the rotor speeds by `dt` and return their thrusts and drag.
+        """Advance the rotor speeds by `dt` towards `commands`; return thrusts and drag.
 
-        Lag: w(t + dt) = w + (command - w) · (1 - exp(-dt/T)). A rotor that speeds up has
-        T = 12.5 ms, a rotor that slows down T = 25 ms. The formula is exact for a command that is
-        constant over a step. Thrust: kf · w^2.
+        Lag: w(t + dt) = w + (command - w) · (1 - exp(-dt/T)), with T = 12.5 ms for a rotor that
+        speeds up, 25 ms for a rotor that slows down. Thrust: kf · w^2.
         Drag: at each rotor F = -w · c · vh, where vh is the hub's velocity across the rotor's axis.
-        With body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h), vh is
-        (u + q · h - r · y, v + r · x - p · h). The hubs have x = (l, 0, -l, 0), y = (0, l, 0, -l).
+        With body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h), vh is (u + q · h - r ·
+        y, v + r · x - p · h). The hubs have x = (l, 0, -l, 0), y = (0, l, 0, -l).
         The sum of r x F over the hubs is the torque (-h · Fy, h · Fx, sum of x · Fy - y · Fx).
-        Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
+                Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
         """
         up, down, k = self._up, self._down, THRUST_COEFFICIENT
         front, left, back, right = self.speeds

@@ -1,8 +1,8 @@
 """Compile a robot and a scene into one MuJoCo model.
 
 The robot may be a user's own model. The onboard controller and the rotors assume fixed numbers,
-such as the mass; a robot with other numbers is refused, and the message lists the differences.
-The other modules of `world` use this module's import of the package `mujoco`.
+such as the mass. A model with other numbers is refused, and the message lists the differences.
+Other modules of `world` import `mujoco` from here, because this module imports it without OpenGL.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 TIMESTEP = 0.002
 """Step of the physics [s]. Source: docs/reference/plant.md, "Physics step"."""
 INERTIA = (0.0121, 0.0116, 0.0226)
-"""Inertia about x, y, z for which the attitude gains were tuned [kg m^2]: the pelican's inertia."""
+"""Inertia about x, y, z for which the attitude gains were tuned: the pelican's [kg m^2]."""
 TIP = (0.40, 0.0, 0.17)
-"""Position of the arm's tip, from which clearance is computed [m], body frame."""
+"""Position of the arm's tip that a robot model must have [m], body frame."""
 SHOWN = 6
-"""Largest number of differences that one message lists."""
+"""Largest number of differences that one error message lists."""
 FOLDER = Path(__file__).parent
 
 
 def import_mujoco() -> Any:
     """Import MuJoCo without OpenGL, which a flight does not need.
 
-    With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. Therefore MUJOCO_GL is `disable`
-    during the import. Its value is restored afterwards, for a child process that renders.
+    With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. MUJOCO_GL is therefore `disable` during
+    the import. Afterwards it has its old value, for a child process that renders.
     """
     wanted = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "disable"
@@ -61,9 +61,9 @@ mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 
 def model_path(kind: str, name: str) -> Path:
-    """Find a file of a `kind`, "robots" or "scenes", by its shipped name or an .xml file's path.
+    """Find a shipped model by its name, or a user's model by the path of its .xml file.
 
-    If there is no such file, raise a BadInputError that lists the shipped files.
+    `kind` is "robots" or "scenes". A missing file raises a BadInputError.
     """
     path = Path(name) if name.endswith(".xml") else FOLDER / kind / f"{name}.xml"
     if not path.is_file():
@@ -75,10 +75,10 @@ def model_path(kind: str, name: str) -> Path:
 def compile_model(robot: str, scene: str) -> Any:
     """Attach the robot to the scene's frame `spawn` and compile both into an `MjModel`.
 
-    Both arguments are names or paths of files. Raise a BadInputError if a file is missing, does not
-    compile or does not fit the onboard controller. The robot's names begin with `robot/`. Static
-    bodies are fused, which halves the time of a step but loses their names. Therefore each geom of
-    the scene gets the name BODY/NUMBER.
+    Both arguments are names of shipped models or paths of files. In the result, names of the robot
+    begin with `robot/`. Static bodies are fused: a step takes half the time, but the bodies lose
+    their names. Therefore each geom of the scene gets the name BODY/NUMBER. Raise a BadInputError
+    if a file is missing, does not compile or does not fit the onboard controller.
     """
     robot_path, scene_path = model_path("robots", robot), model_path("scenes", scene)
     try:
@@ -103,7 +103,6 @@ def compile_model(robot: str, scene: str) -> Any:
 
 
 def _check(model: Any, robot_path: Path, scene_path: Path) -> None:
-    """Check that robot and scene have what the loop needs."""
     actuators = [model.actuator(number).name for number in range(model.nu)]
     if actuators != [f"{ROBOT_PREFIX}{rotor}" for rotor in ROTORS]:
         raise BadInputError(f"{robot_path}: needs the actuators {', '.join(ROTORS)}, in this order")
@@ -130,9 +129,9 @@ def _check(model: Any, robot_path: Path, scene_path: Path) -> None:
 
 
 def _compare(name: str, found: Iterable[float], wanted: Iterable[float], slack: float) -> list[str]:
-    """Describe values of the model that differ by more than `slack` from the controller's values.
+    """List in words the values of `found` that differ from `wanted` by more than `slack`.
 
-    A name with AXIS stands for three values, about or along x, y and z.
+    AXIS in the quantity's `name` stands for x, y and z, one for each value.
     """
     return [
         f"{name.replace('AXIS', axis)} is {have:.4g}, not {want:g} +- {slack:.2g}"
@@ -142,10 +141,10 @@ def _compare(name: str, found: Iterable[float], wanted: Iterable[float], slack: 
 
 
 def _robot_differences(model: Any) -> list[str]:
-    """Compare a robot with what the onboard controller and the rotors assume.
+    """List in words where a robot differs from what the onboard controller and the rotors assume.
 
-    The tolerances of mass and inertia: the velocity loop compensates for a weight that differs by
-    1 N, and the attitude gains work for an inertia that differs by half.
+    The tolerances: the velocity loop compensates for a weight that differs by 1 N, and the attitude
+    gains work for an inertia that differs by half.
     """
     base = model.jnt_bodyid[0]
     turned, centre = _axes(model.body_iquat[base]), model.body_ipos[base]
@@ -166,7 +165,7 @@ def _robot_differences(model: Any) -> list[str]:
 def _rotor_differences(
     model: Any, number: int, place: tuple[float, float, float], sign: int
 ) -> list[str]:
-    """Compare one actuator with the rotor at `place` [m], body frame.
+    """List in words where an actuator differs from the rotor at `place` [m], body frame.
 
     `sign` is the sign of the rotor's reaction torque about z.
     """
@@ -196,7 +195,6 @@ def _rotor_differences(
 
 
 def _axes(quaternion: Any) -> Any:
-    """Return the rotation matrix of a quaternion."""
     axes = np.empty(9)
     mujoco.mju_quat2Mat(axes, quaternion)
     return axes.reshape(3, 3)

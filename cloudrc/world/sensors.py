@@ -1,6 +1,6 @@
-"""Sensors that add seeded noise to odometry, at 100 Hz.
+"""Add seeded noise to the odometry that goes to cloud, at 100 Hz.
 
-Only the odometry for cloud has noise; the onboard controller uses the true state.
+The onboard controller uses the true state, without noise.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from cloudrc.messages import Odometry, Vector
 
 
 class Sensors:
-    """White Gaussian noise, independent per axis and sample, on position and velocity."""
+    """Add white Gaussian noise, independent per axis and sample, to position and velocity."""
 
     def __init__(
         self, position_noise: float, velocity_noise: float, rng: np.random.Generator
     ) -> None:
-        """Set the deviations per axis, `position_noise` [m] and `velocity_noise` [m/s]; 0: none."""
+        """Set the standard deviations per axis, `position_noise` [m] and `velocity_noise` [m/s]."""
         self._position_noise, self._velocity_noise = position_noise, velocity_noise
         self._rng = rng
         self._exact = position_noise == velocity_noise == 0.0

@@ -1,7 +1,7 @@
-"""The physics: it turns commanded rotor speeds into readings and contacts.
+"""Simulate the physics: turn commanded rotor speeds into readings and contacts.
 
-`struct` accesses MuJoCo's arrays through memory views: writing four elements takes a quarter of the
-time of a numpy slice assignment.
+The module writes to MuJoCo's arrays with `struct` through memory views. Four elements take a
+quarter of the time of a numpy slice assignment.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
 TOUCH_GAP = 0.1
 """Shortest time without contact before a contact counts as a new contact [s]."""
 CONTACT_CHECK_STEPS = 5
-"""Number of steps between two checks of the contacts, as long as their number is constant. A check
-takes as long as a step."""
+"""Number of steps between two checks of the contacts while the number of contacts is constant. A
+check takes as long as a step."""
 
 _mj_step = mujoco.mj_step
 _pack_ctrl = Struct("4d").pack_into
@@ -40,15 +40,16 @@ class Simulator:
         dt: Duration of a step [s].
         steps: Number of steps since the last reset.
         readings: State of the base after the last step.
-        touches: Contacts that began since the last call of `take_contacts`, without stamps.
-        tape: None, or a list to which every step since the last reset appends its controls, for
-            `replay`.
+        tip_force_peak: Largest force on the arm's tip since the last call of `take_tip_force` [N].
+        tip_impulse: Integral of that force over time since the last call [N s].
+        touches: Contacts that began since the last call of `take_contacts`.
+        tape: Controls of every step since the last reset, for `replay`; None if not recorded.
     """
 
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
-        Raise a BadInputError if a file is missing or does not suit the loop.
+        Raise a BadInputError if a file is missing or does not fit the onboard controller.
         """
         self.model = model = compile_model(robot, scene)
         self.dt: float = model.opt.timestep
@@ -64,7 +65,7 @@ class Simulator:
         self._tip_offset: Vector = tuple(model.site_pos[self._tip].tolist())
         self._tip_radius = float(model.site_size[self._tip, 0])
         names = [model.geom(number).name for number in range(model.ngeom)]
-        # The robot's geoms get an empty name: in a contact the other geom names the body.
+        # The robot's geoms get an empty name, because a contact has the name of the other body.
         self._bodies = ["" if n.startswith(ROBOT_PREFIX) else n.split("/")[0] for n in names]
         self._gap_steps = round(TOUCH_GAP / self.dt)
         self.reset()
@@ -75,18 +76,19 @@ class Simulator:
         mujoco.mj_forward(self.model, self._data)
         self._rotors.speeds = STOPPED
         self.steps = self._contacts = 0
+        self.tip_force_peak = self.tip_impulse = 0.0
         if self.tape is not None:
             self.tape.clear()
         self.touches: list[Contact] = []
-        # The robot stands on the floor: a contact with it is new only after a flight.
+        # The robot stands on the floor: only after a flight is the next contact a new contact.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
 
     def step(self, rotor_speeds: RotorSpeeds) -> None:
         """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
 
-        Thrust and drag use the rotor speeds at the end of the step, and the drag uses the velocity
-        at the beginning of the step.
+        Thrust and drag use the rotor speeds at the end of the step. The drag uses the velocity at
+        the beginning of the step.
         """
         before, data = self.readings, self._data
         controls = self._rotors.step(rotor_speeds, before)
@@ -101,14 +103,18 @@ class Simulator:
         self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
         contacts = data.ncon
         if contacts or self._contacts:
-            # Look at once if their number has changed, else only every few steps.
+            force = self._sensors[self._tip_sensor]
+            self.tip_impulse += force * self.dt
+            if force > self.tip_force_peak:
+                self.tip_force_peak = force
+            # Check at once if the number of contacts has changed, else only every few steps.
             if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
                 self._note_contacts(before)
             self._contacts = contacts
 
     @property
     def touch_age(self) -> float:
-        """Time since the robot last touched something [s]; at the reset it touches the floor."""
+        """Time since the robot last touched something [s]; a reset counts as a touch."""
         return (self.steps - max(self._last_touch.values())) * self.dt
 
     @property
@@ -120,13 +126,19 @@ class Simulator:
         """Return the normal force on the arm's tip at the beginning of the last step [N]."""
         return self._sensors[self._tip_sensor]
 
+    def take_tip_force(self) -> tuple[float, float]:
+        """Return `tip_force_peak` [N] and `tip_impulse` [N s], and set both to 0."""
+        found = self.tip_force_peak, self.tip_impulse
+        self.tip_force_peak = self.tip_impulse = 0.0
+        return found
+
     def take_contacts(self) -> list[Contact]:
-        """Return the contacts that began since the last call, oldest first, without stamps."""
+        """Return the contacts that began since the last call, oldest first, with stamp 0."""
         touches, self.touches = self.touches, []
         return touches
 
     def state(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return the state of the physics, `mjSTATE_FULLPHYSICS`, for `replay`, shape (n,).
+        """Return the state of the physics for `replay`: `mjSTATE_FULLPHYSICS`, shape (n,).
 
         The second array has the accelerations from which the contact solver starts, shape (nv,).
         """
@@ -136,7 +148,7 @@ class Simulator:
         return physics, self._data.qacc_warmstart.copy()
 
     def _note_contacts(self, before: Readings) -> None:
-        """Note the new contacts, which MuJoCo found in the state `before` the step."""
+        """Note the new contacts; MuJoCo found all contacts in the state `before` the step."""
         contact = self._data.contact
         tip = self._data.site_xpos[self._tip].tolist()
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
@@ -167,10 +179,10 @@ def _velocity_at(readings: Readings, offset: Vector) -> Vector:
 def replay(
     model: Any, physics: npt.ArrayLike, warmstart: npt.ArrayLike, tape: npt.ArrayLike
 ) -> npt.NDArray[np.float64]:
-    """Replay a `Simulator.tape` without a reset at the speed of raw `mj_step`, for the benchmark.
+    """Repeat the steps of a `Simulator.tape` at the speed of raw `mj_step`, for the benchmark.
 
-    The replay starts from `Simulator.state()`. Return the state of the physics at the end, which is
-    equal to that of the flight, bit by bit.
+    `physics` and `warmstart` are the result of `Simulator.state()` at the beginning of the tape.
+    Return the state of the physics at the end, which equals that of the simulator bit by bit.
     """
     from mujoco import rollout
 

@@ -9,8 +9,8 @@ def horizons(estimator, *delays):
     """Return the horizon after each loop delay."""
     found = []
     for seconds in delays:
-        # Other delays would give another result if they were used.
-        estimator.update(DelaySample(seconds, seconds - 0.006, applied_minus_stamp=-777.0))
+        # Another delay would give another result if it were used.
+        estimator.update(DelaySample(seconds, seconds - 0.006))
         found.append(estimator.horizon(0.0))
     return found
 
@@ -31,11 +31,11 @@ def test_first_horizons(estimator, delays, expected):
 @pytest.mark.parametrize("offset", [0.0, -86_400.0])
 def test_split_adds_the_age_and_cancels_the_clock_offset(offset):
     estimator = split.build(gain=0.25)
-    estimator.update(DelaySample(9.0, 9.0, applied_minus_stamp=0.050 - offset))
+    estimator.add_applied(0.050 - offset)
     assert estimator.horizon(0.030 + offset) == pytest.approx(0.080, abs=1e-9)
     # The age of a slow packet counts at once, the downlink by its average.
     assert estimator.horizon(0.090 + offset) == pytest.approx(0.140, abs=1e-9)
-    estimator.update(DelaySample(9.0, 9.0, applied_minus_stamp=0.090 - offset))
+    estimator.add_applied(0.090 - offset)
     assert estimator.horizon(0.030 + offset) == pytest.approx(0.090, abs=1e-9)
     assert estimator.horizon(-5.0 + offset) == 0.0, "never negative when world's clock jumps"
 

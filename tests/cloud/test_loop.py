@@ -1,5 +1,7 @@
 """The control loop: delays, when it freezes, and that it goes on whatever a plug-in does."""
 
+import re
+from functools import partial
 from math import inf, nan
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import Estimator
+from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.drivers.process import from_line, to_line
@@ -29,12 +32,29 @@ def test_a_command_names_its_basis_and_its_delays():
     assert control.rtt == pytest.approx(0.083)
 
 
-def test_a_repeated_echo_is_no_sample():
-    """While the downlink is silent, world echoes the same command with a growing age."""
-    a_loop = loop(heard_ms=1090, echo_ms=1000)
-    for k in range(1, 2000):
-        a_loop.observe(telemetry(100 + 10 * k, echo_ms=1000, hold_ms=10 * k), (1090 + 10 * k) * MS)
-    assert command(a_loop, 21_090)[1].horizon == pytest.approx(0.090)
+@pytest.mark.parametrize(("hold_ms", "horizon_ms"), [(0, 90), (50, 140), (51, 90)])
+def test_each_telemetry_is_a_sample_while_its_echo_is_fresh(hold_ms, horizon_ms):
+    """While the downlink is silent, world echoes the same command with a growing hold."""
+    a_loop = loop(estimator=partial(RunningMean, 1), heard_ms=1090, echo_ms=1000)
+    a_loop.observe(telemetry(100 + hold_ms, 1000, hold_ms), (1090 + hold_ms) * MS)
+    assert command(a_loop, 1150)[1].horizon == pytest.approx(horizon_ms * 1e-3)
+
+
+def test_each_applied_command_counts_once_also_in_late_telemetry():
+    applied = []
+
+    class Listening(Estimator):
+        def add_applied(self, applied_minus_stamp):
+            applied.append(round(applied_minus_stamp * 1e3))
+
+        def horizon(self, age):
+            return 0.0
+
+    a_loop = loop(estimator=Listening, heard_ms=1090, echo_ms=1000)  # world's clock is behind
+    a_loop.observe(telemetry(120, echo_ms=1020, hold_ms=2), 1110 * MS)
+    a_loop.observe_late(telemetry(110, echo_ms=1005, hold_ms=1), 1115 * MS)
+    a_loop.observe(telemetry(130, echo_ms=1020, hold_ms=12), 1120 * MS)
+    assert applied == [-900, -902, -896]
 
 
 @pytest.mark.parametrize(("horizon", "clamped"), [(3.0, 1.0), (-0.5, 0.0)])
@@ -136,7 +156,22 @@ def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     assert fault.code == f"{kind}_failed"
     assert "\n" not in fault.text
     assert len(fault.text.encode()) < 2200
+    assert len(fault.traceback.encode()) < 6200
     assert fault.text.endswith(f"fix cloud.{kind} or choose another")
+
+
+def test_a_failure_names_file_and_line_and_keeps_its_traceback():
+    a_loop = loop(controller=raises(ZeroDivisionError("no"))(), heard_ms=1090)
+    command(a_loop, 1094)
+    (fault,) = a_loop.take_faults()
+    assert re.search(r"\(ZeroDivisionError: no, test_loop.py:\d+ in update\)", fault.text)
+    assert "raise error\nZeroDivisionError: no" in fault.traceback
+
+
+def test_a_value_that_is_not_finite_is_named_shortly():
+    a_loop = loop(predictor=NOT_FINITE(), heard_ms=1090)
+    command(a_loop, 1094)
+    assert "failed (InvalidResultError: its position is (inf, 0, 0));" in a_loop.faults[0].text
 
 
 def test_arrays_and_generators_become_plain_numbers():

@@ -105,7 +105,7 @@ def _step(log, counter, stamp, path):
     measured = path((basis - START) / SECOND)
     log.world += [
         TelemetrySent(stamp, 2, counter, telemetry),
-        GroundTruth(stamp, odometry, 0.0, ZERO),
+        GroundTruth(stamp, odometry, 0.0, 0.0, 0.0, ZERO),
         Arrival(applied, False, 2, counter, DOWNLINK, True),
         CommandApplied(applied, 2, counter, basis, ZERO),
     ]
@@ -141,11 +141,17 @@ def good():
 
 
 def pressing(log, since, force):
-    """Apply a force to the tip from a time on [s since the start]."""
-    log.change(
-        GroundTruth,
-        lambda n, truth: truth._replace(tip_force=force(n) if truth.stamp_ns >= at(since) else 0.0),
-    )
+    """Apply a force to the tip from a time on [s since the start]; the peak is 10 N higher."""
+
+    def press(n, truth):
+        if truth.stamp_ns < at(since):
+            return truth
+        newton = force(n)
+        return truth._replace(
+            tip_force=newton, tip_force_peak=newton + 10, tip_impulse=newton * PERIOD / SECOND
+        )
+
+    log.change(GroundTruth, press)
 
 
 @cache

@@ -177,7 +177,7 @@ NUMBERS = {
         **dict.fromkeys(("hold_count", "hold_time", "fault_count"), 0.0),
         **{f"{name}_{way}": 0.0 for name in ("loss", "late") for way in WAYS},
         # No board contact, no pipe, no rest, no real time, no relay.
-        **dict.fromkeys(("contact_time", "tip_speed", "steady_contact_force")),
+        **dict.fromkeys(("contact_time", "tip_speed", "steady_contact_force", "contact_impulse")),
         **dict.fromkeys(("peak_contact_force", "min_clearance", "min_clearance_flight")),
         **dict.fromkeys(("pipe_contacts", "steady_error_x", "recorder_dropped")),
         **dict.fromkeys(REAL_TIME | OF_RELAYS),
@@ -185,7 +185,8 @@ NUMBERS = {
     contact: {
         "contact_time": approx(8.0),
         "tip_speed": approx(0.15),
-        "peak_contact_force": 0.3,
+        "peak_contact_force": 10.3,
+        "contact_impulse": approx(0.02, abs=3e-3),  # 0.2 N over 0.1 s
         "steady_contact_force": approx(0.2, abs=3e-3),
         "pipe_contacts": 1.0,
     },
@@ -266,7 +267,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | {"recorder_dropped"}
     assert set(SHIPPED) >= PROMISED
     for name, number in numbers.items():
-        assert number.unit in {"s", "m", "m/s", "N", "1"}, name
+        assert number.unit in {"s", "m", "m/s", "N", "N s", "1"}, name
         assert number.meaning[0].isupper(), name
         assert number.meaning.endswith("."), name
         assert isfinite(number.value), name

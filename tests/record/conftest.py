@@ -66,7 +66,7 @@ def world_records(count, start_ns=0):
         telemetry = Telemetry(now, odometry, 0.1, now - 5, 7, 0, 1, GuardState.TRACK)
         records += [
             rec.TelemetrySent(now, 1, n, telemetry),
-            rec.GroundTruth(now, odometry, 0.2, velocity),
+            rec.GroundTruth(now, odometry, 0.2, 0.3, 0.001, velocity),
         ]
         if n >= 3:
             records += [

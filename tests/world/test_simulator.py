@@ -143,6 +143,19 @@ def test_the_tip_touches_the_board_and_again_after_0_1_s_without(at_the_board):
     assert (again.body, again.tip) == ("board", True)
 
 
+def test_the_peak_force_is_that_of_every_step_and_the_impulse_stops_the_tip(at_the_board):
+    simulator, low_level = at_the_board
+    peaks, every = [], []
+    for _ in range(100):
+        for _ in range(5):
+            fly(simulator, low_level, (0.2, 0.0, 0.0), simulator.dt)
+            every.append(simulator.tip_force())
+        peaks.append(simulator.take_tip_force())
+    assert max(peak for peak, _ in peaks) == max(every) > 10.0
+    assert sum(impulse for _, impulse in peaks) == pytest.approx(sum(every) * simulator.dt)
+    assert simulator.take_tip_force() == (0.0, 0.0)
+
+
 def test_the_floor_is_a_new_contact_only_after_a_flight():
     simulator, low_level = Simulator("pelican", "empty"), LowLevel()
     for _ in range(200):

@@ -1,7 +1,7 @@
-"""Controllers compute a velocity command from the estimate and the setpoint; one file each.
+"""Controllers compute velocity commands from the robot's estimated state and the setpoint.
 
-A plug-in file defines `build(**parameters)`, which returns a `Controller`. All parameters are
-annotated.
+Each controller is a plug-in in a file of its own. The file defines `build(**parameters)`, which
+returns a `Controller`; all parameters are annotated.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
 
 class ControlOutput(NamedTuple):
-    """The command of a controller and its terms.
+    """The command of a controller, and the terms that make up its velocity.
 
     Attributes:
         velocity: Commanded velocity [m/s], world frame, shape (3,).
         yaw_rate: Commanded yaw rate [rad/s].
-        proportional: Proportional term of the velocity [m/s], shape (3,).
-        integral: Integral term of the velocity [m/s], shape (3,).
-        derivative: Derivative term of the velocity [m/s], shape (3,).
+        proportional: Proportional term of the velocity [m/s], world frame, shape (3,).
+        integral: Integral term of the velocity [m/s], world frame, shape (3,).
+        derivative: Derivative term of the velocity [m/s], world frame, shape (3,).
     """
 
     velocity: Vector
@@ -39,8 +39,8 @@ class Controller:
         """Compute one command.
 
         Args:
-            estimate: Predicted position [m] and velocity [m/s], world frame.
-            setpoint: Position [m], world frame, and yaw [rad].
+            estimate: Predicted pose and twist of the robot, in the units and frames of `Odometry`.
+            setpoint: Wanted position [m], world frame, and yaw [rad].
             dt: Time since the last call [s], > 0.
         """
         raise NotImplementedError

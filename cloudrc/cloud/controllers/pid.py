@@ -17,9 +17,9 @@ UNLIMITED: Vector = (inf, inf, inf)
 
 
 class Pid(Controller):
-    """PID on the position that commands a velocity.
+    """PID controller: from the position error to a velocity command.
 
-    Deviations from eq. (4) and the published code:
+    Deviations from eq. (4) of the paper and from the published code:
 
     - Here error = setpoint - estimate. Eq. (4) as printed has estimate - setpoint, which diverges
       with positive gains.
@@ -51,10 +51,10 @@ class Pid(Controller):
         self._integral = ZERO
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
-        """Compute one command after `dt` [s]: u = P · e + I · (integral of e) - D · v, limited.
+        """Compute one command: u = P · e + I · (integral of e) - D · v, limited.
 
-        The three returned terms are not limited. The integral contains the errors of all earlier
-        updates, not the present error. Source: the paper, eq. (5).
+        The returned terms are not limited. The integral has the errors of earlier updates only; the
+        present error is integrated over `dt` [s] for the next update. Source: the paper, eq. (5).
         """
         px, py, pz = estimate.position
         sx, sy, sz = setpoint.position
@@ -79,7 +79,6 @@ class Pid(Controller):
         return ControlOutput(velocity, yaw_rate, proportional, integral, derivative)
 
     def _limit(self, wanted: Vector) -> Vector:
-        """Clamp each axis, then shorten the vector to `speed_max` without turning it."""
         x, y, z = (
             max(min(value, limit), -limit)
             for value, limit in zip(wanted, self._velocity_max, strict=True)
@@ -91,7 +90,7 @@ class Pid(Controller):
         return (x * scale, y * scale, z * scale)
 
     def _integrate(self, error: Vector, wanted: Vector, velocity: Vector, dt: float) -> None:
-        """Add `error` [m] over `dt` [s] to the integral on each axis where it causes no windup."""
+        """Integrate `error` [m] over `dt` [s], on each axis where this causes no windup."""
         terms = zip(self._integral, self._gain_i, self._integral_limit, strict=True)
         x, y, z = (
             max(min(term + gain * e * dt, limit), -limit) if v == u or e * u < 0 else term
@@ -121,8 +120,8 @@ def build(
         integral_limit: Largest integral term per axis [m/s], shape (3,); None: no limit.
         velocity_max: Largest velocity per axis [m/s], shape (3,); None: no limit.
         speed_max: Largest speed [m/s]; the limit keeps the direction. None: no limit. With an
-            integral gain, `speed_max` should not exceed the guard's cap, which the anti-windup
-            does not know.
+            integral gain, `speed_max` should not exceed the guard's speed cap, because the
+            anti-windup does not take the guard into account.
 
     Raises:
         ValueError: If a parameter is infinite, NaN or negative; the message names it.

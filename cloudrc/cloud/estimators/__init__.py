@@ -1,8 +1,8 @@
-"""Delay estimators compute the horizon of the prediction from echoes; one file each.
+"""Delay estimators compute the horizon: how far ahead the predictor predicts.
 
-The horizon is the time by which the predictor predicts. Telemetry echoes the stamp of the newest
-command that world has applied. A plug-in file defines `build(**parameters)`, which returns an
-`Estimator`. All parameters are annotated.
+Telemetry echoes the stamp of the newest command that world has applied; estimators get the delays
+that these echoes show. Each estimator is a plug-in in a file of its own. The file defines
+`build(**parameters)`, which returns an `Estimator`; all parameters are annotated.
 """
 
 from __future__ import annotations
@@ -11,27 +11,31 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """The delays that one newly echoed command shows.
+    """The delays that telemetry shows when world applied the echoed command shortly before.
 
     Attributes:
-        loop_delay: Arrival of the echo minus the command's stamp [s]. The difference includes the
-            hold time: how long world had the command before it sent the echo.
+        loop_delay: Arrival of the echo minus the command's stamp [s]. The loop delay includes the
+            hold time: the time between the application of the command and the sending of the echo.
         rtt: `loop_delay` minus the hold time [s].
-        applied_minus_stamp: Instant of application on world's clock minus the command's stamp on
-            cloud's clock [s]: the downlink delay plus the unknown offset world - cloud.
     """
 
     loop_delay: float
     rtt: float
-    applied_minus_stamp: float
 
 
 class Estimator:
     """Estimates the horizon: the time from the measurement to the application of the command."""
 
     def update(self, sample: DelaySample) -> None:
-        """Add one sample; called once per newly echoed command, never for a repeated echo."""
-        raise NotImplementedError
+        """Add the delays of telemetry that cloud uses; most echoes come more than once."""
+
+    def add_applied(self, applied_minus_stamp: float) -> None:
+        """Add a command that world has applied; called once for each command that an echo shows.
+
+        Args:
+            applied_minus_stamp: Instant of application on world's clock minus the command's stamp
+                on cloud's clock [s]: the downlink delay plus the unknown offset world - cloud.
+        """
 
     def horizon(self, age: float) -> float:
         """Return the horizon for a command that leaves now [s]; 0 before the first sample.

@@ -11,10 +11,10 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 
 
 class Ewma(Estimator):
-    """Exponentially weighted moving average of the loop delay; starts with the first sample."""
+    """Exponentially weighted moving average of the loop delay, from the first sample on."""
 
     def __init__(self, gain: float) -> None:
-        """Set the weight of a new sample, `gain` [1]."""
+        """Set `gain` [1], the weight of a new sample."""
         self._gain = gain
         self._average: float | None = None
 
@@ -26,7 +26,7 @@ class Ewma(Estimator):
             self._average += self._gain * (sample.loop_delay - self._average)
 
     def horizon(self, age: float) -> float:
-        """Return the average [s]; `age` [s] is not used."""
+        """Return the average [s]. `age` has no effect."""
         return 0.0 if self._average is None else max(0.0, self._average)
 
 

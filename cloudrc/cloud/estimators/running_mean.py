@@ -13,25 +13,25 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 class RunningMean(Estimator):
     """Mean of the loop delays since the session began.
 
-    If every delay counts equally, the mean is slow: after 60 s it needs another 60 s to follow half
-    of a step of the delay. A `count_max` makes the mean follow faster.
+    All delays have the same weight: after 60 s the mean needs another 60 s to follow half of a step
+    of the delay. A finite `count_max` makes the mean follow faster.
     """
 
     def __init__(self, count_max: float = inf) -> None:
-        """Set the number of samples after which the gain stays at 1/count_max [1]."""
+        """Limit the count to `count_max` [1]: a new sample weighs at least 1/count_max."""
         self._count_max, self._count, self._mean = count_max, 0, 0.0
 
     def update(self, sample: DelaySample) -> None:
         """Add one loop delay [s] after k samples: mean += (sample - mean) / (k + 1).
 
-        Source: the paper, eq. (1), as printed; tau_n is `loop_delay`, which includes the hold.
+        Source: the paper, eq. (1), as printed; tau_n is `loop_delay`, which includes the hold time.
         """
         if self._count < self._count_max:
             self._count += 1
         self._mean += (sample.loop_delay - self._mean) / self._count
 
     def horizon(self, age: float) -> float:
-        """Return the mean [s]; `age` [s] is not used."""
+        """Return the mean [s]. `age` has no effect."""
         return max(0.0, self._mean)
 
 

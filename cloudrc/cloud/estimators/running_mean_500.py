@@ -1,8 +1,8 @@
 """Delay estimator: a running mean of the loop delay whose gain stays at 1/500 after 500 samples.
 
-Source: the authors' published code. Its comments describe a window of 500 samples. The code,
-however, computes a mean whose gain 1/(k+1) falls to 1/500; from then on the mean is an exponential
-average.
+Source: the authors' published code. Its comments describe a window of 500 samples, but the code
+computes a mean with the gain 1/(k+1), which falls to 1/500 and then stays: from then on the mean is
+an exponential average.
 """
 
 from __future__ import annotations

@@ -14,28 +14,28 @@ and the sum is the time from the measurement to the application of the command.
 from __future__ import annotations
 
 from cloudrc.cloud import parameters
-from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.estimators import Estimator
 
 
 class Split(Estimator):
-    """Adds the exact age of the newest odometry and the average of `applied_minus_stamp`."""
+    """Adds the age of the newest odometry and the average of `applied_minus_stamp`."""
 
     def __init__(self, gain: float) -> None:
-        """Set the weight of a new sample of the downlink, `gain` [1]."""
+        """Set `gain` [1], the weight of a new sample in the average."""
         self._gain = gain
         self._applied_minus_stamp: float | None = None
 
-    def update(self, sample: DelaySample) -> None:
+    def add_applied(self, applied_minus_stamp: float) -> None:
         """Add one `applied_minus_stamp` [s] to the average of the downlink."""
         if self._applied_minus_stamp is None:
-            self._applied_minus_stamp = sample.applied_minus_stamp
+            self._applied_minus_stamp = applied_minus_stamp
         else:
             self._applied_minus_stamp += self._gain * (
-                sample.applied_minus_stamp - self._applied_minus_stamp
+                applied_minus_stamp - self._applied_minus_stamp
             )
 
     def horizon(self, age: float) -> float:
-        """Return `age` [s] plus the average of the downlink [s]; the clock offsets cancel."""
+        """Return `age` plus the average of `applied_minus_stamp` [s]; the clock offsets cancel."""
         if self._applied_minus_stamp is None:
             return 0.0
         return max(0.0, age + self._applied_minus_stamp)

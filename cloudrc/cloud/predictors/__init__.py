@@ -1,12 +1,12 @@
-"""Predictors extrapolate odometry by the horizon; one file each.
+"""Predictors extrapolate the newest odometry by the horizon, the time until a command acts.
 
-A plug-in file defines `build(**parameters)`, which returns a `Predictor`. All parameters are
-annotated.
+Each predictor is a plug-in in a file of its own. The file defines `build(**parameters)`, which
+returns a `Predictor`; all parameters are annotated.
 
 All predictors except `last_sample` extrapolate the orientation by
 q(t + tau) = q(t) * exp(omega · tau / 2), where * is the product of quaternions. The formula is
-exact while the body's angular velocity is constant. The paper says only "similarly the
-orientation".
+exact while the body's angular velocity is constant. The paper gives no formula ("similarly the
+orientation").
 
 Source: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, eqs. (101), (214).
 """
@@ -19,7 +19,7 @@ from cloudrc.messages import Command, Odometry, Quaternion, Vector
 
 
 class Predictor:
-    """Extrapolates odometry; a plug-in has to define only `predict`."""
+    """Extrapolates odometry; a plug-in has to define `predict` only."""
 
     def observe(self, odometry: Odometry) -> None:
         """Note a new odometry sample; called once per sample, with rising stamps."""
@@ -31,14 +31,14 @@ class Predictor:
         """Reset the predictor at the start of a session."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Return the newest sample, extrapolated by `horizon` [s], >= 0, with a later stamp."""
+        """Return the newest sample, and its stamp, extrapolated by `horizon` [s], >= 0."""
         raise NotImplementedError
 
 
 def rotate_ahead(
     orientation_wxyz: Quaternion, angular_velocity_body: Vector, horizon: float
 ) -> Quaternion:
-    """Rotate an orientation at a constant body rate for `horizon` [s].
+    """Rotate an orientation at a constant angular velocity for the time `horizon`.
 
     Args:
         orientation_wxyz: Unit quaternion, body to world, shape (4,).

@@ -1,7 +1,7 @@
 """Predictor: extrapolate the position with the last commanded velocity.
 
-Source: the authors' published code. The code multiplies the delay by the last commanded velocity;
-the paper, eq. (3), multiplies it by the measured velocity.
+Source: the authors' published code, which multiplies the delay by the last commanded velocity. The
+paper, eq. (3), multiplies the delay by the measured velocity.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from cloudrc.messages import ZERO, Command, Odometry
 class CommandedVelocity(Predictor):
     """Adds the last commanded velocity times the horizon to the position.
 
-    With a proportional controller, u = -K · (p + u · tau) gives u = -K · p / (1 + K · tau). So the
-    longer the delay, the lower the effective gain. The predictor damps well but predicts badly.
+    With a proportional controller, u = -K · (p + u · tau) gives u = -K · p / (1 + K · tau): a
+    longer delay lowers the effective gain. The predictor therefore damps well, but predicts badly.
     """
 
     def __init__(self) -> None:
@@ -25,13 +25,13 @@ class CommandedVelocity(Predictor):
         self._commanded = command.velocity
 
     def reset(self) -> None:
-        """Forget the last command; the velocity is zero until the next command."""
+        """Forget the last command; the commanded velocity is zero until the next command."""
         self._commanded = ZERO
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Extrapolate a sample by `horizon`, tau [s]: p + u · tau; the velocity stays as measured.
 
-        Source: the authors' published code. The orientation turns as in the other predictors.
+        Source: the authors' published code. The orientation is extrapolated as in all predictors.
         """
         px, py, pz = odometry.position
         ux, uy, uz = self._commanded

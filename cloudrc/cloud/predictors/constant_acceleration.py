@@ -14,7 +14,7 @@ from cloudrc.messages import ZERO, Odometry, Vector
 
 
 class ConstantAcceleration(Predictor):
-    """Predicts with the measured velocity and the mean acceleration in a short window."""
+    """Predicts with the measured velocity and the mean acceleration in a short time window."""
 
     def __init__(self, window: float) -> None:
         """Set `window`, the longest time between the two compared velocities [s]."""
@@ -23,7 +23,7 @@ class ConstantAcceleration(Predictor):
         self._acceleration = ZERO
 
     def observe(self, odometry: Odometry) -> None:
-        """Compute the acceleration [m/s^2] from the oldest sample in the window to this sample.
+        """Compute the acceleration from the oldest sample in the window to this sample.
 
         A sample whose stamp is not later than the last stamp is ignored. After a gap longer than
         the window, the acceleration is zero until the next sample.
@@ -43,7 +43,7 @@ class ConstantAcceleration(Predictor):
         self._acceleration = ZERO
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate a sample by `horizon`, tau [s]: p + v · tau + a · tau^2 / 2, v + a · tau.
+        """Extrapolate a sample by `horizon`, tau [s]: p + v · tau + a · tau^2 / 2, and v + a · tau.
 
         Source: the paper, eq. (3b), for the velocity.
         Deviation: eq. (3a) as printed has no acceleration in the position.
@@ -52,7 +52,7 @@ class ConstantAcceleration(Predictor):
         vx, vy, vz = odometry.velocity
         ax, ay, az = self._acceleration
         rate = odometry.angular_velocity_body
-        # From here on the change of the velocity over the horizon [m/s].
+        # From here on, a is the change of the velocity over the horizon [m/s].
         ax, ay, az = ax * horizon, ay * horizon, az * horizon
         return Odometry(
             odometry.stamp_ns + round(horizon * 1e9),
@@ -68,7 +68,6 @@ class ConstantAcceleration(Predictor):
 
 
 def _mean_acceleration(start: Odometry, end: Odometry) -> Vector:
-    """Compute the mean acceleration between two samples [m/s^2], shape (3,)."""
     per_second = 1e9 / (end.stamp_ns - start.stamp_ns)
     ax, ay, az = start.velocity
     bx, by, bz = end.velocity

@@ -10,10 +10,10 @@ from cloudrc.messages import Odometry
 
 
 class ConstantVelocity(Predictor):
-    """Predicts with the measured velocity; the orientation keeps turning at the measured rate."""
+    """Predicts with the measured velocity; the orientation turns on at the measured rate."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate a sample by `horizon`, tau [s]: p + v · tau, v + a · tau with a = 0.
+        """Extrapolate a sample by `horizon`, tau [s]: p + v · tau; the velocity stays as measured.
 
         Source: the paper, eq. (3a), and eq. (3b) with a = 0, because the robot does not measure its
         acceleration.

@@ -10,10 +10,10 @@ from cloudrc.messages import Odometry
 
 
 class LastSample(Predictor):
-    """Predicts nothing: pose and twist stay as measured."""
+    """Predicts that the robot does not move: pose and twist stay as measured."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Return the sample with a stamp that is later by `horizon` [s]."""
+        """Return `odometry` with a stamp that is later by `horizon` [s]."""
         return odometry._replace(stamp_ns=odometry.stamp_ns + round(horizon * 1e9))
 
 

@@ -1,4 +1,4 @@
-"""The faults that are injected in virtual time, in one module per part that fails."""
+"""Faults that are injected in virtual time, one module for each part of the system."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def find(name: str) -> Scenario:
     """Return a scenario by its name (cloud-killed) or number (F13).
 
     Raises:
-        BadInputError: If there is none; names all.
+        BadInputError: If there is no such scenario; the text lists all.
     """
     for each in SCENARIOS:
         if name.lower() in (each.id.lower(), each.name):

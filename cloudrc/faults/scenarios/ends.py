@@ -1,4 +1,4 @@
-"""Faults F13, F15, F17, F25 and F40: cloud is killed, frozen or rivalled, world restarts."""
+"""Faults F13, F15, F17, F25 and F40: processes are killed or frozen, or a second cloud appears."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
 
 
 def _check_epochs(outcome: Outcome, flight: Flight) -> list[int]:
-    """Check that the epochs rise; return them."""
+    """Check that the epochs of world's sessions rise; return them."""
     opened = measures.epochs(flight)
     outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
     return opened
@@ -90,7 +90,7 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     coded = "world_restarted" in str(flight.mission.verdict)
     outcome.true("with the code world_restarted", coded)
     _check_epochs(outcome, flight)
-    refused = "world datagrams_total downlink old_epoch"  # what cloud says to the world before
+    refused = "world datagrams_total downlink old_epoch"  # commands for the old world
     failed = "cloud missions_total world_restarted"
     moves(outcome, flight, refused, "world session_epoch", failed, since=at + 2.0)
 
@@ -137,7 +137,7 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     expects="always a safe state; the mission goes on",
 )
 def _swizzle(outcome: Outcome, seed: int) -> None:
-    """A direction freezes before its sender, so that datagrams are lost.
+    """Each direction of the link stops before its sender, so that datagrams are lost.
 
     Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
     """

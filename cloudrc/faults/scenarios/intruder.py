@@ -1,4 +1,4 @@
-"""Faults F8, F20 to F22 and F24: damaged, forged, replayed and malformed datagrams, a flood."""
+"""Faults F8, F20 to F22 and F24: damaged, forged, replayed and malformed datagrams."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from cloudrc.tunnel import codec
 from cloudrc.world.endpoint import WorldEndpoint
 
 Make: TypeAlias = Callable[[bytes], Iterable[bytes]]
-"""Makes the hostile datagrams that arrive at an end before an honest one."""
+"""Function that makes the hostile datagrams which arrive just before an honest datagram."""
 REFUSED = ("tag", "malformed", "version", "direction", "old_epoch", "repeated")
-"""Counters of an end for datagrams that it refuses."""
+"""Counters of world and cloud for datagrams that they reject."""
 GREETED = ("hello", "unanswered", "accept_ignored")
-"""Counters of an end for captured greetings, which it answers with a challenge at most."""
+"""Counters for captured hello messages; the only possible answer to them is a challenge."""
 FLOOD = 100  # datagrams of garbage per honest one: 10,000 in a second
 SETTLED = 2.0
-"""Time at which a new flight has its session [s], so that an old greeting opens none."""
+"""Time by which a new flight has its session, so that an old hello message cannot open one [s]."""
 
 
 class HostileSender:
-    """Sends hostile datagrams; counts them as `sent`, and as `taken` if they had an effect."""
+    """Sends hostile datagrams and counts them: all as `sent`, those with an effect as `taken`."""
 
     def __init__(self) -> None:
         self.sent = self.taken = 0
 
     def send(self, process: RestartableEndpoint, data: bytes, now_ns: int) -> None:
-        """Hand one datagram to an end at `now_ns` [ns]."""
+        """Pass one datagram to world or cloud at `now_ns` [ns]."""
         inner = process.inner
         assert isinstance(inner, WorldEndpoint | CloudEndpoint)
         before, epoch = Counter(inner.counts), inner.epoch
@@ -44,15 +44,15 @@ class HostileSender:
         self.sent += 1
         rose = Counter(inner.counts) - before
         sent = rose.pop("sent", 0)  # an answer, or a hello to a peer that may have a new epoch
-        # The ticks before a greeting may limit a command.
+        # In the ticks before a hello message the guard may limit a command.
         rose = Counter({name: n for name, n in rose.items() if not name.startswith("limited_")})
-        # A challenge that nobody has asked for is neither counted nor answered.
+        # A challenge without a request is neither counted nor answered.
         ignored = not rose and not sent and codec.peek(data)[0] == codec.Kind.CHALLENGE
         refused = rose.total() == 1 and rose.keys() <= {*REFUSED, *GREETED}
         self.taken += epoch != inner.epoch or not (ignored or refused)
 
     def check(self, outcome: Outcome, least: int) -> None:
-        """Check that there were hostile datagrams, and that none was taken."""
+        """Check that at least `least` hostile datagrams were sent, and that none had an effect."""
         outcome.least("hostile datagrams", self.sent, least)
         outcome.same("of them taken", self.taken, 0)
 
@@ -60,10 +60,10 @@ class HostileSender:
 def _check_no_effect(
     outcome: Outcome, seed: int, makes: Sequence[Make], *refusals: str, since: float = 0.0
 ) -> None:
-    """Fly with hostile datagrams beside the honest ones; the flight must be the same.
+    """Fly with and without hostile datagrams; both flights must be equal.
 
-    From `since` on [s], the first of `makes` makes the datagrams to world, the second those to
-    cloud. World's counters `refusals` have to rise.
+    From `since` [s] on, the first function in `makes` makes the datagrams for world, the second
+    those for cloud. World's counters `refusals` must rise.
     """
     sender, clean, flight = HostileSender(), Flight(seed=seed).fly_mission(), Flight(seed=seed)
 
@@ -117,7 +117,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
     expects="no effect: the same path, bit by bit",
 )
 def _flood(outcome: Outcome, seed: int) -> None:
-    """Send noise alone, and noise after a valid header: too short, and of the right length."""
+    """Send random bytes, and valid headers with too few and with enough random bytes."""
     rng = generator(seed, 20)
 
     def garbage(data: bytes) -> Iterable[bytes]:

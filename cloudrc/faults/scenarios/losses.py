@@ -1,4 +1,4 @@
-"""Faults F1 to F5: the link loses datagrams, in silences, by chance and in bursts."""
+"""Faults F1 to F5: the link loses datagrams during blackouts, at random and in bursts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HOLDS = "world guard_transitions_total hold"
     expects="stays in TRACK, no step above the acceleration cap",
 )
 def _short_silence(outcome: Outcome, seed: int) -> None:
-    """Without jitter a link has no other gaps."""
+    """A link without jitter has no other gaps between datagrams."""
     at = measures.instant(seed)
     both, steady = silent(at, 0.1), conditions(jitter=0.0)
     cut = silent(at, 0.1, jitter=0.0)
@@ -79,7 +79,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
     expects="HOLD, LAND after 60 s at 0.5 m/s, rotors stop on what lies below, latched",
 )
 def _long_silence(outcome: Outcome, seed: int) -> None:
-    """Cut the link over the free floor, and anywhere on the way through the pipes."""
+    """Interrupt the link over the free floor, and at a random place among the pipes."""
     flight = _landed(outcome, seed, measures.instant(seed, 1.6, 2.6), "over the floor")
     first, last = (flight.trajectory()[n].odometry.position for n in (0, -1))
     text = "over the floor: base above where it took off"
@@ -88,7 +88,7 @@ def _long_silence(outcome: Outcome, seed: int) -> None:
 
 
 def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
-    """Cut the link at `at` [s] for long: the robot lands and stops its rotors."""
+    """Interrupt the link at `at` [s] for 75 s: the robot must land and stop its rotors."""
     limit = "criteria.time_limit_s=200"
     flight = Flight(limit, seed=seed, link=silent(at, 75.0), separate=True)
     measures.silence_told(outcome, flight, at, 70.0, f"{where}: ", cloud=True)
@@ -154,7 +154,7 @@ def _bursts(outcome: Outcome, seed: int) -> None:
         if packets < 50:  # else it hardly ever rests on the board for 4 s, and a leg may time out
             measures.done(outcome, flight)
         outcome.true("the mission has ended", flight.mission.ended)
-        # Most bursts do nothing: the fault is the first one that is too long.
+        # Most bursts have no effect; the fault begins with the first that is too long.
         since = measures.first_into(flight, GuardState.HOLD) - measures.AGE_MAX
         moves(outcome, flight, HOLDS, since=since)
         text, busiest = f"bursts of {packets * 10} ms", measures.busiest_second(flight.changes)

@@ -1,4 +1,4 @@
-"""Faults F23, F27 and F28: impossible commands and missions; a waypoint that is not reached."""
+"""Faults F23, F27 and F28: impossible commands, impossible missions, a waypoint out of reach."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EXCESSIVE: dict[str, dict[str, Any]] = {
     "speed": {"velocity": (100.0, 0.0, 0.0)},
     "yaw_rate": {"yaw_rate": 100.0},
 }
-"""Commands of 100 m/s and 100 rad/s, by the limit of the guard that they meet."""
+"""Limit of the guard -> command that exceeds the limit."""
 
 
 @scenario(
@@ -64,7 +64,7 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
 
 
 def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
-    """Change the commands from `at` on for `duration` [s]."""
+    """Change commands from `at` [s] for `duration` [s]."""
 
     def lie(command: Command, control: Control) -> Command:
         now = control.stamp_ns * 1e-9
@@ -110,7 +110,7 @@ def _impossible(outcome: Outcome, seed: int) -> None:
 
 
 def _wall_of(pipe: Pipe) -> Vector:
-    """Return a point in the wall of a horizontal pipe, beside its middle."""
+    """Return a point inside the wall of a horizontal pipe, at half of its length."""
     (x, y, z), (ax, ay, _), radius = pipe.centre, pipe.axis, 0.5 * (pipe.inner + pipe.outer)
     return (x - ay * radius, y + ax * radius, z)
 
@@ -122,7 +122,7 @@ def _wall_of(pipe: Pipe) -> Vector:
     expects="HOLD; the leg ends by its limit of time",
 )
 def _unreachable(outcome: Outcome, seed: int) -> None:
-    """Command the robot to stay where it is."""
+    """Command the robot to stay where it is, so that it cannot reach the next waypoint."""
     at, stays = measures.instant(seed, 12.0, 20.0), list[Vector]()
 
     def stalled(command: Command, control: Control) -> Command:

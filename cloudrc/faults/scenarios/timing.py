@@ -1,4 +1,4 @@
-"""Faults F6, F7 and F9 to F12: disorder, copies, clocks, steps of the delay, asymmetry, jitter."""
+"""Faults F6, F7 and F9 to F12: reordering, copies, clocks, delay steps, asymmetry and jitter."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _clocks(outcome: Outcome, seed: int) -> None:
     expects="estimator `split` within 20 % in 0.5 s; no HOLD; the caps hold",
 )
 def _delay_step(outcome: Outcome, seed: int) -> None:
-    """Step the delay; a jitter of 1 ms makes the round trips differ, as the metric needs."""
+    """Change the delay in one step; 1 ms of jitter makes round trips differ for the metric."""
     at = measures.instant(seed)
     shape = conditions(delay=0.01, jitter=0.001, changes=(Change(at, delay=0.1),))
     flight = fly_safely(outcome, Flight("cloud.estimator=split", seed=seed, link=shape))
@@ -116,7 +116,7 @@ def _asymmetry(outcome: Outcome, seed: int) -> None:
 )
 def _jitter(outcome: Outcome, seed: int) -> None:
     def older(flight: Flight, age: float) -> float:
-        """Return the share of commands [1] that were older than `age` [s] when in use."""
+        """Return the share of applied commands [1] that were older than `age` [s]."""
         return measures.above(flight, "world", AGE, age)[1]
 
     flight = fly_safely(outcome, Flight("link.profile=paper-p3", seed=seed))

@@ -1,1 +1,1 @@
-"""Verify a link: probe it, predict what was asked, and judge what was measured."""
+"""Verify a link: send probes, predict their delays and losses from the profile, and compare."""

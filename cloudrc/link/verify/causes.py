@@ -1,6 +1,7 @@
-"""Name why a link differs from its profile.
+"""Name the likely cause if the measurements of a link differ from its profile.
 
-Reports of the machine (qdiscs, counters, release errors) come before conclusions from the rows.
+Causes that the machine reports (qdiscs, counters, release errors) come before causes that are
+inferred from the measurements.
 """
 
 from __future__ import annotations
@@ -14,39 +15,39 @@ from cloudrc.link.sidecar import Near, Told
 from cloudrc.link.verify.judge import Row
 
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
-"""Above any of these limits a shaper lacks CPU time: 99 % quantile of its release error [s], share
-of datagrams not read in time, share of periods in which a CPU limit stopped the shaper."""
+"""A shaper lacks CPU time above any of these limits: 99 % quantile of its release error [s]; share
+of datagrams not read in time; share of CPU periods in which the shaper was throttled."""
 RAISED = ("mean", "round_trip", "deviation", "loss")
 """Quantities that rise if the shaper lacks CPU time."""
 PASSED = 0.9
-"""Below this share of the arrived datagrams at the shaper, the others take another way."""
+"""If the shaper counts less than this share of the arrived datagrams, the others bypass it."""
 
 
 class Evidence(NamedTuple):
-    """Report of the machine about the shaper of one direction; None or "" if unknown."""
+    """Facts about the shaper of one direction, as its machine reports; None or "" means unknown."""
 
-    shaper: str = ""  # "relay", "netem"; "none" if the kernel has none where the flow leaves
-    why: str = ""  # why this shaper, in words
-    interface: str = ""  # through which the flow leaves
+    shaper: str = ""  # "relay", "netem"; "none" if the interface has no netem qdisc
+    why: str = ""  # why this shaper was chosen, in words
+    interface: str = ""  # interface through which the flow leaves
     elsewhere: tuple[str, ...] = ()  # other interfaces that have a netem qdisc
     layers: int = 1  # number of shapers that the flow passes
-    sent: int | None = None  # datagrams that the end sent
-    passed: int | None = None  # of these, those that the shaper counted
-    starved: str = ""  # how a lack of CPU time shows
+    sent: int | None = None  # datagrams that world or cloud sent
+    passed: int | None = None  # datagrams that the shaper counted
+    starved: str = ""  # signs of a lack of CPU time; "" if there are none
     restored: int = 0  # times that another program removed or changed the qdisc
 
 
 def read_metrics(text: str) -> dict[str, float]:
-    """Read Prometheus' text format: value by "name" or "name/value of its label"."""
+    """Parse Prometheus' text format: "name" or "name/label value" -> value."""
     found = re.findall(r"^cloudrc_(\w+)(?:\{(.*)\})? (\S+)$", text, re.MULTILINE)
     names = ["/".join((name, *re.findall(r'="([^"]*)"', labels))) for name, labels, _ in found]
     return {name: float(value) for name, (_, _, value) in zip(names, found, strict=True)}
 
 
 def read_evidence(told: Told, metrics: Mapping[str, float], sent: int | None = None) -> Evidence:
-    """Combine the page /link.json of a link's process, which names the qdiscs, and its metrics.
+    """Combine the report of a `link` container (page /link.json) with its metrics.
 
-    `sent` is the number of datagrams sent to the process since it started; None if unknown.
+    `sent` is the number of datagrams sent to the shaper since it started; None if unknown.
     """
     received, unread, stopped, periods = (
         int(metrics.get(name, 0.0))
@@ -60,7 +61,7 @@ def read_evidence(told: Told, metrics: Mapping[str, float], sent: int | None = N
         (stopped > STOPPED * periods, f"stopped in {stopped} of {periods} CPU periods"),
     )
     near, netem = told.near or Near("", {}), told.shaper == "netem"
-    ways = {near.interface} if netem else {near.interface, "lo"}  # an end reaches a relay over lo
+    ways = {near.interface} if netem else {near.interface, "lo"}  # the relay receives through lo
     here = [one for way in ways for one in near.netems.get(way, ())]
     passed = received + unread if metrics and not netem else None
     if netem and here:
@@ -87,14 +88,14 @@ class Cause(NamedTuple):
 
 
 class Findings(NamedTuple):
-    """Measurements of one direction, and the report of its machine."""
+    """Judged measurements of one direction, and the facts that its machine reports."""
 
     rows: Sequence[Row]
     evidence: Evidence
 
 
 def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
-    """Name the causes for each direction of a link; none if no row is off."""
+    """Name the causes for each direction of a link; return none if no measurement is "off"."""
     found = {way: list(_causes_of(one)) for way, one in findings.items()}
     silent = [way for way, causes in found.items() if causes and causes[0][0] in _UNSHAPED]
     shaped = [way for way in findings if way not in silent]
@@ -125,12 +126,12 @@ _BY_NUMBERS = (
     ("wrong_order", "reordered", 0.0, inf, ""),
     ("wrong_distribution", "distribution", 0.0, inf, ": delays are distributed otherwise"),
 )
-"""Code, quantity, range of the measured divided by the requested value, and text; the surest
-cause comes first."""
+"""Rules in the order of their certainty: code of the cause, quantity, smallest and largest ratio of
+measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield the surest cause; after a lack of CPU time also the cause that the rows show."""
+    """Yield the most certain cause; if CPU time is lacking, also the cause that the rows show."""
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
     if off and (read := next(_of_machine(one.evidence, off, lost), None)):
@@ -144,7 +145,7 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
-    """Yield causes that the machine reports, the surest first; a share `lost` [1] is lost."""
+    """Yield causes that the machine reports, the most certain first; `lost` is the loss [1]."""
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
     sent, unshaped = known.sent or 0, known.shaper == "none"
     passed = sent if known.passed is None else known.passed
@@ -169,7 +170,6 @@ def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterato
 
 
 def _ratio(row: Row) -> float:
-    """Return the measured divided by the requested value [1]."""
     return row.measured / row.asked if row.asked else inf
 
 
@@ -179,7 +179,7 @@ def describe(row: Row) -> str:
 
 
 def in_unit(value: float, unit: str) -> str:
-    """Write a value [s], [1] or [bit/s] in ms, % or kbit/s."""
+    """Format a value [s], [1] or [bit/s] with the unit ms, % or kbit/s."""
     if isnan(value):
         return "-"
     if unit == "bit/s":

@@ -1,10 +1,12 @@
-"""Predict what the datagrams of one direction measure, and judge what they did measure.
+"""Predict what a link with the requested profile would measure, and judge a real measurement.
 
-The random numbers of a relay depend only on seed and counter, so the delay of each datagram on a
-relay can be predicted. netem has random numbers of its own. For netem, 200 links with other seeds
-are simulated; they give a band for each quantity. A row is "ok" within the band, widened by a
-tolerance, and otherwise "off". A row is "open" if chance could hide a wrong link, and "told" if the
-profile requests something that was not judged.
+The random numbers of a relay depend only on seed and counter, so the delay of each datagram through
+a relay can be predicted. The random numbers of netem cannot be predicted. Therefore 200 simulated
+links with other seeds give a band of likely values for each quantity.
+
+The verdict on a quantity is "ok" if the measured value is inside the band, widened by a tolerance,
+and otherwise "off". It is "open" if the measurement is too short to decide, and "told" if a
+requested property is only reported, not judged.
 """
 
 from __future__ import annotations
@@ -22,15 +24,16 @@ from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
 
 RUNS, RUN_LENGTH = 200, 1000
-"""Simulated links for a band, and datagrams of each; for other numbers a band is scaled."""
+"""Number of simulated links for a band, and number of datagrams on each simulated link. The band is
+scaled for measurements with another number of datagrams."""
 TAIL = 1e-3
-"""Share of honest links below a band, and share of them above it."""
+"""Share of correct links with a value below a band, and share with a value above it, in [0, 1]."""
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
-"""Least correlation of measured and predicted delays, and least share of datagrams whose loss or
-arrival was predicted, from which on the link counts as a relay with known random numbers."""
+"""Limits above which a link counts as a relay with the predicted random numbers: correlation of
+measured and predicted delays; share of datagrams whose loss or arrival was predicted."""
 STILL, SHAPE_FLOOR = 1e-4, 2e-3
-"""Standard deviations of the delay [s]. Below the first, a correlation of delays means nothing;
-below the second, the machine itself changes the shape of the distribution."""
+"""Standard deviations of the delay [s]. Below STILL, the correlation of delays is not used. Below
+SHAPE_FLOOR, the distribution is not judged, because the machine itself changes its shape."""
 TOLERANCES = {
     "mean": (2e-3, 0.05),
     "round_trip": (2e-3, 0.05),
@@ -38,54 +41,55 @@ TOLERANCES = {
     "distribution": (0.05, 0.0),
     "rate": (0.0, 0.25),
 }
-"""Quantity -> tolerance in its unit, and as a share of the requested value: the larger counts.
-On a relay, the share of the deviation is half of that."""
+"""Quantity -> tolerance in the unit of the quantity, and tolerance as a share of the requested
+value. The larger tolerance counts. For the deviation on a relay, half the share is used."""
 SHARE_TOLERANCE = (0.02, 0.25)
-"""Tolerance of loss, order and copies: absolute, and as a share of the requested value."""
+"""Tolerance of loss, reordering and duplication: absolute [1], and as a share of the request."""
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
-"""Quantity -> unit; that of a share is "1"."""
+"""Quantity -> unit; quantities that are not listed are shares with the unit "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
-"""Fewest datagrams for a verdict; widest half of a band for "ok", in tolerances."""
+"""Smallest number of datagrams for a verdict; largest half width of a band, as a multiple of the
+tolerance, for the verdict "ok"."""
 
 
 class Flow(NamedTuple):
-    """Datagrams of one kind in one direction."""
+    """The datagrams of one kind in one direction."""
 
-    seed: int  # of the experiment
+    seed: int  # seed of the experiment
     uplink: bool
     kind: int  # as in the tunnel's header
     size: int  # UDP payload [bytes]
 
 
 class Row(NamedTuple):
-    """One quantity of one direction; an unknown value is NaN.
+    """Verdict on one quantity of one direction; an unknown value is NaN.
 
-    The values asked, measured, low and high have the unit `unit`, so any unit.
+    `asked`, `measured`, `low` and `high` have the unit in `unit` (any unit).
     """
 
     name: str  # as in `Plan.quantities`, or "round_trip"
     unit: str  # "s", "1" or "bit/s"
-    asked: float  # mean on links of the requested profile
+    asked: float  # mean value of links with the requested profile
     measured: float
-    low: float  # lowest value that is believed
-    high: float  # highest value that is believed
+    low: float  # lowest accepted value
+    high: float  # highest accepted value
     verdict: str  # "ok", "off", "open" or "told"
 
 
 class Expected(NamedTuple):
-    """Values that links of the requested profile measure."""
+    """Values that a link with the requested profile would measure."""
 
-    bands: dict[str, tuple[float, float, float]]  # mean; a share TAIL is below, TAIL above the rest
+    bands: dict[str, tuple[float, float, float]]  # mean; limits of the band
     pooled: Floats  # delays minus the requested delays, with median 0, sorted [s]
-    known: bool  # True if the link's random numbers are known: then a band has no width
+    known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return half the width of the band of a quantity, in tolerances [1]."""
+        """Return half a band's width, divided by the tolerance [1]; the limit is `CHANCE_MAX`."""
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
     def judge(self, name: str, value: float) -> Row:
-        """Judge one value [unit of the quantity]."""
+        """Judge one measured `value` of a quantity [any unit]."""
         mean, low, high = self.bands[name]
         slack, hidden = tolerance(name, mean), self.hidden(name)
         if self.known and name == "deviation":
@@ -99,15 +103,15 @@ class Expected(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """Datagrams that measure one direction, and the profile that this direction should have.
+    """A measurement of one direction: the requested profile, and the datagrams to send.
 
     Attributes:
         profile: Requested conditions.
-        flow: The datagrams.
-        sent: When each is sent, since the link came up [s], shape (n,).
-        train: Datagrams per train, sent back to back; a train follows as many single datagrams. 0
-            without trains.
-        pause: Called every few hundred microseconds, so that other threads run.
+        flow: Kind, size and direction of the datagrams.
+        sent: Time of sending of each datagram, since the link came up [s], shape (n,).
+        train: Number of datagrams in a train, which is sent back to back. Before each train, as
+            many datagrams are sent one by one. 0 if there are no trains.
+        pause: Function called every few hundred microseconds, so that other threads can run.
     """
 
     profile: DirectionProfile
@@ -117,9 +121,10 @@ class Plan:
     pause: Callable[[], None] = lambda: None
 
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
-        """Simulate the link for datagrams sent at `sent` [s], with counters from `first` on.
+        """Simulate the link for datagrams sent at the times `sent` [s] since the link came up.
 
-        The receiver refuses damaged datagrams, so they count as lost.
+        `first` is the counter of the first datagram. Damaged datagrams count as lost, because the
+        receiver rejects them.
         """
         seed, uplink, kind, size = self.flow
         link, whole = LinkDirection(self.profile, seed, uplink), bytes(size)
@@ -136,7 +141,7 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """Streams of up to RUN_LENGTH datagrams over 200 links as netem shapes them."""
+        """Simulated streams of up to `RUN_LENGTH` datagrams over 200 links with netem."""
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
@@ -145,14 +150,14 @@ class Plan:
 
     @cached_property
     def chance(self) -> Expected:
-        """Values that `links` measure."""
+        """Bands of the values that the simulated `links` measure."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
-        """Return the values that an honest link measures with the datagrams of a stream.
+        """Return the values that a correct link would measure with the datagrams of a stream.
 
-        The values are exact if the stream fits the random numbers of a relay. Otherwise they are
-        the band of links with other seeds.
+        If the stream matches the predicted random numbers of a relay, the values are exact.
+        Otherwise they are the bands from simulated links with other seeds.
         """
         drawn = self.draw(measured.sent, epoch, first)
         if self._fits(self._singles(measured), self._singles(drawn)):
@@ -165,7 +170,7 @@ class Plan:
         return self.chance._replace(bands=bands)
 
     def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
-        """Judge a stream; rows "told" name requested properties that the stream cannot show."""
+        """Judge a measured stream; properties that it cannot show get the verdict "told"."""
         expected = self.expected(measured, epoch, first)
         found = self.quantities(measured, expected.pooled)
         rows = [expected.judge(name, found[name]) for name in found if name in expected.bands]
@@ -178,15 +183,15 @@ class Plan:
         return rows
 
     def needed(self) -> int:
-        """Return the number of datagrams from which on no band is wider than its tolerances."""
+        """Return the number of datagrams that makes every band narrow enough for a verdict."""
         most = max(map(self.chance.hidden, self.chance.bands))
         return round(len(self.links[0].sent) * max(1.0, most**2))
 
     def quantities(self, stream: Stream, pooled: Floats) -> dict[str, float]:
-        """Compute the judged quantities of a stream; an unknown one is NaN.
+        """Compute the judged quantities of a stream; an unknown quantity is NaN.
 
-        The deviation [s] is that from the delay requested at each time, so it shows the jitter
-        alone. The "distribution" is the distance of Kolmogorov and Smirnov from `pooled` [1].
+        "deviation" is the standard deviation from the delay requested at each time [s], so it shows
+        the jitter alone. "distribution" is the Kolmogorov-Smirnov distance to `pooled` [1].
         """
         singles = self._singles(stream)
         found, shape = numbers(singles), self._shape(singles)
@@ -207,7 +212,7 @@ class Plan:
         return measured
 
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
-        """Return whether the predicted delays, or else the predicted losses, were measured."""
+        """Return whether the delays match the prediction or, without jitter, the losses do."""
         lost = np.isnan(measured.delays), np.isnan(drawn.delays)
         both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)
         pair = [(one.delays - requested)[both] for one in (measured, drawn)]
@@ -232,7 +237,7 @@ class Plan:
         return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
 
     def _shape(self, stream: Stream) -> Floats:
-        """Return the delays minus the delays requested at their time, with median 0 [s]."""
+        """Return measured minus requested delays of arrived datagrams, shifted to median 0 [s]."""
         delays = stream.delays - _requested_delay(self.profile, stream.sent)
         there: Floats = delays[np.isfinite(delays)]
         return there - np.median(there) if len(there) else there
@@ -259,10 +264,10 @@ def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
 
 
 def netem_makes(profile: DirectionProfile) -> DirectionProfile:
-    """Return the profile with which the model does what netem does with `profile`.
+    """Return the profile with which the link's model behaves as netem does with `profile`.
 
-    netem realises almost no correlation of delays. If it draws a loss and a duplicate for a packet,
-    one packet arrives; a copy can be lost, too. Source: Linux, net/sched/sch_netem.c.
+    netem hardly correlates delays. If netem draws both a loss and a duplicate for a packet, one
+    packet arrives. netem can also lose the copy. Source: Linux, net/sched/sch_netem.c.
     """
     loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
     twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)
@@ -274,23 +279,23 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
 
 
 def told(name: str, asked: float, measured: float = nan) -> Row:
-    """Make a row with `asked` and `measured` values [any unit] of a quantity that is not judged."""
+    """Report the `asked` and `measured` values [any unit] of a quantity without judging them."""
     return Row(name, UNITS.get(name, "1"), asked, measured, nan, nan, "told")
 
 
 def tolerance(name: str, asked: float) -> float:
-    """Return the tolerance of a quantity of which the profile requests `asked` [any unit]."""
+    """Return the tolerance of a quantity whose requested value is `asked` [any unit]."""
     floor, share = TOLERANCES.get(name, SHARE_TOLERANCE)
     return max(floor, share * asked)
 
 
 def look_twice(first: Sequence[Row], second: Sequence[Row]) -> list[Row]:
-    """Combine two measurements of a link: a row is off only if it is off in both."""
+    """Combine two measurements of a link: a quantity is "off" only if "off" in both."""
     again = {row.name: row for row in second}
     return [again.get(row.name, row) if row.verdict == "off" else row for row in first]
 
 
 def verdict_of(rows: Iterable[Row]) -> str:
-    """Return "off" if a row is off, else "ok" if all judged rows are ok, else "open"."""
+    """Return "off" if any row is "off", "ok" if all judged rows are "ok", otherwise "open"."""
     verdicts = {row.verdict for row in rows} - {"told"}
     return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"

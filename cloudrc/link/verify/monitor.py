@@ -1,7 +1,7 @@
-"""Monitor the link in flight: every 5 s compare what an end receives with what is predicted.
+"""Monitor the link in flight: every 5 s, compare the received datagrams with the prediction.
 
-World judges the downlink, cloud the uplink and, if the ends share no clock, round trips. The loop's
-thread only hands over its records; a thread of the monitor does the rest.
+World judges the downlink. Cloud judges the uplink and, if the machines of world and cloud share no
+clock, the round trips. A separate thread does the work, so that the control loop is not delayed.
 """
 
 from __future__ import annotations
@@ -39,34 +39,34 @@ from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Reco
 PERIOD = 0.01
 """Period of telemetry and of commands [s]."""
 CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
-"""Time between two verdicts, and from a new session or profile to the first datagram [ns]."""
+"""Period of the verdicts [ns]; pause after a change of session or profile [ns]."""
 KEPT, FINAL = 6000, 128
-"""Most datagrams that are judged; a missing datagram counts as lost after FINAL newer ones."""
+"""Largest number of datagrams judged; a missing one counts as lost after FINAL newer datagrams."""
 ENDS = 2e-3
-"""Largest delay that two punctual ends and a tick of the simulation add to a round trip [s]."""
+"""Largest delay that world and cloud, if they wake on time, add to a round trip [s]."""
 FOLLOW_PERIOD = 0.1
-"""Time between two looks at the records and at the state file of the link [s]."""
+"""Period at which the thread reads new records and the link's state file [s]."""
 UNJUDGED = {"distribution"}
-"""Quantity that is not judged in flight: the ends' own wake-ups change it."""
+"""Quantity that is not judged in flight, because late wakes of world and cloud change it."""
 DELAYS = {"mean", "deviation"}
-"""Quantities that need a common clock."""
+"""Quantities that can be measured only if world and cloud share a clock."""
 
 Asked: TypeAlias = tuple[DirectionProfile, DirectionProfile]
-"""Profiles of uplink and downlink."""
+"""Requested profiles of uplink and downlink."""
 Load: TypeAlias = Callable[[object], Asked]
-"""Reads the values of a profile's file; raises a CloudrcError."""
+"""Function that converts the values of a profile's file, or raises a CloudrcError."""
 
 
 class LinkMonitor:
-    """Judge what one end receives, by its records."""
+    """Judges one direction of the link from the records of the program that receives it."""
 
     def __init__(self, *, uplink: bool, flow: Flow) -> None:
-        """Set up for the end that receives a flow: cloud the uplink; then call `follow`."""
+        """Monitor the received `flow`: at cloud the uplink, at world the downlink."""
         self._uplink, self._flow = uplink, flow
         self._arrivals = deque[Arrival](maxlen=KEPT)
         self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
         self._asked: Asked | None = None
-        self._plans: list[Plan] = []  # of what is received, and of the other direction
+        self._plans: list[Plan] = []  # for the received flow, and for the other direction
         self._epoch, self._fresh, self._seen = -1, True, ""
         self._since_ns, self._due_ns = 0.0, 0
         self._suspects, self._complained = set[str](), False
@@ -75,13 +75,13 @@ class LinkMonitor:
         self._outbox = queue.SimpleQueue[Record]()
 
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
-        """Start the thread; profiles `asked` hold until the link's state file reports others."""
+        """Start the thread; the profiles `asked` hold until the state file reports others."""
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
 
     def follow(self, asked: Asked | None) -> None:
-        """Judge by other profiles from now on; judge nothing while `asked` is None (unknown)."""
+        """Replace the requested profiles; None means unknown, so nothing is judged."""
         if asked != self._asked:
             self._asked, self._fresh, sent = asked, True, np.arange(float(RUN_LENGTH)) * PERIOD
             ways = () if asked is None else asked if self._uplink else asked[::-1]
@@ -90,23 +90,23 @@ class LinkMonitor:
             ]
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Take the newest records of this end at `now_ns`; return records about the link."""
+        """Process the newest records of this end at `now_ns` [ns]; return records of the link."""
         if self._inbox is None:
             return self._see(records, now_ns)
         self._inbox.put((records, now_ns))
         return [self._outbox.get_nowait() for _ in range(self._outbox.qsize())]
 
     def look(self, path: Path, load: Load) -> None:
-        """Follow the state file of the link once."""
+        """Read the link's state file once, and adopt the profiles in it."""
         try:
             text = read(path, STATE_MAX).decode()
             if text != self._seen:
                 self._seen = text
                 self.follow(load(from_text(text).profile))
-        except TooLongError:  # a long time line: what was asked before holds no more
+        except TooLongError:  # a long time line: the profiles are unknown
             self._seen = ""
             self.follow(None)
-        except Exception:  # not there yet, half written or nonsense: what was asked holds
+        except Exception:  # no file yet, or an invalid one: the profiles stay
             pass
 
     def _run(self, path: Path | None, load: Load) -> None:
@@ -118,7 +118,7 @@ class LinkMonitor:
                 records, now_ns = self._inbox.get()
                 try:
                     found = self._see(records, now_ns)
-                except Exception as error:  # the next look may do better
+                except Exception as error:  # the next attempt may succeed
                     text = f"the monitor of the link failed ({describe_error(error)}); it goes on"
                     found = [] if failed else [Fault(now_ns, "link_check", text)]
                     failed = True
@@ -127,7 +127,7 @@ class LinkMonitor:
             threading.Event().wait(FOLLOW_PERIOD)
 
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Store records; once per CHECK_NS judge those of the present session and profile."""
+        """Store records; every `CHECK_NS`, judge the records of the present session and profile."""
         for record in records:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch
@@ -140,7 +140,7 @@ class LinkMonitor:
                     self._trips.append(record.rtt)
         if self._asked is None:
             return []
-        if self._fresh:  # a time line that runs is not judged: where it began is not known here
+        if self._fresh:  # a running time line is not judged, because its start is not known here
             last_ns = max(Timeline(profile).last_ns for profile in self._asked)
             settled_ns = now_ns + SETTLE_NS
             self._since_ns, self._due_ns = settled_ns + last_ns, settled_ns + CHECK_NS
@@ -157,7 +157,7 @@ class LinkMonitor:
             kept.clear()
 
     def _report(self, rows: list[Row], now_ns: int) -> list[Record]:
-        """Make records; look once more at what is off for the first time before saying so."""
+        """Make the records; report a quantity as "off" only after two measurements in a row."""
         count, off = len(self._arrivals), {row.name for row in rows if row.verdict == "off"}
         if off - self._suspects:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
@@ -176,24 +176,24 @@ class LinkMonitor:
         return found
 
     def _rows(self) -> list[Row]:
-        """Judge by the link's own draws where they fit, otherwise by what netem makes."""
+        """Judge all quantities, including the round trip and properties that are only reported."""
         stream, first, timed = _in_order(self._arrivals)
         rows, skipped = list[Row](), UNJUDGED if timed else UNJUDGED | DELAYS
         if len(stream.sent) >= FEWEST:
             rows = self._plans[0].judge(stream, self._epoch, first)
-        elif self._arrivals:  # of a new session or profile: an older verdict holds no more
+        elif self._arrivals:  # a new session or profile ends the old verdict
             rows = [told("loss", nan)._replace(verdict="open")]
         rows = [row for row in rows if row.name not in skipped]
         if not timed and len(self._trips) >= FEWEST:
             rows.append(self._round_trip())
         rows = [self._excuse(row) for row in rows]
         timelines = [Timeline(one) for one in self._asked or ()]
-        if any(one.only() is None for one in timelines):  # 1: it loops, and is never judged
+        if any(one.only() is None for one in timelines):  # 1: it loops, so it is never judged
             rows.append(told("time_line", 1, float(any(isinf(one.last_ns) for one in timelines))))
         return rows
 
     def _round_trip(self) -> Row:
-        """Judge round trips: the newest wins, so datagrams that none overtook make them."""
+        """Judge round trips; world and cloud measure them without overtaken datagrams."""
         means = np.sum([[_first_come(link) for link in plan.links] for plan in self._plans], axis=0)
         low, high = np.quantile(means, (TAIL, 1.0 - TAIL)).tolist()
         bands = {"round_trip": (float(means.mean()), low, high + ENDS)}
@@ -201,9 +201,10 @@ class LinkMonitor:
         return expected.judge("round_trip", float(np.mean(self._trips)))
 
     def _excuse(self, row: Row) -> Row:
-        """Leave a too long delay open if late wakes of this machine's loops may explain it.
+        """Change "off" to "open" for a long delay that late wakes of this machine may explain.
 
-        While a loop stalls, datagrams wait for up to its lateness; hence the cubes.
+        A loop that is late by t delays the datagrams of the time t by up to t. So the mean square
+        of the added delay grows with the third power of t.
         """
         late = np.array(self._lates or [0.0])
         added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * PERIOD)) ** 0.5
@@ -212,10 +213,10 @@ class LinkMonitor:
 
 
 def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
-    """Order arrivals by their counters, and mark the missing counters between them as lost.
+    """Sort arrivals by counter, and mark missing counters between them as lost.
 
-    Returns also the first counter, and whether the ends share a clock. Without a common clock the
-    delays have an unknown offset.
+    Also return the first counter, and whether world and cloud share a clock. Without a common
+    clock, the delays have an unknown constant offset.
     """
     last = max((one.counter for one in arrivals), default=0) - FINAL
     arrivals = [one for one in arrivals if last - KEPT < one.counter <= last]
@@ -226,10 +227,10 @@ def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
     if not arrivals:
         return Stream(delays, delays, copies), first, False
     begin_ns, timed = arrivals[0].stamp_ns, not any(isnan(one.delay) for one in arrivals)
-    numbers, index, times = np.unique(  # the first copy comes first
+    numbers, index, times = np.unique(  # the copy that arrived first
         [one.counter - first for one in arrivals], return_index=True, return_counts=True
     )
-    # A nanosecond apart: what is read in one wake has the same time, but has not lost its order.
+    # Datagrams read in one wake have the same time: 1 ns apart they keep their order.
     stamps_ns = [one.stamp_ns - begin_ns + place for place, one in enumerate(arrivals)]
     stamps = np.array(stamps_ns)[index] * 1e-9
     known = np.array([one.delay for one in arrivals])[index]
@@ -240,7 +241,7 @@ def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
 
 
 def _first_come(stream: Stream) -> float:
-    """Return the mean delay [s], without the datagrams that a later one overtook."""
+    """Return the mean delay of the datagrams that no later datagram overtook [s]."""
     arrival = np.where(np.isnan(stream.delays), inf, stream.sent + stream.delays)
     first = arrival <= np.minimum.accumulate(arrival[::-1])[::-1]
     return float(stream.delays[first & np.isfinite(arrival)].mean())

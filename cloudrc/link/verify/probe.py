@@ -1,7 +1,8 @@
-"""Send numbered probes through both directions of a link and note when each copy arrives.
+"""Send numbered probes through both directions of a link and measure their delays.
 
-One thread sends and receives for both ends, with one clock. This thread stamps a probe just before
-sending it; the kernel stamps its arrival (SO_TIMESTAMPNS), so a late thread adds no delay.
+One thread sends and receives at both ends with the same clock. The thread takes the time just
+before it sends a probe. The kernel records the time of arrival (SO_TIMESTAMPNS), so a late thread
+does not increase the measured delay.
 """
 
 from __future__ import annotations
@@ -23,32 +24,32 @@ from cloudrc.link.verify.judge import Flow, Plan
 from cloudrc.tunnel.codec import Direction, encode_header, peek
 
 PROBE = 254
-"""Kind of datagram in the header of probes; no end of a tunnel accepts this kind."""
+"""Kind of datagram in the header of probes; world and cloud reject this kind."""
 FIRST_PROBE = 1.0
 """Time from the start of the link to the first probe [s]."""
 COUNT = 1500
-"""Fewest probes, unless the user gives a time."""
+"""Smallest number of probes, if the user does not specify a duration."""
 LONGEST, AFTER = 120.0, 5.0
-"""Longest duration of the probes, and duration after the last change of the conditions [s]."""
+"""Largest duration of a measurement, and its duration after the last change of conditions [s]."""
 RATE, LINK_SHARE = 200.0, 0.4
-"""Most probes per second, half as many through netem [1/s]; largest share of a limited rate that
-single probes use."""
+"""Largest number of probes per second [1/s], halved for netem; largest share of a limited rate that
+single probes use, in [0, 1]."""
 RATE_MAX = 1e8
-"""Highest rate limit that this process can measure [bit/s]."""
+"""Largest rate limit of a profile that this process can measure [bit/s]."""
 TRAIN_SIZE, TRAIN_SPAN = 1400, 0.06
-"""UDP payload of a probe if the profile limits the rate [bytes]: one Ethernet frame. Shortest time
-that a train of probes, sent back to back, takes at that rate [s]."""
+"""If the profile limits the rate: size of a probe's UDP payload [bytes], one Ethernet frame; and
+shortest transmission time of a train, which is a group of probes sent back to back [s]."""
 _BUFFER = 4_000_000
 
 
 def plan_probes(
     profile: DirectionProfile, flow: Flow, seconds: float | None = None, *, drawn: bool = False
 ) -> Plan:
-    """Plan probes for `seconds` [s]; None: for as long as a verdict needs.
+    """Plan probes for `seconds` [s], or with None for as long as a verdict needs.
 
-    Without `seconds` a time line is probed as a whole. If the profile limits the rate, the probes
-    are large, and half of them are sent in trains, which show the rate. `drawn` is True for a
-    shaper with random numbers of its own: netem.
+    With None, a profile with a time line is probed along the whole time line. If the profile limits
+    the rate, the probes are large, and half of them are sent in trains, which show the rate.
+    `drawn` is True for netem, whose random numbers cannot be predicted.
     """
     timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
     if (rate := min(piece.rate or inf for piece in timeline.pieces)) <= RATE_MAX:
@@ -70,12 +71,15 @@ def plan_probes(
 
 
 class ProbeEnd:
-    """One end of the link: its socket, the caller's to close, and the probes that it sends."""
+    """Sends the probes of one direction through its socket, and records their arrivals."""
 
     def __init__(
         self, own: socket.socket, route: tuple[str, int], plan: Plan, origin_ns: int
     ) -> None:
-        """Set up; `route` is where it sends, `origin_ns` when the link came up, wall clock [ns]."""
+        """Prepare to send the probes of `plan` from the socket `own`, which the caller closes.
+
+        `route` is the address to send to; `origin_ns` is when the link came up, wall clock [ns].
+        """
         own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         ask_for_stamps(own)
         self.socket, self.route, self.plan, self.origin_ns = own, route, plan, origin_ns
@@ -85,21 +89,21 @@ class ProbeEnd:
         self._delays, self._copies = np.full(count, inf), np.zeros(count, int)
 
     def _encode(self, number: int) -> bytes:
-        """Encode a probe; its header fills all of it, so that damage shows."""
+        """Encode a probe; copies of its header fill the probe, so that damage is visible."""
         _, uplink, kind, size = self.plan.flow
         way = Direction.UPLINK if uplink else Direction.DOWNLINK
         header = encode_header(kind, way, 1, number)
         return (header * (size // len(header) + 1))[:size]
 
     def send(self, number: int) -> None:
-        """Send a probe; if the kernel refuses it, it does not arrive."""
+        """Send a probe; a probe that the kernel refuses counts as lost."""
         self._sent_ns[number] = time.time_ns()
         with suppress(OSError):
             self.socket.sendto(self.probes[number], self.route)
 
     def receive(self, far: socket.socket) -> None:
-        """Read one datagram from the other end's socket `far`; note it if this end sent it."""
-        with suppress(OSError, ValueError):  # nobody listened to an earlier probe; foreign data
+        """Read one datagram from the other end's socket `far`; record a probe of this end."""
+        with suppress(OSError, ValueError):  # an earlier probe had no receiver; no probe
             data, ancillary, _, _ = far.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
             at_ns, number = self._stamps.wall_ns(ancillary) or time.time_ns(), peek(data)[2]
             if number < len(self.probes) and data == self.probes[number]:
@@ -108,13 +112,13 @@ class ProbeEnd:
                 self._copies[number] += 1
 
     def stream(self) -> Stream:
-        """Return the measured delays and copies."""
+        """Return the measured delays and copies of all probes."""
         delays = np.where(self._copies, self._delays, np.nan)
         return Stream((self._sent_ns - self.origin_ns) * 1e-9, delays, self._copies)
 
 
 def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
-    """Send the probes of both ends, each to the other; return the streams that they measured."""
+    """Send the probes of both ends to each other; return the measured stream of each direction."""
     heard = {end.socket: other for end, other in zip(ends, reversed(ends), strict=True)}
     drawn = np.concatenate([end.plan.draw(end.plan.sent).delays for end in ends])
     quiet = 0.5 + 2.0 * float(np.max(drawn, initial=0.0, where=drawn > 0.0))
@@ -131,7 +135,7 @@ def send_probes(ends: Sequence[ProbeEnd]) -> list[Stream]:
                 heard[far].receive(far)
 
     gc.collect()
-    gc.disable()  # a collection takes milliseconds
+    gc.disable()  # a garbage collection takes milliseconds
     try:
         for due_ns, place, number in schedule:
             listen(due_ns)

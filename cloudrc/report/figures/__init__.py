@@ -1,4 +1,4 @@
-"""Draw the figures of a report as PNG and SVG, without a display, GL or pyplot."""
+"""Draw the figures of a report as PNG and SVG, without a display, OpenGL or pyplot."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ FIGURES: dict[str, tuple[Draw, Write, str]] = {
     "error": (curves.draw_error, lambda s: curves.ERROR + marks.legend(s), curves.ERROR_ALT),
     "snapshots": (snapshots.draw, lambda s: snapshots.CAPTION, snapshots.ALT),
 }
-"""Figures in the order of the page: drawing, caption, and text for readers who cannot see it. The
-paper has the figures delay, odom and error."""
+"""Name of a figure -> function that draws the figure, function that returns the caption, text for
+readers who cannot see the figure. The figures of the paper are delay, odom and error."""
 NAMES = tuple(FIGURES)
 
 
@@ -30,17 +30,17 @@ NAMES = tuple(FIGURES)
 class Picture:
     """A drawn figure."""
 
-    name: str  # of its files, without suffix
+    name: str  # name of the files, without suffix
     png: bytes
     svg: bytes
-    caption: str  # as in a paper
+    caption: str
     alt: str  # for readers who cannot see the figure
 
 
 def draw_all(subject: Subject) -> list[Picture]:
-    """Draw every figure.
+    """Draw all figures.
 
-    The settings of matplotlib are global in the process: only one thread at a time may draw.
+    Only one thread at a time may draw, because matplotlib's settings are global in a process.
     """
     pictures = []
     with matplotlib.rc_context():
@@ -56,7 +56,7 @@ def draw_all(subject: Subject) -> list[Picture]:
 
 
 def save(figure: Figure, kind: str) -> bytes:
-    """Return the content of a file, "png", "svg" or "pdf"; equal for equal figures."""
+    """Return the content of a "png", "svg" or "pdf" file; equal figures give equal bytes."""
     target = BytesIO()
     date = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
     figure.savefig(target, format=kind, metadata=date)

@@ -24,11 +24,11 @@ DELAY = (
     "these are the fast ones, so the loop delay lies below the mean of the profile."
 )
 MARGIN = 1.25
-"""Upper end of the delay axis, divided by the 99.5th percentile of the delays."""
+"""Ratio of the upper end of the delay axis to the 99.5th percentile of the delays."""
 
 
 def draw_delay(subject: Subject) -> Figure:
-    """Draw the one-way delay of each datagram, and the loop delay with its estimate."""
+    """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it."""
     figure = new_figure(2.6)
     one_way, loop = figure.subplots(1, 2)
     flight, time = subject.flight, np.linspace(0.0, subject.duration, 600)
@@ -73,7 +73,7 @@ def _fill(axes: Axes, time: Array, low: Array, high: Array, label: str) -> None:
 
 
 def _finish_delay(axes: Axes, subject: Subject, label: str, shown: list[Array]) -> None:
-    """Scale the axis so that outliers do not flatten the curves, and write how many are cut off."""
+    """Scale the delay axis of a panel; outliers are cut off, and their number is written."""
     values = [v[np.isfinite(v)] for v in shown]
     top = max((float(np.percentile(v, 99.5)) for v in values if len(v)), default=1.0) * MARGIN
     top = max(top, 1.0)
@@ -85,7 +85,7 @@ def _finish_delay(axes: Axes, subject: Subject, label: str, shown: list[Array]) 
 
 
 def _finish(axes: Axes, subject: Subject, label: str, columns: int) -> None:
-    """Mark the events, and label the axes of a panel over time."""
+    """Complete a panel over time: marks of events, labels of the axes, legend."""
     mark_events(axes, subject)
     _time_axis(axes, subject)
     axes.set_ylabel(label)
@@ -104,7 +104,7 @@ ODOM = (
     "command was computed."
 )
 STEPS = {"ls": "--", "drawstyle": "steps-post"}
-"""Line of a setpoint, which is constant between its changes."""
+"""Style of the line of the setpoint: dashed, in steps."""
 
 
 def draw_odom(subject: Subject) -> Figure:
@@ -144,7 +144,7 @@ SPAN = 0.5
 
 
 def draw_error(subject: Subject) -> Figure:
-    """Draw the distance to the setpoint, as in the paper, and the error of the estimate."""
+    """Draw the distance to the setpoint, as in the paper, and the error of position estimates."""
     figure = new_figure(2.6)
     tracking, accuracy = figure.subplots(1, 2)
     flight, control, applied = subject.flight, subject.flight.control, subject.flight.applied
@@ -173,7 +173,7 @@ def draw_error(subject: Subject) -> Figure:
 
 
 def _moving_rms(time: Array, values: Array) -> Array:
-    """Compute at each instant the RMS of the values in the last `SPAN` seconds."""
+    """Compute, for each `time` [s], the RMS of the `values` of the last `SPAN` seconds."""
     known = np.isfinite(values)
     squares = np.concatenate([[0.0], np.cumsum(np.where(known, np.square(values), 0.0))])
     counts = np.concatenate([[0], np.cumsum(known)])

@@ -1,4 +1,4 @@
-"""Draw the figure of the flight: the path from above, and height and clearance along the path."""
+"""Draw the figure of the flight: the path from above, and z and clearance along the path."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from cloudrc.metrics.mission import first_touch
 from cloudrc.report.figures.style import BLACK, BORE, GREY, VERMILION, Subject, new_figure, panel
 
 CLEARANCE_SHOWN = 0.40
-"""Clearance at the end of the colour scale [m]; inside a pipe the clearance is never larger."""
+"""Upper end of the colour scale [m]; the clearance inside a pipe is never larger."""
 CEILING = 2 * CLEARANCE_SHOWN
-"""Upper end of the axis of panel (c) [m]."""
+"""Upper end of the clearance axis in panel (c) [m]."""
 ALT = "The flown path from above and from the side through the pipes, coloured by clearance."
 CAPTION_PIPES = (
     "Flight. (a) Path from above: pipes cut open, waypoints numbered, the board as a bar, a star "
@@ -45,7 +45,7 @@ def caption(subject: Subject) -> str:
 
 
 def draw(subject: Subject) -> Figure:
-    """Draw the path from above and, along the path, height and clearance."""
+    """Draw the path from above, and z and clearance over the distance flown."""
     figure = new_figure(3.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.05))
     position = subject.flight.truth["position"]
@@ -70,12 +70,11 @@ def draw(subject: Subject) -> Figure:
 
 
 def _draw_path(axes: Axes, subject: Subject, x: Array, y: Array) -> LineCollection | None:
-    """Draw a path, coloured by clearance, or in one colour if the scene has no pipes."""
     clearance = subject.flight.clearance
     if len(clearance) != len(x) or len(x) < 2:
         axes.plot(x, y, color=BLACK, lw=1.4)
         return None
-    # 20 points per second look smooth; 100 would only make the file larger.
+    # Draw 20 of the 100 points per second: the path looks smooth, and the file is smaller.
     ends = np.append(np.arange(0, len(x) - 1, 5), len(x) - 1)
     points = np.stack([x, y], axis=1)[ends]
     axes.plot(*points.T, color=BLACK, lw=3.0, solid_capstyle="round", zorder=3)
@@ -114,7 +113,7 @@ def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection |
 
 
 def _touch_point(subject: Subject) -> Array | None:
-    """Compute the position of the arm's tip at its first touch of the board [m], shape (3,)."""
+    """Compute where the tip of the arm first touches the board [m], world frame, shape (3,)."""
     touch, truth = first_touch(subject.flight), subject.flight.truth
     if touch is None or not len(truth["stamp_ns"]):
         return None
@@ -125,7 +124,7 @@ def _touch_point(subject: Subject) -> Array | None:
 
 
 def _draw_pipe(axes: Axes, pipe: Pipe) -> None:
-    """Draw a pipe from above, cut along its axis: the bore and the two walls beside it."""
+    """Draw a pipe from above, cut open along its axis: the bore and the wall on either side."""
     centre, along = np.array(pipe.centre[:2]), np.array(pipe.axis[:2])
     across, half = np.array([-along[1], along[0]]), along * pipe.length / 2
     for low, high, colour, zorder in (
@@ -153,7 +152,7 @@ def _draw_side(axes: Axes, subject: Subject, flown: Array, position: Array) -> N
 
 
 def _passages(subject: Subject, flown: Array, position: Array) -> list[tuple[Pipe, float, float]]:
-    """List the pipes in the order flown, with the distances flown up to entry and exit [m]."""
+    """List the pipes that the robot flew through: pipe, distances flown at entry and exit [m]."""
     inside = pipe_index(subject.flight.scene, position)
     changes = np.flatnonzero(np.diff(inside, prepend=-1, append=-1))
     return [

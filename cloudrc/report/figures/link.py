@@ -1,7 +1,4 @@
-"""Draw the figure of a link profile: delay and loss over time, delay distribution, runs of losses.
-
-`cloudrc link show` uses this figure.
-"""
+"""Draw the figure of `cloudrc link show`: delay and loss over time, their distributions."""
 
 from __future__ import annotations
 
@@ -20,34 +17,35 @@ from cloudrc.report.figures import marks, save, style
 from cloudrc.report.figures.style import dots, legend_above, new_figure, panel
 
 RUNS_SHOWN = 20
-"""Longest run of losses in the figure; a longer run counts as one of this length."""
+"""Largest number of packets lost in a row in the figure; a longer run counts as one of this
+length."""
 BLACKOUT = "#f7dccb"
-"""Colour of blackouts, a light variant of the colour of losses."""
+"""Colour of blackouts: the colour of losses, but lighter."""
 DOTS = 6000
-"""Largest number of dots in one panel; more dots would hide each other."""
+"""Approximate limit of the number of dots in a panel; more dots would hide each other."""
 
 
 @dataclass(frozen=True, slots=True)
 class DirectionSample:
-    """One direction of a link: its profile, n packets over time, and m packets for statistics."""
+    """One direction of a link: profile, n packets to draw over time, m packets for statistics."""
 
     asked: Direction  # the link profile
-    sent: Array  # when each packet was sent, since the start of the link [s], shape (n,)
+    sent: Array  # time of sending each packet, since the start of the link [s], shape (n,)
     delays: Array  # one-way delays, NaN for lost packets [s], shape (n,)
     many: Array  # one-way delays for the distribution, NaN for lost packets [s], shape (m,)
-    runs: tuple[int, ...]  # lengths of the runs of losses among the m packets
+    runs: tuple[int, ...]  # numbers of packets lost in a row, one per run, among the m packets
 
 
 _LabelledWay: TypeAlias = tuple[DirectionSample, str, str]
-"""A direction, its name and its colour."""
+"""A direction of the link, its name and its colour."""
 
 
 def render_link(
     title: str, uplink: DirectionSample, downlink: DirectionSample | None, kind: str
 ) -> bytes:
-    """Draw the figure of a link, as the content of a file: "png", "svg" or "pdf".
+    """Draw the figure of a link; return the content of a file of `kind` "png", "svg" or "pdf".
 
-    `downlink` is None for a trace, which has one direction.
+    `downlink` is None for a trace, which has one direction only.
     """
     with matplotlib.rc_context(style.RC):
         return save(_draw(title, uplink, downlink), kind)
@@ -80,7 +78,7 @@ def _draw_delay(axes: Axes, way: DirectionSample, colour: str, top: float) -> No
         low, high = (1e3 * bound for bound in marks.band(delays, time))
         axes.fill_between(time, low, high, color=style.LIGHT, lw=0, zorder=1, label="profile")
     shown = [blackout for blackout in way.asked.blackouts if blackout.start_s < duration]
-    for index, blackout in enumerate(shown):  # at least as wide as a line
+    for index, blackout in enumerate(shown):  # draw a short blackout as wide as a line
         end = blackout.start_s + max(blackout.duration_s, duration / 300)
         label = "_" if index else "blackout"
         axes.axvspan(blackout.start_s, end, color=BLACKOUT, lw=0, zorder=1.5, label=label)
@@ -100,7 +98,7 @@ def _draw_delay(axes: Axes, way: DirectionSample, colour: str, top: float) -> No
 
 
 def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
-    """Draw the share of packets with more than a given delay; a log scale shows the tail."""
+    """Draw the share of packets whose delay exceeds x, over x; a log scale shows the tail."""
     panel(axes, letter, "distribution")
     least = 1e-2
     for (way, name, colour), dashes in zip(ways, ("-", "--"), strict=False):
@@ -109,7 +107,7 @@ def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
             continue
         later = 1.0 - np.arange(1, len(delays) + 1) / len(delays)
         least = min(least, 1.0 / len(delays))
-        # A step for each packet would make a file of megabytes: keep about 1500 from each end.
+        # Keep about 1500 packets from each end, because all packets would make a large file.
         rows = np.unique(np.geomspace(1, len(delays), 1500).astype(int))
         rows = np.unique(np.concatenate((rows - 1, len(delays) - rows)))
         shown = np.concatenate(([0.0, delays[0]], delays[rows]))
@@ -130,7 +128,7 @@ def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
 
 
 def _draw_runs(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
-    """Draw the number of loss runs of each length, per 1000 packets sent."""
+    """Draw how often 1, 2, 3 ... packets were lost in a row, per 1000 packets sent."""
     panel(axes, letter, "losses in a row")
     longest, most, least = 1, 0.0, np.inf
     offsets = (-0.2, 0.2) if len(ways) == 2 else (0.0,)

@@ -1,7 +1,7 @@
-"""Mark HOLD, blackouts and link changes in figures; compute the delays that the profile allows.
+"""Mark HOLD, blackouts and changes of the link in figures; compute the delays of the link profile.
 
-A span is an interval with one link profile. Each change recorded in flight ends a span and begins
-the next span. Within a span the profile follows its own time line.
+A span is an interval of a flight with one link profile: `cloudrc link set` ends a span and starts
+the next. Within a span, the link follows the time line of the profile.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from cloudrc.report.figures.style import Subject
 
 Interval: TypeAlias = tuple[float, float]
 SAME_CHANGE = 0.05
-"""Two records less than this time apart describe the same change [s]."""
+"""Two records of one direction describe the same change if they are less than this apart [s]."""
 SAME_CAUSE = 1.0
-"""Largest time between the records of one change in both directions [s]."""
+"""Records of uplink and downlink describe the same change if they are at most this apart [s]."""
 ROW_HEIGHT, ROWS = 8, 8
-"""Distance between two rows of numbers [points], and number of rows for which there is room. The
-numbers take turns, so that those of close changes do not overlap."""
+"""Distance between two rows for the numbers of changes [points], and number of rows. Successive
+numbers are in different rows, so that they do not overlap."""
 LEGEND = (
     " Behind the curves: red, the guard was in HOLD; hatched, a blackout of the link; dotted, a "
     "change of the link by its profile."
@@ -40,7 +40,7 @@ LEGEND = (
 
 
 def delays_of(direction: Direction) -> Timeline | None:
-    """Return the delays that a link profile sets; None if their trace no longer exists."""
+    """Return delay and jitter of a profile over time; None if the file of its trace is missing."""
     changes = (
         Change(change.at_s, _seconds(change.delay_ms), _seconds(change.jitter_ms))
         for change in direction.changes
@@ -62,9 +62,9 @@ def _seconds(milliseconds: float | None) -> float | None:
 
 
 def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
-    """Compute delay minus and plus jitter [s] at each `time` [s] since the start of the link.
+    """Compute delay - jitter and delay + jitter [s] at each `time` [s] since the link's start.
 
-    For uniform jitter the band contains all delays; for other distributions it has a half-width of
+    Uniformly distributed delays are all in this band; for other distributions, its half width is
     one standard deviation.
     """
     found = [delays.at(round(instant * 1e9)) for instant in time.tolist()]
@@ -75,9 +75,9 @@ def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """An interval in which a direction has one link profile; times are since the flight's start."""
+    """An interval with one link profile in one direction; times since the start of the flight."""
 
-    begin: float  # [s]; -inf if the span began before
+    begin: float  # [s]; -inf for the profile at the start of the flight
     origin: float  # start of the profile's time line [s]
     direction: Direction
     cause: str  # cause of the change; "" if the link started with this profile
@@ -85,7 +85,7 @@ class Span:
 
 
 def spans(subject: Subject, *, uplink: bool) -> list[Span]:
-    """List the spans of a direction, in the order of time."""
+    """List the spans of one direction of the link, in the order of time."""
     configured = subject.uplink if uplink else subject.downlink
     found = [Span(-inf, subject.link_start, configured, "")]
     for span in sorted(_changes(subject, uplink), key=lambda span: span.begin):
@@ -101,23 +101,22 @@ def spans(subject: Subject, *, uplink: bool) -> list[Span]:
 
 
 def _changes(subject: Subject, uplink: bool) -> Iterator[Span]:
-    """Read the recorded changes."""
     table = subject.flight.recording["/link"]
     for row in np.flatnonzero(table["uplink"] == uplink):
         stamp = float(subject.flight.seconds(table["stamp_ns"][row]))
         try:
             direction = Direction.model_validate_json(str(table["conditions"][row]))
-        except ValueError:  # recorded by another version
+        except ValueError:  # another version of cloudrc has recorded this flight
             continue
         begin, origin = stamp - table["age"][row], stamp - table["time_line"][row]
         yield Span(float(begin), float(origin), direction, str(table["cause"][row]))
 
 
 def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
-    """Look up the delays that the link profile sets, by `time` [s] since the flight's start.
+    """Compute the band of delays of the link profile at each `time` [s] since the flight's start.
 
     Returns:
-        Lower and upper bound [s], NaN where a trace no longer exists; None if all values are NaN.
+        Lower and upper end [s], NaN where the file of a trace is missing; None if all are NaN.
     """
     low, high = np.full(len(time), np.nan), np.full(len(time), np.nan)
     for span in spans(subject, uplink=uplink):
@@ -129,7 +128,7 @@ def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array
 
 
 def set_in_flight(subject: Subject) -> list[tuple[float, str]]:
-    """List the changes of the link made in flight: time since its start [s], and cause."""
+    """List the changes by `cloudrc link set`: time since the start of the flight [s], and cause."""
     found: list[tuple[float, str]] = []
     for span in sorted(_all_spans(subject), key=lambda span: span.begin):
         if not span.cause or not 0.0 < span.begin < subject.duration:
@@ -144,7 +143,7 @@ def _all_spans(subject: Subject) -> list[Span]:
 
 
 def legend(subject: Subject) -> str:
-    """Explain the marks in words; "" if there are none."""
+    """Describe the marks of a flight for a caption; "" if there are no marks."""
     changes = [
         f"{number}: {cause}, at {begin:.1f} s"
         for number, (begin, cause) in enumerate(set_in_flight(subject), start=1)
@@ -156,7 +155,7 @@ def legend(subject: Subject) -> str:
 
 
 def mark_events(axes: Axes, subject: Subject) -> None:
-    """Shade HOLD, hatch blackouts and mark each change of the link."""
+    """Draw the marks: HOLD shaded, blackouts hatched, changes of the link as vertical lines."""
     held, silent, changed = _marks(subject)
     for begin, end in held:
         axes.axvspan(begin, end, color=style.VERMILION, alpha=0.15, lw=0, zorder=0.5)
@@ -182,7 +181,7 @@ def mark_events(axes: Axes, subject: Subject) -> None:
 
 
 def _marks(subject: Subject) -> tuple[list[Interval], list[Interval], list[float]]:
-    """List HOLD, blackouts and changes by the profile during the flight [s since its start]."""
+    """List HOLDs, blackouts and changes by the profile, in seconds since the flight's start."""
     flight, duration = subject.flight, subject.duration
     held = [(flight.seconds(start), flight.seconds(end)) for start, end in holds(flight)]
     blackouts: set[Interval] = set()

@@ -1,6 +1,6 @@
 """Draw the figure of snapshots: the robot at six instants, with the board and with pipes cut open.
 
-This needs no 3-D engine: all bodies are small convex polygons, drawn in the order of their depth.
+All bodies consist of small convex polygons, which are drawn from back to front.
 """
 
 from __future__ import annotations
@@ -27,15 +27,14 @@ CAPTION = (
     "floor tiles are 0.5 m wide. The line is the path flown."
 )
 LETTERS = "abcdef"
-"""Letters of the panels."""
+"""The letters of the panels, one per snapshot."""
 MOVING = 0.05
-"""Smallest distance in one second that defines a direction of flight [m]; a robot that moves less
-counts as hovering."""
+"""Horizontal distance flown in one second below which the robot counts as hovering [m]."""
 REACH = 1.0
-"""Distance that a panel shows on either side of the robot [m]."""
+"""Half the width of a panel, which shows the robot in its centre [m]."""
 ELEVATION, AZIMUTH = np.radians(28.0), np.radians(118.0)
-"""Direction from the robot to the eye [rad]: angle above the horizon, and angle from the heading.
-The eye is behind the robot, on its right."""
+"""Direction from the robot to the viewer [rad]: angle above the horizontal plane, and horizontal
+angle from the heading. The viewer is behind the robot, to its right."""
 Colour = tuple[float, float, float]
 PIPE_COLOUR, WALL_COLOUR = (0.86, 0.88, 0.90), (0.45, 0.48, 0.52)
 BASE_COLOUR, ROD_COLOUR, ARM_COLOUR = (0.16, 0.33, 0.55), (0.30, 0.30, 0.32), (0.84, 0.37, 0.0)
@@ -43,7 +42,7 @@ ROTOR_COLOUR, BOARD_COLOUR = (0.10, 0.10, 0.12), (0.95, 0.84, 0.58)
 
 
 class Face(NamedTuple):
-    """A flat convex polygon: k corners [m], world frame, shape (k, 3), with colour and opacity."""
+    """A flat convex polygon: k corners [m], world frame, shape (k, 3); opacity in [0, 1]."""
 
     corners: Array
     colour: Colour
@@ -51,7 +50,6 @@ class Face(NamedTuple):
 
 
 def _robot_faces(position: Array, orientation_wxyz: Array) -> list[Face]:
-    """Build base, top rod, arm and four rotor discs of the robot at its pose."""
     rod, arm = (body.ROD_TOP - body.ROD_BOTTOM) / 2, body.ARM_LENGTH / 2
     wide, thin = body.ROD_RADIUS, body.ARM_RADIUS
     faces = _box((0.0, 0.0, 0.0), body.BASE_HALF, BASE_COLOUR)
@@ -61,7 +59,7 @@ def _robot_faces(position: Array, orientation_wxyz: Array) -> list[Face]:
     disc = body.ROTOR_RADIUS * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         hub = np.array([x * body.ROTOR_ARM, y * body.ROTOR_ARM, body.ROTOR_HEIGHT])
-        # The model has no struts, but without them the rotor discs would float.
+        # The simulated robot has no struts; in the figure they connect the rotors to the base.
         strut = *(abs(end) * body.ROTOR_ARM / 2 + 0.006 for end in (x, y)), 0.006
         faces += _box(hub * (0.5, 0.5, 1.0), strut, ROD_COLOUR)
         faces.append(Face(hub + disc, ROTOR_COLOUR, 0.35))
@@ -72,7 +70,7 @@ def _robot_faces(position: Array, orientation_wxyz: Array) -> list[Face]:
 
 
 def _pipe_faces(pipe: Pipe, view: _View) -> list[Face]:
-    """Build the visible part of the half pipe that faces away from the eye, cut along its axis."""
+    """Build the half of a pipe that is farther from the viewer, as far as the panel shows it."""
     centre, axis = np.array(pipe.centre), np.array(pipe.axis)
     middle = float((view.centre - centre) @ axis)
     begin, end = max(-pipe.length / 2, middle - REACH), min(pipe.length / 2, middle + REACH)
@@ -94,20 +92,18 @@ def _pipe_faces(pipe: Pipe, view: _View) -> list[Face]:
 
 
 def _strip(first: Array, second: Array, colour: Colour) -> list[Face]:
-    """Build the faces between two lines of n points, shape (n, 3)."""
+    """Build n - 1 faces between two lines of n points [m], shape (n, 3)."""
     corners = np.stack([first[:-1], second[:-1], second[1:], first[1:]], axis=1)
     return [Face(each, colour) for each in corners]
 
 
 def _board_faces(board: Board) -> list[Face]:
-    """Build the board, 5 cm thick behind its front face."""
     low = np.array([board.x, board.y[0], board.z[0]])
     high = np.array([board.x + 0.05, board.y[1], board.z[1]])
     return _box((low + high) / 2, (high - low) / 2, BOARD_COLOUR)
 
 
 def _box(centre: Any, half: Any, colour: Colour) -> list[Face]:
-    """Build a box from its centre and half sizes [m], shape (3,)."""
     faces = []
     for axis in range(3):
         for side in (-1.0, 1.0):
@@ -117,10 +113,10 @@ def _box(centre: Any, half: Any, colour: Colour) -> list[Face]:
 
 
 class _View:
-    """A parallel projection of what is near the robot, on the axes of a panel."""
+    """A parallel projection of the robot and its surroundings to a panel."""
 
     def __init__(self, axes: Axes, centre: Array, heading: float) -> None:
-        """Look at `centre` [m], shape (3,), a robot with a `heading` [rad]."""
+        """Look at a robot at `centre` [m], shape (3,), whose direction is `heading` [rad]."""
         azimuth = heading - AZIMUTH
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         self.towards = np.array([*(np.cos(ELEVATION) * right[[1, 0]] * (1, -1)), np.sin(ELEVATION)])
@@ -128,11 +124,11 @@ class _View:
         self._sides = np.stack([right, np.cross(self.towards, right)], axis=1)
 
     def project(self, points: Array) -> Array:
-        """Project points [m], shape (..., 3), to the picture, shape (..., 2)."""
+        """Project points [m], world frame, shape (..., 3), to the panel [m], shape (..., 2)."""
         return np.asarray((points - self.centre) @ self._sides)
 
     def draw_floor(self, height: float) -> None:
-        """Draw the joints of the tiles around the robot; `height` is the floor's z [m]."""
+        """Draw the grid of floor tiles around the robot; `height` is the z of the floor [m]."""
         x, y = np.round(self.centre[:2] * 2) / 2
         for offset in np.arange(-3.0, 3.5, 0.5):
             for ends in (
@@ -142,13 +138,13 @@ class _View:
                 self._axes.plot(*self.project(np.array(ends)).T, color=LIGHT, lw=0.4, zorder=0)
 
     def draw_path(self, path: Array) -> None:
-        """Draw the part of the path flown since the robot entered the picture."""
+        """Draw the part of `path` since the robot last entered the region of the panel."""
         far = np.flatnonzero(np.linalg.norm(path - self.centre, axis=1) > 1.5 * REACH)
         seen = self.project(path[far[-1] if len(far) else 0 :])
         self._axes.plot(*seen.T, color=BLUE, lw=1.0, zorder=2)
 
     def draw_faces(self, faces: list[Face], zorder: int) -> None:
-        """Draw faces from back to front, shaded by their angle to the light."""
+        """Draw faces from back to front; brighter if the light meets them at a right angle."""
         polygons, colours = [], []
         light = (self.towards + self._sides[:, 1]) / np.sqrt(2)
         for face in sorted(faces, key=lambda face: float((face.corners @ self.towards).mean())):
@@ -164,7 +160,7 @@ class _View:
 
 
 def draw(subject: Subject) -> Figure:
-    """Draw the panels."""
+    """Draw the figure with its six panels."""
     figure = new_figure(4.1)
     panels = figure.subplots(2, len(LETTERS) // 2).flat
     rows = _instants(subject)
@@ -179,7 +175,7 @@ def draw(subject: Subject) -> Figure:
 
 
 def _instants(subject: Subject) -> Array:
-    """Choose rows of the true states, evenly spaced by distance flown or, in a hover, by time."""
+    """Choose six rows of the true states at equal distances flown, or in a hover at equal times."""
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]
     if touch is not None:

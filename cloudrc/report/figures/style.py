@@ -1,6 +1,6 @@
-"""Define the style of all figures and `Subject`, the flight that they show.
+"""Define the style of all figures, and `Subject`, the flight that the figures show.
 
-Fonts and sizes suit a two-column paper. Colour-blind readers can distinguish the colours, too.
+Fonts and sizes suit a paper with two columns. Colour-blind readers can distinguish the colours.
 Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
 """
 
@@ -20,7 +20,7 @@ from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Array
 
 PAGE = 7.16
-"""Width of two columns [in]. Source: IEEE conference template."""
+"""Width of both columns of a page [in]. Source: IEEE conference template."""
 BLACK, GREY, LIGHT, BORE = "#1a1a1a", "#6b6b6b", "#d9d9d9", "#f4f4f4"
 BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
 ORANGE, VERMILION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
@@ -62,7 +62,7 @@ def panel(axes: Axes, letter: str, title: str = "") -> None:
 
 
 def legend_above(axes: Axes, columns: int) -> None:
-    """Put the legend, if there is one, above the panel, where it cannot hide data."""
+    """Draw the legend of a panel, if there is one, above the panel in `columns` columns."""
     if axes.get_legend_handles_labels()[0]:
         axes.legend(
             loc="lower right",
@@ -74,9 +74,9 @@ def legend_above(axes: Axes, columns: int) -> None:
 
 
 def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1.8) -> None:
-    """Draw dots of `size` [points] at `x` and `y`, any unit, and their entry in the legend.
+    """Draw dots of `size` [points] at `x` and `y`, any unit, and add them to the legend.
 
-    As pixels inside the SVG file, thousands of dots stay small and fast to display.
+    In an SVG file the dots are a bitmap, because thousands of vector shapes are slow to display.
     """
     axes.plot(x, y, ".", ms=size, mew=0, color=colour, rasterized=True, zorder=2)
     axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label=name)
@@ -84,7 +84,7 @@ def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1
 
 @dataclass(frozen=True)
 class Subject:
-    """A flight and the configured link profile of both directions."""
+    """A flight, and the link profile at its start, by direction."""
 
     flight: Flight
     uplink: Direction
@@ -92,10 +92,7 @@ class Subject:
 
     @cached_property
     def waypoints(self) -> dict[int, Vector]:
-        """Positions [m] of the waypoints to which the robot flew, by index.
-
-        The position is that of the first setpoint with this index.
-        """
+        """Waypoints to which the robot flew: index -> position [m], world frame."""
         control = self.flight.control
         indices, rows = np.unique(control["waypoint"], return_index=True)
         points = control["setpoint"][rows].tolist()
@@ -113,6 +110,6 @@ class Subject:
 
     @cached_property
     def link_start(self) -> float:
-        """Time of the first datagram on the link, counted from the start of the mission [s]."""
+        """Time of world's first telemetry [s since the start of the flight]."""
         stamps = self.flight.recording["/telemetry"]["stamp_ns"]
         return float(self.flight.seconds(stamps[0])) if len(stamps) else 0.0

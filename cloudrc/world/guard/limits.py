@@ -1,9 +1,9 @@
-"""The limits of the guard, and the arithmetic that keeps a velocity reference within them.
+"""The limits of the guard, and functions that keep a velocity reference within these limits.
 
-World alone sets the limits. Each limit is finite and above 0: no value switches a limit off. For
-any input, NaN and infinity included, each function returns a finite result within its bound; so
-every comparison is written for the case that it is false for NaN.
-`tests/world/guard/test_proof.py` proves the bounds of the scalar functions for all 64-bit floats.
+The limits come from world's experiment; no message changes them. Each limit is finite and above 0,
+so no value switches a limit off. Functions accept NaN and infinity unless their docstring says
+otherwise; for this, comparisons are written so that NaN leads to the safe branch.
+`tests/world/guard/test_proof.py` proves the bounds of the scalar functions for all floats.
 """
 
 from __future__ import annotations
@@ -15,37 +15,39 @@ from cloudrc.geometry.fence import FLOOR_MARGIN, WALL_MARGIN
 from cloudrc.messages import ZERO, Vector
 
 BRAKE = 3.0
-"""Deceleration that the robot reaches in any case [m/s^2].
+"""Deceleration that a braking robot reaches in any case [m/s^2].
 Source: docs/reference/plant.md, "Stop rule"."""
 REACTION = 0.2
-"""Time until the robot decelerates at BRAKE [s]. Source: docs/reference/plant.md, "Stop rule"."""
+"""Time from the start of braking until the robot decelerates at BRAKE [s].
+Source: docs/reference/plant.md, "Stop rule"."""
 STOPPING_DISTANCE = 8.7
-"""Distance within which the robot stops from the speed cap [m].
+"""Largest distance that the robot may need to stop [m]; this limit determines the speed cap.
 Source: docs/reference/plant.md, "Speed cap"."""
 STOP_COEFFICIENT = 1.0 / (2.0 * BRAKE)
 """Braking distance divided by the square of the speed [s^2/m]."""
 FENCE_REACTION, FENCE_MARGIN = 0.6, WALL_MARGIN
-"""Reaction time [s] and margin [m] towards a wall or the ceiling of the fence: the guard limits the
-speed v so that FENCE_REACTION · v + v^2/6 <= distance - FENCE_MARGIN. Towards the floor it uses
-REACTION and FLOOR_MARGIN, because the robot climbs readily.
-Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With these values, a hostile
+"""Stop rule at the walls and the ceiling of the fence: reaction time [s] and margin [m]. The guard
+limits the speed v so that FENCE_REACTION · v + v^2/6 <= distance - FENCE_MARGIN. At the floor the
+guard uses REACTION and FLOOR_MARGIN, because the robot climbs readily.
+Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With 0.2 s and 0.1 m a hostile
 cloud can move the robot 0.3 m beyond the fence, because the low-level controller follows late."""
 FAR = 1e6
-"""Distance beyond which a face of the fence limits nothing [m]."""
+"""Distance from a face of the fence beyond which the face limits no speed [m]."""
 RECHECK_DISTANCE, RECHECK_NS = 0.25, 10_000_000
 """If the fence limits nothing within RECHECK_DISTANCE [m] of the robot, the guard checks the fence
-only once per RECHECK_NS [ns]. In this time the robot moves by less than RECHECK_DISTANCE, since the
-robot is never faster than 25 m/s."""
+only once per RECHECK_NS [ns]. In that time the robot moves by less than RECHECK_DISTANCE, because
+the robot is never faster than 25 m/s."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
-"""Return from beyond the margin to the inside of the fence: velocity per distance [1/s], largest
-speed [m/s]."""
+"""Return of a robot that is too close to the fence, or outside: velocity per distance [1/s], and
+largest speed [m/s]."""
 LOW_HEIGHT, LOW_SPEED = 0.25, 1.0
-"""Below LOW_HEIGHT [m] above the fence's floor, the horizontal speed is at most LOW_SPEED [m/s]."""
+"""Largest horizontal speed, LOW_SPEED [m/s], of a robot that is less than LOW_HEIGHT [m] above the
+fence's floor."""
 SINK_LEAD_MAX = 0.5
-"""Largest difference by which the reference may sink faster than the robot [m/s]. Otherwise the
-low-level controller would turn the robot over and could not brake."""
+"""Largest difference by which the velocity reference may sink faster than the robot [m/s]. With a
+larger difference the low-level controller would turn the robot over."""
 ROUNDING_FACTOR = 1.0 - 2.0**-45
-"""Factor on the speed cap that leaves room for rounding errors."""
+"""Factor on the speed cap [1] that leaves room for rounding errors."""
 
 
 def stopping_distance(speed: float, reaction: float) -> float:
@@ -61,11 +63,10 @@ def clamp(value: float, low: float, high: float) -> float:
 
 
 def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
-    """Return the largest reference speed towards a face of the fence [m/s].
+    """Return the largest velocity towards a face of the fence [m/s].
 
-    The largest v with t · v + v^2/6 <= d is 2 · d / (t + sqrt(t^2 + 2 · d/3)), for the distance d
-    to the face minus the margin [m] and the reaction time t [s]. Beyond the face v is negative, so
-    that the robot returns.
+    The result v solves reaction · v + v^2/6 = distance, with the reaction time [s] and the distance
+    to the face minus the margin [m]. Beyond the margin v is negative: the robot returns.
     """
     if distance > FAR:
         return inf
@@ -76,9 +77,9 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
 
 
 def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether `limit_to_fence` changes nothing up to RECHECK_DISTANCE from `position`.
+    """Tell whether `limit_to_fence` changes nothing within RECHECK_DISTANCE of `position`.
 
-    `velocity`, `position`, `low` and `high` are as in `limit_to_fence` [m/s], [m].
+    `velocity` [m/s], `position` [m], `low` and `high` are those of `limit_to_fence`.
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if vx > 0.0:
@@ -104,8 +105,8 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
     """Slow a finite `velocity` [m/s], axis by axis, so that the robot can stop before the fence.
 
     Near the floor the horizontal velocity is limited, too, because a rotor that touches the floor
-    at speed turns the robot over. `position` [m] is that of the base; `low` and `high` [m] are the
-    corners of the fence, margins taken off; all are in the world frame, shape (3,).
+    at speed turns the robot over. `position` is that of the base [m]. `low` and `high` are the
+    corners of the fence minus the margins [m]. All are in the world frame, shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if not z >= az - FLOOR_MARGIN + LOW_HEIGHT:
@@ -113,13 +114,13 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
     return (
         clamp(vx, -approach_speed(x - ax), approach_speed(bx - x)),
         clamp(vy, -approach_speed(y - ay), approach_speed(by - y)),
-        # A robot that stands on the floor is not told to climb.
+        # At most 0: a robot that stands on the floor does not have to climb.
         clamp(vz, min(0.0, -approach_speed(z - az, REACTION)), approach_speed(bz - z)),
     )
 
 
 def limit_length(a: Vector, length_max: float) -> Vector:
-    """Shorten `a` [m/s] to at most `length_max` [m/s]; zero if a component is NaN or infinite."""
+    """Shorten a velocity to `length_max` [m/s]; return zero if `a` has NaN or infinity."""
     x, y, z = a
     largest = max(abs(x), abs(y), abs(z))
     if largest > length_max:
@@ -136,7 +137,7 @@ def limit_length(a: Vector, length_max: float) -> Vector:
 
 
 def step_towards(start: Vector, end: Vector, step: float) -> Vector:
-    """Move from `start` towards `end` by at most `step`, all in [m/s]."""
+    """Move a velocity from `start` towards `end` by at most `step`, all in [m/s]."""
     (ax, ay, az), (bx, by, bz) = start, end
     x, y, z = bx - ax, by - ay, bz - az
     square = x * x + y * y + z * z
@@ -147,10 +148,10 @@ def step_towards(start: Vector, end: Vector, step: float) -> Vector:
 
 
 def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
-    """Limit how much a velocity [m/s] speeds up in a tick to `step` [m/s]; it may slow down freely.
+    """Limit how much a velocity speeds up in one step to `step` [m/s]; it may slow down freely.
 
-    The fence may turn one axis back while another one speeds up: then each axis is within the cap,
-    but not all together. `before` and `after` are finite.
+    `before` and `after` are finite velocities [m/s]. The limit applies to all axes together,
+    because the fence may reverse one axis while another axis speeds up.
     """
     (ax, ay, az), (bx, by, bz) = before, after
     x, y, z = growth(ax, bx), growth(ay, by), growth(az, bz)
@@ -166,17 +167,17 @@ def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
 
 
 def growth(before: float, after: float) -> float:
-    """Return by how much `after` is faster than `before`, in the direction of `after` [m/s]."""
+    """Return by how much one axis speeds up from `before` to `after`, all in [m/s]; at least 0."""
     if after < 0.0:
         before, after = -before, -after
     return max(after - max(before, 0.0), 0.0)
 
 
 def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float) -> Vector:
-    """Limit how fast the `reference` [m/s] sinks, so that the robot does not turn over.
+    """Limit how fast the velocity `reference` [m/s] sinks, so that the robot does not turn over.
 
-    `before` is the reference of the last tick, at most `speed_max` long; `climb` is the vertical
-    velocity of the robot; `speed_max` is the largest speed of the result; all in [m/s].
+    `before` is the reference of the last step, at most `speed_max` long. `climb` is the vertical
+    velocity of the robot. `speed_max` is the largest speed of the result. All are in [m/s].
     """
     x, y, z = reference
     lowest = min(before[2], climb - SINK_LEAD_MAX)
@@ -184,15 +185,15 @@ def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float
 
 
 AGE_MAX_NS = 10_000_000_000
-"""Largest command age that an experiment may allow [ns]."""
+"""Largest command age limit that an experiment may set [ns]."""
 GROUND_WAIT_MIN_NS = 10_000_000_000
-"""Lower limit of the time for which a robot on the ground waits for a mission's first command [ns],
-which arrives a round trip after the start."""
+"""Shortest time for which a robot on the ground waits for the first command of its mission [ns]."""
 RAMP_MIN = 1.0
-"""Lower limit of the time for which the reference speeds up slowly after a HOLD [s]."""
+"""Shortest time after the guard state HOLD in which the reference speeds up by at most BRAKE
+[s]."""
 COMMAND_MAX = 1000.0
-"""Largest value of a command that the guard shortens to a cap [m/s, rad/s]; a larger value comes
-from a bug, and its direction is as wrong as its length.
+"""Largest component of a command that the guard accepts [m/s, rad/s]. A larger component comes from
+a bug, and the direction of the command is then wrong, too.
 Source: docs/reference/faults.md, "F23"."""
 
 
@@ -202,13 +203,12 @@ class Limits:
 
     Attributes:
         fence_low: Lower corner of the box that the base may not leave [m], world frame, shape (3,).
-        fence_high: Upper corner [m], shape (3,).
-        command_age_max_ns: Largest age of the basis of a command that is flown [ns].
-        speed_max: Largest speed [m/s].
-        acceleration_max: Largest change of the reference [m/s^2].
+        fence_high: Upper corner of the box [m], world frame, shape (3,).
+        command_age_max_ns: Largest accepted age of the odometry behind a command [ns].
+        speed_max: Largest speed of the velocity reference [m/s].
+        acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: Longest HOLD in a mission [ns]; after this time LAND begins. See
-            `alone_max_ns`.
+        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]; see `alone_max_ns`.
     """
 
     fence_low: Vector
@@ -220,10 +220,10 @@ class Limits:
     hold_max_ns: int = 60_000_000_000
 
     def __post_init__(self) -> None:
-        """Check the limits; raise a ValueError that names the first wrong one.
+        """Check the limits; raise a ValueError that names the first invalid limit.
 
-        Each limit must be finite and above 0, the robot must be able to stop in time from
-        `speed_max` with `command_age_max_ns`, and the fence must leave room.
+        Each limit has to be finite and above 0. The robot has to stop in time from `speed_max` with
+        a command as old as `command_age_max_ns`. The fence has to be larger than its margins.
         """
         for name in self.__slots__[2:]:
             value = getattr(self, name)
@@ -243,22 +243,23 @@ class Limits:
 
     @property
     def ramp_ns(self) -> int:
-        """How long the reference speeds up by at most BRAKE after a HOLD [ns]: up to the speed cap.
+        """Time after a HOLD in which the velocity reference speeds up by at most BRAKE [ns].
 
-        The ramp ends by time only: the first commands after a silence may be zero.
+        The time is long enough to reach the speed cap. The limit ends by time, not by speed,
+        because the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
 
     def alone_max_ns(self, flies: bool) -> int:
-        """Return how long a robot in a mission waits for its cloud before LAND [ns].
+        """Return how long a robot in a mission waits for cloud's commands before LAND [ns].
 
         `flies` tells whether the robot is in the air.
         """
         return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
 
     def inner_corners(self) -> tuple[Vector, Vector]:
-        """Return both corners of the fence, margins taken off [m], shape (3,) each."""
+        """Return the lower and upper corner of the fence minus its margins [m], shape (3,)."""
         (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high
         low = (ax + FENCE_MARGIN, ay + FENCE_MARGIN, az + FLOOR_MARGIN)
         return low, (bx - FENCE_MARGIN, by - FENCE_MARGIN, bz - FENCE_MARGIN)

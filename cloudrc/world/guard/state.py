@@ -1,8 +1,8 @@
 """The guard: the state machine that decides which commands the robot flies.
 
-The guard stands between the tunnel and the low-level controller. Every 2 ms it gives a velocity
-reference. The guard uses only its own clock and the onboard sensors, and assumes that the cloud is
-hostile.
+The guard stands between the tunnel and the low-level controller, and gives the controller a
+velocity reference every 2 ms. It trusts only its own clock and the onboard sensors. It assumes that
+the cloud is hostile.
 
                  fresh command of a         command too old, mission over,
                   started mission                   new session
@@ -14,18 +14,18 @@ hostile.
           |                          |   5 impossible commands within 1 s   |
           +------------------------ LAND <----------------------------------+
 
-The *basis* of a command is the odometry from which the command was computed. A command is fresh
+The *basis* of a command is the odometry from which cloud computed the command. A command is fresh
 while its basis is at most `command_age_max` old.
 
-- ESTOP begins from every state: by the operator's request, or when the robot has turned over,
-  because the rotors would push it in any direction. An acknowledgement leads to GROUND.
-- LAND: an acknowledgement in the air leads to HOLD. An acknowledgement low above the ground or on
-  an obstacle leads to GROUND at touch-down.
-- LAND and ESTOP end the mission: only a new start arms the robot again.
+- Every state can change to ESTOP: by the operator's request, or when the robot has turned over,
+  because its rotors would then push it in any direction. An acknowledgement leads to GROUND.
+- In LAND, an acknowledgement in the air leads to HOLD. An acknowledgement near the ground or on an
+  obstacle leads to GROUND at touch-down.
+- LAND and ESTOP end the mission. Afterwards only a new start arms the robot again.
 - HOLD before the robot has left the ground becomes GROUND: the rotors stop and the mission
-  continues. The robot waits 60 s for the cloud, as in HOLD.
-- HOLD within a mission has a time limit, because the operator may be gone. HOLD after the end of a
-  mission has no time limit: the robot waits for the next mission.
+  continues. The robot then waits 60 s for cloud's commands.
+- HOLD within a mission has a time limit, because the operator may be gone. HOLD after a mission has
+  no time limit: the robot waits for the next mission.
 
 A robot that touches nothing never turns over: no command tilts it as far as OVERTURNED_COSINE.
 """
@@ -43,37 +43,37 @@ from cloudrc.world.guard.limits import COMMAND_MAX, Limits
 from cloudrc.world.readings import Readings
 
 OVERTURNED_COSINE = 0.2
-"""Below this cosine of the tilt the robot counts as turned over, and its rotors stop. Commands
-alone tilt the robot to a cosine of 0.4 at worst; only a collision tilts it further."""
+"""Cosine of the tilt below which the robot counts as turned over, so that its rotors stop [1].
+Commands tilt the robot to a cosine of 0.4 at worst; only a collision tilts it further."""
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # looking up a member of an enum is slow
 
 RESUME_COMMANDS = 10
 RESUME_NS = 500_000_000
-"""Time within which RESUME_COMMANDS fresh commands end a HOLD [ns].
+"""RESUME_COMMANDS fresh commands within RESUME_NS [ns] end a HOLD.
 Source: docs/reference/plant.md, "Leaving HOLD"."""
 SETTLE_NS = 1_000_000_000
-"""Shortest time from one HOLD to the next, and from one TRACK to the next [ns].
+"""Shortest time between the beginnings of two HOLDs, and between those of two TRACKs [ns].
 Source: docs/reference/plant.md, "Settling time"; docs/reference/faults.md, "F5"."""
 INVALID_COMMANDS = 5
 IMPOSSIBLE = f"{INVALID_COMMANDS} impossible commands within 1 s"
 INVALID_NS = 1_000_000_000
-"""Time within which INVALID_COMMANDS impossible commands lead to LAND [ns].
+"""INVALID_COMMANDS impossible commands within INVALID_NS [ns] lead to LAND.
 Source: docs/reference/faults.md, "F23"."""
 
 
 class Guard:
-    """The state machine of the guard, on world's clock. It begins in GROUND.
+    """The state machine of the guard, on world's clock. It begins in the state GROUND.
 
     Attributes:
         state: Current state.
         cause: Why the guard is in this state; after touch-down in LAND, why the robot landed.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
-        reference: Last velocity reference for the low-level controller [m/s], shape (3,).
-        yaw_rate: Capped yaw rate [rad/s]; the published low-level controller ignores it.
+        reference: Velocity reference of the last step [m/s], world frame, shape (3,).
+        yaw_rate: Limited yaw rate [rad/s]; the published low-level controller ignores it.
         changes: Changes of the state since the last `take_changes`.
         counts: How often a limit changed a command: "limited_speed" and "limited_yaw_rate" count
-            commands, "limited_fence" counts ticks.
+            commands, "limited_fence" counts steps.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -97,12 +97,12 @@ class Guard:
 
     @property
     def brakes(self) -> bool:
-        """Whether the robot still brakes and has no hold point yet."""
+        """Whether the robot is in HOLD or LAND and still brakes."""
         return self._position_hold.brakes
 
     @property
     def latched(self) -> bool:
-        """Whether only the operator's acknowledgement leads out of this state."""
+        """Whether the state is LAND or ESTOP, which only the operator's acknowledgement ends."""
         return self.state is LAND or self.state is ESTOP
 
     def take_changes(self) -> list[GuardChange]:
@@ -111,15 +111,15 @@ class Guard:
         return changes
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Reset to GROUND: the robot stands at its spawn with stopped rotors."""
+        """Reset to GROUND; the robot stands at its spawn with stopped rotors."""
         self.forget_commands()
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._enter(GROUND, now_ns, Cause.SPAWN, cause)
 
     def start_mission(self, now_ns: int) -> None:
-        """Arm for a mission that the operator starts: from now on the robot flies fresh commands.
+        """Arm the robot for a mission; from now on the robot flies fresh commands.
 
-        A latched guard ignores this: the operator must acknowledge first.
+        In LAND or ESTOP nothing happens, because the operator has to acknowledge first.
         """
         if self.latched:
             return
@@ -140,7 +140,7 @@ class Guard:
             self._enter(ESTOP, now_ns, Cause.STOPPED)
 
     def acknowledge(self, now_ns: int) -> None:
-        """End LAND or ESTOP after the operator has acknowledged the cause; start no rotor."""
+        """Process the operator's acknowledgement of LAND or ESTOP; no rotor starts."""
         if self.latched and not self._flies:
             self._enter(GROUND, now_ns, self._take_off.condition)
         elif self.state is LAND:
@@ -154,10 +154,10 @@ class Guard:
         self._wanted, self.yaw_rate = ZERO, 0.0
 
     def accept_command(self, command: Command, now_ns: int) -> str | None:
-        """Accept or reject at `now_ns` [ns] a command, whose numbers may have any value, even NaN.
+        """Accept or reject a command at `now_ns` [ns]; its numbers may have any value, even NaN.
 
-        Return None, or the reason of the rejection: "range" for a value that is too large or NaN,
-        "future" for a basis that is not yet measured, "stale" for one that is too old.
+        Return None, or the reason of the rejection: "range" for a number that is too large or NaN;
+        "future" or "stale" for odometry (the basis) from the future or too old.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
@@ -191,7 +191,6 @@ class Guard:
         return None
 
     def _leave_hold(self, now_ns: int, fresh_until_ns: int) -> None:
-        """Count a fresh command. Begin TRACK after RESUME_COMMANDS of them within RESUME_NS."""
         self._fresh_ns.append(now_ns)
         took_ns = now_ns - self._fresh_ns[0]
         enough = len(self._fresh_ns) == RESUME_COMMANDS and took_ns <= RESUME_NS
@@ -201,12 +200,11 @@ class Guard:
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Tell whether TRACK may begin: the robot may leave the ground and SETTLE_NS has passed."""
+        """Tell whether TRACK may begin: take-off is allowed, and SETTLE_NS have passed."""
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS
 
     def _note_invalid(self, now_ns: int) -> None:
-        """Count an impossible command, which no honest cloud sends; land after several of them."""
         self._invalid_ns.append(now_ns)
         if len(self._invalid_ns) < INVALID_COMMANDS or now_ns - self._invalid_ns[0] > INVALID_NS:
             return
@@ -214,12 +212,12 @@ class Guard:
             self._enter(LAND, now_ns, Cause.IMPOSSIBLE, IMPOSSIBLE)
 
     def step(self, now_ns: int, readings: Readings, dt: float) -> Vector | None:
-        """Advance by one tick of `dt` [s] at `now_ns` [ns].
+        """Run one step of `dt` [s] at `now_ns` [ns], world's clock.
 
-        Return the velocity reference for the low-level controller [m/s], shape (3,); None while the
-        rotors are stopped.
+        Return the velocity reference for the low-level controller [m/s], world frame, shape (3,).
+        Return None while the rotors are stopped.
         """
-        # The usual case: the same command as in the last tick, far from the fence.
+        # The usual case: the same command as in the last step, far from the fence.
         if now_ns <= self._steady_until_ns and self.reference is self._wanted:
             return self.reference
         if self._flies and readings.axes[8] < OVERTURNED_COSINE:
@@ -239,7 +237,7 @@ class Guard:
         return self.reference
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
-        """Set the reference, limited so that the robot neither turns over nor leaves the fence."""
+        """Set the velocity reference, limited to keep the robot upright and inside the fence."""
         climb, position = readings.velocity[2], readings.position
         if reference[2] < climb - rules.SINK_LEAD_MAX:
             reference = rules.limit_sink(reference, self.reference, climb, self._speed_max)
@@ -258,7 +256,7 @@ class Guard:
         self.reference = reference
 
     def _look_after_itself(self, now_ns: int, readings: Readings) -> None:
-        """Change the state while there is no fresh command."""
+        """Change the state if necessary while there is no fresh command."""
         state, limits = self.state, self._limits
         if state is TRACK and self._track_until_ns == NEVER_NS:
             self._enter(HOLD, now_ns, Cause.SESSION)
@@ -278,12 +276,12 @@ class Guard:
                 state = GROUND if self._descent.acknowledged else LAND
                 self._enter(state, now_ns, Cause.DOWN)
                 self._flies, self.reference = False, ZERO
-                self._take_off.forget(stopped=True)  # it may stand on a pipe and slide off
+                self._take_off.forget(stopped=True)  # the robot may slide off a pipe
         if self.state is HOLD and self._take_off.may_end(readings):
             self._enter(GROUND, now_ns, Cause.NOT_OFF)
 
     def _enter(self, state: GuardState, now_ns: int, cause: Cause, text: str = "") -> None:
-        """Change the state and record the change; a `text` replaces the words of the cause."""
+        """Change the state and record the change, with `text` or the words of the cause."""
         self.cause = self.cause if cause is Cause.DOWN and state is LAND else cause
         if self.state is not HOLD or state is not LAND:  # LAND descends from the hold point
             self._position_hold.forget()
