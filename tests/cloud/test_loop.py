@@ -1,10 +1,8 @@
 """The control loop: delays, when it freezes, and that it goes on whatever a plug-in does."""
 
 import re
-from collections import Counter
 from functools import partial
 from math import inf, nan
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ import pytest
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import Estimator
 from cloudrc.cloud.estimators.running_mean import RunningMean
-from cloudrc.cloud.estimators.split import build as split
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.drivers.process import from_line, to_line
@@ -60,13 +57,6 @@ def test_each_applied_command_counts_once_also_in_late_telemetry():
     assert applied == [-900, -902, -896]
 
 
-def test_split_counts_how_long_cloud_has_held_the_odometry():
-    a_loop = loop(estimator=split)
-    # Applied at 95 ms of world's clock, 5 ms before the odometry, sent at 1000 ms of cloud's.
-    a_loop.observe(telemetry(100, echo_ms=1000, hold_ms=5), 1090 * MS)
-    assert command(a_loop, 1093)[1].horizon == pytest.approx((1093 - 100 + 95 - 1000) * 1e-3)
-
-
 @pytest.mark.parametrize(("horizon", "clamped"), [(3.0, 1.0), (-0.5, 0.0)])
 def test_a_horizon_out_of_range_is_clamped_and_counted(horizon, clamped):
     a_loop = loop(estimator=returns(horizon), heard_ms=1090)
@@ -86,14 +76,8 @@ def test_a_new_session_forgets_what_was_measured():
 
 
 def test_a_silent_echo_freezes_after_horizon_plus_400_ms():
-    told = []
-
-    class Listening(LastSample):
-        def commanded(self, command):
-            told.append(command.velocity)
-
     controller = Integrating()
-    a_loop = loop(predictor=Listening(), controller=controller, heard_ms=1100, echo_ms=1000)
+    a_loop = loop(controller=controller, heard_ms=1100, echo_ms=1000)
     assert command(a_loop, 1500)[0].velocity == ONE  # a horizon of 100 ms
     assert command(a_loop, 1501)[0][3:] == (ZERO, 0.0)
     assert (a_loop.counts["frozen"], controller.asked) == (1, 1)
@@ -102,7 +86,6 @@ def test_a_silent_echo_freezes_after_horizon_plus_400_ms():
     assert command(a_loop, 1510)[0].velocity == ZERO
     a_loop.observe(telemetry(510, echo_ms=1420), 1520 * MS)
     assert command(a_loop, 1520)[0].velocity == ONE
-    assert told == [ONE, ZERO, ZERO, ONE], "the predictor hears what is flown"
 
 
 def test_the_first_echo_has_as_much_time():
@@ -154,9 +137,12 @@ LONG = ValueError("no caf\udce9 " + "x" * 100_000)
 ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
 OUT_OF_SHAPE = returns((0.1,), ANY._replace(velocity=(0.1, 0.2)), position=(1.0, 2.0))
 NOT_FINITE = returns(nan, ANY._replace(velocity=(0.0, nan, 0.0)), position=(inf, 0.0, 0.0))
+NO_NUMBERS = returns("abc", ANY._replace(integral=(None,) * 3), velocity="abc")
 
 
-@pytest.mark.parametrize("bad", [*map(raises, (*ERRORS, LONG)), OUT_OF_SHAPE, NOT_FINITE])
+@pytest.mark.parametrize(
+    "bad", [*map(raises, (*ERRORS, LONG)), OUT_OF_SHAPE, NOT_FINITE, NO_NUMBERS]
+)
 @pytest.mark.parametrize("kind", ["estimator", "predictor", "controller"])
 def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     a_loop = loop(**{kind: bad if kind == "estimator" else bad()})
@@ -188,23 +174,6 @@ def test_a_value_that_is_not_finite_is_named_shortly():
     assert "failed (InvalidResultError: its position is (inf, 0, 0));" in a_loop.faults[0].text
 
 
-VECTORS = ("velocity", "proportional", "integral", "derivative")
-WRONG = ((0.1, 0.2), (0.1, 0.2, 0.3, 0.4), "abc", None, (None,) * 3)
-
-
-@pytest.mark.parametrize(
-    "output",
-    [
-        *(ANY._replace(**{field: w}) for w in WRONG for field in VECTORS),
-        SimpleNamespace(velocity=(0.1, 0.2, 0.3), yaw_rate=0.0),  # without its terms
-    ],
-)
-def test_an_output_that_is_not_three_numbers_is_not_flown(output):
-    a_loop = loop(controller=returns(output=output)(), heard_ms=1090)
-    assert command(a_loop, 1094)[0].velocity == ZERO
-    assert a_loop.counts["controller_failed"] == 1
-
-
 def test_arrays_and_generators_become_plain_numbers():
     class Arrays(returns(np.float32(0.5))):
         def update(self, *arguments):
@@ -220,28 +189,9 @@ def test_arrays_and_generators_become_plain_numbers():
 
 
 def test_a_failing_reset_is_reported_with_the_next_telemetry():
-    times = Counter()
-
-    class Once:
-        """Begins once, and again raises."""
-
-        def reset(self):
-            times[type(self)] += 1
-            if times[type(self)] > 1:
-                raise RuntimeError("not again")
-
-    class Mean(Once, RunningMean):
-        def __init__(self):
-            self.reset()
-            super().__init__()
-
-    class Sample(Once, LastSample):
-        pass
-
-    class Steady(Once, Integrating):
-        pass
-
-    a_loop = loop(Mean, Sample(), Steady())
+    estimators, sample, steady = [Estimator()], LastSample(), Integrating()
+    a_loop = loop(estimators.pop, sample, steady)  # there is no second estimator
+    sample.reset = steady.reset = lambda: 1 / 0
     a_loop.start_mission()
     a_loop.reset()
     assert a_loop.take_faults() == []

@@ -25,56 +25,33 @@ def fly(controller, position=ZERO, wanted=ZERO, velocity=ZERO, times=1):
 
 def test_published_gains_pull_towards_the_setpoint():
     output = fly(pid.build(), (1.0, 2.0, 3.0), velocity=(9.0, 9.0, 9.0))
-    assert output.velocity == pytest.approx((-0.8, -1.6, -4.5))
-    assert output.proportional == output.velocity
-    assert output[3:] == (ZERO, ZERO)
-    assert output.yaw_rate == 0.0
-    assert fly(pid.build(gain_p=[1, 2, 3]), wanted=ONES).velocity == (1.0, 2.0, 3.0)  # from YAML
+    assert output.velocity == output.proportional == pytest.approx((-0.8, -1.6, -4.5))
+    assert output[1:] == (0.0, output.proportional, ZERO, ZERO)
 
 
-def test_derivative_brakes_the_measured_velocity_without_a_kick():
-    controller = pid.build(gain_p=ONES, gain_d=(0.5, 0.5, 0.0))
-    for wanted in (0.0, 10.0):
-        output = fly(controller, wanted=x(wanted), velocity=(2.0, -1.0, 3.0))
-        assert output.derivative == pytest.approx((-1.0, 0.5, 0.0))
-        assert output.velocity == pytest.approx((wanted - 1.0, 0.5, 0.0))
-
-
-def test_integral_is_gain_times_error_times_time_and_limited():
-    controller = pid.build(gain_p=ZERO, gain_i=(0.5, 0.5, 0.5), integral_limit=(1.0, 1.0, 0.15))
+def test_integral_and_derivative_are_those_of_the_equation_and_limited():
+    controller = pid.build(
+        gain_p=[1, 1, 1], gain_i=(0.5,) * 3, gain_d=(0.5, 0.5, 0), integral_limit=(1, 1, 0.15)
+    )
     fly(controller, wanted=(0.2, 0.0, -0.4), times=100)
-    output = fly(controller)
-    assert output.integral == pytest.approx((0.1, 0.0, -0.15))  # .5 * .2 m * 1 s
-    assert output.velocity == output.integral
+    for jump in (0.0, 10.0):  # the derivative of the velocity has no kick
+        output = fly(controller, wanted=x(jump), velocity=(2.0, -1.0, 3.0))
+        assert output.integral == pytest.approx((0.1, 0.0, -0.15))  # .5 * .2 m * 1 s
+        assert output.derivative == pytest.approx((-1.0, 0.5, 0.0))
+        assert output.velocity == pytest.approx((jump + 0.1 - 1.0, 0.5, -0.15))
     controller.reset()
     assert fly(controller, wanted=ONES).integral == ZERO
 
 
-def test_only_a_saturated_axis_stops_integrating():
-    controller = pid.build(gain_p=ONES, gain_i=ONES, velocity_max=ONES)
+def test_only_a_saturated_axis_stops_integrating_and_goes_on_backwards():
+    controller = pid.build(gain_p=ONES, gain_i=ONES, gain_d=ONES, velocity_max=ONES)
     output = fly(controller, wanted=(10.0, 0.05, 0.0), times=1000)
     assert output.velocity[0] == 1.0
     assert output.integral == pytest.approx((0.0, 0.4995, 0.0))
-
-
-def test_a_saturated_axis_integrates_an_opposite_error():
-    controller = pid.build(gain_p=ONES, gain_i=ONES, gain_d=ONES, velocity_max=(0.5, 0.5, 0.5))
     # The derivative saturates upwards while the error points down.
     output = fly(controller, x(1.0), velocity=x(-5.0), times=10)
-    assert output.velocity[0] == 0.5
+    assert output.velocity[0] == 1.0
     assert output.integral[0] == pytest.approx(-0.09)
-
-
-@pytest.mark.parametrize("limit", [{"speed_max": 1.0}, {"velocity_max": ONES}])
-def test_saturation_causes_no_overshoot_by_windup(limit):
-    controller = pid.build(gain_p=ONES, gain_i=(0.2, 0.2, 0.2), **limit)
-    position, highest = 0.0, 0.0
-    for _ in range(4000):
-        position += fly(controller, x(position), x(10.0)).velocity[0] * DT
-        highest = max(highest, position)
-    # Without anti-windup the integral would reach 9 m/s in 9 s: an overshoot of metres.
-    assert highest < 10.3
-    assert position == pytest.approx(10.0, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -94,25 +71,13 @@ def test_yaw_turns_the_short_way_round():
     assert output.yaw_rate == pytest.approx(2.0 * 20 * pi / 180)
 
 
-def test_a_limit_does_not_turn_nan_into_full_speed():
-    controller = pid.build(velocity_max=ONES, gain_i=ONES)
-    velocity = fly(controller, x(float("nan"))).velocity
-    assert velocity[0] != velocity[0]
-    assert fly(controller).velocity == ZERO
-
-
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
         ({"gain_p": (0.8, -0.8, 1.5)}, r"gain_p\[y\]: -0.8 .*not negative"),
         ({"gain_i": (0.0, 0.0, float("nan"))}, r"gain_i\[z\]: nan .*finite"),
         ({"gain_d": (0.5, 0.5)}, r"gain_d: \(0.5, 0.5\) .*three numbers"),
-        ({"gain_p": 0.8}, r"gain_p: 0.8 .*three numbers"),
-        ({"gain_p": "abc"}, r"gain_p: 'abc' .*three numbers"),
-        ({"gain_p": ["a", 1, 1]}, r"gain_p\[x\]: 'a' is not a number"),
-        ({"gain_yaw": float("inf")}, r"gain_yaw: inf .*finite"),
-        ({"integral_limit": (-1, 1, 1)}, r"integral_limit\[x\]: -1"),
-        ({"velocity_max": (1, 1)}, r"velocity_max: "),
+        ({"velocity_max": "abc"}, r"velocity_max: 'abc' .*three numbers"),
         ({"speed_max": True}, r"speed_max: True is not a number"),
     ],
 )

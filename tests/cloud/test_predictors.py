@@ -8,61 +8,41 @@ from cloudrc.cloud.predictors import (
     commanded_velocity,
     constant_acceleration,
     constant_velocity,
-    last_sample,
 )
 from cloudrc.messages import UPRIGHT, Command, Odometry
 
 HALF = sqrt(0.5)
-SAMPLE = Odometry(
-    stamp_ns=1_000_000_000,
-    position=(1.0, 2.0, 3.0),
-    orientation_wxyz=UPRIGHT,
-    velocity=(0.5, -1.0, 2.0),
-    angular_velocity_body=(0.0, 0.0, pi / 2),
-)
-
-
-def test_last_sample_moves_nothing_but_the_stamp():
-    moved = SAMPLE._replace(stamp_ns=1_100_000_000)
-    assert last_sample.build().predict(SAMPLE, 0.1) == moved
+SAMPLE = Odometry(1_000_000_000, (1.0, 2.0, 3.0), UPRIGHT, (0.5, -1.0, 2.0), (0.0, 0.0, pi / 2))
 
 
 def test_constant_velocity_is_equation_3():
-    prediction = constant_velocity.build().predict(SAMPLE, 0.1)
-    assert prediction.stamp_ns == 1_100_000_000
-    assert prediction.position == pytest.approx((1.05, 1.9, 3.2))
-    assert prediction.velocity == SAMPLE.velocity
-    assert prediction.angular_velocity_body == SAMPLE.angular_velocity_body
+    stamp_ns, position, _, *rates = constant_velocity.build().predict(SAMPLE, 0.1)
+    assert (stamp_ns, position) == (1_100_000_000, pytest.approx((1.05, 1.9, 3.2)))
+    assert rates == [SAMPLE.velocity, SAMPLE.angular_velocity_body]
 
 
 @pytest.mark.parametrize("module", [constant_velocity, commanded_velocity, constant_acceleration])
 @pytest.mark.parametrize(
-    ("before", "rate", "after"),
+    ("before", "after"),
     [
-        (UPRIGHT, pi / 2, (HALF, 0.0, 0.0, HALF)),  # a quarter turn in 1 s
+        (UPRIGHT, (HALF, 0.0, 0.0, HALF)),  # a quarter turn in 1 s
         # About the body's axes: about the world's z axis it would be (.5, .5, .5, .5).
-        ((HALF, HALF, 0.0, 0.0), pi / 2, (0.5, 0.5, -0.5, 0.5)),
-        (UPRIGHT, 0.0, UPRIGHT),
+        ((HALF, HALF, 0.0, 0.0), (0.5, 0.5, -0.5, 0.5)),
     ],
 )
-def test_the_rate_turns_about_the_axes_of_the_body(module, before, rate, after):
-    turning = SAMPLE._replace(orientation_wxyz=before, angular_velocity_body=(0.0, 0.0, rate))
+def test_the_rate_turns_about_the_axes_of_the_body(module, before, after):
+    turning = SAMPLE._replace(orientation_wxyz=before)
     assert module.build().predict(turning, 1.0).orientation_wxyz == pytest.approx(after)
 
 
 def test_commanded_velocity_uses_the_last_command():
     predictor = commanded_velocity.build()
-    for velocity, position in (
-        ((9.0, 9.0, 9.0), (2.8, 3.8, 4.8)),
-        ((1.0, 0.0, -2.0), (1.2, 2.0, 2.6)),
-    ):
+    for velocity in ((9.0, 9.0, 9.0), (1.0, 0.0, -2.0)):
         predictor.commanded(Command(0, 0, 0, velocity, 0.0))
-        prediction = predictor.predict(SAMPLE, 0.2)
-        assert prediction.position == pytest.approx(position)
-        assert prediction.velocity == SAMPLE.velocity
-    for fresh in (predictor, commanded_velocity.build()):
-        fresh.reset()
-        assert fresh.predict(SAMPLE, 0.2).position == SAMPLE.position
+    prediction = predictor.predict(SAMPLE, 0.2)
+    assert prediction.position == pytest.approx((1.2, 2.0, 2.6))
+    assert prediction.velocity == SAMPLE.velocity
+    assert commanded_velocity.build().predict(SAMPLE, 0.2).position == SAMPLE.position
 
 
 def accelerated(velocities, window=0.05, more=()):
@@ -76,22 +56,15 @@ def accelerated(velocities, window=0.05, more=()):
     return predictor.predict(newest, 0.1)
 
 
-def test_constant_acceleration_uses_recent_velocities():
+def test_constant_acceleration_uses_the_velocities_of_its_window():
     prediction = accelerated([0.0, 0.1, 0.2])  # 10 m/s^2
     # x: 1 + .2 * .1 + .5 * 10 * .01; v: .2 + 10 * .1
     assert prediction.position == pytest.approx((1.07, 2.0, 3.0))
     assert prediction.velocity == pytest.approx((1.2, 0.0, 0.0))
-    assert prediction.stamp_ns == 120_000_000
     assert accelerated([0.0, 0.1, 0.2], more=(20_000_000, 5_000_000)) == prediction, "late stamps"
-
-
-def test_constant_acceleration_forgets_samples_before_its_window_or_a_gap():
     settled = accelerated([0.0, 5.0, 6.0, 6.0, 6.0], window=0.02)
     assert settled.velocity == pytest.approx((6.0, 0.0, 0.0))
-    assert accelerated([0.0, 1.0], more=(10_000_000_000,)).velocity == pytest.approx((1.0, 0, 0))
-
-
-@pytest.mark.parametrize("window", [0.0, -0.1, float("nan"), "short"])
-def test_constant_acceleration_refuses_a_window_without_length(window):
-    with pytest.raises(ValueError, match=r"^window: "):
-        constant_acceleration.build(window=window)
+    after_a_gap = accelerated([0.0, 1.0], more=(10_000_000_000,))
+    assert after_a_gap.velocity == pytest.approx((1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match=r"^window: 0.0 "):
+        constant_acceleration.build(window=0.0)

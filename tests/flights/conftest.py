@@ -47,6 +47,7 @@ def bare_robot() -> Mock:
     guard.accept_command.return_value = None
     readings = (ZERO, UPRIGHT, ZERO, ZERO, ZERO * 3)
     simulator = Mock(tip_force=lambda: 0.0, readings=readings, touches=[])
+    simulator.take_tip_force.return_value = (0.0, 0.0)
     run = lambda tick_ns, stop_ns: stop_ns  # noqa: E731
     return Mock(guard=guard, simulator=simulator, observers=[], run=run)
 

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.load import load_experiment
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import Mission, Steps, Waypoint
 from cloudrc.geometry import fence
@@ -35,24 +34,21 @@ def crossed(start, end):
 
 def refusals(*positions, start="spawn", scene="pipes", **more):
     waypoints = tuple(Waypoint(position_m=position, **more) for position in positions)
-    problems = check_mission(Mission(start=start, waypoints=waypoints), load_scene(scene))  # type: ignore[arg-type]
+    problems = check_mission(Mission(start=start, waypoints=waypoints), load_scene(scene))
     return "\n".join(map(str, problems))
 
 
 @pytest.mark.parametrize(
     ("position", "yaw", "pipe"),
     [
-        ((-1.0, 0.0, 0.8), 0, -1),
         # The arm's tip is at x + .40, z + .17: from x = -.81 on it is within .04 m of the wall.
         ((-0.82, 0.0, 0.8), 0, -1),
         ((-0.80, 0.0, 0.8), 0, 0),
-        ((-0.60, 0.0, 0.8), 0, 0),  # the arm goes through the wall
         ((-0.80, 0.0, 0.8), math.pi / 2, -1),  # along the pipe
         # The rims of the rotors, .338 from the axis, in the lower part of the bore.
         ((-1.0, 0.0, 0.29), math.pi / 2, -1),
         ((-1.0, 0.0, 0.25), math.pi / 2, 0),
         ((0.0, 0.0, 0.8), 0, 0),  # the rear rotor is in the outside of pipe 1
-        ((8.235, -6.422, 0.7), 0, -1),  # behind the board
     ],
 )
 def test_overlaps(position, yaw, pipe):
@@ -63,20 +59,11 @@ def test_overlaps(position, yaw, pipe):
     ("start", "end", "pipe"),
     [
         ((-1.0, 0.0, 0.8), (0.5, 0.0, 0.8), 0),  # out of the bore, sideways
-        ((0.5, 0.0, 0.8), (-1.0, 0.0, 0.8), 0),
-        ((0.5, 0.0, 0.8), (-2.5, 0.0, 0.8), 0),  # right through
-        ((-1.0, 0.0, 0.8), (-1.0, 0.0, 2.0), 0),
         ((-1.0, 3.6, 0.7), (-1.0, 0.0, 0.7), -1),  # into the bore, by its mouth
-        ((-1.0, 0.0, 0.8), (-1.0, 0.0, 0.8), -1),
-        ((-1.0, -1.0, 0.8), (-1.0, 1.0, 0.8), -1),  # along the axis
-        ((0.5, -2.0, 0.8), (0.5, 2.0, 0.8), -1),  # past it
-        ((-2.5, 2.9, 0.8), (0.5, 2.9, 0.8), -1),  # across, in front of its mouth
         ((-2.5, 2.7, 0.8), (0.5, 2.7, 0.8), 0),  # with a rotor in it
         ((-2.5, 0.0, 1.7), (0.5, 0.0, 1.7), -1),  # over it
         ((-2.5, 0.0, 1.6), (0.5, 0.0, 1.6), 0),  # its box would scrape along the top
-        ((-1.0, -2.0, 0.8), (5.66, -6.42, 0.8), 0),  # out of one bore, into another
         ((-0.78, 0.0, 0.8), (-1.0, 0.0, 0.8), -1),  # at a wall, away from it
-        ((-0.78, 0.0, 0.8), (-0.7, 0.0, 0.8), 0),
     ],
 )
 def test_a_straight_way_through_a_wall_is_found(start, end, pipe):
@@ -107,12 +94,11 @@ def test_the_nearest_legal_point_is_legal(position, yaw):
     assert find_nearest_legal(PIPES, found, yaw) == found
 
 
-@pytest.mark.parametrize("start", ["spawn", "here"])
-def test_a_straight_way_leads_to_the_offered_point(start):
-    said = refusals((0.0, 0.0, 0.8), start=start)
+def test_a_straight_way_leads_to_the_offered_point():
+    said = refusals((0.0, 0.0, 0.8))
     x, y, z = (float(word) for word in said.rpartition("[")[2].rstrip("]").split(","))
     assert math.dist((x, y, z), (0.0, 0.0, 0.8)) < 0.15
-    assert refusals((x, y, z), start=start) == ""
+    assert refusals((x, y, z)) == ""
 
 
 @pytest.mark.parametrize(
@@ -121,9 +107,6 @@ def test_a_straight_way_leads_to_the_offered_point(start):
         ((9.2, 0.0, 1.0), 0.1, True),  # in the fence; the guard stops the robot at 9.03
         ((9.05, 0.0, 1.0), 0.1, False),  # within half of the tolerance
         ((9.05, 0.0, 1.0), 0.01, True),
-        ((9.25, 0.0, 1.0), 1.0, True),  # beyond the fence
-        ((0.5, 0.0, 0.1), 0.1, True),
-        ((0.5, 0.0, 0.3), 0.1, False),
         ((1e300, 0.0, 1.0), 0.1, True),
     ],
 )
@@ -131,7 +114,7 @@ def test_a_waypoint_that_the_guard_keeps_the_robot_from_is_refused(position, tol
     said = refusals(position, start="here", scene="empty", tolerance_m=tolerance)
     assert ("x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]" in said) is outside
     corners = Limits(fence_low=fence.LOW, fence_high=fence.HIGH).inner_corners()
-    assert corners == (fence.INNER_LOW, fence.INNER_HIGH)
+    assert corners == (fence.INNER_LOW, fence.INNER_HIGH), "the guard's margins"
 
 
 @pytest.mark.parametrize(
@@ -141,10 +124,7 @@ def test_a_waypoint_that_the_guard_keeps_the_robot_from_is_refused(position, tol
         ([(0.0, 0.0, 1.2)], "spawn", "the spawn leads through"),
         ([(0.0, 0.0, 1.2)], "here", ""),
         ([(0.0, 0.0, 0.8)], "here", "the robot would be within 0.04 m"),
-        ([(-2.5, 0.0, 0.8)], "spawn", "the spawn leads through the wall of pipe_1"),
-        ([(-2.5, 0.0, 0.8)], "here", ""),
         ([(-1.0, 0.0, 0.7), (0.5, 0.0, 0.7)], "here", "from waypoint 0 leads through the wall"),
-        ([(0.5, 0.0, 0.7), (0.5, 0.0, 0.7)], "spawn", ""),
         ([], "spawn", "none given"),
     ],
 )
@@ -153,33 +133,16 @@ def test_a_mission_with_a_wall_on_its_way_is_refused(positions, start, reason):
     assert reason in said if reason else said == ""
 
 
-def test_every_bad_waypoint_is_named_up_to_a_number():
-    problems = refusals(*[(-1.0, 0.0, 0.7), (-0.6, 0.0, 0.7)] * 30).splitlines()
-    assert len(problems) == 21
-    assert problems[0].startswith("waypoints.1.position_m: [-0.6, 0, 0.7]: the robot would")
-    assert problems[-1].startswith("waypoints: 10 more waypoints")
-
-
-@pytest.mark.parametrize("experiment", ["paper", "steps", "hover"])
-def test_shipped_missions_can_be_flown(experiment):
-    loaded = load_experiment(experiment)
-    assert check_mission(loaded.mission, load_scene(loaded.world.scene)) == []
-
-
 @pytest.mark.parametrize(
     ("steps", "scene", "reason"),
     [
-        ({"centre_m": (0.0, 0.0, 2.0)}, "empty", "beyond the fence"),
         ({"centre_m": (1e308, 0, 1), "range_m": (1e308, 0, 0)}, "empty", "beyond the fence"),
         ({}, "pipes", "can end in the wall of pipe_1"),
     ],
 )
-def test_steps_that_can_end_in_a_wall_are_refused(steps, scene, reason):  # type: ignore[type-arg]
+def test_steps_that_can_end_in_a_wall_are_refused(steps, scene, reason):
     (problem,) = check_mission(Mission(steps=Steps(**steps)), load_scene(scene))
     assert problem.path == ("steps",)
     assert reason in problem.reason
-
-
-def test_waypoints_and_steps_together_are_refused():
-    both = Mission(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps())
+    both = Mission(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps(**steps))
     assert "not both" in str(check_mission(both, PIPES)[0])

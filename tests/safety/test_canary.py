@@ -10,23 +10,18 @@ from mcap.exceptions import McapError
 from mcap.stream_reader import StreamReader
 
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.record.writer import McapWriter
-from cloudrc.records import Fault
-from cloudrc.teleop.auth import Tokens
-from cloudrc.tunnel.keys import Key
 from tests.drivers.conftest import KEY, TOKEN, Release
 
 SECRET_FILES = ("operator", "key")
-"""The files that contain the token and the key."""
-FORMS = (
-    lambda secret: secret,
-    lambda secret: secret.hex().encode(),
-    lambda secret: secret.hex().upper().encode(),
-    lambda secret: base64.b64encode(secret).rstrip(b"="),
-    lambda secret: base64.urlsafe_b64encode(secret).rstrip(b"="),
-    lambda secret: repr(secret)[2:-1].encode(),
-)
-CANARIES = [form(secret) for secret in (KEY, TOKEN.encode()) for form in FORMS]
+CANARIES = [
+    form
+    for secret in (KEY, TOKEN.encode())
+    for form in (
+        *(secret, secret.hex().encode(), secret.hex().upper().encode()),
+        *(encode(secret).rstrip(b"=") for encode in (base64.b64encode, base64.urlsafe_b64encode)),
+        repr(secret)[2:-1].encode(),
+    )
+]
 
 
 def found_in(data):
@@ -41,24 +36,6 @@ def content_of(path):
             for record in StreamReader(stream).records:
                 data += bytes(getattr(record, "data", b"")) + repr(record).encode()
     return data
-
-
-def test_a_secret_in_a_compressed_recording_is_found(tmp_path):
-    """Among many other records, so that it is compressed."""
-    path = tmp_path / "a.mcap"
-    with McapWriter(path, clock="world") as writer:
-        writer.write(Fault(n, "journal", f"line {n}") for n in range(50))
-        writer.write([Fault(50, "journal", f"token {TOKEN}")])
-    assert found_in(path.read_bytes()) == [], "compressed"
-    assert TOKEN.encode() in found_in(content_of(path))
-
-
-@pytest.mark.promise("secrets-stay-secret")
-def test_objects_with_a_secret_do_not_print_it(tmp_path):
-    (tmp_path / "operator").write_text(TOKEN)
-    for holder in (Key(KEY), Tokens(tmp_path)):
-        shown = f"{holder} {holder!r} {[holder]} {getattr(holder, '__dict__', '')}"
-        assert found_in(shown.encode()) == []
 
 
 class ObservedRelease(Release):
@@ -99,5 +76,5 @@ def test_a_flight_exposes_no_secret(tmp_path):
         if path.is_file() and path.name not in SECRET_FILES:
             shown[str(path.relative_to(tmp_path))] = content_of(path)
     assert {"world.mcap", "cloud.mcap", "audit.jsonl", "journal/missions"} <= shown.keys()
-    assert len(shown["world.mcap"]) > 1000
+    assert b"position" in shown["world.mcap"], "it is decompressed"
     assert {place: found_in(data) for place, data in shown.items() if found_in(data)} == {}

@@ -22,7 +22,6 @@ from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.session import pair
 from tests.flights.conftest import MS, Bare, BareCloud, bare_cloud, ring
 
-LONGEST = 2048
 STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
 """Steps of time [ns]; cloud asks for a session after 0.5 s of silence."""
 TOLD_MAX = 256
@@ -76,10 +75,8 @@ class Target:
         return (
             [[end._counts[name] for name in accepted] for end in ends],
             [end._session.epoch for end in ends],
-            self.world._door._fresh_until_ns,
-            self.cloud._heard_ns,
-            self.world._orders.number,
-            self.world._waiting,
+            *(self.world._door._fresh_until_ns, self.cloud._heard_ns),
+            *(self.world._orders.number, self.world._waiting),
         )
 
     def try_one(self, program):
@@ -90,10 +87,9 @@ class Target:
         self.tried += 1
         self.world.receive_datagram(data, self.now_ns)
         self.cloud.receive_datagram(data, self.now_ns)
-        if self.tried % 1000 == 0:
+        if self.tried % 1000 == 0 or self.tried % self.pace == 0:
             self.check()
         if self.tried % self.pace == 0:
-            self.check()
             self.pass_time(int.from_bytes(program[-2:], "little"))
             self.before = self.state()
 
@@ -112,8 +108,8 @@ class Target:
             self.known = frozenset(self.frames)
         else:
             before = self.state()[1:]
-            for end in (self.world, self.cloud):
-                self.give(self.captured, end)
+            self.give(self.captured, self.world)
+            self.give(self.captured, self.cloud)
             assert self.state()[1:] == before, "what was captured was let through again"
         self.drain()
 
@@ -142,14 +138,14 @@ class Target:
         way, which, rest = program[0] % 4, program[1] | program[2] << 8, program[3:]
         frame = self.frames[which % len(self.frames)]
         if way == 0:
-            return rest[:LONGEST]
+            return rest[:2048]
         if way == 1:
             spoiled = bytearray(frame)
             for at, change in zip(rest[::2], rest[1::2], strict=False):
                 spoiled[at % len(spoiled)] ^= change
             return bytes(spoiled)
         if way == 2:
-            length = (rest[0] | which & 0x700) % LONGEST
+            length = (rest[0] | which & 0x700) % 2048
             return (frame + rest * (1 + length // len(rest)))[:length]
         kind = DOWNLINK[which % 3] if which & 1 else Kind.TELEMETRY
         size = codec.BODY_SIZES[kind]

@@ -20,57 +20,31 @@ from cloudrc.tunnel.codec import Accept, DecodeError, Hello, Kind
 stamps = st.integers(-(2**63), 2**63 - 1)
 floats = st.floats(allow_nan=False)
 vectors = st.tuples(floats, floats, floats)
+odometries = st.builds(Odometry, stamps, vectors, st.tuples(*[floats] * 4), vectors, vectors)
+unsigned = {bits: st.integers(0, 2**bits - 1) for bits in (16, 32, 63, 64)}
 telemetries = st.builds(
-    lambda stamp, rest, position, orientation, velocity, rate: Telemetry(
-        stamp, Odometry(stamp, position, orientation, velocity, rate), *rest
-    ),
-    stamps,
-    st.tuples(
-        floats,
-        *[stamps] * 3,
-        st.integers(0, 2**32 - 1),
-        st.sampled_from(GuardState),
-        st.integers(0, 2**32 - 1),
-        floats,
-        st.integers(0, 2**64 - 1),
-        st.integers(0, 2**16 - 1),
-        st.sampled_from(Cause),
-    ),
-    vectors,
-    st.tuples(floats, floats, floats, floats),
-    vectors,
-    vectors,
-)
+    Telemetry,
+    *(stamps, odometries, floats, stamps, stamps, stamps, unsigned[32]),
+    *(st.sampled_from(GuardState), unsigned[32], floats, unsigned[64], unsigned[16]),
+    st.sampled_from(Cause),
+).map(lambda t: t._replace(odometry=t.odometry._replace(stamp_ns=t.stamp_ns)))
 commands = st.builds(Command, stamps, stamps, stamps, vectors, floats)
 requests = st.builds(
     OperatorRequest,
-    st.integers(0, 2**32 - 1),
-    st.sampled_from(Request),
-    st.sampled_from(Start),
-    st.integers(0, 2**63 - 1),
-    st.integers(0, 2**16 - 1),
-    st.integers(-1, 2**63 - 1),
-    st.integers(0, 9),
+    *(unsigned[32], st.sampled_from(Request), st.sampled_from(Start), unsigned[63], unsigned[16]),
+    *(st.integers(-1, 2**63 - 1), st.just(0)),  # the epoch is in the header
 )
-
-
-def datagram(kind, body):
-    return codec.encode_header(kind, 0, 1, 2) + body + bytes(codec.TAG_SIZE)
 
 
 names, cookies = (st.binary(min_size=size, max_size=size) for size in (16, codec.COOKIE_SIZE))
 COME_BACK = {
-    "telemetry": (telemetries, codec.encode_telemetry, codec.decode_telemetry),
-    "command": (commands, codec.encode_command, codec.decode_command),
-    "request": (requests, codec.encode_operator, codec.decode_operator),
-    "hello": (
-        st.builds(Hello, names, names, cookies, st.integers(0, 2**32 - 1)),
-        codec.encode_hello,
-        codec.decode_hello,
-    ),
-    "accept": (st.builds(Accept, names, names, names), codec.encode_accept, codec.decode_accept),
-    "challenge": (cookies, codec.encode_challenge, codec.decode_challenge),
-    "busy": (names, codec.encode_busy, codec.decode_busy),
+    "telemetry": telemetries,
+    "command": commands,
+    "operator": requests,
+    "hello": st.builds(Hello, names, names, cookies, unsigned[32]),
+    "accept": st.builds(Accept, names, names, names),
+    "challenge": cookies,
+    "busy": names,
 }
 
 
@@ -78,18 +52,9 @@ COME_BACK = {
 @given(st.data())
 @settings(max_examples=50, deadline=None)
 def test_every_body_comes_back_as_it_was(name, data):
-    strategy, encode, decode = COME_BACK[name]
-    message = data.draw(strategy)
-    again = decode(encode(message))
-    if isinstance(message, OperatorRequest):
-        message = message._replace(epoch=0)  # not in the datagram's body
-    assert again == message
-
-
-def test_the_header_has_the_documented_layout():
-    data = codec.encode_header(Kind.COMMAND, 1, 0x01020304, 0x1122334455667788)
-    assert data == bytes([6, 1, 4, 3, 2, 1, 0, 6]) + bytes.fromhex("8877665544332211")
-    assert codec.peek(data) == (Kind.COMMAND, 0x01020304, 0x1122334455667788)
+    encode, decode = (getattr(codec, f"{way}code_{name}") for way in ("en", "de"))
+    message = data.draw(COME_BACK[name])
+    assert decode(encode(message)) == message
 
 
 def test_no_answer_is_longer_than_its_hello():
@@ -109,7 +74,8 @@ def outcome(read, data):
 
 @pytest.mark.parametrize("kind", list(Kind))
 def test_every_wrong_length_direction_and_version_is_refused(kind):
-    whole = datagram(kind, bytes(codec.BODY_SIZES[kind]))
+    body = bytes(codec.BODY_SIZES[kind] + codec.TAG_SIZE)
+    whole = codec.encode_header(kind, 0, 1, 2) + body
     assert outcome(codec.check, whole) == "fine"
     for length in (*range(len(whole)), len(whole) + 1, 2048):
         assert outcome(codec.check, whole[:length].ljust(length, b"\0")) == "malformed"

@@ -9,7 +9,6 @@ from cloudrc.tunnel.handshake import (
     CLOUDS_MAX,
     COOKIE_NS,
     EPOCH_MAX,
-    GRACE_NS,
     NO_COOKIE,
     REPEATS_MAX,
     HelloAnswer,
@@ -28,31 +27,19 @@ def signed_by(key, answer):
     return key.verifies(data[:-16], data[-16:])
 
 
-def test_a_hello_without_a_cookie_gets_one_and_changes_nothing(step):
-    before = dict(vars(step.door))
-    assert step.receive_hello(cookie=NO_COOKIE).outcome == "hello"
-    del before["_challenged_ns"]
-    assert {name: vars(step.door)[name] for name in before} == before
-    assert step.world.epoch == 0
-
-
 @pytest.mark.parametrize("now_ns", [0, 10 * COOKIE_NS])
-def test_with_the_cookie_it_gets_a_session(step, now_ns):
+def test_a_hello_gets_a_cookie_and_with_the_cookie_a_session(step, now_ns):
     step.now_ns = now_ns
-    answer = step.receive_hello(cookie=step.cookie())
+    before = dict(vars(step.door)) | {"_challenged_ns": now_ns}
+    cookie = step.cookie()
+    assert dict(vars(step.door)) == before, "without a cookie it changes nothing"
+    step.now_ns += CHALLENGE_NS
+    assert step.answer(cookie=cookie[:-1] + b"?")[0] == Kind.CHALLENGE, "a wrong one is as none"
+    answer = step.receive_hello(cookie=cookie)
     assert (answer.outcome, answer.opened, step.world.epoch) == ("hello", True, 1)
     kind, epoch, _, body = step.cloud.open(answer.datagrams[0])
     assert (kind, epoch) == (Kind.ACCEPT, 1)
     assert codec.decode_accept(body) == Accept(NONCE, WORLD, CLOCK)
-
-
-def test_a_wrong_cookie_is_as_good_as_none(step):
-    right = step.cookie()
-    others = Doorstep(nonce=b"v" * 16), Doorstep(key=NEW)
-    for cookie in (right[:-1] + bytes([right[-1] ^ 1]), *(other.cookie() for other in others)):
-        step.now_ns += CHALLENGE_NS
-        assert step.answer(cookie=cookie)[0] == Kind.CHALLENGE
-    assert step.world.epoch == 0
 
 
 @pytest.mark.parametrize(("slots", "opened"), [(0, True), (1, True), (2, False)])
@@ -64,7 +51,7 @@ def test_a_cookie_lasts_its_slot_and_the_next(step, slots, opened):
 
 def test_challenges_are_at_most_100_ms_apart(step):
     for _ in range(50):
-        assert step.receive_hello(cookie=NO_COOKIE).datagrams
+        assert step.receive_hello(cookie=NO_COOKIE).outcome == "hello"
         step.now_ns += CHALLENGE_NS - 1
         assert step.receive_hello(cookie=NO_COOKIE) == ("unanswered", [], False)
         assert step.receive_hello().datagrams, "a hello with a cookie is answered"
@@ -105,21 +92,6 @@ def test_another_cloud_is_refused_while_the_incumbent_is_fresh(step):
     assert step.world.epoch == 2
 
 
-@pytest.mark.parametrize("begins", ["session", "epoch"])
-def test_a_new_epoch_gives_its_cloud_time_to_be_heard(step, begins):
-    step.receive_hello()
-    if begins == "epoch":
-        step.door.accept_once(Kind.OPERATOR, 0, step.now_ns)
-        step.now_ns += 250 * MS
-        assert codec.peek(step.door.begin_next_epoch(step.now_ns))[:2] == (Kind.ACCEPT, 2)
-        step.door.accept_once(Kind.OPERATOR, 0, step.now_ns - GRACE_NS)  # counters restart
-        step.door.begin_next_epoch(step.now_ns)
-    step.now_ns += GRACE_NS
-    assert step.receive_hello(OTHER).outcome == "busy"
-    step.now_ns += 1
-    assert step.receive_hello(OTHER).opened
-
-
 def test_operator_and_alive_are_let_in_once(step):
     step.receive_hello()
     for kind in (Kind.OPERATOR, Kind.ALIVE):
@@ -130,18 +102,17 @@ def test_operator_and_alive_are_let_in_once(step):
     with pytest.raises(DecodeError, match=r"^malformed$"):
         step.door.accept_once(Kind.TELEMETRY, 0, step.now_ns)
     step.now_ns += 300 * MS
+    assert codec.peek(step.door.begin_next_epoch(step.now_ns))[:2] == (Kind.ACCEPT, 2)
+    step.door.accept_once(Kind.ALIVE, 5, step.now_ns - 300 * MS)  # counters restart
     assert step.receive_hello(OTHER).opened, "a repeat is no sign of life"
 
 
 def test_an_incumbent_that_asks_gets_its_epoch_again(step):
     """Until it has asked in vain: world cannot hear it, so a new epoch loses nothing."""
     step.receive_hello()
-    for counter in range(2 * REPEATS_MAX):
-        step.now_ns += SECOND_NS // 5
-        step.door.accept_once(Kind.ALIVE, counter, step.now_ns)
-        assert step.answer()[:2] == (Kind.ACCEPT, 1)
+    step.door.hear(step.now_ns)
     step.now_ns += 250 * MS  # the last instant at which it counts as heard
-    assert [step.answer()[1] for _ in range(2 * REPEATS_MAX)] == [1] * 2 * REPEATS_MAX
+    assert {step.answer()[:2] for _ in range(2 * REPEATS_MAX)} == {(Kind.ACCEPT, 1)}
     step.door.hear(step.now_ns)
     opened = []
     for _ in range(2 * REPEATS_MAX):
@@ -156,10 +127,8 @@ def test_an_incumbent_that_asks_gets_its_epoch_again(step):
     [
         (41, 0, 42),
         (0, 41, 42),  # world has restarted, cloud has not
-        (50, 41, 51),
         (EPOCH_MAX, 0, 1),
         (0, EPOCH_MAX, 1),
-        (5, EPOCH_MAX, 6),  # behind, by the shorter way round
     ],
 )
 def test_epochs_rise_through_restarts_of_world(step, last, known, epoch):
@@ -191,19 +160,14 @@ def test_an_incumbent_with_the_newest_key_gets_a_new_epoch(step):
     assert step.world.epoch_key == NEW
 
 
-@pytest.mark.parametrize("heard", [(), (2,)])
-def test_a_cloud_without_the_key_of_its_epoch_gets_a_new_one(step, heard):
+def test_a_cloud_without_the_key_of_its_epoch_gets_a_new_one(step):
     """Cloud's key file was restored to an older version, world's was not."""
     step.world.ring.keys = KeySet(NEW, KEY)
     assert step.receive_hello().opened
-    told = []
-    for n in range(REPEATS_MAX + len(heard) * 2 + 2):
-        if n in heard:
-            step.door.hear(step.now_ns)
-        answer = step.receive_hello(key=KEY)
-        told.append((answer.opened, signed_by(KEY, answer)))
-    repeated = REPEATS_MAX + 2 * len(heard)
-    assert told == [(False, False)] * repeated + [(True, True), (False, True)]
+    answers = [step.receive_hello(key=KEY) for _ in range(REPEATS_MAX + 2)]
+    opened = [False] * REPEATS_MAX + [True, False]
+    assert [answer.opened for answer in answers] == opened
+    assert [signed_by(KEY, answer) for answer in answers] == [False] * REPEATS_MAX + [True, True]
 
 
 @pytest.mark.promise("old-keys-end")

@@ -37,27 +37,13 @@ def test_an_end_opens_what_the_other_one_sends(secret):
     cloud.seal(Kind.COMMAND, BODY)
     data, hello = cloud.seal(Kind.COMMAND, BODY), cloud.greet(Kind.HELLO, HELLO)
     assert world.open(data) == (Kind.COMMAND, 1, 1, BODY)
-    assert len(data) == codec.SIZES[Kind.COMMAND]
     assert refuses(cloud, data, "direction")
     assert world.open(hello) == (Kind.HELLO, NO_EPOCH, 0, HELLO)
-    assert refuses(world, hello[:-1] + bytes([hello[-1] ^ 1]))
     assert refuses(world, cloud.greet(Kind.HELLO, HELLO, NEW))
+    if secret:
+        assert refuses(world, pair(secret=None)[1].seal(Kind.COMMAND, BODY)), "it is not sealed"
     world.begin(2)
     assert refuses(world, data, "old_epoch")
-
-
-def test_a_sealed_end_opens_no_unsealed_datagram():
-    assert refuses(pair()[0], pair(secret=None)[1].seal(Kind.COMMAND, BODY))
-
-
-def test_a_malformed_datagram_costs_no_cryptography(monkeypatch):
-    world, cloud = pair()
-    data = cloud.seal(Kind.COMMAND, BODY)
-    monkeypatch.setattr(world, "_opening", None)
-    monkeypatch.setattr(world, "_open_greeting", None)
-    sizes = set(range(codec.DATAGRAM_MAX + 2)) - {len(data)}
-    assert all(refuses(world, data[:size].ljust(size, b"x"), "malformed") for size in sizes)
-    assert refuses(world, bytes([data[0] ^ 1]) + data[1:], "version")
 
 
 def test_without_a_session_only_greetings_are_opened():
@@ -71,55 +57,29 @@ def test_without_a_session_only_greetings_are_opened():
         cloud.begin(1)
 
 
-@pytest.mark.parametrize(
-    ("key", "epoch", "nonces"),
-    [
-        (NEW, 1, NONCES),
-        (OLD, 2, NONCES),
-        (OLD, 1, b"x" * 16 + NONCES[16:]),
-        (OLD, 1, NONCES[:16] + b"x" * 16),
-    ],
-)
-def test_keys_depend_on_key_epoch_and_both_nonces(key, epoch, nonces):
+def test_keys_depend_on_key_epoch_and_both_nonces():
     world, _ = pair()
-    cloud = Session(Direction.DOWNLINK, KeyRing(KeySet(key)))
-    cloud.begin(epoch, nonces)
-    cloud.epoch = 1  # as a forger would write it
-    assert refuses(world, cloud.seal(Kind.COMMAND, BODY))
-
-
-def test_each_direction_has_its_own_key():
-    world, cloud = pair()
-    data = bytearray(world.seal(Kind.ALIVE, b""))
-    data[1] = Direction.DOWNLINK
-    assert refuses(world, bytes(data))
-    assert cloud.seal(Kind.ALIVE, b"")[16:] != world.seal(Kind.ALIVE, b"")[16:]
+    other = b"x" * 16
+    for key, epoch, nonces in (
+        *((NEW, 1, NONCES), (OLD, 2, NONCES)),
+        *((OLD, 1, other + NONCES[16:]), (OLD, 1, NONCES[:16] + other)),
+    ):
+        cloud = Session(Direction.DOWNLINK, KeyRing(KeySet(key)))
+        cloud.begin(epoch, nonces)
+        cloud.epoch = 1  # as a forger would write it
+        assert refuses(world, cloud.seal(Kind.COMMAND, BODY))
 
 
 def test_each_kind_has_its_own_counter_in_each_epoch():
     """So no nonce is used twice in an epoch."""
     _, cloud = pair()
     kinds = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
-    told = {
-        codec.peek(cloud.seal(kind, bytes(codec.BODY_SIZES[kind])))
-        for kind in kinds
-        for _ in range(50)
-    }
-    assert told == {(kind, 1, counter) for kind in kinds for counter in range(50)}
-    assert cloud.next_counter(Kind.COMMAND) == 50
+    sealed = [cloud.seal(kind, bytes(codec.BODY_SIZES[kind])) for kind in kinds for _ in range(9)]
+    told = {(kind, 1, counter) for kind in kinds for counter in range(9)}
+    assert set(map(codec.peek, sealed)) == told
+    assert cloud.next_counter(Kind.COMMAND) == 9
     cloud.begin(2)
     assert cloud.next_counter(Kind.COMMAND) == 0
-
-
-@pytest.mark.parametrize(
-    ("kind", "told"),
-    [(Kind.HELLO, (0, 1)), (Kind.CHALLENGE, (0, 1)), (Kind.BUSY, (0, 1)), (Kind.ACCEPT, (5, 0))],
-)
-def test_only_an_acceptance_belongs_to_an_epoch(kind, told):
-    _, session = pair()
-    session.greet(kind, b"")
-    session.begin(5)
-    assert codec.peek(session.greet(kind, b"")) == (kind, *told)
 
 
 def test_while_two_keys_are_accepted_greetings_may_have_either():

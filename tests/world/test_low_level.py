@@ -22,16 +22,13 @@ def turned(orientation, rate=ZERO):
 AT_REST = turned(UPRIGHT)
 
 
-def test_hover_carries_the_assumed_mass_with_508_rad_per_s():
+def test_proportional_and_integral_force_carry_the_mass_and_oppose_the_error():
     # 10.3005 / 4 = 2.575125 N; / 9.9865e-6 = 257860.6; root 507.80.
-    assert LowLevel().force(ZERO, ZERO) == pytest.approx((0, 0, WEIGHT))
     assert LowLevel().update(AT_REST, ZERO) == pytest.approx((507.80,) * 4, abs=0.005)
-
-
-def test_proportional_and_integral_force_oppose_the_error():
     # e = v - v_ref = (.1, -.1, .1): P = 4, 4, 10 times; the integral after 2 ms is .0002.
     force = LowLevel().force((0.1, 0.1, 0.3), (0.0, 0.2, 0.2))
     assert force == pytest.approx((-0.4002, 0.4002, WEIGHT - 1.0005))
+    assert LowLevel(dt=0.01).force((0.1, 0.0, 0.0), ZERO)[0] == pytest.approx(-0.401)
 
 
 def test_the_derivative_is_that_of_the_error():
@@ -41,43 +38,19 @@ def test_the_derivative_is_that_of_the_error():
     assert low_level.force((0.1, 0.1, 0.1), (0.2, 0.0, 0.1)) == pytest.approx((15, 0, WEIGHT + 25))
 
 
-@pytest.mark.parametrize(("limit", "force"), [(0.10, 0.1), (0.30, 0.3)])
-def test_the_integral_force_in_x_and_y_is_limited(limit, force):
-    low_level = LowLevel(integral_limit_xy=limit)
+def test_the_integral_force_in_x_and_y_is_limited():
+    low_level = LowLevel(integral_limit_xy=0.3)
     for _ in range(1000):  # 2 s of 1 m/s would integrate to 2 m
         low_level.force((-1.0, 1.0, -1.0), ZERO)
     low_level.force(ZERO, ZERO)
-    assert low_level.force(ZERO, ZERO) == pytest.approx((force, -force, WEIGHT + 2.5 * 0.40))
+    assert low_level.force(ZERO, ZERO) == pytest.approx((0.3, -0.3, WEIGHT + 2.5 * 0.40))
 
 
-def test_reset_forgets_integral_and_last_error():
-    low_level = LowLevel()
-    fresh = low_level.update(AT_REST, (0.3, 0.2, 0.1))
-    assert low_level.update(AT_REST, (0.5, 0.5, 0.5)) != fresh
-    low_level.reset()
-    assert low_level.update(AT_REST, (0.3, 0.2, 0.1)) == fresh
-
-
-@pytest.mark.parametrize(("axis", "gain"), [((1, 0, 0), 1.0), ((0, 1, 0), 1.0), ((0, 0, 1), 0.035)])
-def test_attitude_error_is_the_sine_of_the_angle(axis, gain):
-    # Rolled, pitched or yawed by 20 deg while the force is straight up: e_R = sin 20 deg.
-    half = radians(10.0)
-    tilted = (cos(half), *(sin(half) * a for a in axis))
-    thrust, *torque = attitude((0.0, 0.0, 10.0), turned(tilted))
-    assert torque == pytest.approx([-gain * sin(radians(20.0)) * a for a in axis])
-    assert thrust == pytest.approx(10.0 * (1.0 if axis[2] else cos(radians(20.0))))
-
-
-def test_a_forward_force_pitches_the_nose_down():
+def test_a_forward_force_pitches_the_nose_down_and_rates_are_damped():
     # Wanted tilt atan(3/4) about +y, so e_R = -sin = -.6; thrust is the force's part along z.
-    thrust, *torque = attitude((3.0, 0.0, 4.0), AT_REST)
-    assert torque == pytest.approx([0, 0.6, 0])
-    assert thrust == pytest.approx(4.0)
-
-
-def test_rates_are_damped():
-    _, *torque = attitude((0.0, 0.0, 10.0), turned(UPRIGHT, (1.0, 2.0, 3.0)))
-    assert torque == pytest.approx([-0.22, -0.44, -0.03])
+    assert attitude((3.0, 0.0, 4.0), AT_REST) == pytest.approx((4.0, 0, 0.6, 0))
+    spinning = turned(UPRIGHT, (1.0, 2.0, 3.0))
+    assert attitude((0.0, 0.0, 10.0), spinning) == pytest.approx((10.0, -0.22, -0.44, -0.03))
 
 
 unit = st.floats(-1.0, 1.0)
@@ -103,7 +76,7 @@ def test_attitude_is_the_matrix_formula(force, quaternion):
     assert torque == pytest.approx([-error[2, 1], -error[0, 2], -0.035 * error[1, 0]], abs=1e-9)
 
 
-@pytest.mark.parametrize("yaw", [18.0, -18.0, 60.0, 90.0, 135.0, 180.0, -100.0])
+@pytest.mark.parametrize("yaw", [18.0, -60.0, 135.0, 180.0])
 def test_after_a_hit_the_turned_robot_tilts_the_right_way(yaw):
     """In the world frame the torque turns the thrust towards the force: e_z x z_d."""
     half = radians(yaw) / 2
@@ -114,21 +87,17 @@ def test_after_a_hit_the_turned_robot_tilts_the_right_way(yaw):
 
 
 def test_while_braking_the_integral_is_frozen():
-    law = LowLevel()
+    law, fresh = LowLevel(), LowLevel()
     moving = AT_REST._replace(velocity=(1.0, 0.0, 0.0))
     for _ in range(50):
         law.brake(moving, ZERO)
-    for _ in range(50):
-        fresh = LowLevel()
-        fresh.brake(moving, ZERO)
+    fresh.brake(moving, ZERO)
     assert law.brake(moving, ZERO) == fresh.brake(moving, ZERO)
 
 
-@pytest.mark.parametrize("force", [ZERO, (5.0, 0.0, 0.0), (0.0, 0.0, -5.0)])
+@pytest.mark.parametrize("force", [ZERO, (5.0, 0.0, 0.0)])
 def test_no_force_leaves_the_attitude_undefined(force):
-    thrust, *torque = attitude(force, AT_REST)
-    assert isfinite(thrust)
-    assert all(isfinite(t) for t in torque)
+    assert all(map(isfinite, attitude(force, AT_REST)))
 
 
 small = st.floats(-0.1, 0.1)
@@ -148,7 +117,3 @@ def test_allocation_gives_thrust_and_torque(thrust, roll, pitch, yaw):
 @pytest.mark.parametrize(("thrust", "speed"), [(-5.0, 0.0), (0.0, 0.0), (200.0, 1838.0)])
 def test_rotor_speeds_stay_within_their_range(thrust, speed):
     assert allocate((thrust, *ZERO)) == (speed,) * 4
-
-
-def test_a_slower_loop_integrates_over_its_own_period():
-    assert LowLevel(dt=0.01).force((0.1, 0.0, 0.0), ZERO)[0] == pytest.approx(-0.401)

@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from math import pi, sin, tan
+from math import pi, tan
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,7 +16,6 @@ from cloudrc.world.simulator import Simulator
 
 ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
 SCENES = sorted(path.stem for path in (FOLDER / "scenes").glob("*.xml"))
-BASE = 1  # the only moving body after the static ones are fused
 
 
 @pytest.fixture(scope="module")
@@ -34,94 +33,26 @@ def facts(scene):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    model = compile_model(robot, scene)
-    assert model.opt.timestep == 0.002
-    assert model.opt.gravity.tolist() == [0.0, 0.0, -9.8066]
-    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert compile_model(robot, scene).opt.timestep == 0.002
     assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
 
 
-def test_mass_centre_and_inertia_are_the_sum_of_the_parts(pipes):
-    def rod(radius, length):  # across and along its axis, 10 g
-        return 0.01 * (3 * radius**2 + length**2) / 12, 0.01 * radius**2 / 2
-
-    across, along = rod(0.01, 0.4)
-    flat, spin = rod(0.128, 0.005)
-    parts = [
-        (1.0, (0, 0, 0), (0.01, 0.01, 0.02)),
-        (0.01, (0, 0, 0.12), (1.825e-5, 1.825e-5, 1.25e-5)),
-        (0.01, (0.2, 0, 0.17), (along, across, across)),
-        *(
-            (0.01, (x, y, 0.05), (flat, flat, spin))
-            for x, y in [(0.21, 0), (0, 0.21), (-0.21, 0), (0, -0.21)]
-        ),
-    ]
-    mass = sum(m for m, _, _ in parts)
-    centre = sum(m * np.array(r) for m, r, _ in parts) / mass
-    inertia = np.zeros((3, 3))
-    for m, r, diagonal in parts:
-        d = np.array(r) - centre
-        inertia += np.diag(diagonal) + m * (d @ d * np.eye(3) - np.outer(d, d))
-
-    assert pipes.body_mass[BASE] == pytest.approx(mass) == pytest.approx(1.06)
-    assert pipes.body_ipos[BASE] == pytest.approx(centre, abs=1e-9)
-    rotation = np.empty(9)
-    mujoco.mju_quat2Mat(rotation, pipes.body_iquat[BASE])
-    axes = rotation.reshape(3, 3)
-    assert axes @ np.diag(pipes.body_inertia[BASE]) @ axes.T == pytest.approx(inertia, abs=1e-9)
-
-
-def test_readers_without_mujoco_see_what_is_compiled(pipes):
-    told = facts("pipes")
-    assert list(told) == ["pipe_1", "pipe_2", "pipe_3", "board"]
-    for name, numbers in told.items():
-        assert pipes.numeric(name).data.tolist() == numbers
-    x, y_min, y_max, z_min, z_max = told["board"]
-    assert (x, y_min, y_max, z_min, z_max) == (8.535, -6.82, -6.02, 0.025, 1.225)
-    geoms = [pipes.geom(number) for number in range(pipes.ngeom)]
-    (board,) = [geom for geom in geoms if geom.name.startswith("board/")]
-    assert (board.pos - board.size).tolist() == pytest.approx([x, y_min, z_min])
-    assert (board.pos + board.size)[1:].tolist() == pytest.approx([y_max, z_max])
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("pipe_1", (-1, 0, 0.8, 0, -1, 0)),
-        ("pipe_2", (0.96, -4.61, 0.8, sin(0.8), -sin(pi / 2 - 0.8), 0)),
-        ("pipe_3", (5.66, -6.42, 0.8, sin(1.57), -sin(pi / 2 - 1.57), 0)),
-    ],
-)
-def test_staves_are_tangent_to_the_pipe(pipes, name, expected):
+@pytest.mark.parametrize("name", ["pipe_1", "pipe_2", "pipe_3"])
+def test_staves_are_tangent_to_the_pipe(pipes, name):
     numbers = facts("pipes")[name]
-    assert numbers == pytest.approx((*expected, 5.0, 0.662, 0.700), abs=1e-9)
     centre, axis = np.array(numbers[:3]), np.array(numbers[3:6])
     data = mujoco.MjData(pipes)
     mujoco.mj_kinematics(pipes, data)
     staves = [i for i in range(pipes.ngeom) if pipes.geom(i).name.startswith(f"{name}/")]
     assert len(staves) == 32
-    directions = []
     for stave in staves:
         out = data.geom_xpos[stave] - centre
         frame = data.geom_xmat[stave].reshape(3, 3)
-        thickness, width, length = pipes.geom_size[stave]
         assert out @ axis == pytest.approx(0, abs=1e-9)
         assert abs(frame[:, 2] @ axis) == pytest.approx(1)
-        assert frame[:, 0] @ out == pytest.approx(np.linalg.norm(out))
-        assert np.linalg.norm(out) - thickness == pytest.approx(0.662)
-        assert np.linalg.norm(out) + thickness == pytest.approx(0.700)
-        assert width == pytest.approx(0.700 * tan(pi / 32), abs=1e-4)
-        assert length == 2.5
-        directions.append(out / np.linalg.norm(out))
-    assert np.sum(directions, axis=0) == pytest.approx([0, 0, 0], abs=1e-9)
-
-
-def touched_at(scene):
-    """Return the bodies that the robot touches at its spawn, without the floor."""
-    simulator = Simulator("pelican", scene)
-    simulator.step(STOPPED)
-    return {touch.body for touch in simulator.take_contacts()}
+        assert frame[:, 0] @ out == pytest.approx(0.681)  # the middle of the wall
+        assert pipes.geom_size[stave] == pytest.approx((0.019, 0.7 * tan(pi / 32), 2.5), abs=1e-4)
+    assert sum(data.geom_xpos[staves] - centre) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -130,135 +61,71 @@ def touched_at(scene):
         ((0.0, 0.0, 0.1), set()),
         # The rear rotor's rim reaches x = -.338; pipe 1's outside is at -1 + .7 = -.3.
         ((0.0, 0.0, 0.75), {"pipe_1"}),
-        *(((0.2, 0.0, height), set()) for height in (0.3, 0.5, 0.75, 1.0)),
+        ((0.2, 0.0, 0.75), set()),
         ((8.134, -6.42, 0.7), set()),  # the tip meets the board with the base at 8.135
         ((8.136, -6.42, 0.7), {"board"}),
     ],
 )
 def test_what_the_robot_touches(scene_at, place, touched):
-    assert touched_at(scene_at(*place)) == touched
+    simulator = Simulator("pelican", scene_at(*place))
+    simulator.step(STOPPED)
+    assert {touch.body for touch in simulator.take_contacts()} == touched
 
 
-def test_a_contact_has_the_stiffness_and_friction_of_the_scene(scene_at):
-    contact = Simulator("pelican", scene_at(8.136, -6.42, 0.7))._data.contact
-    assert contact.solref[0].tolist() == [0.005, 1.0]
-    assert contact.friction[0, 0] == 0.6
-
-
-GOOD = (FOLDER / "robots" / "pelican.xml").read_text()
+SHIPPED = {"robots": "pelican", "scenes": "empty"}
 
 
 @pytest.mark.parametrize(
-    ("robot", "message"),
+    ("kind", "old", "new", "message"),
     [
-        (GOOD.replace("</mujoco>", ""), "does not compile"),
-        (GOOD.replace('size=".05 .05 .10"', 'size=".05 nan .10"'), "does not compile"),
-        (GOOD.replace('name="rotor_left" site', 'name="rotor_5" site'), "needs the actuators"),
-        (GOOD.replace('touch name="tip"', 'touch name="hand"'), "needs a sensor named tip"),
-        (GOOD.replace('<freejoint name="base"/>', ""), "freejoint"),
+        ("robots", 'size=".05 .05 .10"', 'size=".05 nan .10"', "does not compile"),
+        ("robots", 'name="rotor_left" site', 'name="rotor_5" site', "needs the actuators"),
+        ("robots", '<freejoint name="base"/>', "", "freejoint"),
+        # What the controller is not made for:
+        ("robots", 'mass="1.0"', 'mass="1.265"', r"mass .kg. is 1.325, not 1.05 \+- 0.1"),
+        ("robots", ".01 .01 .02", ".02 .01 .02", "inertia about x .kg m.2. is 0.0215"),
+        ("robots", '"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "left gear"),
+        ("robots", 'ctrllimited="false"', 'ctrlrange="0 13"', "end .N. is 13, not at least 33.7"),
+        ("robots", 'ctrllimited="false"', 'ctrlrange="1 40"', "begin .N. is 1, not 0 or less"),
+        ("robots", 'ctrllimited="false"', 'dyntype="filter" dynprm="1"', "dyntype is 2, not 0"),
+        ("robots", 'size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip, x .m. is 0.3, not"),
+        ("scenes", 'name="spawn"', 'name="start"', "needs a frame named spawn"),
+        ("scenes", '<body name="floor">', '<body><freejoint/><geom size="1"/></body>'
+                   '<body name="floor">', "nothing else may move"),
+        ("scenes", '<body name="floor">', "<body>", "needs a body named floor"),
+        ("scenes", "-9.8066", "-1.62", r"gravity .m/s.2. is 1.62, not 9.81"),
     ],
-)
-def test_a_robot_that_cannot_fly_is_refused(tmp_path, monkeypatch, robot, message):
+)  # fmt: skip
+def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, old, new, message):
     monkeypatch.chdir(tmp_path)
-    path = tmp_path / "robot.xml"
-    path.write_text(robot)
-    with pytest.raises(BadInputError, match=message) as error:
-        compile_model(str(path), "empty")
-    assert str(path) in str(error.value)
+    path, good = tmp_path / "mine.xml", (FOLDER / kind / f"{SHIPPED[kind]}.xml").read_text()
+    assert old in good
+    path.write_text(good.replace(old, new))
+    with pytest.raises(BadInputError, match=f"mine.xml[^\n]*{message}") as error:
+        compile_model(*(SHIPPED | {kind: str(path)}).values())
     assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('mass="1.0"', 'mass="1.265"', r"mass .kg. is 1.325, not 1.05 \+- 0.1"),
-        (".01 .01 .02", ".02 .01 .02", "inertia about x .kg m.2. is 0.0215"),
-        ('inertial pos="0 0 0"', 'inertial pos="0 .03 0"', "centre of mass, y .m. is 0.028"),
-        ("<freejoint", "<joint type='free' damping='.1'", "damping of the base is 0.1, not 0"),
-        ('pos=".21 0 .05"', 'pos=".15 .15 .05"', "rotor_front place, x .m. is 0.15, not 0.21"),
-        ('"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "rotor_left gear"),
-        ('gear="0 0 1 0 0 .016"', 'gear="0 0 1 0 0 .02"', "torque about z .m. is 0.02, not 0.016"),
-        ('gear="0 0 1 0 0 -.016"', 'gear="0 0 1 0 0 .016"', "is 0.016, not -0.016"),
-        ('gear="0 0 1 0 0 .016"', 'gear="0 0 2 0 0 .016"', "thrust along z is 2, not 1"),
-        ('ctrllimited="false"', 'ctrlrange="0 13"', "ctrlrange, end .N. is 13, not at least 33.7"),
-        ('ctrllimited="false"', 'forcerange="1 40"', "forcerange, begin .N. is 1, not 0 or less"),
-        ('ctrllimited="false"', 'gainprm="2"', "rotor_front gain is 2, not 1"),
-        ('ctrllimited="false"', 'dyntype="filter" dynprm="1"', "nothing else|dyntype is 2, not 0"),
-        ('size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip, x .m. is 0.3, not 0.4"),
-    ],
-)
-def test_what_the_controller_is_not_made_for_is_refused_by_name(tmp_path, old, new, message):
-    path = tmp_path / "robot.xml"
-    assert old in GOOD
-    path.write_text(GOOD.replace(old, new))
-    with pytest.raises(BadInputError, match=f"robot.xml: [^\n]*{message}"):
-        compile_model(str(path), "empty")
-
-
-SCENE = (FOLDER / "scenes" / "empty.xml").read_text()
-
-
-@pytest.mark.parametrize(
-    ("scene", "message"),
-    [
-        (SCENE.replace('name="spawn"', 'name="start"'), "needs a frame named spawn"),
-        (SCENE.replace('timestep=".002"', 'timestep=".01"'), "timestep is 0.01, not 0.002"),
-        (SCENE.replace('<body name="floor">', '<body><freejoint/><geom size="1"/></body>'
-                       '<body name="floor">'), "nothing else may move"),
-        (SCENE.replace('<body name="floor">', "<body>"), "needs a body named floor"),
-        (SCENE.replace("-9.8066", "-1.62"), r"gravity .m/s.2. is 1.62, not 9.81"),
-    ],
-)  # fmt: skip
-def test_a_scene_that_cannot_be_flown_in_is_refused(tmp_path, scene, message):
-    path = tmp_path / "scene.xml"
-    path.write_text(scene)
-    with pytest.raises(BadInputError, match=message) as error:
-        compile_model("pelican", str(path))
-    assert str(path) in str(error.value)
-
-
 def test_an_unknown_name_lists_the_available_ones():
-    for robot, scene, message in (
-        ("pelikan", "pipes", r"no robot named 'pelikan'; available: pelican"),
-        ("pelican", "tubes", r"no scene named 'tubes'; available: empty, pipes"),
-        ("pelican", "/nowhere/scene.xml", "no scene named"),
-    ):
-        with pytest.raises(BadInputError, match=message):
-            compile_model(robot, scene)
+    with pytest.raises(BadInputError, match=r"no robot named 'pelikan'; available: pelican"):
+        compile_model("pelikan", "pipes")
 
 
-FLIGHT = """
-from cloudrc.world.simulator import Simulator
-simulator = Simulator("pelican", "pipes")
-for _ in range(100):
-    simulator.step((600.0,) * 4)
-assert simulator.readings.position[2] > 0.1
-"""
+FLIES = "from cloudrc.world.simulator import Simulator; Simulator('pelican', 'pipes')"
 
 
-def test_it_flies_without_the_requested_gl(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", FLIGHT],
-        env={**os.environ, "MUJOCO_GL": "egl", "PYTHONPATH": os.pathsep.join(sys.path)},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("wanted", [None, "disable", "egl"])
-def test_the_variable_is_restored(monkeypatch, wanted):
-    if wanted is None:
-        monkeypatch.delenv("MUJOCO_GL", raising=False)
-    else:
+@pytest.mark.parametrize("wanted", [None, "egl"])
+def test_it_is_imported_without_gl(monkeypatch, wanted):
+    """The variable is restored for a child process that renders."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    if wanted is not None:
         monkeypatch.setenv("MUJOCO_GL", wanted)
     import_mujoco()
     assert os.environ.get("MUJOCO_GL") == wanted
+    command = [sys.executable, "-c", FLIES]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_without_the_package_the_extra_is_named(monkeypatch):

@@ -32,12 +32,10 @@ LIMITS = Limits(fence.LOW, fence.HIGH)
 
 
 def command(velocity=(1.0, 0.0, 0.0), basis_ns=0, yaw_rate=0.0):
-    """Return a command that was computed from odometry of `basis_ns`."""
     return Command(0, basis_ns, 0, velocity, yaw_rate)
 
 
 def sensed(position=HERE, velocity=ZERO):
-    """Return the readings of an upright robot."""
     return Readings.of((*position, *UPRIGHT), (*velocity, *ZERO))
 
 
@@ -95,20 +93,17 @@ def bring_down(guard, now_ns):
 
 
 def stopped(guard, now_ns=0):
-    """Return the guard after an emergency stop."""
     guard.stop(now_ns)
     assert guard.state is GuardState.ESTOP
     return guard
 
 
 def states(guard):
-    """Return the states entered since the last call."""
     return [change.state for change in guard.take_changes()]
 
 
 @pytest.fixture(scope="module")
 def simulator():
-    """Return the robot in the empty scene."""
     return Simulator("pelican", "empty")
 
 
@@ -245,24 +240,6 @@ class Run:
         solver = z3.Solver()
         solver.add(*self.path)
         return solver.check() != z3.unsat
-
-
-class AtLeast:
-    """Any float from `bound` > 0 on, infinity included; z3 takes half a minute for their product.
-
-    A correctly rounded sum or product of such floats is monotonic: the result is at least that of
-    the bounds, and never NaN. A factor that is zero, negative or NaN fails the assertion.
-    """
-
-    def __init__(self, bound):
-        assert bound > 0.0
-        self.bound = bound
-
-    def __add__(self, other):
-        return AtLeast(self.bound + other.bound)
-
-    def __mul__(self, other):
-        return AtLeast(self.bound * (other.bound if isinstance(other, AtLeast) else other))
 
 
 def root(x, top=LARGEST):

@@ -29,13 +29,9 @@ ALLOWED = {
     "session": set(),
     "turn_over": {(state, ESTOP) for state in (TRACK, HOLD, LAND)},
     "time": {
-        (TRACK, HOLD),
-        (GROUND, LAND),
-        (HOLD, GROUND),
-        (HOLD, LAND),
-        (LAND, LAND),
-        (LAND, HOLD),
-        (LAND, GROUND),
+        *((TRACK, HOLD), (GROUND, LAND)),
+        *((HOLD, state) for state in (GROUND, LAND)),
+        *((LAND, state) for state in (LAND, HOLD, GROUND)),
     },
 }
 

@@ -8,7 +8,7 @@ from cloudrc.world.guard import hold
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
 from cloudrc.world.guard.state import Guard
-from tests.world.guard.conftest import LIMITS, AtLeast, everywhere, root
+from tests.world.guard.conftest import LIMITS, everywhere, root
 
 LATEST = AGE_MAX_NS * 1e-9 + rules.REACTION
 """Time until the robot brakes [s] with the largest command age."""
@@ -37,23 +37,16 @@ def test_a_command_with_one_value_out_of_range_is_rejected():
     assert everywhere(check) == 5
 
 
-def test_clamp_of_any_value_is_in_its_interval():
+def test_clamp_keeps_a_value_inside_its_interval_and_moves_any_other_into_it():
     def check(run):
         value, low, high = (run.fresh(name) for name in ("value", "low", "high"))
         run.learn(z3.And(is_finite(low.term), is_finite(high.term), low.term <= high.term))
-        answer = rules.clamp(value, low, high)
-        run.prove(z3.And(answer.term >= low.term, answer.term <= high.term))
+        answer = rules.clamp(value, low, high).term
+        run.prove(z3.And(answer >= low.term, answer <= high.term))
+        inside = z3.And(value.term > low.term, value.term < high.term)
+        run.prove(z3.Implies(inside, z3.fpEQ(answer, value.term)))
 
     assert everywhere(check) == 3
-
-
-def test_clamp_keeps_a_value_inside_its_interval():
-    def check(run):
-        value = run.fresh("value")
-        run.learn(z3.And(value.term > -1.0, value.term < 1.0))
-        run.prove(z3.fpEQ(lift(run, rules.clamp(value, -1.0, 1.0)).term, value.term))
-
-    everywhere(check)
 
 
 @pytest.mark.parametrize("caution", [rules.FENCE_REACTION, rules.REACTION])
@@ -114,12 +107,6 @@ def test_stopping_distance_is_a_number_and_never_negative():
         run.prove(rules.stopping_distance(speed, reaction).term >= 0.0)
 
     assert everywhere(check) == 1
-
-
-def test_above_7_mps_every_stopping_distance_is_too_long():
-    """A distance that overflows is infinite, which is too long as well."""
-    way = rules.stopping_distance(AtLeast(7.0), AtLeast(rules.REACTION))
-    assert way.bound > rules.STOPPING_DISTANCE + 1e-4
 
 
 def lift(run, value):

@@ -1,15 +1,16 @@
-"""How the guard is armed, limits commands, enters and leaves HOLD, lands, and stops."""
+"""How the guard is armed, limits commands, holds, lands, stops, and takes off."""
 
 from dataclasses import replace
-from itertools import pairwise
-from math import dist, hypot, inf, nan, nextafter
+from math import cos, dist, inf, nan, nextafter, radians, sin
 
 import pytest
 
+from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Cause, GuardState
-from cloudrc.world.guard.hold import BRAKE_MAX, HOLD_SPEED_MAX, LAND_SPEED, STILL_SPEED
-from cloudrc.world.guard.limits import COMMAND_MAX
+from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
+from cloudrc.world.guard.limits import COMMAND_MAX, RECHECK_NS
 from cloudrc.world.guard.state import Guard
+from cloudrc.world.readings import Readings
 from tests.world.guard.conftest import (
     DT,
     HERE,
@@ -25,15 +26,15 @@ from tests.world.guard.conftest import (
     landing,
     run,
     sensed,
+    states,
     stopped,
     tracking,
 )
-from tests.world.guard.test_arithmetic import SPECIAL
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-BEYOND = [value for value in (*SPECIAL, 1e308, -1e308) if abs(value) > COMMAND_MAX]
-LOW, SINKS = (1.0, 2.0, 0.1), (0.0, 0.0, -0.5)
+LOW, NEAR, SINKS = (1.0, 2.0, 0.1), (1.0, 2.0, FLOOR_MARGIN), (0.0, 0.0, -LAND_SPEED)
 BAD = command((nan, 0.0, 0.0))
+DOWN = "touched down, rotors stopped"
 
 
 def told(guard):
@@ -58,24 +59,30 @@ def test_fresh_commands_alone_never_arm():
     guard.accept_command(command(basis_ns=12 * MS), 12 * MS)
     assert told(guard) == (12 * MS, TRACK, "fresh command")
     guard.start_mission(20 * MS)
+    guard.acknowledge(20 * MS)
     run(guard, 20 * MS, 30 * MS)
     assert guard.state is TRACK, "a second start within a mission forgets nothing"
 
 
 def test_put_on_the_ground_nothing_is_armed_or_remembered():
     guard = tracking()
-    run(guard, 0, 10 * MS)
-    guard.put_on_ground(10 * MS, "mission starts from spawn")
-    assert told(guard) == (10 * MS, GROUND, "mission starts from spawn")
+    run(guard, 0, 300 * MS)
+    now_ns = feed(guard, 300 * MS, 80)
+    guard.put_on_ground(now_ns, "mission starts from spawn")
+    assert told(guard) == (now_ns, GROUND, "mission starts from spawn")
     assert (guard.cause, guard.armed, guard.reference) == (Cause.SPAWN, False, ZERO)
-    guard.accept_command(command(basis_ns=10 * MS), 10 * MS)
+    guard.accept_command(command(basis_ns=now_ns), now_ns)
     assert guard.state is GROUND
+    guard.start_mission(now_ns)
+    feed(guard, now_ns, 1, (0.0, 0.0, 1.0))
+    assert guard.state is TRACK, "the last TRACK and HOLD do not count"
+    assert guard.reference[2] == pytest.approx(12.0 * 0.01), "nor does their ramp"
 
 
 # Limits of a command
 
 
-@pytest.mark.parametrize("bad", [*BEYOND, nan, inf, -inf, nextafter(COMMAND_MAX, inf), -1000.1])
+@pytest.mark.parametrize("bad", [nan, inf, nextafter(COMMAND_MAX, inf), -1000.1])
 @pytest.mark.parametrize("axis", range(4))
 def test_a_command_with_an_absurd_value_is_rejected(bad, axis):
     guard = tracking((0.5, 0.0, 0.0))
@@ -97,40 +104,20 @@ def test_a_command_is_fresh_while_its_basis_is(age_ns, answer):
     assert armed().accept_command(command(basis_ns=now_ns - age_ns), now_ns) == answer
 
 
-def test_the_speed_is_capped_and_keeps_its_direction():
-    guard = tracking((30.0, 40.0, 0.0))
-    feed(guard, 10 * MS, 60, (30.0, 40.0, 0.0), position=(1.0, -3.0, 1.0))
-    assert guard.reference[1] / guard.reference[0] == pytest.approx(4 / 3)
-    assert 5.99 < hypot(*guard.reference) <= 6.0
-    assert guard.counts["limited_speed"] == 61
-
-
 @pytest.mark.parametrize(
     ("asked", "allowed"), [(0.4, 0.4), (7.0, 1.0), (-7.0, -1.0), (COMMAND_MAX, 1.0)]
 )
-def test_the_yaw_rate_is_capped(asked, allowed):
+def test_speed_and_yaw_rate_are_capped(asked, allowed):
     guard = armed()
     for _ in range(2):
-        assert guard.accept_command(command((asked, asked, asked), yaw_rate=asked), 0) is None
+        assert guard.accept_command(command((asked,) * 3, yaw_rate=asked), 0) is None
     assert guard.yaw_rate == allowed
     assert guard.counts["limited_yaw_rate"] == 2 * (asked != allowed)
     assert guard.counts["limited_speed"] == 2 * (abs(asked) > 6.0)
+    feed(guard, 0, 60, (asked, 0.0, 0.0), position=(-2.0, 0.0, 1.0))
+    assert abs(guard.reference[0]) <= 6.0
     guard.forget_commands()
     assert guard.yaw_rate == 0.0
-
-
-def test_one_command_is_slowed_more_and_more_near_the_fence():
-    guard = tracking((0.0, 2.0, 0.0))
-    feed(guard, 0, 30, (0.0, 2.0, 0.0), position=(1.0, 0.0, 1.3))
-    assert (guard.reference, guard.counts) == ((0.0, 2.0, 0.0), {})
-    flown = []
-    for k, y in enumerate((3.0, 4.0, 4.5, 5.0, 5.4)):  # no faster than a robot can move
-        start_ns = (300 + 40 * k) * MS
-        flown.append(run(guard, start_ns, start_ns + 2 * MS, (1.0, y, 1.3))[0][1])
-    assert flown[0] == 2.0
-    assert flown[1:] == sorted(flown[1:], reverse=True)
-    assert flown[-1] <= 0.0
-    assert guard.counts == {"limited_fence": 4}
 
 
 def test_the_fence_changes_the_reference_within_the_cap():
@@ -143,13 +130,9 @@ def test_the_fence_changes_the_reference_within_the_cap():
         before = after
     assert before[0] > 0.2
     assert before[1] > 0.3
-
-
-def test_a_command_into_the_floor_ends_above_it():
-    guard = tracking((0.0, 0.0, -2.0))
-    lower = run(guard, 0, 200 * MS, (1.0, 2.0, 0.40))[-1][2]
-    assert 0.2 * -lower + lower * lower / 6 == pytest.approx(0.05)
-    assert run(guard, 200 * MS, 210 * MS, (1.0, 2.0, 0.34))[-1][2] == 0.0
+    assert guard.counts["limited_fence"] == 39
+    low = tracking((0.0, 0.0, -2.0))
+    assert run(low, 0, 200 * MS, (1.0, 2.0, FLOOR_MARGIN - 0.01))[-1][2] == 0.0
 
 
 # From TRACK to HOLD
@@ -162,94 +145,28 @@ def test_hold_begins_with_the_first_tick_after_the_age_limit():
     assert guard.state is TRACK
     run(guard, 252 * MS, 254 * MS)
     assert told(guard) == (252 * MS, HOLD, "command age 0.252 s above 0.250 s")
-    assert guard.cause is Cause.SILENCE
+    assert (guard.cause, guard.brakes) == (Cause.SILENCE, False)
     feed(guard, 2 * SECOND, 20)
-    assert told(guard)[1:] == (TRACK, "10 fresh commands within 0.090 s")
+    assert told(guard) == (2090 * MS, TRACK, "10 fresh commands within 0.090 s")
     assert guard.cause is Cause.COMMANDS
     guard.forget_commands()
     run(guard, 2200 * MS, 2202 * MS)
     assert told(guard) == (2200 * MS, HOLD, "new session")
 
 
-def test_hold_brakes_at_once_and_then_holds_the_position():
-    guard = tracking((1.5, 0.0, 0.0))
-    run(guard, 0, 252 * MS, velocity=(1.5, 0.0, 0.0))
-    first, *rest = run(guard, 252 * MS, 900 * MS, velocity=(1.5, 0.0, 0.0))
-    assert hypot(*first) < 1.0  # below the speed of the robot, which follows late
-    assert rest[-1] == ZERO
-    assert guard.brakes
-    run(guard, 900 * MS, 902 * MS, velocity=(0.75, 0.0, 0.0))
-    run(guard, 902 * MS, 904 * MS)
-    assert not guard.brakes
-    assert run(guard, 904 * MS, 906 * MS, (1.02, 2.0, 1.3))[0][0] < 0.0
-    far = run(guard, 906 * MS, 2 * SECOND, (3.0, 2.0, 1.3))[-1]
-    assert far == pytest.approx((-HOLD_SPEED_MAX, 0.0, 0.0))
-    assert run(guard, 2 * SECOND, 3 * SECOND, HERE, (0.0, 0.2, 0.0))[-1][1] < -0.2, "it is damped"
-
-
-def test_the_reference_brakes_from_the_robot_and_no_harder_than_its_limit():
-    guard = tracking((5.0, 0.0, 0.0))
-    run(guard, 0, 252 * MS, velocity=(0.2, 0.0, 0.0))
-    assert guard.reference[0] > 2.5
-    run(guard, 252 * MS, 254 * MS, velocity=(0.2, 0.0, 0.0))
-    assert hypot(*guard.reference) <= 0.2
-    guard = tracking((3.0, 0.0, 0.0))
-    run(guard, 0, 252 * MS, velocity=(3.0, 0.0, 0.0))
-    references = run(guard, 252 * MS, 1200 * MS, velocity=(3.0, 0.0, 0.0))
-    assert max(a[0] - b[0] for a, b in pairwise(references)) <= BRAKE_MAX * DT * (1 + 1e-9)
-
-
-def test_the_next_hold_has_a_new_hold_point():
-    guard = holding()
-    now_ns = feed(guard, 2 * SECOND, 20, (0.0, 0.0, 0.0))
-    assert guard.state is TRACK
-    elsewhere = run(guard, now_ns, now_ns + 2 * SECOND, (3.0, 2.0, 1.3))
-    assert (guard.state, set(elsewhere)) == (HOLD, {ZERO})
-
-
-def test_after_the_end_of_a_mission_it_holds_despite_commands():
-    guard = tracking()
-    guard.end_mission(10 * MS)
-    assert told(guard) == (10 * MS, HOLD, "mission ended")
-    assert guard.armed is False
-    feed(guard, 20 * MS, 300)
-    assert (guard.state, guard.changes) == (HOLD, [])
-    guard.start_mission(4 * SECOND)
-    feed(guard, 4 * SECOND, 9)
-    assert guard.state is HOLD, "the next mission leaves HOLD as any other"
-    feed(guard, 4090 * MS, 1)
-    assert guard.state is TRACK
-
-
-def test_a_low_speed_cap_holds_for_hold_and_land_too():
-    guard = tracking(limits=replace(LIMITS, speed_max=0.2))
-    run(guard, 0, 2 * SECOND)
-    fastest = max(hypot(*r) for r in run(guard, 2 * SECOND, 4 * SECOND, (5.0, -2.0, 0.4)))
-    assert fastest <= 0.2
-    bring_down(guard, 4 * SECOND)
-    down = run(guard, 4 * SECOND, 6 * SECOND, (5.0, -2.0, 0.4), (0.0, 0.0, -0.1))
-    assert max(hypot(*r) for r in down) <= 0.2
-
-
 # From HOLD to TRACK
 
 
 @pytest.mark.parametrize(
-    ("stamps_ms", "state"),
-    [
-        ([*range(9)], HOLD),
-        ([*range(10)], TRACK),
-        ([*range(9), 500], TRACK),
-        ([*range(9), 500 + 1 / MS], HOLD),
-        ([56 * k for k in range(30)], HOLD),
-    ],
+    ("count", "took_ns", "state"),
+    [(9, 0, HOLD), (10, 0, TRACK), (10, SECOND // 2, TRACK), (10, SECOND // 2 + 9, HOLD)],
 )
-def test_ten_fresh_commands_within_half_a_second_end_a_hold(stamps_ms, state):
+def test_ten_fresh_commands_within_half_a_second_end_a_hold(count, took_ns, state):
     guard = holding()
     for _ in range(30):
         assert guard.accept_command(command(basis_ns=0), 2 * SECOND - 1) == "stale"
-    for stamp_ms in stamps_ms:
-        now_ns = 2 * SECOND + round(stamp_ms * MS)
+    for k in range(count):
+        now_ns = 2 * SECOND + k * took_ns // 9
         guard.accept_command(command(basis_ns=now_ns), now_ns)
     assert guard.state is state
 
@@ -279,14 +196,6 @@ def test_from_one_hold_or_track_to_the_next_it_takes_a_second():
     assert until_track(guard, start_ns + 20 * MS) == start_ns + 1000 * MS
 
 
-def test_commands_from_before_a_hold_do_not_count():
-    guard = holding()
-    feed(guard, 2 * SECOND, 9)
-    guard.forget_commands()
-    feed(guard, 2100 * MS, 9)
-    assert guard.state is HOLD
-
-
 @pytest.mark.parametrize(("speed_max", "ramp_s"), [(6.0, 2.0), (4.5, 1.5), (1.5, 1.0)])
 def test_after_a_hold_the_ramp_lasts_until_the_cap(speed_max, ramp_s):
     """A first command of zero, or one that the reference reaches, does not end the ramp."""
@@ -301,100 +210,22 @@ def test_after_a_hold_the_ramp_lasts_until_the_cap(speed_max, ramp_s):
         assert guard.reference[0] == pytest.approx(rate * 0.01)
 
 
-def test_after_a_hold_slowing_down_has_no_ramp():
-    guard = holding()
-    now_ns = feed(guard, 2 * SECOND, 30, (1.0, 0.0, 0.0))
-    before = guard.reference[0]
-    feed(guard, now_ns, 1, ZERO)
-    assert before - guard.reference[0] == pytest.approx(12.0 * 0.01)
-
-
-def test_after_a_hold_the_return_to_the_fence_has_the_ramp():
-    """The ramp limits every change of the reference, also that of the fence."""
-    guard = holding()
-    outside = (LIMITS.inner_corners()[1][0] + 0.15, 1.0, 2.0)
-    now_ns = feed(guard, 2 * SECOND, 10, ZERO, position=outside)
-    guard.reference = ZERO
-    guard.counts.clear()
-    flown = [ZERO, *run(guard, now_ns, now_ns + 20 * MS, outside)]
-    assert guard.counts["limited_fence"] == 10
-    for before, after in pairwise(flown):
-        assert dist(before, after) == pytest.approx(3.0 * DT)
-        assert after[0] < before[0]
-
-
-def test_a_reset_to_the_ground_forgets_the_last_hold_and_its_ramp():
-    guard = holding()
-    now_ns = feed(guard, 2 * SECOND, 20)
-    guard.put_on_ground(now_ns, "from spawn")
-    guard.start_mission(now_ns)
-    feed(guard, now_ns, 1, (0.0, 0.0, 1.0))
-    assert guard.state is TRACK
-    assert guard.reference[2] == pytest.approx(12.0 * 0.01)
-
-
-@pytest.mark.parametrize(("flies", "fresh", "least"), [(True, 12, 10), (False, 1, 15)])
-def test_an_unstable_link_does_not_make_the_state_chatter(flies, fresh, least):
-    """Fresh commands just long enough to fly, then silence, repeatedly for 20 s."""
-    guard, place, now_ns = tracking(), HERE if flies else (0.0, 0.0, 0.1), 0
-    if not flies:
-        guard = armed()
-        run(guard, 0, TICK, place)
-    while now_ns < 20 * SECOND:
-        # The basis has the largest allowed age: each burst gives one tick of TRACK.
-        for _ in range(fresh):
-            guard.accept_command(command((0.0, 0.0, 1.0), now_ns - 249 * MS), now_ns)
-            run(guard, now_ns, now_ns + 10 * MS, place)
-            now_ns += 10 * MS
-        run(guard, now_ns, now_ns + 20 * MS, place)
-        now_ns += 20 * MS
-    changes = guard.take_changes()
-    for state in (TRACK, HOLD):
-        stamps = [change.stamp_ns for change in changes if change.state is state]
-        assert len(stamps) > least
-        assert min(b - a for a, b in pairwise(stamps)) >= 1 * SECOND
-
-
-def test_short_blackouts_are_over_within_a_second():
-    for silent_ms in range(260, 1000, 40):
-        guard = tracking()
-        back_ns = silent_ms * MS
-        run(guard, 0, back_ns)
-        while guard.state is HOLD:
-            back_ns = feed(guard, back_ns, 1)
-        assert back_ns <= (silent_ms + 1000) * MS
-
-
 # To LAND
 
 
-def test_a_minute_of_hold_in_a_mission_ends_in_land():
+def test_a_long_hold_in_a_mission_ends_in_land():
     """Repeated starts do not delay it."""
-    guard = holding()
-    for second in range(2, 60):
+    guard = holding(replace(LIMITS, hold_max_ns=5 * SECOND))
+    for second in range(2, 5):
         guard.start_mission(second * SECOND)
         run(guard, second * SECOND, second * SECOND + TICK)
-    run(guard, 60 * SECOND, 60_254 * MS)
+    run(guard, 5 * SECOND, 5254 * MS)
     assert guard.state is HOLD
-    run(guard, 60_254 * MS, 60_256 * MS)
-    assert told(guard) == (60_254 * MS, LAND, "held for 60 s without the cloud")
+    run(guard, 5254 * MS, 5256 * MS)
+    assert told(guard) == (5254 * MS, LAND, "held for 5 s without the cloud")
     assert (guard.cause, guard.armed) == (Cause.ALONE, False)
-    aside = run(guard, 60_256 * MS, 62 * SECOND, (1.2, 2.0, 1.0), (0.0, 0.0, -0.5))[-1]
+    aside = run(guard, 5256 * MS, 7 * SECOND, (1.2, 2.0, 1.0), (0.0, 0.0, -0.5))[-1]
     assert aside == pytest.approx((-0.16, 0.0, -LAND_SPEED)), "it keeps the hold point"
-
-
-def test_a_mission_on_the_ground_waits_a_minute_for_its_cloud():
-    """Then the state is LAND, without a touch-down."""
-    guard = armed()
-    guard.accept_command(command(basis_ns=-300 * MS), SECOND)  # a stale command does not count
-    assert run(guard, 0, 60 * SECOND + TICK)[-1] is None
-    assert (guard.state, guard.armed) == (GROUND, True)
-    assert run(guard, 60 * SECOND + TICK, 60 * SECOND + 2 * TICK) == [None]
-    assert told(guard) == (60 * SECOND + TICK, LAND, "held for 60 s without the cloud")
-    feed(guard, 61 * SECOND, 20)
-    assert (guard.state, guard.armed) == (LAND, False)
-    guard.acknowledge(62 * SECOND)
-    assert guard.state is GROUND
 
 
 def test_with_fresh_commands_it_waits_until_it_may_take_off():
@@ -410,9 +241,11 @@ def test_with_fresh_commands_it_waits_until_it_may_take_off():
 
 def test_a_hold_that_sinks_to_its_point_does_not_land():
     """It moves like a descent and stands still as if on an obstacle."""
-    guard = holding()
-    down = run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 2.2))
-    assert (down[-1], guard.state) == ((0.0, 0.0, -LAND_SPEED), HOLD)
+    guard, below = holding(), (1.0, 2.0, 2.2)
+    assert run(guard, 2 * SECOND, 4 * SECOND, below)[-1] == SINKS
+    assert guard.state is HOLD
+    stood = run(bring_down(guard, 4 * SECOND), 4 * SECOND, 5 * SECOND, below)
+    assert stood.index(None) * TICK == 400 * MS, "in LAND it does, after as long as ever"
 
 
 def test_hold_between_missions_has_no_limit():
@@ -428,7 +261,7 @@ def test_hold_between_missions_has_no_limit():
     assert guard.state is LAND
 
 
-@pytest.mark.parametrize("bad", [BAD, command((1e308, 0.0, 0.0)), command(basis_ns=1 << 60)])
+@pytest.mark.parametrize("bad", [BAD, command(basis_ns=1 << 60)])
 def test_five_impossible_commands_within_a_second_land(bad):
     guard = tracking((0.5, 0.0, 0.0))
     for k in range(5):
@@ -441,12 +274,13 @@ def test_five_impossible_commands_within_a_second_land(bad):
 
 
 def test_impossible_commands_now_and_then_only_count():
-    guard, now_ns = tracking(), 0
+    guard, now_ns, elsewhere = holding(), 2 * SECOND, (3.0, 2.0, 1.0)
     for _ in range(20):
         guard.accept_command(BAD, now_ns)
-        now_ns = feed(guard, now_ns, 26)
+        now_ns = feed(guard, now_ns, 26, ZERO, position=elsewhere)
     assert guard.state is TRACK
     bring_down(guard, now_ns)
+    assert run(guard, now_ns, now_ns + SECOND, elsewhere, SINKS)[-1] == SINKS, "where it is"
     on_ground, at_rest = armed(), tracking()
     at_rest.end_mission(0)
     for guard, state in ((on_ground, GROUND), (at_rest, HOLD)):  # nor without a mission
@@ -459,14 +293,13 @@ def test_land_sinks_slowly_and_stops_the_rotors_when_it_stands():
     guard = landing()
     cause = guard.cause
     down = run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 0.6), SINKS)
-    assert down[-1] == pytest.approx((0.0, 0.0, -LAND_SPEED), abs=0.7)
-    assert down[-1][2] == -LAND_SPEED
     assert None not in down
+    assert down[-1][2] == -LAND_SPEED
     stood = run(guard, 4 * SECOND, 5 * SECOND, LOW)
     assert stood.index(None) * TICK == 398 * MS  # it moved until 3.998 s
     assert set(stood[stood.index(None) :]) == {None}
     assert guard.reference == ZERO
-    assert told(guard) == (4398 * MS, LAND, "touched down, rotors stopped")
+    assert told(guard) == (4398 * MS, LAND, DOWN)
     assert guard.cause is cause, "why it landed"
     guard.acknowledge(5 * SECOND)
     assert told(guard) == (5 * SECOND, GROUND, "acknowledged")
@@ -481,9 +314,6 @@ def test_after_touch_down_it_may_slide_off_an_obstacle():
     guard.start_mission(6 * SECOND)
     feed(guard, 6 * SECOND, 1, position=(1.0, 2.0, 0.3))
     assert guard.state is GROUND
-    run(guard, 7 * SECOND, 8 * SECOND, LOW)
-    feed(guard, 8 * SECOND, 1, position=LOW)
-    assert guard.state is TRACK
 
 
 @pytest.mark.parametrize(
@@ -496,30 +326,48 @@ def test_a_robot_that_moves_has_not_touched_down(climb, down_ms):
     assert (stood.index(None) * TICK == down_ms * MS) if down_ms else (None not in stood)
 
 
-def test_land_from_a_fast_descent_touches_down():
-    guard = tracking((0.0, 0.0, -2.0))
-    assert run(guard, 0, 100 * MS, (1.0, 2.0, 1.0))[-1][2] == pytest.approx(-LAND_SPEED)
-    bring_down(guard, 100 * MS)
-    stood = run(guard, 100 * MS, 2 * SECOND, (1.0, 2.0, 1.0))
-    assert 400 * MS <= stood.index(None) * TICK < 1 * SECOND
-
-
-def test_a_short_stop_of_a_descent_is_no_touch_down():
+@pytest.mark.parametrize(
+    ("position", "velocity"), [(NEAR, SINKS), (HERE, (0.0, 0.0, -LAND_SPEED / 2)), (HERE, ZERO)]
+)
+def test_a_landing_acknowledged_too_low_goes_on_to_touch_down(position, velocity):
+    """A HOLD there would scrape along the ground or climb into an obstacle."""
     guard = landing()
-    run(guard, 2 * SECOND, 4 * SECOND, velocity=SINKS)
-    for k in range(10):
-        start_ns = 4 * SECOND + k * 400 * MS
-        assert None not in run(guard, start_ns, start_ns + 390 * MS)
-        assert None not in run(guard, start_ns + 390 * MS, start_ns + 400 * MS, HERE, (0, 0, -0.3))
+    run(guard, 2 * SECOND, 3 * SECOND, position, SINKS)
+    guard.acknowledge(3 * SECOND)
+    assert None not in run(guard, 3 * SECOND, 3 * SECOND + 300 * MS, position, velocity)
+    assert guard.state is LAND
+    run(guard, 3 * SECOND + 300 * MS, 5 * SECOND, position)
+    assert guard.take_changes()[-1][1:] == (GROUND, DOWN)
+    assert (guard.cause, guard.armed) == (Cause.DOWN, False)
 
 
-def test_land_from_track_descends_where_the_robot_is():
-    guard, elsewhere = holding(), (3.0, 2.0, 1.0)
-    now_ns = feed(guard, 2 * SECOND, 20, ZERO, position=elsewhere)
-    assert guard.state is TRACK
+def test_a_landing_acknowledged_in_a_climb_holds_once_it_sinks():
+    guard, now_ns = landing(), 2 * SECOND
+    guard.acknowledge(now_ns)
+    for climb in (0.5, 0.0, -0.25):
+        now_ns += 10 * MS
+        run(guard, now_ns, now_ns + 10 * MS, velocity=(0.0, 0.0, climb))
+        assert guard.state is LAND
+    run(guard, now_ns + 10 * MS, now_ns + 12 * MS, velocity=(0.0, 0.0, -0.26))
+    change = (now_ns + 10 * MS, HOLD, "acknowledged before touch-down")
+    assert guard.take_changes()[-1] == change
+    feed(guard, 3 * SECOND, 100)
+    assert guard.state is HOLD, "it waits for a new start"
+    guard.start_mission(5 * SECOND)
+    now_ns = feed(guard, 5 * SECOND, 20)
     bring_down(guard, now_ns)
-    down = run(guard, now_ns, now_ns + 1 * SECOND, elsewhere, (0.0, 0.0, -LAND_SPEED))
-    assert (guard.state, down[-1]) == (LAND, (0.0, 0.0, -LAND_SPEED))
+    run(guard, now_ns, now_ns + SECOND, velocity=SINKS)
+    assert guard.state is LAND, "the acknowledgement does not count for the next landing"
+
+
+@pytest.mark.parametrize("speed_max", [0.01, 0.2, 6.0])
+def test_slow_sinking_under_a_low_cap_is_no_touch_down(speed_max):
+    guard = landing(replace(LIMITS, speed_max=speed_max))
+    sinks = (0.0, 0.0, -0.5 * min(LAND_SPEED, 0.5 * speed_max))
+    assert None not in run(guard, 2 * SECOND, 5 * SECOND, velocity=sinks)
+    guard.acknowledge(5 * SECOND)
+    run(guard, 5 * SECOND, 5 * SECOND + TICK, velocity=[2.01 * v for v in sinks])
+    assert guard.state is HOLD, "and may be acknowledged in the air"
 
 
 # Latches
@@ -548,35 +396,102 @@ def test_the_emergency_stop_works_from_everywhere_at_once(make):
 
 
 @pytest.mark.parametrize(
-    ("position", "velocity", "cause"),
-    [
-        (LOW, ZERO, Cause.ACKNOWLEDGED),
-        (LOW, SINKS, Cause.STILL_FIRST),
-        ((9e9, 2.0, 0.1), ZERO, Cause.STILL_FIRST),
-    ],
+    ("velocity", "cause"), [(ZERO, Cause.ACKNOWLEDGED), (SINKS, Cause.STILL_FIRST)]
 )
-def test_an_acknowledgement_names_the_condition_of_a_take_off(position, velocity, cause):
+def test_an_acknowledgement_names_the_condition_of_a_take_off(velocity, cause):
     guard = stopped(tracking())
-    run(guard, 1 * SECOND, 2 * SECOND, position, velocity)
+    run(guard, 1 * SECOND, 2 * SECOND, LOW, velocity)
     guard.acknowledge(2 * SECOND)
     assert told(guard) == (2 * SECOND, GROUND, cause.words)
     assert guard.cause is cause
 
 
-def test_a_landing_that_is_acknowledged_in_the_air_holds():
-    guard = landing()
-    run(guard, 2 * SECOND, 3 * SECOND, velocity=SINKS)
-    guard.acknowledge(3 * SECOND)
-    run(guard, 3 * SECOND, 3 * SECOND + TICK, velocity=SINKS)
-    assert told(guard) == (3 * SECOND, HOLD, "acknowledged before touch-down")
-    assert run(guard, 3 * SECOND + TICK, 5 * SECOND)[-1] == ZERO
-    feed(guard, 5 * SECOND, 100)
-    assert guard.state is HOLD
+# Turned over
 
 
-@pytest.mark.parametrize("make", [lambda: Guard(LIMITS), armed, tracking, holding])
-def test_in_other_states_an_acknowledgement_does_nothing(make):
-    guard = make()
-    before = guard.state, guard.armed, len(guard.changes)
-    guard.acknowledge(2 * SECOND)
-    assert (guard.state, guard.armed, len(guard.changes)) == before
+def felt(tilt_deg=0.0):
+    """Return the readings of a robot that is tilted about x."""
+    half = radians(tilt_deg) / 2
+    return Readings.of((*HERE, cos(half), sin(half), 0.0, 0.0), (*ZERO, *ZERO))
+
+
+@pytest.mark.parametrize("make", [tracking, holding, landing])
+@pytest.mark.parametrize("tilt_deg", [79.0, -120.0])
+def test_a_robot_that_turns_over_stops_its_rotors(make, tilt_deg):
+    guard, now_ns = make(), 10 * MS if make is tracking else 2 * SECOND
+    assert guard.step(now_ns - TICK, felt(78.0), DT) is not None, "almost"
+    assert guard.step(now_ns, felt(tilt_deg), DT) is None
+    assert guard.take_changes()[-1] == (now_ns, ESTOP, Cause.OVERTURNED.words)
+    assert (guard.armed, guard.latched, guard.reference) == (False, True, ZERO)
+    assert guard.accept_command(command(basis_ns=now_ns), now_ns) is None
+    assert run(guard, now_ns + TICK, now_ns + 10 * MS) == [None] * 4
+    guard.acknowledge(now_ns + 10 * MS)
+    assert guard.state is GROUND
+
+
+def test_between_two_checks_the_readings_are_not_used():
+    """The usual tick is fast."""
+    guard = tracking((0.5, 0.0, 0.0))
+    run(guard, 0, 200 * MS)
+    guard.accept_command(command((0.5, 0.0, 0.0), 200 * MS), 200 * MS)
+    run(guard, 300 * MS, 300 * MS + TICK)
+    for now_ns in (302 * MS, 310 * MS):
+        assert guard.step(now_ns, None, DT) == (0.5, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("flown_ticks", range(50, 57))
+def test_a_steady_flight_notices_it_within_12_ms(flown_ticks):
+    guard = armed()
+    for now_ns in range(0, (flown_ticks + 7) * TICK, TICK):
+        guard.accept_command(command((0.0, 0.0, 0.5), now_ns), now_ns)
+        guard.step(now_ns, felt(120.0 * (now_ns >= flown_ticks * TICK)), DT)
+    tracks, hit = guard.take_changes()
+    assert (tracks.state, hit.state) == (TRACK, ESTOP)
+    assert hit.stamp_ns - flown_ticks * TICK <= RECHECK_NS + TICK
+
+
+# Taking off
+
+STANDS = (0.0, 0.0, 0.1)
+
+
+def taking_off(height=0.0):
+    """Return a guard in TRACK that has seen its ground; it has this height since the next tick."""
+    guard = armed()
+    assert run(guard, 0, TICK, STANDS) == [None]
+    guard.accept_command(command((0.0, 0.0, 1.0)), 0)
+    run(guard, TICK, 10 * MS, (0.0, 0.0, 0.1 + height))
+    assert states(guard) == [TRACK]
+    return guard
+
+
+def test_a_hold_on_the_ground_stops_the_rotors_not_the_mission():
+    guard = taking_off(height=0.018)
+    flown = run(guard, 250 * MS, 260 * MS, (0.0, 0.0, 0.118))
+    assert flown[0] is not None
+    assert set(flown[1:]) == {None}
+    silent, not_yet = "command age 0.252 s above 0.250 s", "not off the ground yet, rotors stopped"
+    assert guard.take_changes() == [(252 * MS, HOLD, silent), (252 * MS, GROUND, not_yet)]
+    assert guard.armed
+    assert guard.reference == ZERO
+    feed(guard, 2 * SECOND, 1, (0.0, 0.0, 1.0), position=STANDS)
+    assert states(guard) == [TRACK]
+
+
+@pytest.mark.promise("no-rotor-stop-in-the-air")
+def test_above_the_ground_a_hold_climbs_clear_of_it():
+    guard = taking_off(height=0.022)
+    flown = run(guard, 10 * MS, 3 * SECOND, (0.0, 0.0, 0.122))
+    assert states(guard) == [HOLD]
+    assert flown[-1] == pytest.approx((0.0, 0.0, 0.8 * (FLOOR_MARGIN - 0.122)))
+
+
+@pytest.mark.promise("no-rotor-stop-in-the-air")
+def test_after_flying_the_rotors_do_not_stop_where_it_stood():
+    """It may have taken off from a roof and be beside it now."""
+    guard = taking_off(1.0)
+    run(guard, 10 * MS, 3 * SECOND, STANDS)
+    assert states(guard) == [HOLD]
+    feed(guard, 3 * SECOND, 20, ZERO, position=STANDS)
+    run(guard, 4 * SECOND, 6 * SECOND, STANDS)
+    assert states(guard) == [TRACK, HOLD]
