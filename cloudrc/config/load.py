@@ -320,7 +320,9 @@ def _resolve_files(document: Document) -> list[Problem]:
 def _default_contact(document: Document) -> None:
     """Require contact if the scene has a board and the mission is not one of random steps."""
     scene, mission = document.get("world", "scene"), document.get("mission")
-    with suppress(BadInputError, TypeError):  # the validation reports an invalid scene
+    with suppress(
+        BadInputError, TypeError, AttributeError
+    ):  # the validation reports an invalid scene
         has_board = load_scene(World().scene if scene is None else scene).board is not None
         has_steps = isinstance(mission, dict) and bool(mission.get("steps"))
         _default(document, ("criteria", "contact"), has_board and not has_steps)

@@ -103,7 +103,8 @@ def judge(evidence: Evidence) -> Verdict:
     violations, limit = evidence.violations, evidence.contact_speed_max
     if evidence.contact and evidence.touch is not None and evidence.touch[0] >= limit:
         speed, moment = evidence.touch
-        text = f"the tip met the board at {speed:.2f} m/s, not below criteria.contact_speed_max_mps {limit:g}"
+        key = f"criteria.contact_speed_max_mps {limit:g}"
+        text = f"the tip met the board at {speed:.2f} m/s, not below {key}"
         violations = (Failure("contact_too_fast", text, *moment), *violations)
     if evidence.ending.code in ("interrupted", "cancelled"):  # unmet goals are no failure
         return Verdict("interrupted", (Failure(*evidence.ending, *evidence.end), *violations))
@@ -125,11 +126,11 @@ def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
         text = f"{evidence.reached} of {evidence.waypoints} waypoints reached{evidence.judged_by}"
         yield Failure("waypoint_not_reached", text, *end)
     if evidence.contact and evidence.touch is None:
-        yield Failure(
-            "board_not_touched", "the arm never touched the board, which criteria.contact requires"
-        )
+        text = "the arm never touched the board, which criteria.contact requires"
+        yield Failure("board_not_touched", text)
     if end.time is not None and end.time > evidence.time_limit:
-        text = f"the mission took {end.time:.1f} s, more than criteria.time_limit_s {evidence.time_limit:g}"
+        key = f"criteria.time_limit_s {evidence.time_limit:g}"
+        text = f"the mission took {end.time:.1f} s, more than {key}"
         yield Failure("time_limit_exceeded", text, *end)
 
 
