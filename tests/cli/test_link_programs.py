@@ -10,10 +10,9 @@ from cloudrc.cli.link_run import Programs
 TC = f"""#!{sys.executable}
 import sys
 from pathlib import Path
-log = Path(__file__).with_name("log")
+log = Path(__file__).with_name("log").open("a")
 def answer(words):
-    with log.open("a") as file:
-        file.write(" ".join(words) + chr(10))
+    print(*words, file=log, flush=True)
     if "lacks" in words:
         print("Cannot find device eth0", file=sys.stderr, flush=True)
         return 2
@@ -28,6 +27,8 @@ for number, line in enumerate(sys.stdin, start=1):
     if answer(line.split()):
         print(f"Command failed -:{{number}}", file=sys.stderr, flush=True)
 """
+
+
 CHANGE = ("tc", "qdisc", "change", "dev", "eth0", "netem")
 SHOW = ("tc", "-s", "-j", "qdisc", "show", "dev", "eth0")
 

@@ -77,33 +77,19 @@ def release(monkeypatch):
         yield made
 
 
-def causes(report):
-    return [(cause["code"], cause["way"]) for cause in report["causes"]]
-
-
-def rows(report):
-    return {row["name"]: row for row in report["directions"]["uplink"]["rows"]}
+def causes(said):
+    return [(cause["code"], cause["way"]) for cause in said["causes"]]
 
 
 def test_a_release_is_believed_once_both_ends_do(release):
     release.hears(world="ok", cloud="ok")
     said = release.ask()
     assert (said["verdict"], said["shaper"]) == ("believed", "shaped by relay")
-    assert rows(said)["mean"]["measured"] == pytest.approx(0.0451)
+    (mean,) = (row for row in said["directions"]["uplink"]["rows"] if row["name"] == "mean")
+    assert mean["measured"] == pytest.approx(0.0451)
     assert as_text(said).splitlines()[-1].startswith("BELIEVED")
     release.links["uplink"].link.tell = lambda: "{}"
     assert release.ask()["verdict"] == "believed", "the link's page is not needed"
-
-
-@pytest.mark.parametrize(
-    ("shaper", "leaves", "code"),
-    [("relay", "eth0", "shaped_twice"), ("netem", "eth1", "wrong_interface")],
-)
-def test_qdiscs_that_the_links_find_are_named(release, shaper, leaves, code):
-    for way in release.links:
-        release.shapes(way, Told(shaper, "", APPLIED, Near(leaves, {"eth0": [{"kind": "netem"}]})))
-    release.hears(world="off", cloud="off")
-    assert causes(release.ask()) == [(code, "both")]
 
 
 def test_a_fault_names_its_direction(release):
@@ -112,6 +98,11 @@ def test_a_fault_names_its_direction(release):
     assert said["verdict"] == "not believed"
     assert causes(said) == [("doubled_delay", "downlink")]
     assert "mean 90.20 ms instead of 45.00 ms" in as_text(said)
+    told = Told("relay", "", APPLIED, Near("eth0", {"eth0": [{"kind": "netem"}]}))
+    for way in release.links:
+        release.shapes(way, told)
+    release.hears(cloud="off")
+    assert causes(release.ask()) == [("shaped_twice", "both")], "qdiscs that the links find"
 
 
 def test_a_verdict_off_for_a_moment_does_not_end_the_wait(release, monkeypatch):
@@ -128,23 +119,22 @@ def test_a_verdict_off_for_a_moment_does_not_end_the_wait(release, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("told", "notes"),
+    ("told", "note"),
     [
-        ({}, ["downlink: no datagrams to measure; fly a mission first"]),
-        ({"correlation": (0.9, 0.0)}, ["uplink: correlation NOT JUDGED: netem realises"]),
-        ({"time_line": (1.0, 0.0)}, ["uplink: its time line NOT JUDGED in flight"]),
+        ({}, "downlink: no datagrams to measure; fly a mission first"),
+        ({"correlation": (0.9, 0.0)}, "uplink: correlation NOT JUDGED: netem realises"),
+        ({"time_line": (1.0, 0.0)}, "uplink: its time line NOT JUDGED in flight"),
     ],
 )
-def test_what_is_not_judged_is_noted(release, told, notes):
+def test_what_is_not_judged_is_noted(release, told, note):
     release.hears(cloud="ok", **({"world": "ok"} if told else {}))
     for name, values in told.items():
         release.tells(name, *values)
     said = release.ask(0.0)
+    text, partly = as_text(said), "except what is NOT JUDGED (above)"
     assert said["verdict"] == ("believed" if told else "undecided")
-    for note in notes:
-        assert note in as_text(said)
-    partly = as_text(said).splitlines()[-1].endswith("except what is NOT JUDGED (above)")
-    assert partly is bool(told)
+    assert note in text
+    assert text.splitlines()[-1].endswith(partly) is bool(told)
 
 
 def test_nobody_waits_for_a_time_line_that_loops(release):
@@ -158,8 +148,7 @@ def test_nobody_waits_for_a_time_line_that_loops(release):
 
 
 @pytest.mark.parametrize(
-    ("asked", "applied", "code"),
-    [(2e6, 3e6, "rate_ignored"), (2e6, None, "rate_ignored"), (5e6, 3e6, "slow"), (3e6, 3e6, "")],
+    ("asked", "applied", "code"), [(2e6, None, "rate_ignored"), (5e6, 3e6, "slow"), (3e6, 3e6, "")]
 )
 def test_a_shaper_that_reports_another_rate_is_not_believed(release, asked, applied, code):
     """Single datagrams do not measure the rate."""
@@ -168,7 +157,6 @@ def test_a_shaper_that_reports_another_rate_is_not_believed(release, asked, appl
     release.tells("rate", asked)
     said = release.ask()
     assert causes(said) == ([(code, "uplink")] if code else [])
-    assert said["verdict"] == ("not believed" if code else "believed")
     assert "NOT JUDGED" not in as_text(said)
     assert ("no limit" in as_text(said)) == (applied is None)
     release.links["uplink"].link.tell = lambda: "{}"
@@ -181,7 +169,7 @@ def test_ends_that_do_not_answer_are_a_timeout(release):
         release.ask(0.0)
 
 
-@pytest.mark.parametrize("key", ["seed: 7", "criteria: {}", "guard: {}", "tunnel: {}"])
+@pytest.mark.parametrize("key", ["seed: 7", "tunnel: {}"])
 def test_a_file_with_any_key_of_an_experiment_is_verified_as_one(key, tmp_path):
     (tmp_path / "mine.yaml").write_text(key + "\n")
     assert find_experiment("./mine.yaml", []).uplink == load_experiment("./mine.yaml").uplink
