@@ -1,4 +1,4 @@
-"""The client of the API, when another server answers."""
+"""The client of the API, when another server answers, and over a socket file."""
 
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -18,29 +18,18 @@ class Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(b"[]")
 
-    def log_message(self, *args):
-        """Log nothing."""
 
-
-@pytest.fixture
-def url():
+def test_an_answer_of_another_server_is_shown_as_it_is():
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}"
+        threading.Thread(target=server.serve_forever, args=(0.01,)).start()
+        for status in (307, 404, 503):
+            with pytest.raises(ApiError, match=f"the API answered {status} "):
+                Api(f"http://127.0.0.1:{server.server_port}").get(f"/{status}")
         server.shutdown()
-        thread.join()
 
 
-@pytest.mark.parametrize("status", [307, 404, 418, 503])
-def test_an_answer_of_another_server_is_shown_as_it_is(url, status):
-    with pytest.raises(ApiError, match=f"the API answered {status} "):
-        Api(url).get(f"/{status}")
-
-
-@pytest.mark.parametrize("name", ["a b", "a:80", "a:b", "[::", "ü" * 8])
-def test_a_socket_may_have_any_path(name, tmp_path):
+def test_a_socket_may_have_any_path(tmp_path):
     with running(unix=True) as api:
-        path = tmp_path / name
-        path.symlink_to(api.url.removeprefix("unix:"))
-        assert Api(f"unix:{path}").get("/v1/missions") == {"missions": []}
+        for name in ("a b", "a:80", "[::", "ü" * 8):
+            (tmp_path / name).symlink_to(api.address)
+            assert Api(f"unix:{tmp_path / name}").get("/v1/missions") == {"missions": []}

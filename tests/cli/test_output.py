@@ -39,15 +39,11 @@ def test_columns_line_up_and_numbers_are_right_aligned():
     assert table([("name", "value"), ("a", "1.5"), ("longer", "10.5")], right=[1]) == (
         "name    value\na         1.5\nlonger   10.5"
     )
-    assert table([("a", "short"), ("b", "much longer")]) == "a  short\nb  much longer"
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.1474, "0.1474"), (26.96, "26.96"), (0.0, "0"), (1234.5, "1234"), (-3e-7, "-3.000e-07")],
-)
-def test_numbers_have_four_digits(value, text):
-    assert format_number(value) == text
+def test_numbers_have_four_digits():
+    shown = {0.1474: "0.1474", 0.0: "0", 1234.5: "1234", -3e-7: "-3.000e-07"}
+    assert {value: format_number(value) for value in shown} == shown
 
 
 def test_colour_and_a_status_line_are_for_terminals(monkeypatch):
@@ -63,12 +59,11 @@ def test_colour_and_a_status_line_are_for_terminals(monkeypatch):
 
 @pytest.mark.parametrize("line", [["list"], ["faults", "list"]])
 def test_yaml_has_the_content_of_json(line, capsys):
-    documents = []
-    for form, read in (("json", json.loads), ("yaml", yaml.safe_load)):
-        main([*line, "-o", form])
-        documents.append(read(capsys.readouterr().out))
-    assert documents[0] == documents[1]
-    assert documents[0]["schemaVersion"] == 1
+    main([*line, "-o", "json"])
+    document = json.loads(capsys.readouterr().out)
+    main([*line, "-o", "yaml"])
+    assert yaml.safe_load(capsys.readouterr().out) == document
+    assert document["schemaVersion"] == 1
 
 
 def telemetry(stamp_ns):
@@ -102,14 +97,13 @@ def test_the_status_line_shows_the_state_of_the_flight(seen):
         assert seen(io.StringIO(), *records).line().plain == line
 
 
-@pytest.mark.parametrize(("columns", "left_out"), [("80", "nothing"), ("20", "wayp")])
-def test_a_terminal_gets_a_status_line_that_is_erased(columns, left_out, monkeypatch, seen):
-    monkeypatch.setenv("COLUMNS", columns)
+def test_a_terminal_gets_a_status_line_that_fits_and_is_erased(monkeypatch, seen):
+    monkeypatch.setenv("COLUMNS", "20")
     stream = Terminal()
     seen(stream, telemetry(0), CONTROL).close()
     drawn = re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", stream.getvalue())
-    assert "0.0 s  GROUND  waypoint 3/7"[: int(columns) - 3] in drawn
-    assert left_out not in drawn
+    assert "0.0 s  GROUND  " in drawn
+    assert "wayp" not in drawn
     assert stream.getvalue().endswith("\x1b[2K")
 
 

@@ -33,15 +33,12 @@ def no_page(monkeypatch):
     [
         ("--mode local --seeds 3", "virtual time"),
         ("--seeds 0", "'0' is not a whole number from 1 to 10000"),
-        ("--seed -1", "--seed"),
         ("--seed 1 --seeds 2", "not allowed with"),
         ("papper", "paper"),
         ("no/such.yaml", "no/such.yaml"),
         ("--set cloud.predictr=last_sample", "predictor"),
         ("--set cloud.predictor=kalmann", "last_sample"),
-        ("--set link.uplink.loss=1.2", "loss"),
         ("--set report.metrics=./no.py", "no.py': there is no such file"),
-        ("--set report.metrics=duratoin", "did you mean duration?"),
         ("--set nonsense", "key=value"),
     ],
 )
@@ -89,13 +86,6 @@ def test_a_run_and_its_report_can_be_repeated(folder, capsys):
     assert json.loads((folder / "a/report.json").read_text())["numbers"] == first["numbers"]
 
 
-@pytest.mark.parametrize("name", ["missing", "empty"])
-def test_a_report_needs_a_run(name, capsys):
-    Path("empty").mkdir()
-    assert main(["report", name]) == 2
-    assert capsys.readouterr().err.startswith("cloudrc: error: ")
-
-
 @pytest.mark.usefixtures("no_page")
 def test_an_interrupt_while_the_report_is_written_names_the_remedy(monkeypatch, capsys):
     def interrupt(*arguments, **options):
@@ -108,18 +98,15 @@ def test_an_interrupt_while_the_report_is_written_names_the_remedy(monkeypatch, 
     assert main(["report", "here"]) == 0
 
 
-@pytest.mark.parametrize("output", ["table", "json"])
 @pytest.mark.usefixtures("no_page")
-def test_a_closed_pipe_does_not_end_the_run(output, folder, monkeypatch):
+def test_a_closed_pipe_does_not_end_the_run(folder, monkeypatch):
     """As in `cloudrc run | head -1`; the exit code still follows the verdict, here 1."""
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "w") as closed_pipe:
         monkeypatch.setattr("sys.stdout", closed_pipe)
-        line = [*FLY, "--out", "here", "-o", output, "--set", "criteria.contact=true"]
-        assert main(line) == 1
-    left = {path.name for path in (folder / "here").iterdir()}
-    assert {"mission.mcap", "report.json", "config.yaml"} <= left
+        assert main([*FLY, "--out", "here", "--set", "criteria.contact=true"]) == 1
+    assert json.loads((folder / "here/report.json").read_text())["verdict"] == "failure"
 
 
 def test_folders_are_numbered_and_latest_is_the_newest():
@@ -165,27 +152,19 @@ def report(outcome, *failures, **numbers):
         (
             report("success", duration=(30.9, "s"), rtt_mean=(0.0697, "s"), fault_count=(0.0, "1")),
             0,
-            [
-                "SUCCESS: every waypoint reached, every criterion met",
-                "mission took 30.90 s",
-                "round trip, mean 69.70 ms",
-            ],
+            "SUCCESS: every waypoint reached, every criterion met\n"
+            "mission took 30.90 s\nround trip, mean 69.70 ms",
         ),
         (
             report("failure", "the robot touched pipe_2", "too slow", fault_count=(41.0, "1")),
             1,
-            [
-                "FAILURE: the robot touched pipe_2",
-                "also: too slow (at 3.25 s)",
-                "no numbers: nothing was flown",
-                "faults noted in flight: 41, see the report",
-            ],
+            "FAILURE: the robot touched pipe_2\nalso: too slow (at 3.25 s)\n"
+            "no numbers: nothing was flown\nfaults noted in flight: 41, see the report",
         ),
-        (report("invalid", "x"), 6, ["INVALID: x", "no numbers: nothing was flown"]),
-        (report("interrupted", "x"), 130, ["INTERRUPTED: x", "no numbers: nothing was flown"]),
+        (report("interrupted", "x"), 130, "INTERRUPTED: x\nno numbers: nothing was flown"),
     ],
 )
 def test_summary(found, code, lines):
-    shown = summary(found, Path("runs/a")).splitlines()
-    assert [" ".join(line.split()) for line in shown if line] == [*lines, "runs/a/report.html"]
+    shown = [" ".join(line.split()) for line in summary(found, Path("runs/a")).splitlines()]
+    assert "\n".join(filter(None, shown)) == f"{lines}\nruns/a/report.html"
     assert EXIT_CODES[found["verdict"]] == code
