@@ -69,19 +69,6 @@ def test_ctrl_c_ends_all_processes_in_2_s_and_leaves_a_report(tmp_path, how):
     assert (tmp_path / "run" / "mission.mcap").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("victim", ["cloud", *nightly("world", "teleop", "relay")])
-def test_a_process_that_dies_ends_the_run_and_is_named(tmp_path, victim):
-    run = start(tmp_path / "run")
-    pids = wait_until_flying(run)
-    os.kill(pids[victim], signal.SIGKILL)
-    _, errors = run.communicate(timeout=60)
-    assert run.returncode == 6
-    assert f"the {victim} process died" in errors
-    assert "Traceback" not in errors
-    assert not any(alive(pid) for pid in pids.values())
-    assert report(tmp_path / "run")["verdict"] in ("interrupted", "invalid")
-
-
 def test_a_killed_supervisor_ends_all_and_leaves_a_recording(tmp_path):
     folder = tmp_path / "run"
     run = start(folder)
@@ -90,15 +77,26 @@ def test_a_killed_supervisor_ends_all_and_leaves_a_recording(tmp_path):
     run.kill()
     run.communicate()
     wait_until_ended(pids, 5.0)
-    assert not (folder / "mission.mcap").exists()
     subprocess.run([*COMMAND, "report", str(folder)], check=False, capture_output=True)
     assert report(folder)["numbers"]["commands_applied"]["value"] > 10
     assert (folder / "mission.mcap").exists()
-    assert (folder / "report.html").exists()
 
 
-@pytest.mark.parametrize("victim", ["relay", *nightly("teleop", "world", "cloud")])
-def test_a_supervisor_that_stood_still_still_sees_who_hangs(tmp_path, victim):
+HANGS, DIES = signal.SIGSTOP, signal.SIGKILL
+
+
+@pytest.mark.parametrize(
+    ("victim", "how"),
+    [
+        ("relay", HANGS),
+        ("cloud", DIES),
+        *(
+            pytest.param(*other, marks=pytest.mark.full)
+            for other in (("teleop", HANGS), ("world", HANGS), ("cloud", HANGS), ("world", DIES))
+        ),
+    ],
+)
+def test_a_supervisor_that_stood_still_still_sees_who_hangs_or_dies(tmp_path, victim, how):
     run = start(tmp_path / "run", dwell=30.0)
     pids = wait_until_flying(run)
     os.kill(run.pid, signal.SIGSTOP)
@@ -106,11 +104,12 @@ def test_a_supervisor_that_stood_still_still_sees_who_hangs(tmp_path, victim):
     os.kill(run.pid, signal.SIGCONT)
     time.sleep(1.0)
     assert all(alive(pid) for pid in pids.values()), "the flight goes on"
-    os.kill(pids[victim], signal.SIGSTOP)
+    os.kill(pids[victim], how)
     wait_until_ended(pids, 10.0)
     _, errors = run.communicate(timeout=60)
-    assert run.returncode == 4
-    assert f"the {victim} process was silent" in errors
+    assert run.returncode == (4 if how == HANGS else 6)
+    assert f"the {victim} process {'was silent' if how == HANGS else 'died'}" in errors
+    assert "Traceback" not in errors
     notes = " ".join(report(tmp_path / "run")["notes"])
     stood = re.findall(r"supervisor of this run stood still for ([\d.]+) s", notes)
     assert max(map(float, stood)) >= local.SILENCE_LIMIT + 1.0
@@ -120,7 +119,6 @@ PREDICTOR = '''
 """A predictor that is slow and talks."""
 import time
 from cloudrc.cloud.predictors import Predictor
-print("loaded")
 class Odd(Predictor):
     def predict(self, odometry, horizon):
         print("hello")
@@ -138,12 +136,8 @@ def test_a_late_link_a_slow_plug_in_and_no_fastapi_end_no_run(tmp_path):
     late = f"blackouts=[{{start_s: 0, duration_s: {local.SILENCE_LIMIT + 1.0}}}]"
     links = (f"link.uplink.{late}", f"link.downlink.{late}")
     command = [sys.executable, "-c", WITHOUT_API + WITHOUT_PAGE]
-    run = start(
-        tmp_path / "run",
-        *(*links, f"cloud.predictor={tmp_path}/odd.py"),
-        dwell=2.0,
-        command=command,
-    )
+    settings = (*links, f"cloud.predictor={tmp_path}/odd.py")
+    run = start(tmp_path / "run", *settings, dwell=2.0, command=command)
     output, errors = run.communicate(timeout=90)
     document = report(tmp_path / "run")
     assert run.returncode in FLOWN, errors
@@ -151,13 +145,12 @@ def test_a_late_link_a_slow_plug_in_and_no_fastapi_end_no_run(tmp_path):
     assert document["numbers"]["missed_periods"]["value"] > 100
     assert "a plug-in is slow" in output
     assert any("a plug-in is slow" in note for note in document["notes"])
-    log = (tmp_path / "run" / "cloud.log").read_text()
-    assert "loaded" in log
-    assert "hello" in log
+    assert "hello" in (tmp_path / "run" / "cloud.log").read_text()
     assert "no operator's API in this run" in errors
     assert "pip install 'cloudrc[api]'" in errors
 
 
+CAUSE = "downlink.delay_ms=120, downlink.jitter_ms=0"
 WITHIN = 0.005
 """Tolerance of a median one-way delay beside other tests [s]."""
 LEGS = (0.5, 8.9), (9.2, 9.95), (10.2, 12.0)
@@ -198,7 +191,7 @@ def test_an_operator_steers_a_run_and_sets_its_link(tmp_path, figure):
     wait_until_flying(run)
     assert json.loads((folder / "api.json").read_text())["url"] == local.under_way()[folder]
     time.sleep(2.0)
-    took = [set_link(folder, "downlink.delay_ms=120", "downlink.jitter_ms=0")]
+    took = [set_link(folder, *CAUSE.split(", "))]
     time.sleep(2.0)
     took.append(set_link(folder, "--profile", "handover"))
     changed = time.monotonic()
@@ -215,15 +208,13 @@ def test_an_operator_steers_a_run_and_sets_its_link(tmp_path, figure):
     assert said[5][0] == "cancel"
     assert local.under_way() == {}
 
-    assert "link: downlink 120 ms (downlink.delay_ms=120, downlink.jitter_ms=0)" in output
+    assert f"link: downlink 120 ms ({CAUSE})" in output
     assert not (folder / "link").exists()
     figure("link set, local: in force after", min(took), "<=", 1.0, "s")
     assert max(took) < 2.0, "on a busy machine"
     numbers = report(folder)["numbers"]
     for way in ("uplink", "downlink"):
-        late = {name: numbers[f"release_error_{name}_{way}"] for name in ("p50", "p99", "p999")}
-        assert 0.0 < late["p50"]["value"] <= late["p99"]["value"] <= late["p999"]["value"]
-        assert late["p50"]["value"] < WITHIN
+        assert 0.0 < numbers[f"release_error_p50_{way}"]["value"] < WITHIN
         assert numbers[f"released_early_{way}"] == {"value": 0.0, "unit": "1"}
         assert numbers[f"relay_overflow_{way}"]["value"] == 0.0
     check_delays(Recording.read(folder / "mission.mcap"))
@@ -237,7 +228,7 @@ def check_delays(recording):
     told = {cause: stamp - age * 1e9 for cause, stamp, age, uplink in
             zip(link["cause"], link["stamp_ns"], link["age"], link["uplink"], strict=True)
             if not uplink}  # fmt: skip
-    first, second = told["downlink.delay_ms=120, downlink.jitter_ms=0"], told["profile handover"]
+    first, second = told[CAUSE], told["profile handover"]
     sent_ns = recording["/downlink_delay"]["stamp_ns"] - delays * 1e9
     assert np.median(delays[sent_ns < first]) == pytest.approx(0.045, abs=WITHIN)
     between = (sent_ns > first + 1e8) & (sent_ns < second)
@@ -252,18 +243,13 @@ def check_delays(recording):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("attempt", range(3))
-def test_real_time_takes_as_long_as_virtual_time(tmp_path, attempt):
-    reports = {}
+def test_real_time_takes_as_long_as_virtual_time(tmp_path):
+    took = []
     for mode in ("virtual", "local"):
-        folder = tmp_path / mode
-        command = [sys.executable, "-m", "cloudrc", "run", "paper", "--mode", mode]
-        subprocess.run([*command, "--out", str(folder)], check=True, capture_output=True)
-        reports[mode] = report(folder)["numbers"]
-    local, virtual = (reports[mode]["contact_time"]["value"] for mode in ("local", "virtual"))
-    assert local == pytest.approx(virtual, rel=0.05)
-    for name in ("real_time_factor", "world_lateness_p99", "cloud_lateness_p99"):
-        assert reports["local"][name]["value"] > 0
+        words = ["run", "paper", "--mode", mode, "--out", str(tmp_path / mode)]
+        subprocess.run([*COMMAND, *words], check=True, capture_output=True)
+        took.append(report(tmp_path / mode)["numbers"]["contact_time"]["value"])
+    assert took[1] == pytest.approx(took[0], rel=0.05)
 
 
 def private_memory(pid):
