@@ -19,7 +19,7 @@ class Slow(Shelf):
     def __init__(self):
         super().__init__()
         self.release, self.begun = threading.Event(), threading.Semaphore(0)
-        self.began, self.flushed = list[float](), threading.Semaphore(0)
+        self.began, self.flushed = [], threading.Semaphore(0)
 
     def flush(self):
         self.flushed.release()
@@ -84,18 +84,17 @@ def test_a_pod_records_flights_whole_and_events_between_them():
     assert choose([]) == []
 
 
-@pytest.mark.parametrize("by", [3600.0, -1.0])
-def test_a_step_of_the_wall_clock_is_noticed_once(by, monkeypatch):
+def test_a_step_of_the_wall_clock_is_noticed_once(monkeypatch):
     offset, true = [0.0], time.time
     monkeypatch.setattr(time, "time", lambda: true() + offset[0])
     thread = RecordingThread(Recorder(Path("x"), lambda path: Shelf()))
     thread.start()
-    offset[0] = by
-    steps, until = list[float](), time.monotonic() + 10.0
+    offset[0] = -1.0
+    steps, until = [], time.monotonic() + 10.0
     while not steps and time.monotonic() < until:
         time.sleep(0.01)
         steps = thread.take_steps()
-    assert steps == [pytest.approx(by, abs=0.1)]
+    assert steps == [pytest.approx(-1.0, abs=0.1)]
     assert thread.take_steps() == []
     assert thread.stop(10.0)
 

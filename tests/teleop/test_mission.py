@@ -1,14 +1,15 @@
-"""The mission machine: each transition, each early end, and who may move the robot."""
+"""The mission machine and its requests: transitions, early ends, and who may move the robot."""
 
 import pytest
 
-from cloudrc.messages import GuardState, Request, Setpoint, Start
-from cloudrc.teleop.mission import HELD_LOWEST
-from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.teleop.mission import HELD_LOWEST, Teleop
+from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, RequestSender
+from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
+from cloudrc.tunnel.codec import NUMBER_MAX
 from tests.teleop.conftest import AWAY, FROM_SPAWN, ID, PLAN, THREE, A, B, C, Flight, asked, flying
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-AT_ONCE = Plan((Leg(A, dwell=0.0),))
 
 
 def last_event(flight):
@@ -47,23 +48,14 @@ def test_a_mission_flies_its_legs_in_order_and_ends_in_a_hold():
     assert (flight.state, flight.guard) == ("DONE", HOLD)
 
 
-@pytest.mark.parametrize("away", [(1.11, 0.0, 1.0), (1.07, 0.07, 1.07)])
-def test_dwell_starts_again_outside_of_the_tolerance(away):
+def test_dwell_starts_again_outside_of_the_tolerance():
     flight = flying()
     flight.step(position=A, seconds=0.45)
-    flight.step(position=away)
+    flight.step(position=(1.07, 0.07, 1.07))
     flight.step(position=A, seconds=0.45)
     assert last_event(flight) == "started"
     flight.step(position=A, seconds=0.06)
     assert last_event(flight) == "reached"
-
-
-def test_legs_of_infinite_tolerance_last_their_dwell_time():
-    flight = flying(Plan(tuple(Leg(at, tolerance=float("inf"), dwell=0.4) for at in (A, B, C))))
-    flight.step(position=AWAY, seconds=1.3)
-    first, second, third = (e.stamp_ns for e in flight.events if e.event == "reached")
-    assert (second - first, third - second) == (400_000_000, 400_000_000)
-    assert flight.state == "DONE"
 
 
 def test_time_in_hold_or_unseen_is_no_dwell():
@@ -77,18 +69,6 @@ def test_time_in_hold_or_unseen_is_no_dwell():
     assert last_event(flight) == "started"
     flight.step(seconds=0.6)
     assert last_event(flight) == "reached"
-
-
-# Early ends
-
-
-def assert_failed(flight, code, text):
-    outcome = flight.teleop.outcome
-    assert (flight.state, outcome.event, outcome.text) == ("FAILED", code, text)
-    assert (flight.events[-1].event, flight.events[-1].text) == (code, text)
-    assert flight.setpoints[-1].waypoint == -1
-    flight.step(seconds=0.05)
-    assert flight.requests[-1].request is Request.END
 
 
 def test_a_leg_that_takes_too_long_fails_the_mission():
@@ -105,61 +85,34 @@ def test_a_leg_that_takes_too_long_fails_the_mission():
     flight.step(seconds=1.4)
     assert flight.state == "FLYING"
     flight.step(seconds=0.2)
-    assert_failed(flight, "leg_timed_out", "waypoint 2 of 2 not reached in 2 s")
-    assert flight.events[-1].waypoint == 1
+    outcome = flight.teleop.outcome
+    assert (flight.state, outcome.event) == ("FAILED", "leg_timed_out")
+    assert outcome.text == "waypoint 2 of 2 not reached in 2 s"
+    assert flight.events[-1] == outcome
+    flight.step(seconds=0.05)
+    assert flight.requests[-1].request is Request.END
 
 
 def test_no_robot_is_held_where_it_would_scrape_along_the_floor():
     flight = flying()
     flight.step(position=(0.2, 0.1, 0.12))
-    for verb in ("hold", "cancel"):
-        flight.operate(verb)
-        assert flight.setpoints[-1] == Setpoint((0.2, 0.1, HELD_LOWEST), 0.3, -1)
-
-
-# The first setpoint: an armed robot flies to it at once
-
-
-@pytest.fixture
-def ended():
-    """A mission is done, but its end has not reached the robot, which tracks on."""
-    flight = flying(AT_ONCE)
-    flight.downlink = False
-    flight.step(position=A)
-    assert (flight.state, flight.guard) == ("DONE", TRACK)
-    return flight
-
-
-@pytest.mark.parametrize("acted_on", [None, False, True])
-def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once(ended, acted_on):
-    """Not after a request between end and start, which may have taken effect."""
-    ended.downlink = True
-    ended.step(seconds=0.15)
-    assert ended.guard is HOLD
-    if acted_on is not None:
-        ended.operate("start", Plan((Leg(B),), Start.HERE))
-        ended.uplink, ended.downlink = False, acted_on
-        ended.step(seconds=0.15)
-        ended.downlink = False
-        ended.operate("cancel")
-        ended.uplink = True
-        ended.step(seconds=0.15)
-    before = len(ended.setpoints)
-    ended.operate("start", PLAN)
-    assert ended.setpoints[before:] == ([Setpoint(A, 0.3, 0)] if acted_on is None else [])
-
-
-def test_cloud_is_told_the_setpoint_again_in_every_session():
-    flight = started()
-    told = flight.setpoints[-1]
-    flight.restart_cloud()
-    flight.step(seconds=0.02)
-    assert flight.setpoints.count(told) == 2
     flight.operate("hold")
-    flight.operate("go_to", Leg(C))
-    flight.restart_cloud()
+    assert flight.setpoints[-1] == Setpoint((0.2, 0.1, HELD_LOWEST), 0.3, -1)
+
+
+def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
+    """One that was told to start does not: an armed robot flies to a setpoint at once."""
+    flight = flying(Plan((Leg(A, dwell=0.0),)))
     flight.step(position=A)
-    assert [setpoint.position for setpoint in flight.setpoints[-2:]] == [C, C]
+    flight.step(seconds=0.15)
+    assert (flight.state, flight.guard) == ("DONE", HOLD)
+    before = len(flight.setpoints)
+    flight.operate("start", PLAN)
+    assert flight.setpoints[before:] == [Setpoint(A, 0.3, 0)]
+    flight.operate("cancel")
+    before = len(flight.setpoints)
+    flight.operate("start", PLAN)
+    assert flight.setpoints[before:] == []
 
 
 @pytest.mark.parametrize("before", ["cancel", "acknowledge"])
@@ -180,28 +133,12 @@ def test_after_a_foreign_start_the_robot_counts_as_flying(before):
     assert flight.setpoints[-1].position == AWAY
 
 
-# What the robot stores on board
-
-
 def started():
     flight = Flight()
     flight.step(position=AWAY)
     flight.operate("start", THREE, ID)
     flight.step(seconds=0.05)
     return flight
-
-
-# Requests of others
-
-
-def test_a_predecessors_late_end_does_not_stop_the_mission():
-    flight = started()
-    flight.mission += 1
-    flight.guard = HOLD
-    flight.step(seconds=0.2)
-    assert flight.guard is TRACK
-    assert (flight.requests[-1].request, flight.requests[-1].start) == (Request.START, Start.HERE)
-    assert [event.event for event in flight.events] == ["started"]
 
 
 @pytest.mark.parametrize("guard", [HOLD, GROUND])
@@ -220,3 +157,65 @@ def test_a_robot_that_waits_during_its_mission_is_started_again(guard):
     flight.step(seconds=3.2)
     assert flight.requests[-1][1:3] == (Request.START, Start.HERE)
     assert (flight.guard, flight.state) == (TRACK, "FLYING")
+
+
+# Requests and the emergency stop: repeated until the robot has acted on them
+
+
+def first_request(seen, now_ns):
+    sender = RequestSender()
+    sender.see(seen, now_ns)
+    sender.ask(Request.END)
+    return sender.due(now_ns)
+
+
+def test_whoever_begins_later_begins_higher_and_numbers_last():
+    """Though both see a robot that has been asked nothing; for a thousand restarts."""
+    seen = RobotStatus(1, A, GROUND, 0)
+    numbers = [first_request(seen, REPEAT_NS * n).number for n in (5_000, 5_010, 0)]
+    assert numbers == [PREDECESSORS + 5_000, PREDECESSORS + 5_010, PREDECESSORS]
+    for _ in range(1_000):
+        seen = seen._replace(mission=first_request(seen, 10 * 365 * 86_400 * 10**9).number)
+    assert seen.mission < NUMBER_MAX / 10
+
+
+def test_a_start_of_the_teleop_before_that_arrives_late_is_ended():
+    """Nobody flies that mission any more."""
+    flight = Flight()
+    flight.teleop = Teleop(ended=lambda number: number == ID)
+    flight.step(seconds=0.5)
+    assert flight.requests == []
+    flight._obey(OperatorRequest(1, Request.START, Start.HERE, mission_id=ID))
+    flight.step(seconds=0.1)
+    assert flight.requests[-1].request is Request.END
+    assert flight.guard is HOLD
+
+
+def test_each_copy_of_a_setpoint_or_request_names_the_current_session():
+    flight, said = Flight(), []
+    flight.step()
+    flight.operate("start", FROM_SPAWN, ID)
+    for epoch in (1, 1, 2):
+        flight.epoch = epoch
+        flight.now_ns += REPEAT_NS
+        flight.see()
+        flight.teleop.handle_deadline(flight.now_ns)
+        said += flight.teleop.take_outputs()
+    requests = [each for each in said if isinstance(each, OperatorRequest)]
+    assert len({(each.request, each.number) for each in requests}) == 1
+    assert [each.epoch for each in requests] == [1, 1, 2]
+    assert [each.epoch for each in said if isinstance(each, Setpoint)] == [2]
+
+
+def test_a_stop_leaves_at_once_and_is_told_until_it_is_seen():
+    """Cloud gives it a number, above all others, and repeats it towards the robot."""
+    flight = flying()
+    flight.uplink = False
+    flight.operate("stop")
+    assert flight.said[-1] == ALARM
+    flight.step(seconds=1.0)
+    assert 10 <= flight.said.count(ALARM) <= 11
+    flight.uplink = True
+    flight.step(seconds=0.5)
+    assert flight.said.count(ALARM) <= 11
+    assert flight.guard is ESTOP
