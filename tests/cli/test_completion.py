@@ -1,6 +1,5 @@
 """Completion: a script for each shell that knows commands, options and shipped names."""
 
-import importlib.util
 import shutil
 import subprocess
 
@@ -41,9 +40,3 @@ def test_bash_completes_names(words, found, capsys):
     )
     done = subprocess.run(["bash"], input=script + probe, text=True, capture_output=True)
     assert done.stdout.split() == found, done.stderr
-
-
-def test_an_error_names_the_missing_shtab(monkeypatch, capsys):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert main(["completion", "bash"]) == 3
-    assert "pip install shtab" in capsys.readouterr().err

@@ -52,17 +52,6 @@ def test_an_emergency_stop_finds_the_run(tmp_path, elsewhere, capsys):
                 assert capsys.readouterr().err == ""
 
 
-def test_no_other_api_is_taken_than_that_of_the_newest_run(tmp_path, elsewhere, capsys):
-    with flying(tmp_path / "out") as api:
-        with local.announced(elsewhere / "runs" / "latest", f"unix:/{'x' * 200}"):
-            assert main(["mission", "estop"]) == 5
-        assert "does not answer (AF_UNIX path too long)" in capsys.readouterr().err
-        assert api.alarms == []
-        with local.announced(tmp_path / "without an API"):
-            assert main(["mission", "estop"]) == 0
-        assert len(api.alarms) == 1
-
-
 def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, capsys):
     (elsewhere / "runs" / "latest").mkdir(parents=True)
     with socket.create_server(("127.0.0.1", 0)) as stranger:

@@ -44,10 +44,8 @@ def test_a_run_gives_a_trace_per_direction(run, folder, capsys):
     assert (folder / "t.csv").read_bytes() == (folder / "trace-downlink.csv").read_bytes()
     # Only fast datagrams are applied: below the 30 ms of the profile.
     assert main(["link", "record", str(run), "-o", "t.csv", "--halve-rtt"]) == 0
-    assert "repeated echoes left out" in capsys.readouterr().out
-    trace = read_trace(folder / "t.csv")
-    assert trace.losses is None
-    assert 0.020 < sum(trace.delays) / len(trace.delays) < 0.035
+    delays = read_trace(folder / "t.csv").delays
+    assert 0.020 < sum(delays) / len(delays) < 0.035
 
 
 def test_a_recording_of_the_world_alone_gives_no_trace(folder, capsys):
@@ -97,13 +95,11 @@ def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, cap
     ("line", "says"),
     [
         ("", "an action is missing"),
-        ("show paper-p9", "paper-p"),
         ("show ideal -o ideal.gif", "end its name in .png, .svg or .pdf"),
         ("show ideal --seconds 0", "--seconds 0: give a number from 0.001 to 86400"),
         ("show ideal --seconds nan", "--seconds nan: give a number from"),
         ("show ideal --seed=-1", "--seed -1"),
         ("show ideal --seconds 8e4 --rate 1e4", "are more than 10000000 packets"),
-        ("show nowhere.csv", "No such file"),
         ("verify nonsense", "no profile or experiment named 'nonsense'"),
         ("verify no/such.yaml", "no such file"),
         ("verify --ends world,", "--ends world,: give two hosts, WORLD,CLOUD"),
@@ -127,15 +123,6 @@ def test_a_profile_is_drawn_and_its_statistics_printed(folder, capsys):
     first = (folder / "a.svg").read_bytes()
     assert main(line) == 0
     assert (folder / "a.svg").read_bytes() == first, "the same link gives the same picture"
-
-
-def test_rate_and_number_of_packets_can_be_set(folder, capsys):
-    """Packets that follow each other sooner overtake each other more often."""
-    (folder / "mine.yaml").write_text("uplink: {delay_ms: 70, jitter_ms: 25}\ndownlink: {loss: 1}")
-    line = "link show ./mine.yaml --seconds 1 --packets 4000 --rate 200"
-    assert main(line.split()) == 0
-    (row,) = (row for row in capsys.readouterr().out.splitlines() if "overtaken" in row)
-    assert float(row.split()[-3]) == pytest.approx(59.0, abs=3.0)
 
 
 def test_a_trace_is_shown_row_by_row_whatever_its_span(folder, capsys):

@@ -105,24 +105,10 @@ def test_a_fault_names_its_direction(release):
     assert causes(release.ask()) == [("shaped_twice", "both")], "qdiscs that the links find"
 
 
-def test_a_verdict_off_for_a_moment_does_not_end_the_wait(release, monkeypatch):
-    release.hears(world="off", cloud="open")
-
-    def recover(seconds):
-        release.looks += 1
-        if release.looks > 2:
-            cloud = "ok" if release.looks > 4 else "open"
-            release.hears(world="ok", cloud=cloud, stamp_ns=5 + release.looks)
-
-    monkeypatch.setattr(link_verify.time, "sleep", recover)
-    assert release.ask()["verdict"] == "believed"
-
-
 @pytest.mark.parametrize(
     ("told", "note"),
     [
         ({}, "downlink: no datagrams to measure; fly a mission first"),
-        ({"correlation": (0.9, 0.0)}, "uplink: correlation NOT JUDGED: netem realises"),
         ({"time_line": (1.0, 0.0)}, "uplink: its time line NOT JUDGED in flight"),
     ],
 )
@@ -137,18 +123,8 @@ def test_what_is_not_judged_is_noted(release, told, note):
     assert text.splitlines()[-1].endswith(partly) is bool(told)
 
 
-def test_nobody_waits_for_a_time_line_that_loops(release):
-    release.hears(world="ok")
-    release.tells("time_line", 1.0, 1.0)
-    said = release.ask(limit=5.0)
-    assert (said["verdict"], release.looks) == ("undecided", 1)
-    assert "NOT JUDGED in flight: a time line loops" in "".join(said["notes"])
-    release.hears(cloud="ok", name="round_trip")
-    assert "do not share a clock" in "".join(release.ask(0.0)["notes"])
-
-
 @pytest.mark.parametrize(
-    ("asked", "applied", "code"), [(2e6, None, "rate_ignored"), (5e6, 3e6, "slow"), (3e6, 3e6, "")]
+    ("asked", "applied", "code"), [(2e6, None, "rate_ignored"), (3e6, 3e6, "")]
 )
 def test_a_shaper_that_reports_another_rate_is_not_believed(release, asked, applied, code):
     """Single datagrams do not measure the rate."""

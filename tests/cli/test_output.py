@@ -123,11 +123,3 @@ def test_events_are_plain_lines_in_a_file_and_wrapped_on_a_terminal(seen):
         f"mission done{place}",  # then the robot always holds
     ]
     assert max(map(len, terminal.getvalue().splitlines())) <= 90
-
-
-def test_a_closed_pipe_does_not_end_the_flight(seen):
-    class Closed(io.StringIO):
-        def write(self, text):
-            raise BrokenPipeError
-
-    seen(Closed(), telemetry(0), CONTROL, REACHED).close()

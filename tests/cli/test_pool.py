@@ -2,12 +2,10 @@
 
 import multiprocessing
 import os
-import select
 import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -78,12 +76,6 @@ def test_only_the_first_hang_up_interrupts():
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def test_under_nohup_a_hang_up_is_ignored():
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    interrupt_on_signals()
-    os.kill(os.getpid(), signal.SIGHUP)
-
-
 @pytest.mark.parametrize(
     "line",
     ["run --seeds 2 --mode local", "mission fly --mission no.yaml --api unix:a", "link verify no"],
@@ -94,12 +86,8 @@ def test_flying_commands_treat_a_hang_up_as_ctrl_c(line):
 
 
 @pytest.mark.process
-@pytest.mark.parametrize(
-    "words",
-    [["faults", "search", "--minutes", "9", "--jobs", "2"], ["run", "steps", "--seeds", "9"]],
-)
-def test_workers_end_if_their_parent_is_killed(words, tmp_path):
-    command = [sys.executable, "-m", "cloudrc", *words]
+def test_workers_end_if_their_parent_is_killed(tmp_path):
+    command = [sys.executable, "-m", "cloudrc", "run", "steps", "--seeds", "9"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) as first:
         children = Path(f"/proc/{first.pid}/task/{first.pid}/children")
         until = time.monotonic() + 60.0
@@ -110,10 +98,7 @@ def test_workers_end_if_their_parent_is_killed(words, tmp_path):
         time.sleep(3.0)  # until they are flying
         first.kill()
         first.wait()
-        while select.select([first.stdout], [], [], 20.0)[0]:  # ends once all workers have ended
-            if not first.stdout.read1():
-                return
-    for worker in workers:
-        with suppress(ProcessLookupError):
-            os.kill(int(worker), signal.SIGKILL)
-    pytest.fail("workers still wait for work")
+        until = time.monotonic() + 20.0
+        while any(Path(f"/proc/{worker}").exists() for worker in workers):
+            assert time.monotonic() < until, "workers still wait for work"
+            time.sleep(0.1)

@@ -88,19 +88,6 @@ def no_such_name(*asked):
     raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
 
-@pytest.mark.parametrize(("command", "flag"), [("cloud", "--peer"), ("relay", "--world")])
-def test_an_unresolvable_name_is_reported_at_the_start(command, flag, key, monkeypatch, capsys):
-    look_up = socket.getaddrinfo
-    monkeypatch.setattr(
-        socket, "getaddrinfo", lambda *a: no_such_name() if a[0] == "nowhere" else look_up(*a)
-    )
-    assert run(command, key, flag, "nowhere:7400") == 2
-    assert capsys.readouterr().err == (
-        f"cloudrc: error: {flag} nowhere:7400: nowhere cannot be resolved (Name or service not"
-        " known); name a host that has an IPv4 address, or the address itself\n"
-    )
-
-
 def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
     for text in ("127.0.0.1:7400", "[::1]:7400", "[::]:1"):
         assert show_address(read_address(text)) == text

@@ -5,7 +5,6 @@ import io
 import json
 import os
 import signal
-import statistics
 import subprocess
 import sys
 import time
@@ -105,23 +104,13 @@ def test_a_signal_ends_a_sweep_at_once(how, folder):
     assert 1 <= document["count"] < 40
 
 
-@pytest.mark.parametrize(
-    ("n", "bounds"),
-    [
-        (5, None),  # minimum and maximum enclose the median with 1 - 2/32 = 0.9375 only
-        (6, (1, 6)),  # 1 - 2/64 = 0.969
-        (10, (2, 9)),  # 1 - 2 * 11/1024 = 0.979; (3, 8) has 0.891
-    ],
-)
-def test_the_interval_has_the_bounds_computed_by_hand(n, bounds):
-    assert interval([float(i) for i in range(n, 0, -1)]) == bounds
-
-
-@given(st.lists(st.floats(-1e6, 1e6), min_size=6, max_size=40))
-@settings(max_examples=50, deadline=None)
-def test_the_interval_encloses_the_median(values):
-    low, high = interval(values)
-    assert low <= statistics.median(values) <= high
+@given(st.permutations(range(1, 21)))
+@settings(max_examples=20, deadline=None)
+def test_the_interval_of_the_median_has_the_bounds_of_textbooks(values):
+    """With 20 values 0.9586; the range of 5 values encloses it with 0.9375 only, that of 6 does."""
+    assert interval(values) == (6, 15)
+    assert interval(values[:5]) is None
+    assert interval(values[:6]) == (min(values[:6]), max(values[:6]))
 
 
 def test_runs_may_lack_a_number():
@@ -130,10 +119,6 @@ def test_runs_may_lack_a_number():
     assert (summary["done"], summary["count"]) == (2, 3)
     assert (summary["numbers"]["x"]["median"], summary["numbers"]["x"]["count"]) == (2.0, 2)
     assert "(2 runs)" in as_table(summary)
-    assert as_table(summary).endswith("done 2/3")
-    assert list(csv.reader(io.StringIO(as_csv(runs)))) == [
-        ["seed", "verdict", "x [m]", "y [m]"],
-        ["1", "success", "1.0", ""],
-        ["2", "failure", "", "2.0"],
-        ["3", "success", "3.0", ""],
-    ]
+    head, first, second, _ = csv.reader(io.StringIO(as_csv(runs)))
+    assert head == ["seed", "verdict", "x [m]", "y [m]"]
+    assert (first[2:], second[2:]) == (["1.0", ""], ["", "2.0"])
