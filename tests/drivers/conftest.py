@@ -48,11 +48,6 @@ def slower(told):
     return max(1.0, float(told) / NOMINAL)
 
 
-def here():
-    """Measure the slowdown of this machine's interpreter."""
-    return slower(subprocess.check_output([sys.executable, "-c", WORK]))
-
-
 def ages_at_hold(recording):
     """Return the age [s] of the newest applied basis at each HOLD for want of fresh commands."""
     guard, applied = recording["/guard"], recording["/command_applied"]

@@ -14,7 +14,6 @@ from contextlib import suppress
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from cloudrc import __version__
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import exporter as exporters
 from cloudrc.drivers.exporter import Exporter, read_throttling
@@ -114,13 +113,6 @@ def test_the_sync_age_is_absent_until_it_is_known():
     assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
 
 
-def test_the_build_names_the_configuration_that_runs():
-    world = Exporter("world")
-    world.runs("0123456789ab" + "f" * 52)
-    labels = f'config="0123456789ab",role="world",version="{__version__}"'
-    assert f"cloudrc_build_info{{{labels}}} 1.0" in world.text()
-
-
 LIMITED = "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n"
 OLD = "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n"
 
@@ -165,14 +157,12 @@ def test_metrics_and_probes_are_on_one_port(served, monkeypatch):
     exporter, port = served
     assert get(port, "/healthz") == (200, "alive\n")
     assert get(port, "/readyz") == (503, "no peer yet\n")
-    assert "cloudrc_ready 0.0" in get(port, "/metrics")[1]
-    exporter.ready(True)
-    assert get(port, "/readyz")[0] == 200
-    with urllib.request.urlopen(f"http://{HOST}:{port}/metrics?name=any", timeout=10) as answer:
+    for ready, status in ((True, 200), (False, 503)):
+        exporter.ready(ready)
+        assert get(port, "/readyz")[0] == status
+        assert f"cloudrc_ready {ready:.1f}" in get(port, "/metrics?name=any")[1]
+    with urllib.request.urlopen(f"http://{HOST}:{port}/metrics", timeout=10) as answer:
         assert answer.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
-        assert b"cloudrc_ready 1.0" in answer.read()
-    exporter.ready(False)
-    assert get(port, "/readyz")[0] == 503
     assert get(port, "/") == (404, "there are /metrics, /healthz, /readyz, /link.json\n")
 
 
@@ -218,22 +208,15 @@ def test_probes_of_both_address_families_are_answered():
 
 
 def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
+    """The oldest are closed."""
     waiting = [socket.create_connection((HOST, served[1]), timeout=0.9) for _ in range(200)]
-    for client in waiting[-2:]:
-        client.sendall(b"GET /metr")
+    waiting[-1].sendall(b"GET /metr")
     assert get(served[1], "/healthz")[0] == 200
-    closed = select.select(waiting, [], [], 0)[0]  # the oldest ones
+    closed = select.select(waiting, [], [], 0)[0]
     assert closed == waiting[: len(closed)]
     assert len(closed) == len(waiting) + 1 - exporters.CONNECTIONS_MAX
     for client in waiting:
         client.close()
-
-
-def test_a_client_that_hangs_is_cut(served, monkeypatch):
-    monkeypatch.setattr(exporters._Handler, "timeout", 0.05)
-    with socket.create_connection((HOST, served[1]), timeout=10) as client:
-        client.sendall(b"GET /metrics HT")
-        assert client.recv(100) == b""
 
 
 @pytest.mark.process

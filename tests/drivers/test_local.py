@@ -2,10 +2,7 @@
 
 import errno
 import os
-import signal
 import stat
-import subprocess
-import sys
 import tempfile
 from contextlib import suppress
 from pathlib import Path
@@ -20,14 +17,6 @@ from cloudrc.drivers.process import to_line
 from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
 
-KILLED = """
-import os, signal, sys
-from pathlib import Path
-from cloudrc.drivers import local
-with local.announced(Path(sys.argv[1])):
-    assert local.under_way()
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
 EVENT = MissionEvent(5, "reached", 1, "waypoint 2 of 7 reached")
 
 
@@ -53,15 +42,6 @@ def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(tmp_path, places, m
         assert local.under_way() == {}
         raise KeyboardInterrupt
     assert list(places[0].iterdir()) == []
-
-
-@pytest.mark.process
-def test_a_flight_that_is_killed_is_over_and_is_cleared_away(tmp_path, places):
-    ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
-    assert ended.returncode == -signal.SIGKILL
-    (left,) = places[0].glob("*.json")
-    assert local.under_way() == {}
-    assert not left.exists()
 
 
 @pytest.mark.parametrize("mode", [0o770, None])
@@ -92,16 +72,6 @@ def test_another_users_folder_is_neither_read_nor_written(tmp_path, monkeypatch)
         assert local.under_way() == {}
         with local.announced(tmp_path / "b") as told:
             assert not told
-
-
-def test_without_a_home_there_is_no_folder_in_the_working_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("XDG_STATE_HOME")
-    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "here")
-    with local.announced(tmp_path) as told:
-        assert not told
-    assert local.places() == []
 
 
 def test_an_unannounced_flight_names_the_flag_for_its_commands(tmp_path, monkeypatch):

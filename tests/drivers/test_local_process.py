@@ -78,6 +78,7 @@ def test_a_killed_supervisor_ends_all_and_leaves_a_recording(tmp_path):
     run.kill()
     run.communicate()
     wait_until_ended(pids, 5.0)
+    assert local.under_way() == {}, "nor does a file say that it flies"
     subprocess.run([*COMMAND, "report", str(folder)], check=False, capture_output=True)
     assert report(folder)["numbers"]["commands_applied"]["value"] > 10
     assert (folder / "mission.mcap").exists()

@@ -1,15 +1,12 @@
 """The real-time driver: addresses and routes, sockets, stalls and floods, seals."""
 
-import ast
 import os
 import socket
 import time
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 
-from cloudrc.drivers import realtime
 from cloudrc.drivers.realtime import (
     BACKLOG_MAX,
     DRAIN_MAX,
@@ -21,12 +18,10 @@ from cloudrc.drivers.realtime import (
     serve,
     split_address,
 )
-from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.tunnel.codec import DATAGRAM_MAX, DecodeError, Kind
 from cloudrc.tunnel.session import pair
 from tests.flights.conftest import bare_world, ring
 
-PACKAGE = Path(__file__).parents[2] / "cloudrc"
 HERE, THERE = ("127.0.0.1", 7401), ("10.1.2.3", 7400)
 MANY = 300
 MS = 1_000_000
@@ -126,17 +121,6 @@ def test_ends_meet_over_ipv6_and_at_both_families(listen, other):
         assert (far.receive(), own.receive()) == ([b"there"], [b"back"])
 
 
-def test_ports_in_use_are_not_chosen(monkeypatch):
-    with socket.socket() as taken, bind(("127.0.0.1", 0)) as udp:
-        taken.bind(("127.0.0.1", 0))
-        (free,) = realtime.free_ports(1)
-        busy = [taken.getsockname()[1], udp.getsockname()[1]]
-        monkeypatch.setattr(realtime, "PORTS", [*busy, free])
-        assert realtime.free_ports(1) == [free]
-        with pytest.raises(MissingPrerequisiteError, match="only 1 of 2 ports"):
-            realtime.free_ports(2)
-
-
 class Late:
     """An end with a given lateness at each wake [ns]."""
 
@@ -210,23 +194,3 @@ def test_an_end_without_keys_gets_no_socket_and_strangers_no_answer():
                 serve(bare_world(ring=None), peer, end="world", sink=list, stop=lambda: False)
         with pytest.raises(TimeoutError):
             stranger.recv(2048)
-
-
-def calls(name):
-    """Find the package's files that use a name."""
-    found = set()
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            named = getattr(node, "id", None) or getattr(node, "attr", None)
-            if named == name or (isinstance(node, ast.alias) and node.name == name):
-                found.add(path.relative_to(PACKAGE).as_posix())
-    return found
-
-
-def test_only_what_checks_the_seal_sends_what_an_end_says():
-    """Each caller of `take_datagrams` has no socket or checks for the seal."""
-    takers = {name for name in calls("take_datagrams") if not name.startswith("faults/")}
-    assert takers == {"drivers/realtime.py", "drivers/virtual.py"}
-    assert "drivers/virtual.py" not in calls("socket")
-    users = {"cli/bench.py", "tunnel/handshake.py", "tunnel/session.py"}
-    assert calls("Session") - users == {"tunnel/end.py"}

@@ -42,8 +42,7 @@ def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path):
     for _ in range(3):
         assert shelf.begun.acquire(timeout=5.0)
     ages = [thread.sync_age(), thread.sync_age()]
-    assert all(age is not None and age >= shelf.began[2] - shelf.began[1] for age in ages)
-    assert ages[0] < ages[1], "it rises while the disk hangs"
+    assert shelf.began[2] - shelf.began[1] <= ages[0] < ages[1], "it rises while the disk hangs"
     recorder.put(counted(500))
     while shelf.flushed.acquire(blocking=False):
         pass

