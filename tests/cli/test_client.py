@@ -6,7 +6,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from cloudrc.cli.client import Api, ApiError
-from tests.teleop.conftest import running
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -26,10 +25,3 @@ def test_an_answer_of_another_server_is_shown_as_it_is():
             with pytest.raises(ApiError, match=f"the API answered {status} "):
                 Api(f"http://127.0.0.1:{server.server_port}").get(f"/{status}")
         server.shutdown()
-
-
-def test_a_socket_may_have_any_path(tmp_path):
-    with running(unix=True) as api:
-        for name in ("a b", "a:80", "[::", "ü" * 8):
-            (tmp_path / name).symlink_to(api.address)
-            assert Api(f"unix:{tmp_path / name}").get("/v1/missions") == {"missions": []}

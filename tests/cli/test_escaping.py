@@ -9,13 +9,10 @@ import yaml
 
 from cloudrc.cli import mission, report
 from cloudrc.cli.client import Api
-from cloudrc.cli.link_verify import as_text, make_report
 from cloudrc.cli.main import main
 from cloudrc.cli.output import escape, table
 from cloudrc.cli.progress import FlightView
 from cloudrc.errors import BadInputError
-from cloudrc.link.verify.causes import Evidence, Findings
-from cloudrc.link.verify.judge import Row
 from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import Fault
 from cloudrc.teleop.store import Order
@@ -43,14 +40,6 @@ def test_a_name_in_an_error(words, printed):
     assert line.startswith("cloudrc: error: ")
 
 
-def test_names_in_an_error_of_several_lines(folder, printed):
-    (folder / "a.yaml").write_text(yaml.safe_dump({EVIL: 1, "seed": EVIL}))
-    assert main(["run", "./a.yaml"]) == 2
-    head, *lines = printed().splitlines()
-    assert head.endswith("a.yaml has 2 problems:")
-    assert [line.startswith("  ./a.yaml:") for line in lines] == [True, True]
-
-
 def test_the_note_of_a_recording(folder, capsys):
     with McapWriter(folder / "a.mcap", clock="world") as writer:
         writer.write(world_records(5))
@@ -70,13 +59,6 @@ def test_what_is_printed_of_a_flight(printed):
     assert_harmless(stream.getvalue())
     print(table([["name", "value"], [EVIL, "1"]]))
     assert printed().count("\n") == 2
-
-
-def test_the_state_of_a_link_container():
-    row = Row("mean", "s", 0.1, 0.1, 0.1, 0.1, "off")
-    known = Evidence("none", elsewhere=(EVIL,))
-    ways, probes = {"uplink": Findings([row], known)}, {"uplink": EVIL}
-    assert_harmless(as_text(make_report(EVIL, ways, probes)), count=3)
 
 
 @pytest.fixture

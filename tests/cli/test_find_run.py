@@ -75,19 +75,6 @@ def test_a_local_run_gets_no_token(tmp_path, monkeypatch):
         assert main(["mission", "estop", "--api", api.url]) == 2
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["mission", "estop"], "--run nowhere: no run with an API flies there"),
-        ([*SET, "-n", "demo"], "the other flags a cluster; give one"),
-    ],
-)
-def test_a_wrong_run_flag_gives_one_line(words, said, capsys):
-    assert main([*words, "--run", "nowhere"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
-
-
 def with_link(folder):
     """Make the folder of a run whose relay has just started, and announce it."""
     (folder / "link").mkdir(parents=True)

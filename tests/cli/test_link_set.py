@@ -2,13 +2,12 @@
 
 import json
 from copy import deepcopy
-from errno import ENOSPC
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.cli import link_set, processes
+from cloudrc.cli import link_set
 from cloudrc.cli.main import main
 from cloudrc.cli.processes import RelayControl
 from cloudrc.config.document import Document
@@ -100,22 +99,6 @@ def flight(tmp_path, monkeypatch):
     monkeypatch.setattr(link_set, "sleep", found.wait)
     with local.announced(tmp_path / "runs" / "latest"):
         yield found
-
-
-def test_state_that_a_full_disk_refused_is_written_later(flight, monkeypatch):
-    def full(path, text):
-        raise OSError(ENOSPC, "No space left on device")
-
-    (flight.folder / "profile.json").write_text('{"uplink": {"delay_ms": 80}}')
-    with monkeypatch.context() as disk:
-        disk.setattr(processes, "publish", full)
-        for _ in range(3):
-            flight.wait(0.05)
-    assert flight.delay("uplink") == pytest.approx(0.08), "in force all the same"
-    flight.wait(0.05)
-    states = [json.loads((flight.folder / f"{way}.json").read_text()) for way in flight.links]
-    assert [state["changes"] for state in states] == [1, 1]
-    assert states[0]["asked"]["delay"] == 0.08
 
 
 def test_a_run_here_is_found_changed_and_read_back(flight, capsys):

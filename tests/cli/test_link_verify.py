@@ -106,24 +106,6 @@ def test_a_fault_names_its_direction(release):
 
 
 @pytest.mark.parametrize(
-    ("told", "note"),
-    [
-        ({}, "downlink: no datagrams to measure; fly a mission first"),
-        ({"time_line": (1.0, 0.0)}, "uplink: its time line NOT JUDGED in flight"),
-    ],
-)
-def test_what_is_not_judged_is_noted(release, told, note):
-    release.hears(cloud="ok", **({"world": "ok"} if told else {}))
-    for name, values in told.items():
-        release.tells(name, *values)
-    said = release.ask(0.0)
-    text, partly = as_text(said), "except what is NOT JUDGED (above)"
-    assert said["verdict"] == ("believed" if told else "undecided")
-    assert note in text
-    assert text.splitlines()[-1].endswith(partly) is bool(told)
-
-
-@pytest.mark.parametrize(
     ("asked", "applied", "code"), [(2e6, None, "rate_ignored"), (3e6, 3e6, "")]
 )
 def test_a_shaper_that_reports_another_rate_is_not_believed(release, asked, applied, code):

@@ -3,7 +3,6 @@
 import io
 import json
 import math
-import re
 
 import pytest
 import yaml
@@ -95,16 +94,6 @@ def test_the_status_line_shows_the_state_of_the_flight(seen):
         (flown, "   4.0 s  TRACK   waypoint 3/7  (-1.00,  2.50, 0.00) m  delay  96 ms  x2.00"),
     ):
         assert seen(io.StringIO(), *records).line().plain == line
-
-
-def test_a_terminal_gets_a_status_line_that_fits_and_is_erased(monkeypatch, seen):
-    monkeypatch.setenv("COLUMNS", "20")
-    stream = Terminal()
-    seen(stream, telemetry(0), CONTROL).close()
-    drawn = re.sub(r"\x1b\[[?0-9;]*[a-zA-Z]", "", stream.getvalue())
-    assert "0.0 s  GROUND  " in drawn
-    assert "wayp" not in drawn
-    assert stream.getvalue().endswith("\x1b[2K")
 
 
 def test_events_are_plain_lines_in_a_file_and_wrapped_on_a_terminal(seen):

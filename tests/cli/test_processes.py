@@ -12,13 +12,11 @@ from cloudrc import assembly
 from cloudrc.cli import processes
 from cloudrc.cli.main import main
 from cloudrc.cli.processes import (
-    ipv4_addresses,
     open_recorder,
     open_relay,
     read_address,
     read_profiles,
     read_size,
-    resolve_address,
     show_address,
 )
 from cloudrc.config.load import load_experiment
@@ -95,19 +93,6 @@ def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
         read_address("::1:7400")
     monkeypatch.setattr(socket, "socket", Mock(side_effect=OSError("Address family")))
     assert read_address("[::]:7400") == ("0.0.0.0", 7400), "on a machine without IPv6"
-
-
-def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
-    def look_up(name, port, family, kind):
-        return [(family, kind, 17, "", ("::5", 0))] if family == socket.AF_INET6 else no_such_name()
-
-    with monkeypatch.context() as patch:
-        patch.setattr(socket, "getaddrinfo", look_up)
-        with pytest.raises(OSError, match="IPv6 addresses alone, and a link is shaped over IPv4"):
-            ipv4_addresses("cloud")
-        assert resolve_address("--peer", ("cloud", 1), ("::1", 2)) == ("::5", 1)
-    with pytest.raises(BadInputError, match=r"cannot be resolved \(not a name"):
-        resolve_address("--peer", ("x" * 64 + ".test", 1))
 
 
 # Here, too, the socket stays open after the command.

@@ -14,9 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.cli import sweep
 from cloudrc.cli.main import main
-from cloudrc.cli.pool import WorkerDiedError
 from cloudrc.cli.sweep import as_csv, as_table, interval, summarise
 from tests.conftest import nightly
 
@@ -46,30 +44,6 @@ def test_many_seeds_become_one_table(folder, capsys):
     document, rows = written(folder)
     assert ([run["seed"] for run in document["runs"]], rows) == ([1, 2], 2)
     assert (document["done"], document["count"], document["interrupted"]) == (0, 2, False)
-
-
-@pytest.mark.parametrize(
-    ("finished", "error", "code", "word"),
-    [
-        (0, KeyboardInterrupt(), 130, "interrupted"),
-        (2, WorkerDiedError("a worker was killed"), 6, "a worker was killed"),
-    ],
-)
-def test_an_interrupted_sweep_keeps_what_is_finished(
-    finished, error, code, word, folder, capsys, monkeypatch
-):
-    def reports(*arguments):
-        yield from (report(seed, duration=1.0) for seed in range(1, finished + 1))
-        raise error
-
-    monkeypatch.setattr(sweep, "map_in_order", reports)
-    assert main(["run", "steps", "--seeds", "9", "--out", "sweep"]) == code
-    out, err = capsys.readouterr()
-    assert f"cloudrc: {word}" in err
-    assert f": {finished} of 9 seeds are finished\n" in err
-    assert out.splitlines()[-1] == "sweep/sweep.json"
-    document, rows = written(folder)
-    assert (document["count"], rows, document["interrupted"]) == (finished, finished, True)
 
 
 @pytest.mark.process

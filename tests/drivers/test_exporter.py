@@ -2,14 +2,10 @@
 
 import select
 import socket
-import subprocess
-import sys
 import threading
-import time
 import urllib.error
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -17,7 +13,6 @@ from prometheus_client.parser import text_string_to_metric_families
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import exporter as exporters
 from cloudrc.drivers.exporter import Exporter, read_throttling
-from cloudrc.drivers.realtime import free_ports
 from cloudrc.exposition.table import (
     BODIES,
     DIRECTIONS,
@@ -217,24 +212,3 @@ def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
     assert len(closed) == len(waiting) + 1 - exporters.CONNECTIONS_MAX
     for client in waiting:
         client.close()
-
-
-@pytest.mark.process
-def test_a_link_counts_unresolved_names_before_it_shapes(tmp_path):
-    (tmp_path / "profile.yaml").write_text("uplink: {delay_ms: 1}\n")
-    listen, metrics = free_ports(2)
-    words = f"link run --config hover --profile {tmp_path}/profile.yaml --direction uplink"
-    words += f" --mode relay --peer no..name:7400 --route {tmp_path}/route"
-    words += f" --listen {HOST}:{listen} --metrics {HOST}:{metrics}"
-    command = [sys.executable, "-m", "cloudrc", *words.split()]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as link:
-        try:
-            until, errors = time.monotonic() + 15, 0.0
-            while errors < 1:
-                assert time.monotonic() < until
-                time.sleep(0.05)
-                with suppress(OSError):
-                    page = get(metrics, "/metrics")[1]
-                    errors = float(page.partition("\ncloudrc_dns_errors_total ")[2].split()[0])
-        finally:
-            link.terminate()

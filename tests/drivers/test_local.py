@@ -74,16 +74,6 @@ def test_another_users_folder_is_neither_read_nor_written(tmp_path, monkeypatch)
             assert not told
 
 
-def test_an_unannounced_flight_names_the_flag_for_its_commands(tmp_path, monkeypatch):
-    monkeypatch.setattr(LocalRun, "_fly", lambda *_: None)
-    for places, api in ((local.places, True), (list, False), (list, True)):
-        monkeypatch.setattr(local, "places", places)
-        said = []
-        LocalRun(tmp_path, said.extend, api=api).fly(1.0)
-        assert len(said) == (places is list and api)
-    assert "--api unix:/" in str(said[0])
-
-
 def test_a_bad_feed_line_ends_no_flight(tmp_path):
     child = Child("cloud", None, tmp_path / "cloud.log")
     event = to_line(EVENT).encode()

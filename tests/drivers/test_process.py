@@ -192,13 +192,6 @@ def test_nonsense_in_either_file_is_recorded_as_nothing(path, wrong):
     assert len(notes.after([], 2400 * MS)) == 1
 
 
-def test_foreign_words_are_noted_in_one_line_that_can_be_written(path):
-    tell(path, replace(STATE, cause="torn\nin two \udce9 " + "x" * 10_000))
-    (noted,) = LinkNotes(path, uplink=False).after([], 200 * MS)
-    assert noted.cause.startswith("torn in two \\udce9 xxx")
-    assert len(noted.cause.encode()) < 2100
-
-
 def test_how_late_a_relay_is_is_noted_every_other_second(path):
     """Unknown names would fill the tables of counters."""
     notes, errors = LinkNotes(path, uplink=True), ReleaseErrors()
@@ -210,20 +203,6 @@ def test_how_late_a_relay_is_is_noted_every_other_second(path):
     assert notes.after([], 2000 * MS) == [
         Counted(2000 * MS, "link", f"uplink_{name}", number) for name, number in told.items()
     ]
-
-
-def test_a_change_of_the_other_direction_is_recorded_but_not_fed(path, pipe):
-    notes, recorded, feed = LinkNotes(path, uplink=False), [], Feed(pipe[1], watched=False)
-    slower = {**STATE.profile, "downlink": {"delay_ms": 120.0}}
-    changes = [{}, {"cause": "uplink.loss=0.1"}, {"cause": "slower", "profile": slower}]
-    for n, change in enumerate(changes):
-        tell(path, replace(STATE, since_ns=200 * n * MS, **change))
-        noted = notes.after(BEGINS, 200 * (n + 1) * MS)
-        recorded += [one.cause for one in noted]
-        feed.tell(noted)
-    assert recorded == ["", "uplink.loss=0.1", "slower"]
-    (said,) = os.read(pipe[0], 4096).decode().splitlines()
-    assert said.endswith("(slower)")
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ from contextlib import closing
 import pytest
 
 from cloudrc.drivers.realtime import (
-    BACKLOG_MAX,
     DRAIN_MAX,
     ROUTE_PERIOD_NS,
     STALL_AGAIN_NS,
@@ -170,16 +169,6 @@ def test_what_waited_through_a_stall_is_taken_in_one_wake(late_ns, arrive, wakes
 
         serve(end, Peer(udp, None), end="world", sink=list, stop=over)
         assert end.wakes == wakes
-
-
-def test_a_flood_that_is_too_much_does_not_keep_the_loop_in_it(monkeypatch):
-    """More datagrams wait than one wake takes."""
-    monkeypatch.setattr(Peer, "receive", lambda peer, most=DRAIN_MAX: [b"flood"] * most)
-    with bind(("127.0.0.1", 0)) as udp, socket.socket(type=socket.SOCK_DGRAM) as sender:
-        sender.sendto(b"waits", udp.getsockname())
-        end = Late(*[LONG_NS] * 4)
-        serve(end, Peer(udp, None), end="world", sink=list, stop=lambda: len(end.wakes) == 4)
-        assert end.wakes == [BACKLOG_MAX, DRAIN_MAX, BACKLOG_MAX, DRAIN_MAX]
 
 
 def test_an_end_without_keys_gets_no_socket_and_strangers_no_answer():

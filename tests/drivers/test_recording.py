@@ -106,21 +106,3 @@ def test_a_clock_that_drifts_has_not_been_set(monkeypatch):
     for later in (1.0, 60.0, 3600.0, 86_400.0):
         boot.append(later)
         assert seen.step() == 0.0
-
-
-@pytest.mark.parametrize("stopped_before", [True, False])
-def test_nor_has_one_whose_reader_was_stopped_meanwhile(stopped_before, monkeypatch):
-    """A stop of a second between the reads of both clocks, by SIGSTOP or a CPU quota."""
-    true, stops = [0.0], iter([False, True])
-
-    def look():
-        stop = next(stops, False)
-        true[0] += stop and stopped_before
-        shown = 1.7e9 + true[0]
-        true[0] += stop and not stopped_before
-        return shown
-
-    monkeypatch.setattr(time, "clock_gettime", lambda clock: true[0])
-    monkeypatch.setattr(time, "time", look)
-    seen = WallClock()
-    assert [seen.step(), seen.step()] == [0.0, 0.0]

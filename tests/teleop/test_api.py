@@ -22,7 +22,7 @@ from cloudrc.messages import GuardState
 from cloudrc.records import Counted
 from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
-from cloudrc.teleop.api import ApiServer, Bridge
+from cloudrc.teleop.api import ApiServer
 from cloudrc.teleop.auth import LOCAL
 from tests.teleop.conftest import DIRECT, OPERATOR, READER, A, B, C, connect, head, running
 
@@ -215,27 +215,6 @@ def test_a_stop_during_the_start_is_the_first_call_unless_another_teleop_flies(l
         else:
             api.bridge.open(api.flight.teleop)
             assert answer.result() == (200, {"id": None, "state": "stopping"})
-
-
-@emergency_stop
-def test_stop_and_hold_overtake_a_full_queue_of_calls():
-    bridge, made = Bridge(), []
-    bridge.open(object())
-
-    def submit(what, *lane):
-        bridge.submit(lambda service, now_ns: made.append(what), *lane)
-
-    for number in range(100):
-        submit(number)
-    for what in ("hold", "stop", "hold"):
-        submit(what, what)
-    for call in (*bridge.take_stops(), *bridge.take_stops()):
-        call(0)
-    assert made == ["stop"]
-    submit("stop", "stop")
-    for call in bridge.take():
-        call(0)
-    assert made == ["stop", "stop", "hold", "hold", *range(100)]
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,8 @@
 import pytest
 
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
-from cloudrc.teleop.mission import HELD_LOWEST, Teleop
-from cloudrc.teleop.requests import PREDECESSORS, REPEAT_NS, RequestSender
-from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
-from cloudrc.tunnel.codec import NUMBER_MAX
+from cloudrc.teleop.requests import REPEAT_NS
+from cloudrc.teleop.wire import ALARM, Leg, Plan
 from tests.teleop.conftest import AWAY, FROM_SPAWN, ID, PLAN, THREE, A, B, C, Flight, asked, flying
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -93,13 +91,6 @@ def test_a_leg_that_takes_too_long_fails_the_mission():
     assert flight.requests[-1].request is Request.END
 
 
-def test_no_robot_is_held_where_it_would_scrape_along_the_floor():
-    flight = flying()
-    flight.step(position=(0.2, 0.1, 0.12))
-    flight.operate("hold")
-    assert flight.setpoints[-1] == Setpoint((0.2, 0.1, HELD_LOWEST), 0.3, -1)
-
-
 def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
     """One that was told to start does not: an armed robot flies to a setpoint at once."""
     flight = flying(Plan((Leg(A, dwell=0.0),)))
@@ -113,24 +104,6 @@ def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
     before = len(flight.setpoints)
     flight.operate("start", PLAN)
     assert flight.setpoints[before:] == []
-
-
-@pytest.mark.parametrize("before", ["cancel", "acknowledge"])
-def test_after_a_foreign_start_the_robot_counts_as_flying(before):
-    """A predecessor's late start moves it; it would leave for the next mission's point."""
-    flight = started() if before == "cancel" else Flight()
-    flight.onboard = (ID + 1, 2)
-    flight.step(position=AWAY)
-    if flight.state != "FAILED":
-        flight.operate(before)
-    flight.step(seconds=0.1)
-    flight.mission += 1
-    flight.guard = TRACK
-    flight.step()
-    flight.downlink = False
-    flight.operate("start", FROM_SPAWN, ID + 2)
-    flight.step(seconds=0.2)
-    assert flight.setpoints[-1].position == AWAY
 
 
 def started():
@@ -160,35 +133,6 @@ def test_a_robot_that_waits_during_its_mission_is_started_again(guard):
 
 
 # Requests and the emergency stop: repeated until the robot has acted on them
-
-
-def first_request(seen, now_ns):
-    sender = RequestSender()
-    sender.see(seen, now_ns)
-    sender.ask(Request.END)
-    return sender.due(now_ns)
-
-
-def test_whoever_begins_later_begins_higher_and_numbers_last():
-    """Though both see a robot that has been asked nothing; for a thousand restarts."""
-    seen = RobotStatus(1, A, GROUND, 0)
-    numbers = [first_request(seen, REPEAT_NS * n).number for n in (5_000, 5_010, 0)]
-    assert numbers == [PREDECESSORS + 5_000, PREDECESSORS + 5_010, PREDECESSORS]
-    for _ in range(1_000):
-        seen = seen._replace(mission=first_request(seen, 10 * 365 * 86_400 * 10**9).number)
-    assert seen.mission < NUMBER_MAX / 10
-
-
-def test_a_start_of_the_teleop_before_that_arrives_late_is_ended():
-    """Nobody flies that mission any more."""
-    flight = Flight()
-    flight.teleop = Teleop(ended=lambda number: number == ID)
-    flight.step(seconds=0.5)
-    assert flight.requests == []
-    flight._obey(OperatorRequest(1, Request.START, Start.HERE, mission_id=ID))
-    flight.step(seconds=0.1)
-    assert flight.requests[-1].request is Request.END
-    assert flight.guard is HOLD
 
 
 def test_each_copy_of_a_setpoint_or_request_names_the_current_session():

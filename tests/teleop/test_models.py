@@ -26,9 +26,7 @@ def waypoint(**more):
         (waypoint(position_m=[0, 0, "high"]), "waypoints.0.position_m.2", 0, "be a number [m]"),
         (waypoint(dwell=1), "waypoints.0.dwell", 0, "did you mean dwell_s"),
         (waypoint(tolerance_m=0), "waypoints.0.tolerance_m", 0, "> 0"),
-        ({"name": "nothing"}, "waypoints", None, "none given; give at least one"),
         ({**waypoint(), "time_limit_s": 1e308}, "time_limit_s", None, "and <= 1000000"),
-        ({**waypoint(), "start": "there"}, "start", None, "'spawn' or 'here'"),
         ({**waypoint(), "key": "k" * 201}, "key", None, "must be text of at most 200 characters"),
         ({**waypoint(), "key": "to \u202e"}, "key", None, "one line of printable characters"),
         ({**waypoint(), "\u00b3": 1}, "\u00b3", None, ""),  # `int` does not read this digit
