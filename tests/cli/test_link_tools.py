@@ -10,11 +10,6 @@ from cloudrc.cli.main import main
 from cloudrc.link.traces import read_table, read_trace
 from tests.record.conftest import world_records, write
 
-PING = "\n".join(
-    f"[{100 + n / 5 + 0.04:.6f}] 64 bytes from 192.0.2.1: icmp_seq={n} ttl=57 time={40 + n % 3} ms"
-    for n in range(20)
-)
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
@@ -54,17 +49,6 @@ def test_a_recording_of_the_world_alone_gives_no_trace(folder, capsys):
     said = capsys.readouterr().err
     assert "world.mcap: no rows on /uplink_delay, so no uplink; give the run's folder" in said
     assert "world.mcap: holds no round trip; give the folder of a run that flew" in said
-
-
-def test_a_ping_log_gives_a_trace_and_what_was_left_out(folder, capsys):
-    (folder / "ping.log").write_text(PING + "\nping: sendmsg: Operation not permitted\n")
-    assert main(["link", "record", "ping.log", "-o", "t.csv"]) == 2
-    assert "--halve-rtt" in capsys.readouterr().err
-    assert main(["link", "record", "ping.log", "-o", "t.csv", "--halve-rtt"]) == 0
-    said = capsys.readouterr().out.splitlines()[0]
-    assert "20 packets in 3.8 s, half of each round trip 20.48" in said
-    assert said.endswith(", 0 lost; 1 other lines left out")
-    assert read_trace(folder / "t.csv").delays[:3] == pytest.approx((0.020, 0.0205, 0.021))
 
 
 @pytest.mark.parametrize(

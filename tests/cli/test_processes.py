@@ -15,7 +15,6 @@ from cloudrc.cli.processes import (
     open_recorder,
     open_relay,
     read_address,
-    read_profiles,
     read_size,
     show_address,
 )
@@ -24,7 +23,6 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import summary
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.record.columns import Recording
 from tests.record.conftest import MS, counted, world_records
@@ -161,17 +159,6 @@ def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_both_recordings_together_stay_within_the_limit(tmp_path):
-    path, limit = tmp_path / "world.mcap", 200_000
-    for _ in range(3):
-        recorder = record(started(path, limit), 30)
-        recorder.close()
-        assert "the file has reached its size limit" in recorder.error
-    sizes = [each.stat().st_size for each in tmp_path.iterdir()]
-    assert len(sizes) == 2
-    assert sum(sizes) < limit + 2 * 16_000, "each recording ends with its open chunk"
-
-
 def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     loads, path = [], tmp_path / "trace.csv"
     monkeypatch.setattr(LinkMonitor, "begin", lambda self, asked, path, load: loads.append(load))
@@ -189,14 +176,6 @@ def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
         load(trace=str(path))
     with pytest.raises(BadInputError, match="not a file; give a CSV file"):
         load(trace="/dev/null")  # an endless device would fill the memory
-
-
-def test_the_requested_delay_of_a_relay_is_that_of_the_trace(tmp_path):
-    (tmp_path / "t.csv").write_text("time_s,delay_ms\n0,40\n5,90\n")
-    (tmp_path / "mine.yaml").write_text("link: {uplink: {trace: t.csv}, downlink: {delay_ms: 25}}")
-    first = read_profiles(load_experiment("./mine.yaml"))
-    delays = {way: summary(loaded.direction)["delay"] for way, loaded in first.items()}
-    assert delays == {"uplink": 0.04, "downlink": 0.025}
 
 
 def test_a_side_of_a_relay_that_cannot_reach_its_end_is_refused():

@@ -138,14 +138,11 @@ class Release:
         self.running[name] = self.run(name, "--config", "config.yaml", *self.flags[name])
 
     def run(self, *words):
-        command = [sys.executable, "-m", "cloudrc", *words]
         environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-        pipe = subprocess.PIPE
-        process = subprocess.Popen(
-            command, cwd=self.folder, stdout=pipe, stderr=pipe, text=True, env=environ
-        )
-        self.all.append(process)
-        return process
+        how = {"cwd": self.folder, "env": environ, "text": True}
+        how |= dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
+        self.all.append(subprocess.Popen([sys.executable, "-m", "cloudrc", *words], **how))
+        return self.all[-1]
 
     def kill(self, *names):
         for name in names:

@@ -1,11 +1,9 @@
 """Who may do what, the gate before the API, and the log of who commanded what."""
 
-import errno
 import json
 import os
 import stat
 import subprocess
-from unittest.mock import Mock
 
 import pytest
 
@@ -86,12 +84,11 @@ def test_a_token_file_that_others_can_read_is_warned_of(tmp_path, monkeypatch, m
     assert warnings == (expected if told else [])
 
 
-def test_a_changed_token_file_counts_at_once(monkeypatch):
+def test_a_changed_token_file_counts_at_once():
     with running() as api:
 
         def role(token):
-            status, _ = api.send(api.request("/v1/state", token=token))
-            return status
+            return api.send(api.request("/v1/state", token=token))[0]
 
         assert (role(OPERATOR), role(ANOTHER)) == (200, 401)
         api.token_file.write_text(ANOTHER)
@@ -100,10 +97,7 @@ def test_a_changed_token_file_counts_at_once(monkeypatch):
         api.until(lambda: role(READER) == 401)
         api.token_file.write_text("short")  # an unusable file admits nobody
         api.until(lambda: role(ANOTHER) == 401)
-        with monkeypatch.context() as patch:  # without a free file descriptor
-            patch.setattr(auth, "read", Mock(side_effect=OSError(errno.EMFILE, "no descriptor")))
-            api.token_file.write_text(OPERATOR)
-            assert role(OPERATOR) == 401
+        api.token_file.write_text(OPERATOR)
         api.until(lambda: role(OPERATOR) == 200)
         away = api.token_file.rename(api.token_file.with_name("away"))
         assert role(OPERATOR) == 401

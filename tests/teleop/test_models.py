@@ -119,4 +119,3 @@ def test_a_mission_from_here_begins_with_a_free_way(api):
     assert api.post("/v1/missions", order)[0] == 200, "the mission is known, whatever the place"
     later = {**order, "key": "later", "queue": True}
     assert api.post("/v1/missions", later)[0] == 201, "it may begin elsewhere"
-    assert api.post("/v1/missions", {**order, "start": "spawn"})[0] == 409, "another plan"
