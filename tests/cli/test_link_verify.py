@@ -105,22 +105,6 @@ def test_a_fault_names_its_direction(release):
     assert causes(release.ask()) == [("shaped_twice", "both")], "qdiscs that the links find"
 
 
-@pytest.mark.parametrize(
-    ("asked", "applied", "code"), [(2e6, None, "rate_ignored"), (3e6, 3e6, "")]
-)
-def test_a_shaper_that_reports_another_rate_is_not_believed(release, asked, applied, code):
-    """Single datagrams do not measure the rate."""
-    release.shapes("uplink", Told("relay", "", DirectionProfile(0.045, rate=applied)))
-    release.hears(world="ok", cloud="ok")
-    release.tells("rate", asked)
-    said = release.ask()
-    assert causes(said) == ([(code, "uplink")] if code else [])
-    assert "NOT JUDGED" not in as_text(said)
-    assert ("no limit" in as_text(said)) == (applied is None)
-    release.links["uplink"].link.tell = lambda: "{}"
-    assert "uplink: rate NOT JUDGED" in as_text(release.ask())
-
-
 def test_ends_that_do_not_answer_are_a_timeout(release):
     release.ends["world"].close()
     with pytest.raises(TimedOutError, match="world did not answer"):

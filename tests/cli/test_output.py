@@ -2,7 +2,6 @@
 
 import io
 import json
-import math
 
 import pytest
 import yaml
@@ -82,18 +81,6 @@ def seen(monkeypatch):
         return view
 
     return show
-
-
-def test_the_status_line_shows_the_state_of_the_flight(seen):
-    guard = GuardChange(0, GuardState.TRACK, "mission started")
-    early = CONTROL._replace(horizon=0.0, rtt=math.nan, waypoint=-1)
-    flown = telemetry(SECOND), CONTROL, guard, telemetry(5 * SECOND)  # 4 s, in 2 s of the clock
-    for records, line in (
-        ((), "   0.0 s  GROUND"),
-        ((telemetry(0), early), "   0.0 s  GROUND  (-1.00,  2.50, 0.00) m"),
-        (flown, "   4.0 s  TRACK   waypoint 3/7  (-1.00,  2.50, 0.00) m  delay  96 ms  x2.00"),
-    ):
-        assert seen(io.StringIO(), *records).line().plain == line
 
 
 def test_events_are_plain_lines_in_a_file_and_wrapped_on_a_terminal(seen):

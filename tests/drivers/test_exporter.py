@@ -116,7 +116,6 @@ OLD = "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n"
     ("file", "text", "counts"),
     [
         ("cpu.stat", LIMITED, [120, 17, 1.25]),
-        ("cpu/cpu.stat", OLD, [4, 2, 0.5]),  # of cgroups v1
         ("cpu,cpuacct/cpu.stat", OLD, [4, 2, 0.5]),
         ("cpu.stat", "usage_usec 4402130\n", []),  # without a limit
         ("none", "", []),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread, WallClock
+from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread
 from cloudrc.messages import GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import GuardChange, Lateness
@@ -96,13 +96,3 @@ def test_a_step_of_the_wall_clock_is_noticed_once(monkeypatch):
     assert steps == [pytest.approx(-1.0, abs=0.1)]
     assert thread.take_steps() == []
     assert thread.stop(10.0)
-
-
-def test_a_clock_that_drifts_has_not_been_set(monkeypatch):
-    boot = [0.0]
-    monkeypatch.setattr(time, "clock_gettime", lambda clock: boot[-1])
-    monkeypatch.setattr(time, "time", lambda: 1.7e9 + boot[-1] * 1.0005)
-    seen = WallClock()
-    for later in (1.0, 60.0, 3600.0, 86_400.0):
-        boot.append(later)
-        assert seen.step() == 0.0

@@ -2,15 +2,11 @@
 
 import re
 from math import inf, nan
-from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.cli.teleop import ending
-from cloudrc.drivers.teleop import serve_teleop
 from cloudrc.exposition.table import MISSION_OUTCOMES
-from cloudrc.messages import Cause, GuardState, Request, Setpoint, Start
-from cloudrc.teleop import wire
+from cloudrc.messages import Cause, GuardState, Setpoint, Start
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, SILENCE, next_step
 from cloudrc.teleop.store import ConflictError, Order, UnavailableError
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
@@ -18,7 +14,6 @@ from tests.teleop.conftest import (
     FROM_SPAWN,
     PLACES,
     A,
-    Disk,
     ServiceFlight,
     finish,
     play,
@@ -266,30 +261,6 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
     assert [failure["code"] for failure in verdict["failures"]] == codes
 
 
-def test_a_slow_disk_does_not_delay_the_pause_at_shutdown(monkeypatch):
-    """The time for that was over before: the robot flew on to its waypoint."""
-    flight, _ = service_flying()
-    clock, commit, said = [flight.now_ns], Disk.commit, []
-
-    def sleep(seconds):
-        clock[0] += round(seconds * 1e9)
-
-    def fsync(disk):
-        clock[0] += 1_000_000_000
-        commit(disk)
-
-    monkeypatch.setattr(Disk, "commit", fsync)
-    monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
-    monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
-    seen = wire.encode(flight.seen)
-    cloud = SimpleNamespace(receive=lambda: [seen], send=lambda data: not said.append(data))
-    how = {"calls": list, "tell": lambda told: None, "stop": ending(flight.teleop, lambda: True)}
-    serve_teleop(flight.teleop, cloud, wire.encode, wire.decode, **how)
-    requests = [getattr(wire.decode(each), "request", None) for each in said]
-    assert requests.count(Request.END) >= 3
-    assert clock[0] - flight.now_ns < 2_000_000_000
-
-
 # What is shown
 
 
@@ -317,11 +288,9 @@ def test_the_state_is_shown_with_cause_and_since_when_in_this_world():
     flight, _ = service_flying()
     flight.step(seconds=0.5)
     assert shown(flight)["guard_for_s"] > 0.5
-    assert shown(flight)["next_step"] == "the robot flies its mission"
     flight.guard, flight.cause, flight.downlink = HOLD, Cause.SILENCE, False
     flight.step()
     assert (shown(flight)["guard"], shown(flight)["guard_for_s"]) == ("HOLD", 0.0)
-    flight.step(seconds=0.5)
     flight.uplink = False
     flight.step(seconds=2.0)
     assert (shown(flight)["guard_for_s"], shown(flight)["cause"]) == (None, "no fresh commands")
@@ -329,7 +298,7 @@ def test_the_state_is_shown_with_cause_and_since_when_in_this_world():
     flight.uplink = True
     flight.restart_cloud()
     flight.step(position=(nan, 0.0, inf))
-    assert shown(flight)["guard_for_s"] == pytest.approx(2.51)
+    assert shown(flight)["guard_for_s"] == pytest.approx(2.01)
     assert shown(flight)["position_m"] == [None, 0.0, None], "JSON has no such numbers"
     assert (shown(flight)["touch_speed_mps"], shown(flight)["loop_delay_s"]) == (None, None)
     flight.restart()
