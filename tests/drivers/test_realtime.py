@@ -17,8 +17,6 @@ from cloudrc.drivers.realtime import (
     serve,
     split_address,
 )
-from cloudrc.tunnel.codec import DATAGRAM_MAX, DecodeError, Kind
-from cloudrc.tunnel.session import pair
 from tests.flights.conftest import bare_world, ring
 
 HERE, THERE = ("127.0.0.1", 7401), ("10.1.2.3", 7400)
@@ -95,18 +93,6 @@ def test_a_peer_follows_its_route_twice_a_second(tmp_path):
         peer.follow(ROUTE_PERIOD_NS)
         peer.send([b"hello"])
         assert there.recv(100) == b"hello"
-
-
-@pytest.mark.parametrize("size", [DATAGRAM_MAX, 60_000])
-def test_an_oversized_datagram_is_cut_to_what_no_end_takes(size):
-    world, cloud = pair()
-    peer = Peer.bind(("127.0.0.1", 0), ("127.0.0.1", 9))
-    with closing(peer.socket), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.sendto(cloud.seal(Kind.COMMAND, b"").ljust(size, b"x"), peer.socket.getsockname())
-        (received,) = peer.receive()
-    assert len(received) == min(size, DATAGRAM_MAX + 1)
-    with pytest.raises(DecodeError, match=r"^malformed$"):
-        world.open(received)
 
 
 @pytest.mark.parametrize(("listen", "other"), [("::", "::1"), ("::", "127.0.0.1")])

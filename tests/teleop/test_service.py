@@ -7,7 +7,7 @@ import pytest
 
 from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
-from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, SILENCE, next_step
+from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX
 from cloudrc.teleop.store import ConflictError, Order, UnavailableError
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
 from tests.teleop.conftest import (
@@ -266,22 +266,6 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
 
 def shown(flight):
     return flight.teleop.state(flight.now_ns)["seen"]
-
-
-@pytest.mark.parametrize(
-    ("guard", "mission", "said"),
-    [
-        (GROUND, None, "waits for a mission; it takes off, after a stop or a landing only when"),
-        (TRACK, "flying", "flies its mission"),
-        (HOLD, "held", "continues by itself when they arrive"),
-        (ESTOP, None, "find the cause, then: cloudrc mission acknowledge"),
-    ],
-)
-def test_what_comes_next_follows_from_the_guard_and_the_mission(guard, mission, said):
-    past = SILENCE + 0.01
-    assert said in next_step(guard, SILENCE, SILENCE, mission)
-    assert next_step(guard, past, SILENCE, mission) == NOT_HEARD
-    assert next_step(guard, past, past, mission) == NO_CLOUD
 
 
 def test_the_state_is_shown_with_cause_and_since_when_in_this_world():

@@ -280,17 +280,6 @@ def test_a_full_disk_stops_no_flight_and_is_told_once():
     assert flight.stored().missions == flight.teleop.book.missions
 
 
-def test_what_was_refused_is_stored_with_the_next_mission():
-    flight, mission_id = service_flying()
-    flight.full = True
-    play(flight, "B C")
-    flight.full = False
-    second = flight.create()
-    flight.restart_teleop()
-    assert flight.view(mission_id)["verdict"]["exit_code"] == 0
-    assert [mission.id for mission in flight.teleop.book.open()] == [second]
-
-
 def flown(kill, at):
     """Fly a mission whose process is killed once; say whether it was."""
     flight, killed = ServiceFlight(), False
