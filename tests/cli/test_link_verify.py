@@ -1,7 +1,6 @@
 """`cloudrc link verify` of a release, which `helm test` runs, over real HTTP."""
 
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 
 import pytest
 
@@ -15,25 +14,26 @@ from cloudrc.link.sidecar import Near, Told, write_told
 from cloudrc.records import LinkChecked
 
 APPLIED = DirectionProfile(0.045, loss=0.02, duplicate=0.01, rate=3e6)
-MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}
+MEASURED = {"ok": 0.0451, "off": 0.0902}
 
 
-@dataclass
 class Release:
-    """The exporters of two pods."""
+    """The exporters of two pods, of their ends and their links."""
 
-    ends: dict[str, Exporter]
-    links: dict[str, Exporter]
-    pods: dict[str, tuple[str, str]]
-    looks: int = 0
+    def __init__(self, open_exporter):
+        self.ends = {end: open_exporter(end) for end in ("world", "cloud")}
+        self.links = {way: open_exporter("link") for way in ("uplink", "downlink")}
+        for way, link in self.links.items():
+            link.shaped("relay", way, "auto")
+            self.shapes(way, Told("relay", "", APPLIED, Near("eth0", {})))
 
-    def hears(self, *, stamp_ns=5, name="mean", **verdicts):
+    def hears(self, **verdicts):
         """Give ends a verdict on the direction that they receive."""
         for end, verdict in verdicts.items():
             up, value = end == "cloud", MEASURED[verdict]
             rows = [
-                LinkChecked(stamp_ns, up, name, 0.045, value, 0.043, 0.047, verdict, 3300),
-                LinkChecked(stamp_ns, up, "loss", 0.0, 0.0, 0.0, 0.02, "ok", 3300),
+                LinkChecked(5, up, "mean", 0.045, value, 0.043, 0.047, verdict, 3300),
+                LinkChecked(5, up, "loss", 0.0, 0.0, 0.0, 0.02, "ok", 3300),
             ]
             self.ends[end].see(rows)
 
@@ -41,7 +41,11 @@ class Release:
         self.links[way].link.tell = lambda: write_told(told)
 
     def ask(self, limit=30.0):
-        return verify_release("demo", self.pods, limit)
+        pods = {}
+        for end, link in zip(self.ends, self.links.values(), strict=True):
+            ports = self.ends[end].port, link.port
+            pods[end] = tuple(f"http://127.0.0.1:{port}" for port in ports)
+        return verify_release("demo", pods, limit)
 
 
 @pytest.fixture
@@ -49,26 +53,16 @@ def release(monkeypatch):
     for name in ("no_proxy", "NO_PROXY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # a proxy is not used
+    monkeypatch.setattr(link_verify.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)  # as no time passes
     with ExitStack() as stack:
 
-        def served(role):
+        def open_exporter(role):
             exporter = stack.enter_context(closing(Exporter(role)))
-            return exporter, f"http://127.0.0.1:{exporter.serve(('127.0.0.1', 0))}"
+            exporter.port = exporter.serve(("127.0.0.1", 0))
+            return exporter
 
-        (world, at_world), (cloud, at_cloud) = served("world"), served("cloud")
-        (up, at_up), (down, at_down) = served("link"), served("link")
-        pods = {"world": (at_world, at_up), "cloud": (at_cloud, at_down)}
-        made = Release({"world": world, "cloud": cloud}, {"uplink": up, "downlink": down}, pods)
-        for way, exporter in made.links.items():
-            exporter.shaped("relay", way, "auto")
-            made.shapes(way, Told("relay", "", APPLIED, Near("eth0", {})))
-
-        def count(seconds):
-            made.looks += 1
-
-        monkeypatch.setattr(link_verify.time, "sleep", count)
-        monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)  # as no time passes
-        yield made
+        yield Release(open_exporter)
 
 
 def causes(said):

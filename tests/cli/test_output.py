@@ -6,19 +6,11 @@ import json
 import pytest
 import yaml
 
-from cloudrc.cli import progress
 from cloudrc.cli.main import main
 from cloudrc.cli.output import format_number, is_live, paint, table
+from cloudrc.cli.progress import FlightView
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
-from cloudrc.records import Control, Fault, GuardChange, MissionEvent, TelemetrySent
-
-SECOND = 1_000_000_000
-CONTROL = Control(
-    stamp_ns=0, epoch=1, counter=1, basis_stamp_ns=0, horizon=0.0964, rtt=0.09, loop_delay=0.1,
-    measured=ZERO, position=ZERO, orientation_wxyz=UPRIGHT, velocity=ZERO, setpoint=ZERO,
-    waypoint=2, command=ZERO, yaw_rate=0.0, proportional=ZERO, integral=ZERO, derivative=ZERO,
-)  # fmt: skip
-REACHED = MissionEvent(0, "reached", 1, "waypoint 2 of 7 reached at 4.85 s")
+from cloudrc.records import Fault, GuardChange, MissionEvent, TelemetrySent
 
 
 class Terminal(io.StringIO):
@@ -64,33 +56,19 @@ def test_yaml_has_the_content_of_json(line, capsys):
     assert document["schemaVersion"] == 1
 
 
-def telemetry(stamp_ns):
-    odometry = Odometry(stamp_ns, (-1.0, 2.5, -0.0004), UPRIGHT, ZERO, ZERO)
-    sent = Telemetry(stamp_ns, odometry, 0.0, -1, 0, 0, 0, GuardState.TRACK)
-    return TelemetrySent(stamp_ns, 1, 1, sent)
-
-
-@pytest.fixture
-def seen(monkeypatch):
-    """Return a function that shows records on a stream; each call of the clock adds 1 s."""
-
-    def show(stream, *records):
-        monkeypatch.setattr(progress, "monotonic", map(float, range(1000)).__next__)
-        view = progress.FlightView(stream, 7)
-        view.see(records)
-        return view
-
-    return show
-
-
-def test_events_are_plain_lines_in_a_file_and_wrapped_on_a_terminal(seen):
+def test_events_are_plain_lines_in_a_file_and_wrapped_on_a_terminal():
     file, terminal = io.StringIO(), Terminal()
+    odometry = Odometry(0, (-1.0, 2.5, -0.0004), UPRIGHT, ZERO, ZERO)
+    seen = TelemetrySent(0, 1, 1, Telemetry(0, odometry, 0.0, -1, 0, 0, 0, GuardState.TRACK))
+    reached = MissionEvent(0, "reached", 1, "waypoint 2 of 7 reached at 4.85 s")
     hold = GuardChange(0, GuardState.HOLD, "command age 0.252 s above 0.250 s")
     track = GuardChange(0, GuardState.TRACK, "fresh commands")
-    done = REACHED._replace(event="done", text="mission done")
     late = Fault(0, "late", "plug-in " * 20)
+    done = MissionEvent(0, "done", 6, "mission done")
     for stream in (file, terminal):
-        seen(stream, telemetry(0), CONTROL, REACHED, hold, track, late, done, hold).close()
+        view = FlightView(stream, 7)
+        view.see([seen, reached, hold, track, late, done, hold])
+        view.close()
     place = " (-1.00, 2.50, 0.00) m"
     assert [" ".join(line.split()) for line in file.getvalue().splitlines()] == [
         f"waypoint 2 of 7 reached at 4.85 s{place}",
@@ -99,3 +77,4 @@ def test_events_are_plain_lines_in_a_file_and_wrapped_on_a_terminal(seen):
         f"mission done{place}",  # then the robot always holds
     ]
     assert max(map(len, terminal.getvalue().splitlines())) <= 90
+    assert terminal.getvalue().endswith("\x1b[2K"), "the status line is erased"

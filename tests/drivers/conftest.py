@@ -92,13 +92,10 @@ def wait_until_flying(run):
     else:
         raise AssertionError(run.stderr.read())
     found = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            stat, line = path.read_text(), (path.parent / "cmdline").read_text().split("\0")
-        except OSError:
-            continue
-        if int(stat.rpartition(")")[2].split()[1]) == run.pid and "cloudrc" in line:
-            found[line[line.index("cloudrc") + 1]] = int(path.parent.name)
+    for children in Path(f"/proc/{run.pid}/task").glob("*/children"):
+        for pid in children.read_text().split():
+            line = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+            found[line[line.index("cloudrc") + 1]] = int(pid)
     return found
 
 

@@ -22,8 +22,6 @@ from tests.drivers.conftest import WITHOUT_PAGE, start, wait_until_flying
 pytestmark = pytest.mark.process
 
 ENDS = ("world", "cloud")
-FLOWN = (0, 6)
-"""Exit codes of a finished run, in real time or not: the machine may be busy."""
 COMMAND = [sys.executable, "-m", "cloudrc"]
 WITHOUT_API = """
 from cloudrc.cli import extras
@@ -117,37 +115,14 @@ def test_a_supervisor_that_stood_still_still_sees_who_hangs_or_dies(tmp_path, vi
     assert max(map(float, stood)) >= local.SILENCE_LIMIT + 1.0
 
 
-PREDICTOR = '''
-"""A predictor that is slow and talks."""
-import time
-from cloudrc.cloud.predictors import Predictor
-class Odd(Predictor):
-    def predict(self, odometry, horizon):
-        print("hello")
-        time.sleep(0.05)
-        return odometry
-def build() -> Predictor:
-    """Make it."""
-    return Odd()
-'''
-
-
-def test_a_late_link_a_slow_plug_in_and_no_fastapi_end_no_run(tmp_path):
+def test_a_late_link_and_no_fastapi_end_no_run(tmp_path):
     """Before the link is up world has no telemetry to tell of, but it is alive."""
-    (tmp_path / "odd.py").write_text(PREDICTOR)
     late = f"blackouts=[{{start_s: 0, duration_s: {local.SILENCE_LIMIT + 1.0}}}]"
     links = (f"link.uplink.{late}", f"link.downlink.{late}")
     command = [sys.executable, "-c", WITHOUT_API + WITHOUT_PAGE]
-    settings = (*links, f"cloud.predictor={tmp_path}/odd.py")
-    run = start(tmp_path / "run", *settings, dwell=2.0, command=command)
-    output, errors = run.communicate(timeout=90)
-    document = report(tmp_path / "run")
-    assert run.returncode in FLOWN, errors
-    assert document["numbers"]["cloud_lateness_p99"]["value"] > 0.02
-    assert document["numbers"]["missed_periods"]["value"] > 100
-    assert "a plug-in is slow" in output
-    assert any("a plug-in is slow" in note for note in document["notes"])
-    assert "hello" in (tmp_path / "run" / "cloud.log").read_text()
+    run = start(tmp_path / "run", *links, dwell=2.0, command=command)
+    _, errors = run.communicate(timeout=90)
+    assert run.returncode in (0, 6), errors  # in real time or not: the machine may be busy
     assert "no operator's API in this run" in errors
     assert "pip install 'cloudrc[api]'" in errors
 

@@ -21,7 +21,6 @@ from cloudrc.drivers.process import (
     in_words,
 )
 from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
-from cloudrc.link.relay import ReleaseErrors
 from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import (
@@ -186,19 +185,6 @@ def test_nonsense_is_recorded_as_nothing(path, wrong):
     path.unlink()
     os.mkfifo(path)  # is not waited for
     assert notes.after(BEGINS, 2400 * MS) == []
-
-
-def test_how_late_a_relay_is_is_noted_every_other_second(path):
-    """Unknown names would fill the tables of counters."""
-    notes, errors = LinkNotes(path, uplink=True), ReleaseErrors()
-    errors.observe(5)
-    told = errors.in_ns() | {"overflow": 1, "stalled": 2}
-    assert notes.after([], 0) == []
-    path.with_suffix(".released").write_text(json.dumps(told | {"another": 3}))
-    assert notes.after([], 1999 * MS) == []
-    assert notes.after([], 2000 * MS) == [
-        Counted(2000 * MS, "link", f"uplink_{name}", number) for name, number in told.items()
-    ]
 
 
 @pytest.fixture

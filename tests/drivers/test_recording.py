@@ -53,22 +53,6 @@ def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path):
     shelf.release.set()
 
 
-def test_a_hanging_disk_does_not_keep_the_process():
-    class Hanging(Shelf):
-        def write(self, records):
-            release.wait(10.0)
-
-    release, recorder = threading.Event(), Recorder(Path("x"), lambda path: Hanging(), capacity=5)
-    thread = RecordingThread(recorder)
-    recorder.put(counted(5))
-    thread.start()
-    recorder.put(counted(20))
-    assert not thread.stop(timeout=0.05)
-    assert recorder.dropped >= 15
-    release.set()
-    assert thread.stop(timeout=10.0)
-
-
 def test_a_pod_records_flights_whole_and_events_between_them():
     now, kept = 0, {}
     choose = FlightsOnly(lambda: now in (100, 101, 102))
