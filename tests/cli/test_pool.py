@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.main import main
-from cloudrc.cli.pool import _hung_up, interrupt_on_signals, map_in_order, take_each
+from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 
 KILLED = 5
 """The piece of work at which a worker kills its own process."""
@@ -74,15 +73,6 @@ def test_only_the_first_hang_up_interrupts():
     os.kill(os.getpid(), signal.SIGHUP)
     with pytest.raises(KeyboardInterrupt):  # a second request still counts
         os.kill(os.getpid(), signal.SIGTERM)
-
-
-@pytest.mark.parametrize(
-    "line",
-    ["run --seeds 2 --mode local", "mission fly --mission no.yaml --api unix:a", "link verify no"],
-)
-def test_flying_commands_treat_a_hang_up_as_ctrl_c(line):
-    assert main(line.split()) == 2
-    assert signal.getsignal(signal.SIGHUP) is _hung_up
 
 
 @pytest.mark.process

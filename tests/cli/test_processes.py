@@ -25,7 +25,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.record.columns import Recording
-from tests.record.conftest import MS, counted, world_records
+from tests.record.conftest import counted, world_records
 
 FREE = "127.0.0.1:9"
 ENDS = ("world", "cloud")
@@ -127,24 +127,18 @@ def test_sizes_are_read_as_in_kubernetes():
             read_size(text)
 
 
-def started(path, size_max=None):
-    options = argparse.Namespace(record=path, record_max=size_max)
-    return open_recorder(options, "world", b"id")
-
-
-def record(recorder, seconds=1):
-    for start in range(0, 1000 * seconds, 500):
-        recorder.put(world_records(50, start * MS))
-        while recorder.drain():
-            pass
-        recorder.flush(sync=False)
-    return recorder
+def started(path):
+    return open_recorder(argparse.Namespace(record=path, record_max=None), "world", b"id")
 
 
 def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):
     path, before = tmp_path / "world.mcap", tmp_path / "world.before.mcap"
     path.touch()  # an empty one is not kept
-    killed = record(started(path))
+    killed = started(path)
+    killed.put(world_records(100))
+    while killed.drain():
+        pass
+    killed.flush(sync=False)
     left = path.read_bytes()
     again = started(path)
     again.put(counted(3))

@@ -5,7 +5,6 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.drivers import keyfile
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile, read_keys
 from cloudrc.errors import BadInputError
@@ -75,16 +74,3 @@ def test_a_wrong_file_leaves_the_keys_and_is_told_once(wrong, path, keys, monkey
         put(path, b"2" * 32)
     keys.follow(3 * PERIOD_NS)
     assert keys.ring.keys.current == SECOND
-
-
-@pytest.mark.parametrize(
-    ("end", "data", "said"),
-    [("world", b"short", "neither 32 bytes nor lines"), ("cloud", bytes(32), "an all-zero key")],
-)
-def test_an_end_without_a_key_does_not_start(end, data, said, tmp_path, capsys):
-    key = tmp_path / "key"
-    key.write_bytes(data)
-    words = ["--config", "hover", "--listen", "127.0.0.1:7499", "--peer", "127.0.0.1:9"]
-    for flag in (["--key", str(key)], []):
-        assert main([end, *words, *flag]) == 2
-        assert (f"--key {key}: {said}" if flag else "--key") in capsys.readouterr().err
