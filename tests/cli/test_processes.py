@@ -12,10 +12,12 @@ from cloudrc import assembly
 from cloudrc.cli import processes
 from cloudrc.cli.main import main
 from cloudrc.cli.processes import (
+    ipv4_addresses,
     open_recorder,
     open_relay,
     read_address,
     read_size,
+    resolve_address,
     show_address,
 )
 from cloudrc.config.load import load_experiment
@@ -117,6 +119,18 @@ def test_an_end_stopped_at_its_start_completes_its_recording(
     errors = capsys.readouterr().err
     assert f"warning: {tmp_path / 'key'} can be read by others: chmod 600" in errors
     assert f"sends nothing until {tmp_path / 'route'} exists" in errors
+
+
+def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
+    def look_up(name, port, family, kind):
+        return [(family, kind, 17, "", ("::5", 0))] if family == socket.AF_INET6 else no_such_name()
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    with pytest.raises(OSError, match="IPv6 addresses alone, and a link is shaped over IPv4"):
+        ipv4_addresses("cloud")
+    assert resolve_address("--peer", ("cloud", 1), ("::1", 2)) == ("::5", 1)
+    with pytest.raises(BadInputError, match="--peer cloud:1: cloud cannot be resolved"):
+        resolve_address("--peer", ("cloud", 1))
 
 
 def test_sizes_are_read_as_in_kubernetes():
