@@ -1,60 +1,42 @@
-"""Text from files is escaped: it cannot control the terminal or fake a line of output."""
+"""Text from files and from the API is escaped: it cannot control the terminal or fake a line."""
 
 import io
+import json
 from pathlib import Path
 
 import pytest
 import yaml
 
 from cloudrc.cli import report
-from cloudrc.cli.link_verify import as_text, make_report
 from cloudrc.cli.main import main
-from cloudrc.cli.output import print_line, table
+from cloudrc.cli.output import escape, table
 from cloudrc.cli.progress import FlightView
-from cloudrc.link.verify.causes import Evidence, Findings
-from cloudrc.link.verify.judge import Row
+from cloudrc.errors import BadInputError
 from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import Fault
+from cloudrc.teleop.store import Order
+from tests.cli.conftest import EVIL, SHOWN, assert_harmless
 from tests.record.conftest import world_records
-
-EVIL = "x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
-SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
+from tests.teleop.conftest import PLAN, running
 
 
 @pytest.fixture
 def printed(capsys):
     """Return a function that checks the output for the escaped text, and returns the output."""
 
-    def check():
-        out, err = capsys.readouterr()
-        assert_harmless(out + err)
-        return out + err
+    def check(count=None):
+        said = "".join(capsys.readouterr())
+        assert_harmless(said, count)
+        return said
 
     return check
 
 
-def assert_harmless(text):
-    assert SHOWN in text
-    assert [c for c in text if not c.isprintable() and c != "\n"] == []
-    assert [line for line in text.splitlines() if line.startswith("cloudrc: all")] == []
-
-
-@pytest.mark.parametrize(
-    "words",
-    [["run"], ["report"], ["recover"], ["link", "show"], ["link", "verify"], ["faults", "run"]],
-)
+@pytest.mark.parametrize("words", ["run", "report", "recover", "link show", "faults run"])
 def test_a_name_in_an_error(words, printed):
-    assert main([*words, EVIL]) != 0
+    assert main([*words.split(), EVIL]) != 0
     (line,) = printed().splitlines()
     assert line.startswith("cloudrc: error: ")
-
-
-def test_names_in_an_error_of_several_lines(folder, printed):
-    (folder / "a.yaml").write_text(yaml.safe_dump({EVIL: 1, "seed": EVIL}))
-    assert main(["run", "./a.yaml"]) == 2
-    head, *lines = printed().splitlines()
-    assert head.endswith("a.yaml has 2 problems:")
-    assert [line.startswith("  ./a.yaml:") for line in lines] == [True, True]
 
 
 def test_the_note_of_a_recording(folder, capsys):
@@ -66,30 +48,45 @@ def test_the_note_of_a_recording(folder, capsys):
     assert f"lossy: {note}\n" in capsys.readouterr().out
 
 
-def test_the_description_of_a_profile(folder, printed):
-    (folder / "a.yaml").write_text(yaml.safe_dump({"description": EVIL, "uplink": {"delay_ms": 1}}))
-    assert main(["link", "show", "./a.yaml", "--packets", "10", "-o", "a.svg"]) == 0
-    assert printed().startswith(f"a: {SHOWN}\n")
-
-
 def test_what_is_printed_of_a_flight(printed):
     failures = [{"code": "x", "text": EVIL}] * 2
     found = {"verdict": "failure", "failures": failures, "numbers": {}}
     print(report.summary(found, Path(EVIL)))
-    assert printed().count(SHOWN) == 3
+    printed(count=3)
     stream = io.StringIO()
     FlightView(stream, 1).see([Fault(0, "bad", EVIL)])
     assert_harmless(stream.getvalue())
     print(table([["name", "value"], [EVIL, "1"]]))
     assert printed().count("\n") == 2
-    print_line(EVIL)
-    assert printed() == f"{SHOWN}\n"
 
 
-def test_the_state_of_a_link_container():
-    row = Row("mean", "s", 0.1, 0.1, 0.1, 0.1, "off")
-    known = Evidence("none", elsewhere=(EVIL,))
-    ways, probes = {"uplink": Findings([row], known)}, {"uplink": EVIL}
-    text = as_text(make_report(EVIL, ways, probes))
-    assert_harmless(text)
-    assert text.count(SHOWN) == 3
+@pytest.fixture
+def api():
+    """An API with a stored mission whose name is EVIL, as an older teleop may have taken it."""
+    with running(unix=True) as one:
+        made = one.bridge.submit(lambda service, now_ns: service.create(Order(PLAN, EVIL), now_ns))
+        made.result(10.0)
+        yield one
+
+
+def test_a_missions_name(api, printed, capsys):
+    for words in ("list", "status", "status m1", "hold", "cancel"):
+        main(["mission", *words.split(), "--api", api.url])
+        printed()
+    for form, read in (("json", json.loads), ("yaml", yaml.safe_load)):
+        assert main(["mission", "list", "--api", api.url, "-o", form]) == 0
+        said = capsys.readouterr().out
+        assert [c for c in said if (c != "\n" and ord(c) < 32) or 127 <= ord(c) < 160] == []
+        assert read(said)["missions"][0]["name"] == EVIL
+    with pytest.raises(BadInputError) as refused:
+        api.post_local("/v1/missions", {EVIL: 2, "waypoints": [{"position_m": [99.0, 0, 1]}]})
+    assert_harmless(str(refused.value))
+
+
+def test_an_id_that_no_mission_can_have(api, capsys):
+    for given in ("\x1b[31m", "m1?x", "..", "a/b", "tür", "\udcff", "%"):
+        assert main(["mission", "cancel", given, "--api", api.url]) == 5
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.isprintable()
+        shown = {"a/b": "Not Found", "\udcff": "no mission '\ufffd'"}
+        assert shown.get(given, f"no mission '{escape(given)}'") in line

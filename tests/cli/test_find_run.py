@@ -52,91 +52,55 @@ def test_an_emergency_stop_finds_the_run(tmp_path, elsewhere, capsys):
                 assert capsys.readouterr().err == ""
 
 
-def test_no_other_api_is_taken_than_that_of_the_newest_run(tmp_path, elsewhere, capsys):
-    with flying(tmp_path / "out") as api:
-        with local.announced(elsewhere / "runs" / "latest", f"unix:/{'x' * 200}"):
-            assert main(["mission", "estop"]) == 5
-        assert "does not answer (AF_UNIX path too long)" in capsys.readouterr().err
-        assert api.alarms == []
-        with local.announced(tmp_path / "without an API"):
-            assert main(["mission", "estop"]) == 0
-        assert len(api.alarms) == 1
-
-
-@pytest.mark.parametrize("folder", ["runs/latest", "foreign"])
-def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, capsys, folder):
-    (elsewhere / folder).mkdir(parents=True)
+def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, capsys):
+    (elsewhere / "runs" / "latest").mkdir(parents=True)
     with socket.create_server(("127.0.0.1", 0)) as stranger:
         stranger.setblocking(False)
         url = f"http://127.0.0.1:{stranger.getsockname()[1]}"
-        (elsewhere / folder / "api.json").write_text(json.dumps({"url": url}))
-        named = [] if folder == "runs/latest" else ["--run", folder]
-        assert main(["mission", "estop", *named]) in (2, 3)
-        assert "flies" in capsys.readouterr().err
+        (elsewhere / "runs" / "latest" / "api.json").write_text(json.dumps({"url": url}))
+        for words, code in (([], 3), (["--run", "runs/latest"], 2)):
+            assert main(["mission", "estop", *words]) == code
+            assert "flies" in capsys.readouterr().err
         with pytest.raises(BlockingIOError):
             stranger.accept()
 
 
-@pytest.mark.parametrize("by", ["flag", "environment"])
-def test_a_local_run_gets_no_token(tmp_path, monkeypatch, by):
+def test_a_local_run_gets_no_token(tmp_path, monkeypatch):
     unread = str(tmp_path / "there is none")  # sending it would mean reading it
-    words = ["--token-file", unread] if by == "flag" else []
     monkeypatch.setenv("CLOUDRC_TOKEN_FILE", unread)
     with flying(tmp_path / "out") as api:
-        assert main(["mission", "estop", *words]) == 0
-        assert main(["mission", "estop", *words, "--run", str(tmp_path / "out")]) == 0
-        assert len(api.alarms) == 2
+        for more in ([], ["--run", str(tmp_path / "out")], ["--token-file", unread]):
+            assert main(["mission", "estop", *more]) == 0
+        assert len(api.alarms) == 3
         assert main(["mission", "estop", "--api", api.url]) == 2
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["mission", "estop"], "--run nowhere: no run with an API flies there"),
-        (["mission", "estop", "-n", "demo"], "the other flags a cluster; give one"),
-        (SET, "--run nowhere: no run flies there"),
-        ([*SET, "-n", "demo"], "the other flags a cluster; give one"),
-    ],
-)
-def test_a_wrong_run_flag_gives_one_line(words, said, capsys):
-    assert main([*words, "--run", "nowhere"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
-
-
 def with_link(folder):
-    """Make the folder of a run whose relay has just started."""
+    """Make the folder of a run whose relay has just started, and announce it."""
     (folder / "link").mkdir(parents=True)
-    return folder
+    return local.announced(folder)
 
 
 def test_link_set_finds_the_only_run_and_ignores_a_killed_one(
     tmp_path, elsewhere, capsys, monkeypatch
 ):
-    run, killed = with_link(tmp_path / "a"), with_link(elsewhere / "runs" / "latest")
-    with local.announced(run), local.announced(tmp_path / "without a link"):
-        assert main(SET) == 2
-        said = capsys.readouterr().err
-        assert said.startswith(f"cloudrc: using the run in {run}\n")
-        assert f"{run}: no link is up there (yet); wait for the start" in said
-        with local.announced(with_link(tmp_path / "b")):
-            assert main(SET) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+    def said(code, *words):
+        assert main([*SET, *words]) == code
+        return capsys.readouterr().err
+
+    here = elsewhere / "runs" / "latest"
+    with with_link(tmp_path / "a"), local.announced(tmp_path / "without a link"):
+        found = f"cloudrc: using the run in {tmp_path / 'a'}\ncloudrc: error: {tmp_path / 'a'}: "
+        assert said(2).startswith(f"{found}no link is up there (yet); wait for the start")
+        with with_link(tmp_path / "b"):
+            several = said(2)
         for name in "ab":
-            assert f"--run {tmp_path / name}" in line
-    with local.announced(killed.resolve()):
-        assert main(SET) == 2
-    assert "runs/latest: no link is up there (yet)" in capsys.readouterr().err
-    assert main([*SET, "--run", str(killed)]) == 2
-    assert f"--run {killed}: no run flies there" in capsys.readouterr().err
+            assert f"--run {tmp_path / name}" in several
+    with with_link(here):
+        assert "runs/latest: no link is up there (yet)" in said(2)
+        monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc", *SET])
+        assert main() == 3, "the plug-in of kubectl never uses a local run"
+        assert "KUBECONFIG" in capsys.readouterr().err
+    assert f"--run {here}: no run flies there" in said(2, "--run", str(here))
     monkeypatch.setenv("PATH", str(elsewhere))  # without kubectl
-    assert main(SET) == 3
-    said = "no run flies here (start one: cloudrc run; or name one: --run)"
-    assert said in capsys.readouterr().err
-
-
-def test_the_kubectl_plugin_never_uses_a_local_run(elsewhere, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc", *SET])
-    with local.announced(with_link(elsewhere / "runs" / "latest")):
-        assert main() == 3
-    assert "KUBECONFIG" in capsys.readouterr().err
+    assert "no run flies here (start one: cloudrc run; or name one: --run)" in said(3)

@@ -4,16 +4,14 @@ import sys
 
 import pytest
 
-from cloudrc.cli import link_run
 from cloudrc.cli.link_run import Programs
 
 TC = f"""#!{sys.executable}
 import sys
 from pathlib import Path
-log = Path(__file__).with_name("log")
+log = Path(__file__).with_name("log").open("a")
 def answer(words):
-    with log.open("a") as file:
-        file.write(" ".join(words) + chr(10))
+    print(*words, file=log, flush=True)
     if "lacks" in words:
         print("Cannot find device eth0", file=sys.stderr, flush=True)
         return 2
@@ -28,6 +26,8 @@ for number, line in enumerate(sys.stdin, start=1):
     if answer(line.split()):
         print(f"Command failed -:{{number}}", file=sys.stderr, flush=True)
 """
+
+
 CHANGE = ("tc", "qdisc", "change", "dev", "eth0", "netem")
 SHOW = ("tc", "-s", "-j", "qdisc", "show", "dev", "eth0")
 
@@ -54,15 +54,5 @@ def test_changes_and_listings_go_through_one_process(programs, tmp_path):
     assert programs((*CHANGE, "dies")).code == 0  # repeated in its own process
     assert programs(SHOW).output == '[{"kind":"netem"}]'
     programs.close()
-    programs.close()
-
-
-def test_other_commands_run_in_their_own_processes(programs, tmp_path, monkeypatch):
-    assert programs(("tc", "qdisc", "add", "dev", "eth0", "root", "prio")).code == 0
-    assert programs(("tc", "qdisc", "add", "lacks")).code == 2
+    assert programs(("tc", "qdisc", "add", "lacks")).code == 2, "not a change"
     assert programs(("no-such-program",)).code == 127
-    (tmp_path / "folder").mkdir()  # EACCES even for root
-    assert "denied" in programs((str(tmp_path / "folder"),)).error
-    monkeypatch.setattr(link_run, "TOOL_TIMEOUT", 0.1)
-    assert "timed out" in programs(("sleep", "9")).error
-    assert (tmp_path / "log").read_text().splitlines()[0] == "qdisc add dev eth0 root prio"

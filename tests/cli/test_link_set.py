@@ -2,13 +2,12 @@
 
 import json
 from copy import deepcopy
-from errno import ENOSPC
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.cli import link_set, processes
+from cloudrc.cli import link_set
 from cloudrc.cli.main import main
 from cloudrc.cli.processes import RelayControl
 from cloudrc.config.document import Document
@@ -18,84 +17,67 @@ from cloudrc.errors import BadInputError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import LinkState
 
-TIMED = {
-    "uplink": {"delay_ms": 40.0},
-    "downlink": {
-        "delay_ms": 25.0,
-        "jitter_ms": 8.0,
-        "changes": [
-            {"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0},
-            {"at_s": 12.0, "loss": 0.1},
-        ],
-        "blackouts": [{"start_s": 20.0, "duration_s": 0.3}],
-    },
-}
+CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "loss": 0.1}]
+TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes": CHANGES}}
 
 
-def test_a_value_set_by_hand_stays_and_the_rest_goes_on(tmp_path):
-    texts = ["uplink.loss=0.02", "link.uplink.delay_ms=60"]
-    made = edit_profile(Document(deepcopy(TIMED)), None, texts)
-    assert made.values == {**TIMED, "uplink": {"delay_ms": 60.0, "loss": 0.02}}
-    assert (made.cause, made.restart, made.notes) == (", ".join(texts), False, [])
+def edit(before, *settings, profile=None):
+    return edit_profile(Document(deepcopy(before)), profile, settings)
 
-    made = edit_profile(Document(deepcopy(TIMED)), None, ["downlink.delay_ms=120"])
-    assert made.values["downlink"]["delay_ms"] == 120.0
-    assert made.values["downlink"]["changes"] == [
-        {"at_s": 9.0, "jitter_ms": 20.0},
-        {"at_s": 12.0, "loss": 0.1},
-    ]
+
+def test_a_value_set_by_hand_stays_and_the_rest_goes_on():
+    made = edit(TIMED, "uplink.loss=0.02", "link.uplink.delay_ms=60")
+    assert made.values["uplink"] == {"delay_ms": 60.0, "loss": 0.02}
+    assert made.values["downlink"]["changes"] == CHANGES
+    assert (made.cause, made.notes) == ("uplink.loss=0.02, link.uplink.delay_ms=60", [])
+    assert not made.restart, "the time line goes on where it is"
+    made = edit(TIMED, "downlink.delay_ms=120")
+    assert made.values["downlink"]["changes"] == [{"at_s": 9.0, "jitter_ms": 20.0}, CHANGES[1]]
     assert made.notes == ["the time line of the downlink no longer changes delay_ms"]
-    assert not made.restart, "blackouts and the other values go on when they were due"
 
-    trace = tmp_path / "t.csv"
-    trace.write_text("time_s,delay_ms\n0,40\n")
-    before = {"uplink": {"trace": str(trace)}}
-    made = edit_profile(Document(deepcopy(before)), None, ["uplink.delay_ms=20"])
+
+def test_a_delay_set_by_hand_ends_a_trace(tmp_path):
+    (tmp_path / "t.csv").write_text("time_s,delay_ms\n0,40\n")
+    traced = {"uplink": {"trace": str(tmp_path / "t.csv")}}
+    made = edit(traced, "uplink.delay_ms=20")
     assert made.values == {"uplink": {"delay_ms": 20.0}}
     assert made.notes == ["the uplink no longer follows its trace"]
-    made = edit_profile(Document(before), None, ["uplink.loss=0.1"])
+    made = edit(traced, "uplink.loss=0.1")
     assert made.notes == ["if the trace of the uplink has a column loss, it still sets the loss"]
 
-    made = edit_profile(Document(deepcopy(TIMED)), "satellite", ["uplink.delay_ms=280"])
+
+def test_a_profile_takes_the_place_of_all_values():
+    made = edit(TIMED, "uplink.delay_ms=280", profile="satellite")
     assert made.values["uplink"]["delay_ms"] == 280.0
     assert made.values["downlink"]["queue_packets"] == 100
     assert (made.cause, made.restart) == ("profile satellite, uplink.delay_ms=280", True)
     assert "guard.command_age_max_ms=800" in made.notes[0]
 
 
-@pytest.mark.parametrize(
-    ("profile", "settings", "words"),
-    [
-        (None, [], "nothing to set"),
-        (None, ["delay_ms=3"], "delay_ms: set a key of uplink or downlink"),
-        (None, ["uplink=3"], "uplink: set a key of uplink or downlink"),
-        (None, ["uplink.delay=3"], "delay_ms"),
-        (None, ["uplink.loss=1.5"], "link set: uplink.loss: 1.5"),
-        ("nowhere", [], "nowhere"),
-    ],
-)
-def test_invalid_settings_are_refused(profile, settings, words):
-    with pytest.raises(BadInputError) as refused:
-        edit_profile(Document(deepcopy(TIMED)), profile, settings)
-    assert words in str(refused.value)
+def test_invalid_settings_are_refused():
+    for settings, words in (
+        ([], "nothing to set"),
+        (["delay_ms=3"], "delay_ms: set a key of uplink or downlink"),
+        (["uplink.delay=3"], "delay_ms"),
+        (["uplink.loss=1.5"], "link set: uplink.loss: 1.5"),
+    ):
+        with pytest.raises(BadInputError, match=words):
+            edit(TIMED, *settings)
 
 
 class Flight:
     """A local run whose relay reads the change while the command waits."""
 
     def __init__(self, folder):
-        direction = DirectionProfile(0.045)
-        self.links = {way: LinkDirection(direction, 1, way == "uplink") for way in
-                      ("uplink", "downlink")}  # fmt: skip
-        values = {way: {"delay_ms": 45.0} for way in self.links}
-        first = {way: Loaded(direction, values) for way in self.links}
+        direction, ways = DirectionProfile(0.045), ("uplink", "downlink")
+        self.links = {way: LinkDirection(direction, 1, way == "uplink") for way in ways}
+        first = {way: Loaded(direction, {way: {"delay_ms": 45.0} for way in ways}) for way in ways}
         folder.mkdir(parents=True)
-        self.delays = []
-        note = lambda way, delay: self.delays.append((way, delay))  # noqa: E731
+        self.delays, self.folder = [], folder / "link"
         relay = SimpleNamespace(take_in=lambda: None, released=lambda way: {})
-        self.control = RelayControl(folder / "link", self.links, first, note, relay)
+        note = lambda *noted: self.delays.append(noted)  # noqa: E731
+        self.control = RelayControl(self.folder, self.links, first, note, relay)
 
     def wait(self, _):
         self.control.look()
@@ -104,25 +86,6 @@ class Flight:
     def delay(self, way):
         """Return the one-way delay of a packet sent now [s]."""
         return self.links[way].send(1, 3, 0, 172, 0)[0] * 1e-9
-
-
-def test_state_that_a_full_disk_refused_is_written_later(tmp_path, monkeypatch):
-    flight = Flight(tmp_path / "run")
-    folder = tmp_path / "run" / "link"
-
-    def full(path, text):
-        raise OSError(ENOSPC, "No space left on device")
-
-    (folder / "profile.json").write_text('{"uplink": {"delay_ms": 80}}')
-    with monkeypatch.context() as disk:
-        disk.setattr(processes, "publish", full)
-        for _ in range(3):
-            flight.wait(0.05)
-    assert flight.delay("uplink") == pytest.approx(0.08), "in force all the same"
-    flight.wait(0.05)
-    states = [json.loads((folder / f"{way}.json").read_text()) for way in ("uplink", "downlink")]
-    assert [state["changes"] for state in states] == [1, 1]
-    assert states[0]["asked"]["delay"] == 0.08
 
 
 @pytest.fixture
@@ -140,11 +103,12 @@ def test_a_run_here_is_found_changed_and_read_back(flight, capsys):
     assert shown[2].split()[:4] == ["downlink", "relay", "120", "ms"]
     assert (flight.delay("uplink"), flight.delay("downlink")) == pytest.approx((0.045, 0.120))
     assert flight.delays[-2:] == [("uplink", 0.045), ("downlink", 0.12)]
+    assert main(["link", "set", "--profile", "handover"]) == 0
+    assert "2 blackouts" in capsys.readouterr().out, "what has no column of its own"
     assert main(["link", "set", "--profile", "paper-p1", "-o", "json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["links"]["downlink"]["profile"]["downlink"]["delay_ms"] == 20.0
-    assert document["links"]["downlink"]["cause"] == "profile paper-p1"
-    assert document["links"]["downlink"]["changes"] == 2
+    downlink = json.loads(capsys.readouterr().out)["links"]["downlink"]
+    assert downlink["profile"]["downlink"]["delay_ms"] == 20.0
+    assert (downlink["cause"], downlink["changes"]) == ("profile paper-p1", 3)
 
 
 def test_a_relay_that_does_not_answer_is_an_error(flight, capsys, monkeypatch):
@@ -154,14 +118,4 @@ def test_a_relay_that_does_not_answer_is_an_error(flight, capsys, monkeypatch):
     assert capsys.readouterr().err == (
         "cloudrc: error: the uplink and downlink did not apply the change within 0 s; "
         f"see {Path('runs/latest/relay.log')}\n"
-    )
-
-
-def test_the_table_names_all_settings():
-    own = {"corrupt": 0.1, "reorder": 0.05, "duplicate": 0.01, "correlation": 0.4,
-           "keep_order": True, "blackouts": [{}], "trace": "/a/t.csv"}  # fmt: skip
-    row = link_set._row(LinkState("relay", "", "relay", "uplink", {"uplink": own}, "", 1))
-    assert row[-1] == (
-        "corrupt 0.1, reorder 0.05, duplicate 0.01, correlation 0.4, keep_order True, 1 blackouts, "
-        "trace t.csv"
     )

@@ -10,11 +10,6 @@ from cloudrc.cli.main import main
 from cloudrc.link.traces import read_table, read_trace
 from tests.record.conftest import world_records, write
 
-PING = "\n".join(
-    f"[{100 + n / 5 + 0.04:.6f}] 64 bytes from 192.0.2.1: icmp_seq={n} ttl=57 time={40 + n % 3} ms"
-    for n in range(20)
-)
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
@@ -44,48 +39,27 @@ def test_a_run_gives_a_trace_per_direction(run, folder, capsys):
     assert (folder / "t.csv").read_bytes() == (folder / "trace-downlink.csv").read_bytes()
     # Only fast datagrams are applied: below the 30 ms of the profile.
     assert main(["link", "record", str(run), "-o", "t.csv", "--halve-rtt"]) == 0
-    assert "without a new round trip left out" in capsys.readouterr().out
-    trace = read_trace(folder / "t.csv")
-    assert trace.losses is None
-    assert 0.020 < sum(trace.delays) / len(trace.delays) < 0.035
+    delays = read_trace(folder / "t.csv").delays
+    assert 0.020 < sum(delays) / len(delays) < 0.035
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ([], "no rows on /uplink_delay, so no uplink; give the run's folder"),
-        (["--halve-rtt"], "holds no round trip; give the folder of a run that flew"),
-    ],
-)
-def test_a_recording_of_the_world_alone_gives_no_trace(words, says, folder, capsys):
-    recording = write(folder / "world.mcap", world_records(5))
-    assert main(["link", "record", str(recording), "-o", "t.csv", *words]) == 2
-    assert f"world.mcap: {says}" in capsys.readouterr().err
-
-
-def test_a_ping_log_gives_a_trace_and_what_was_left_out(folder, capsys):
-    (folder / "ping.log").write_text(PING + "\nping: sendmsg: Operation not permitted\n")
-    assert main(["link", "record", "ping.log", "-o", "t.csv"]) == 2
-    assert "--halve-rtt" in capsys.readouterr().err
-    assert main(["link", "record", "ping.log", "-o", "t.csv", "--halve-rtt"]) == 0
-    said = capsys.readouterr().out.splitlines()[0]
-    assert "20 packets in 3.8 s, half of each round trip 20.48" in said
-    assert said.endswith(", 0 lost; 1 other lines left out")
-    assert read_trace(folder / "t.csv").delays[:3] == pytest.approx((0.020, 0.0205, 0.021))
+def test_a_recording_of_the_world_alone_gives_no_trace(folder, capsys):
+    line = ["link", "record", str(write(folder / "world.mcap", world_records(5))), "-o", "t.csv"]
+    assert main(line) == main([*line, "--halve-rtt"]) == 2
+    said = capsys.readouterr().err
+    assert "world.mcap: no rows on /uplink_delay, so no uplink; give the run's folder" in said
+    assert "world.mcap: holds no round trip; give the folder of a run that flew" in said
 
 
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [
         ("a.csv", b"time_s,delay_ms\n0,0.045\n", "looks like seconds"),
-        ("a.csv", b"a\0b", "not a text file"),
         ("a.json", b'{"round_trips": []}', "choose --direction uplink"),
         ("a.json.gz", b"not packed", "cannot be unpacked"),
         ("a.mcap", b"\x89MCAP0\r\n", "a.mcap"),
-        ("a.json.gz", gzip.compress(b"{}", mtime=0), "not a log of irtt"),
         ("a.json.gz", gzip.compress(bytes(8 << 20)), "cannot be unpacked: it holds more than 1"),
         ("pipe", None, "pipe: no such file or folder"),
-        ("nowhere", None, "nowhere: no such file or folder"),
         (".", None, "has no mission.mcap"),
     ],
 )
@@ -105,16 +79,11 @@ def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, cap
     ("line", "says"),
     [
         ("", "an action is missing"),
-        ("show paper-p9", "paper-p"),
         ("show ideal -o ideal.gif", "end its name in .png, .svg or .pdf"),
         ("show ideal --seconds 0", "--seconds 0: give a number from 0.001 to 86400"),
         ("show ideal --seconds nan", "--seconds nan: give a number from"),
         ("show ideal --seed=-1", "--seed -1"),
-        ("show ideal --rate 0", "--rate 0: give a number from 1 to 10000"),
-        ("show ideal --packets 0", "--packets 0: give a number from 1 to 10000000"),
         ("show ideal --seconds 8e4 --rate 1e4", "are more than 10000000 packets"),
-        ("show nowhere.csv", "No such file"),
-        ("verify --seconds nan", "--seconds nan: give a number from 1 to 3600"),
         ("verify nonsense", "no profile or experiment named 'nonsense'"),
         ("verify no/such.yaml", "no such file"),
         ("verify --ends world,", "--ends world,: give two hosts, WORLD,CLOUD"),
@@ -126,38 +95,29 @@ def test_a_wrong_line_is_refused(line, says, capsys):
     assert says in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("kind", ["png", "svg"])
-def test_a_profile_is_drawn_and_its_statistics_printed(kind, folder, capsys):
-    line = ["link", "show", "handover", "--seconds", "12", "-o", f"a.{kind}"]
+def test_a_profile_is_drawn_and_its_statistics_printed(folder, capsys):
+    line = ["link", "show", "handover", "--seconds", "12", "-o", "a.svg"]
     assert main(line) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("handover: LTE")
     assert lines[1].split() == ["one", "way", "uplink", "downlink"]
     assert lines[2].split()[0] == "mean"
     assert 25.0 < float(lines[2].split()[1]) < 35.0
-    assert lines[-1] == f"a.{kind}"
-    first = (folder / f"a.{kind}").read_bytes()
+    assert lines[-1] == "a.svg"
+    first = (folder / "a.svg").read_bytes()
     assert main(line) == 0
-    assert (folder / f"a.{kind}").read_bytes() == first, "the same link gives the same picture"
+    assert (folder / "a.svg").read_bytes() == first, "the same link gives the same picture"
 
 
-@pytest.mark.parametrize(("rate", "overtaken"), [(50, 19.0), (200, 59.0)])
-def test_rate_and_number_of_packets_can_be_set(rate, overtaken, folder, capsys):
-    (folder / "mine.yaml").write_text("uplink: {delay_ms: 70, jitter_ms: 25}\ndownlink: {loss: 1}")
-    line = f"link show ./mine.yaml --seconds 1 --packets 4000 --rate {rate}"
-    assert main(line.split()) == 0
-    (row,) = (row for row in capsys.readouterr().out.splitlines() if "overtaken" in row)
-    assert float(row.split()[-3]) == pytest.approx(overtaken, abs=3.0)
-
-
-@pytest.mark.parametrize("loop", ["", ", loop: true"])
-def test_a_trace_is_shown_row_by_row_whatever_its_span(loop, folder, capsys):
+def test_a_trace_is_shown_row_by_row_whatever_its_span(folder, capsys):
     """Its time is Unix time; a row in a year would be 3 billion packets at 100 Hz."""
     rows = [f"{1_700_000_000 + n / 100},{40 + n % 7},{int(n % 10 == 0)}" for n in range(500)]
     (folder / "t.csv").write_text("\n".join(["time_s,delay_ms,loss", *rows, "1731536000,90,0"]))
-    (folder / "mine.yaml").write_text(f"uplink: {{trace: t.csv{loop}}}\n")
-    assert main(["link", "show", "./mine.yaml" if loop else "t.csv"]) == 0
-    said = capsys.readouterr().out
-    assert loop or said.startswith("t: a trace of 501 rows in 3.154e+07 s\n")
-    assert ("downlink" in said) is bool(loop)
-    assert any(line.split()[:2] == ["lost", "9.98"] for line in said.splitlines())
+    (folder / "mine.yaml").write_text("uplink: {trace: t.csv, loop: true}\n")
+    for name in ("t.csv", "./mine.yaml"):
+        assert main(["link", "show", name]) == 0
+        said = capsys.readouterr().out
+        assert any(line.split()[:2] == ["lost", "9.98"] for line in said.splitlines())
+        if name == "t.csv":
+            assert said.startswith("t: a trace of 501 rows in 3.154e+07 s\n")
+            assert "downlink" not in said

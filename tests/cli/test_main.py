@@ -10,7 +10,7 @@ from cloudrc.cli.faults import SEED_MAX
 from cloudrc.cli.link import ACTIONS
 from cloudrc.cli.main import INTERNAL, main
 from cloudrc.cli.parser import COMMANDS
-from cloudrc.errors import BadInputError, InvalidRunError, MissingPrerequisiteError
+from cloudrc.errors import BadInputError, InvalidRunError
 
 HEAVY = ("numpy", "mujoco", "matplotlib", "pydantic", "yaml", "kubernetes", "rosbags", "mcap")
 QUIET = f"""
@@ -27,8 +27,7 @@ print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
 def test_help_imports_nothing_heavy(command):
     words = [sys.executable, "-c", QUIET, *command, "--help"]
-    done = subprocess.run(words, capture_output=True, text=True)
-    assert done.stderr.strip() == "[]"
+    assert subprocess.run(words, capture_output=True, text=True).stderr.strip() == "[]"
 
 
 def test_help_answers_within_150_ms():
@@ -49,25 +48,19 @@ def test_help_fits_80_columns(command, capsys):
     text = capsys.readouterr().out
     assert end.value.code == 0
     assert max(map(len, text.splitlines())) <= 80
-    assert all(name in text for name in COMMANDS) or command
-
-
-def test_no_argument_prints_help(capsys):
-    assert main([]) == 0
-    assert "examples:" in capsys.readouterr().out
+    if not command:
+        assert all(name in text for name in COMMANDS)
+        assert main([]) == 0, "no argument prints help, too"
+        assert capsys.readouterr().out == text
 
 
 @pytest.mark.parametrize(
     ("line", "words"),
     [
         ("rnu", "did you mean 'run'"),
-        ("zzz", "choose "),
-        ("-q", "-q"),
         ("doctor --mode vitual", "did you mean 'virtual'"),
         ("doctor --nonsense", "--nonsense"),
         ("list predictor", "did you mean 'predictors'"),
-        ("completion klingon", "choose one of bash, fish, zsh"),
-        ("completion", "required: shell"),
         ("bench --repeats 0", "'0' is not a whole number from 1 to 10000"),
         (f"faults search --first {2**63}", f"is not a whole number from 0 to {SEED_MAX}"),
     ],
@@ -85,11 +78,9 @@ def test_a_wrong_command_line_is_one_line_of_error(line, words, capsys):
     ("error", "code", "words"),
     [
         (BadInputError("key x"), 2, "key x"),
-        (MissingPrerequisiteError("no mujoco"), 3, "no mujoco"),
         (InvalidRunError("fell behind"), 6, "fell behind"),
         (PermissionError(13, "Not allowed", "/x"), 2, "/x: Not allowed; check the path"),
         (OSError(28, "No space left on device"), 2, "No space left on device; free some space"),
-        (OSError("no errno"), 2, "no errno; check the path"),
         (ZeroDivisionError("two\nlines"), INTERNAL, "ZeroDivisionError: two lines"),
         (KeyboardInterrupt(), 130, None),
     ],

@@ -2,20 +2,15 @@
 
 import multiprocessing
 import os
-import select
 import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.main import main
-from cloudrc.cli.pool import WorkerDiedError, _hung_up, interrupt_on_signals, map_in_order
+from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 
 KILLED = 5
 """The piece of work at which a worker kills its own process."""
@@ -49,23 +44,14 @@ def test_results_keep_the_order_of_the_work(pieces, jobs, workers):
     numbers, pids = zip(first, *done, strict=True)
     assert numbers == tuple(range(pieces))
     assert (os.getpid() in pids) is (workers == 0)
-    assert list(map_in_order(_slow_first, [], 2)) == []
 
 
 def test_results_before_a_worker_was_killed_are_kept():
     results = []
-    with pytest.raises(WorkerDiedError, match=r"a worker was killed.*use fewer processes"):
-        results.extend(each for each in map_in_order(_kill_at_five, range(9), 2))
+    end = take_each(map_in_order(_kill_at_five, range(9), 2), results.append)
+    text = "a worker was killed, perhaps by the kernel because memory ran out; use fewer processes"
+    assert end == (text, 6)
     assert results == list(range(KILLED))
-
-
-def test_a_worker_killed_while_work_is_submitted_is_reported(monkeypatch):
-    def break_down(*arguments):
-        raise BrokenProcessPool
-
-    monkeypatch.setattr(ProcessPoolExecutor, "submit", break_down)
-    with pytest.raises(WorkerDiedError, match="use fewer processes"):
-        list(map_in_order(_slow_first, range(2), 2))
 
 
 def test_ctrl_c_ends_the_workers_at_once():
@@ -89,34 +75,10 @@ def test_only_the_first_hang_up_interrupts():
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def test_under_nohup_a_hang_up_is_ignored():
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    interrupt_on_signals()
-    os.kill(os.getpid(), signal.SIGHUP)
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["run", "--seeds", "2", "--mode", "local"],
-        ["mission", "fly", "--mission", "none.yaml", "--api", "http://127.0.0.1:9"],
-        ["link", "verify", "none"],
-    ],
-)
-def test_flying_commands_treat_a_hang_up_as_ctrl_c(words):
-    assert main(words) == 2
-    assert signal.getsignal(signal.SIGHUP) is _hung_up
-
-
 @pytest.mark.process
-@pytest.mark.parametrize(
-    "words",
-    [["faults", "search", "--minutes", "9", "--jobs", "2"], ["run", "steps", "--seeds", "9"]],
-)
-def test_workers_end_if_their_parent_is_killed(words, tmp_path):
-    command = [sys.executable, "-m", "cloudrc", *words]
+def test_workers_end_if_their_parent_is_killed(tmp_path):
+    command = [sys.executable, "-m", "cloudrc", "run", "steps", "--seeds", "9"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) as first:
-        assert first.stdout is not None
         children = Path(f"/proc/{first.pid}/task/{first.pid}/children")
         until = time.monotonic() + 60.0
         while len(workers := children.read_text().split()) < 2:
@@ -126,10 +88,7 @@ def test_workers_end_if_their_parent_is_killed(words, tmp_path):
         time.sleep(3.0)  # until they are flying
         first.kill()
         first.wait()
-        while select.select([first.stdout], [], [], 20.0)[0]:  # ends once all workers have ended
-            if not first.stdout.read1():
-                return
-    for worker in workers:
-        with suppress(ProcessLookupError):
-            os.kill(int(worker), signal.SIGKILL)
-    pytest.fail("workers still wait for work")
+        until = time.monotonic() + 20.0
+        while any(Path(f"/proc/{worker}").exists() for worker in workers):
+            assert time.monotonic() < until, "workers still wait for work"
+            time.sleep(0.1)

@@ -7,18 +7,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.cli import sweep
 from cloudrc.cli.main import main
-from cloudrc.cli.pool import WorkerDiedError
 from cloudrc.cli.sweep import as_csv, as_table, interval, summarise
-from tests.conftest import nightly
 
 SHORT = [
     "--set",
@@ -43,74 +39,30 @@ def written(folder):
 
 
 def test_many_seeds_become_one_table(folder, capsys):
-    assert main(["run", "steps", "--seeds", "2", *SHORT, "--out", "sweep"]) == 0
+    """A robot that touches nothing has failed, and so has the sweep."""
+    line = ["run", "steps", "--seeds", "2", *SHORT, "--set", "criteria.contact=true"]
+    assert main([*line, "--out", "sweep"]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1] == "sweep/sweep.json"
-    assert "done 2/2" in lines
+    assert "done 0/2" in lines
     assert any(line.startswith("prediction_error_rms") for line in lines)
     document, rows = written(folder)
     assert ([run["seed"] for run in document["runs"]], rows) == ([1, 2], 2)
-    assert (document["done"], document["count"], document["interrupted"]) == (2, 2, False)
-
-
-@pytest.mark.parametrize("finished", [0, 2])
-@pytest.mark.parametrize(
-    ("error", "code", "word"),
-    [
-        (KeyboardInterrupt(), 130, "interrupted"),
-        (WorkerDiedError("a worker was killed"), 6, "a worker was killed"),
-    ],
-)
-def test_an_interrupted_sweep_keeps_what_is_finished(
-    error, code, word, finished, folder, capsys, monkeypatch
-):
-    def reports(*arguments):
-        yield from (report(seed, duration=1.0) for seed in range(1, finished + 1))
-        raise error
-
-    monkeypatch.setattr(sweep, "map_in_order", reports)
-    assert main(["run", "steps", "--seeds", "9", "--out", "sweep"]) == code
-    captured = capsys.readouterr()
-    assert f"cloudrc: {word}" in captured.err
-    assert f": {finished} of 9 seeds are finished\n" in captured.err
-    assert captured.out.splitlines()[-1] == "sweep/sweep.json"
-    document, rows = written(folder)
-    assert (len(document["runs"]), document["count"], rows) == (finished,) * 3
-    assert document["interrupted"]
-
-
-def test_a_failed_run_sets_the_exit_code(folder, monkeypatch):
-    reports = [report(1), report(2, "failure"), report(3)]
-    monkeypatch.setattr(sweep, "map_in_order", lambda *given: (each for each in reports))
-    assert main(["run", "steps", "--seeds", "3", "--out", "sweep"]) == 1
+    assert (document["done"], document["count"], document["interrupted"]) == (0, 2, False)
 
 
 @pytest.mark.process
-@pytest.mark.parametrize(
-    "how", [signal.SIGTERM, signal.SIGKILL, *nightly(signal.SIGINT, signal.SIGHUP)]
-)
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_a_signal_ends_a_sweep_at_once(how, folder):
-    """SIGINT and SIGHUP go to all processes, SIGTERM to the command, SIGKILL to one worker."""
+    """SIGTERM goes to the command, SIGKILL to one worker."""
     command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    assert process.stdout is not None
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert "1/40" in process.stdout.readline()
-    start = time.monotonic()
-    if how == signal.SIGKILL:
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-        of_pool = [p for p in children if "spawn_main" in Path(f"/proc/{p}/cmdline").read_text()]
-        os.kill(int(of_pool[0]), how)
-    elif how == signal.SIGTERM:
-        process.send_signal(how)
-    else:
-        os.killpg(process.pid, how)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    workers = [p for p in children if "spawn_main" in Path(f"/proc/{p}/cmdline").read_text()]
+    os.kill(int(workers[0]) if how == signal.SIGKILL else process.pid, how)
     _, errors = process.communicate(timeout=20)  # returns only once no worker holds the pipes
-    if how == signal.SIGKILL:
-        assert "cloudrc: a worker was killed" in errors
-    else:
-        assert time.monotonic() - start < 3.0
+    assert ("cloudrc: a worker was killed" in errors) == (how == signal.SIGKILL)
     assert process.returncode == (6 if how == signal.SIGKILL else 130)
     assert "Traceback" not in errors
     document, _ = written(folder)
@@ -118,27 +70,13 @@ def test_a_signal_ends_a_sweep_at_once(how, folder):
     assert 1 <= document["count"] < 40
 
 
-@pytest.mark.parametrize(
-    ("n", "bounds"),
-    [
-        (5, None),  # minimum and maximum enclose the median with 1 - 2/32 = 0.9375 only
-        (6, (1, 6)),  # 1 - 2/64 = 0.969
-        (9, (2, 8)),  # 1 - 2 * 10/512 = 0.961
-        (10, (2, 9)),  # 1 - 2 * 11/1024 = 0.979; (3, 8) has 0.891
-        (20, (6, 15)),  # 0.9586 in textbooks
-    ],
-)
-def test_the_interval_has_the_bounds_computed_by_hand(n, bounds):
-    assert interval([float(i) for i in range(n, 0, -1)]) == bounds
-
-
-@given(st.lists(st.floats(-1e6, 1e6), min_size=6, max_size=40))
-@settings(max_examples=50, deadline=None)
-def test_the_interval_encloses_the_median(values):
-    bounds = interval(values)
-    median = summarise([report(i, x=v) for i, v in enumerate(values)])["numbers"]["x"]["median"]
-    assert bounds is not None
-    assert bounds[0] <= median <= bounds[1]
+@given(st.permutations(range(1, 21)))
+@settings(max_examples=20, deadline=None)
+def test_the_interval_of_the_median_has_the_bounds_of_textbooks(values):
+    """With 20 values 0.9586; the range of 5 values encloses it with 0.9375 only, that of 6 does."""
+    assert interval(values) == (6, 15)
+    assert interval(values[:5]) is None
+    assert interval(values[:6]) == (min(values[:6]), max(values[:6]))
 
 
 def test_runs_may_lack_a_number():
@@ -147,10 +85,6 @@ def test_runs_may_lack_a_number():
     assert (summary["done"], summary["count"]) == (2, 3)
     assert (summary["numbers"]["x"]["median"], summary["numbers"]["x"]["count"]) == (2.0, 2)
     assert "(2 runs)" in as_table(summary)
-    assert as_table(summary).endswith("done 2/3")
-    assert list(csv.reader(io.StringIO(as_csv(runs)))) == [
-        ["seed", "verdict", "x [m]", "y [m]"],
-        ["1", "success", "1.0", ""],
-        ["2", "failure", "", "2.0"],
-        ["3", "success", "3.0", ""],
-    ]
+    head, first, second, _ = csv.reader(io.StringIO(as_csv(runs)))
+    assert head == ["seed", "verdict", "x [m]", "y [m]"]
+    assert (first[2:], second[2:]) == (["1.0", ""], ["", "2.0"])

@@ -38,16 +38,14 @@ async def ask(address, requests, due, answers):
 async def flood(url, token, seconds, rate):
     host, _, port = url.removeprefix("http://").partition(":")
     look, order = request("GET", "/v1/state", token), request("POST", "/v1/resume", token)
-    requests, answers = [look, request("GET", "/v1/state"), look, order], Counter()
+    mixed, answers = [look, request("GET", "/v1/state"), look, order], Counter()
     began = time.monotonic()
     due = [began + number / rate for number in range(int(seconds * rate))]
-    connections = [
-        ask((host, int(port)), requests, due[number::CONNECTIONS], answers)
-        for number in range(CONNECTIONS)
-    ]
-    await asyncio.gather(*connections)
+    each = (due[number::CONNECTIONS] for number in range(CONNECTIONS))
+    await asyncio.gather(*(ask((host, int(port)), mixed, own, answers) for own in each))
     return answers | {"seconds": time.monotonic() - began}
 
 
 if __name__ == "__main__":
-    print(json.dumps(asyncio.run(flood(*sys.argv[1:3], *map(float, sys.argv[3:])))))
+    url, token, seconds, rate = sys.argv[1:]
+    print(json.dumps(asyncio.run(flood(url, token, float(seconds), float(rate)))))

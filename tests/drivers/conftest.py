@@ -48,11 +48,6 @@ def slower(told):
     return max(1.0, float(told) / NOMINAL)
 
 
-def here():
-    """Measure the slowdown of this machine's interpreter."""
-    return slower(subprocess.check_output([sys.executable, "-c", WORK]))
-
-
 def ages_at_hold(recording):
     """Return the age [s] of the newest applied basis at each HOLD for want of fresh commands."""
     guard, applied = recording["/guard"], recording["/command_applied"]
@@ -97,13 +92,10 @@ def wait_until_flying(run):
     else:
         raise AssertionError(run.stderr.read())
     found = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            stat, line = path.read_text(), (path.parent / "cmdline").read_text().split("\0")
-        except OSError:
-            continue
-        if int(stat.rpartition(")")[2].split()[1]) == run.pid and "cloudrc" in line:
-            found[line[line.index("cloudrc") + 1]] = int(path.parent.name)
+    for children in Path(f"/proc/{run.pid}/task").glob("*/children"):
+        for pid in children.read_text().split():
+            line = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+            found[line[line.index("cloudrc") + 1]] = int(pid)
     return found
 
 
@@ -143,14 +135,11 @@ class Release:
         self.running[name] = self.run(name, "--config", "config.yaml", *self.flags[name])
 
     def run(self, *words):
-        command = [sys.executable, "-m", "cloudrc", *words]
         environ = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-        pipe = subprocess.PIPE
-        process = subprocess.Popen(
-            command, cwd=self.folder, stdout=pipe, stderr=pipe, text=True, env=environ
-        )
-        self.all.append(process)
-        return process
+        how = {"cwd": self.folder, "env": environ, "text": True}
+        how |= dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
+        self.all.append(subprocess.Popen([sys.executable, "-m", "cloudrc", *words], **how))
+        return self.all[-1]
 
     def kill(self, *names):
         for name in names:

@@ -3,7 +3,6 @@
 import select
 import socket
 import threading
-import time
 import urllib.error
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from cloudrc import __version__
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import exporter as exporters
 from cloudrc.drivers.exporter import Exporter, read_throttling
@@ -37,7 +35,6 @@ from cloudrc.records import (
     MissionEvent,
     TelemetrySent,
 )
-from tests.drivers.conftest import here
 from tests.flights.conftest import records
 
 HOST = "127.0.0.1"
@@ -47,26 +44,20 @@ HOST = "127.0.0.1"
 def flight():
     """The records of a flight with real-time wakes, and those of the other roles."""
     both = records(load_experiment("hover", ["link.profile=paper-p3"]))
-    seen = {}
-    for end, of_end in zip(ENDS, both, strict=True):
-        seen[end] = []
-        for record in of_end:
-            seen[end].append(record)
-            if isinstance(record, TelemetrySent | Control):
-                seen[end].append(Lateness(record.stamp_ns, end, 80e-6, 300e-6, 0))
-        way = DIRECTIONS[ENDS.index(end) - 1]
+    seen = {end: [*of_end] for end, of_end in zip(ENDS, both, strict=True)}
+    for end, uplink in zip(ENDS, (False, True), strict=True):
+        stamps = [r.stamp_ns for r in seen[end] if isinstance(r, TelemetrySent | Control)]
+        seen[end] += [Lateness(stamp_ns, end, 80e-6, 300e-6, 0) for stamp_ns in stamps]
         seen[end] += [
-            LinkChecked(9, way == "uplink", name, 0.1, 0.1, 0.0, 0.2, "ok", 3000)
+            LinkChecked(9, uplink, name, 0.1, 0.1, 0.0, 0.2, "ok", 3000)
             for name in ("mean", "deviation", "loss")
         ]
     seen["world"] += [Contact(0, body, ZERO, ZERO, ZERO, True) for body in BODIES]
     seen["teleop"] = [r for r in seen["cloud"] if isinstance(r, MissionEvent)]
     errors, steps = ReleaseErrors(), Steps()
-    for late_ns in (3_000, 30_000, 300_000, 3_000_000, 300_000_000):
-        errors.observe(late_ns)
+    errors.observe(3_000)
     steps.note(1_000_000, 0)
-    counts = dict.fromkeys(LINK_OUTCOMES, 5) | errors.in_ns() | {"restored": 1}
-    counts |= steps.counts()
+    counts = dict.fromkeys(LINK_OUTCOMES, 5) | errors.in_ns() | {"restored": 1} | steps.counts()
     seen["link"] = [Counted(0, "link", name, total) for name, total in counts.items()]
     return seen
 
@@ -84,10 +75,6 @@ def exporter(role, flight, *, missions=True):
     return made
 
 
-def series(text):
-    return [line for line in text.splitlines() if not line.startswith("#")]
-
-
 @pytest.mark.parametrize("role", ROLES)
 def test_a_flight_shows_the_metrics_of_its_role(role, flight):
     text = exporter(role, flight).text()
@@ -98,8 +85,6 @@ def test_a_flight_shows_the_metrics_of_its_role(role, flight):
             metric = METRICS.get(sample.name)
             if metric is not None and metric.kind is not Kind.HISTOGRAM:
                 assert set(sample.labels) == set(metric.labels)
-                for name, value in sample.labels.items():
-                    assert value in (metric.labels[name] or (__version__, ""))
     expected = {metric.name for metric in of_role(role)}
     own = {name for name in found if not name.startswith("process_")}
     assert own | optional == expected | optional
@@ -109,8 +94,8 @@ def test_a_flight_shows_the_metrics_of_its_role(role, flight):
 
 @pytest.mark.parametrize("pod", [("world", "link"), ("cloud", "teleop", "link")])
 def test_a_pod_has_less_than_200_series(pod, flight):
-    made = [exporter(role, flight, missions=role != "cloud") for role in pod]
-    assert sum(len(series(one.text())) for one in made) < 200
+    texts = [exporter(role, flight, missions=role != "cloud").text() for role in pod]
+    assert sum(not line.startswith("#") for text in texts for line in text.splitlines()) < 200
 
 
 @pytest.mark.promise("unknown-is-absent")
@@ -123,44 +108,22 @@ def test_the_sync_age_is_absent_until_it_is_known():
     assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
 
 
-def test_the_build_names_the_configuration_that_runs():
-    world = Exporter("world")
-    world.runs("0123456789ab" + "f" * 52)
-    labels = f'config="0123456789ab",role="world",version="{__version__}"'
-    assert f"cloudrc_build_info{{{labels}}} 1.0" in world.text()
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("end", ENDS)
-def test_a_record_costs_less_than_a_microsecond(end, flight):
-    """The fastest of several repeats counts, since the machine may be busy."""
-    chunks = [flight[end][i : i + 4] for i in range(0, len(flight[end]), 4)]
-    least = float("inf")
-    for _ in range(15):
-        made = Exporter(end)
-        began = time.process_time()
-        for chunk in chunks:
-            made.see(chunk)
-        least = min(least, time.process_time() - began)
-    assert least / len(flight[end]) < 1e-6 * here()
+LIMITED = "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n"
+OLD = "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n"
 
 
 @pytest.mark.parametrize(
     ("file", "text", "counts"),
     [
-        ("cpu.stat", "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n", [120, 17, 1.25]),
-        *((file, "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n", [4, 2, 0.5])
-          for file in ("cpu/cpu.stat", "cpu,cpuacct/cpu.stat")),
-        ("cpu.stat", "usage_usec 4402130\nuser_usec 3301211\nsystem_usec 1100919\n", []),
-        ("cpu.stat", "", []),
-        (None, "", []),
+        ("cpu.stat", LIMITED, [120, 17, 1.25]),
+        ("cpu,cpuacct/cpu.stat", OLD, [4, 2, 0.5]),
+        ("cpu.stat", "usage_usec 4402130\n", []),  # without a limit
+        ("none", "", []),
     ],
-    ids=["limited", "v1", "v1 with a joint mount", "unlimited", "empty", "missing"],
-)  # fmt: skip
+)
 def test_throttling_is_read_from_the_kernel(file, text, counts, tmp_path):
-    if file is not None:
-        (tmp_path / file).parent.mkdir(exist_ok=True)
-        (tmp_path / file).write_text(text)
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text(text)
     read = read_throttling(tmp_path)
     values = [value for reading in read.values() for value in dict(reading).values()]
     assert values == pytest.approx(counts)
@@ -188,14 +151,12 @@ def test_metrics_and_probes_are_on_one_port(served, monkeypatch):
     exporter, port = served
     assert get(port, "/healthz") == (200, "alive\n")
     assert get(port, "/readyz") == (503, "no peer yet\n")
-    assert "cloudrc_ready 0.0" in get(port, "/metrics")[1]
-    exporter.ready(True)
-    assert get(port, "/readyz")[0] == 200
-    with urllib.request.urlopen(f"http://{HOST}:{port}/metrics?name=any", timeout=10) as answer:
+    for ready, status in ((True, 200), (False, 503)):
+        exporter.ready(ready)
+        assert get(port, "/readyz")[0] == status
+        assert f"cloudrc_ready {ready:.1f}" in get(port, "/metrics?name=any")[1]
+    with urllib.request.urlopen(f"http://{HOST}:{port}/metrics", timeout=10) as answer:
         assert answer.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
-        assert b"cloudrc_ready 1.0" in answer.read()
-    exporter.ready(False)
-    assert get(port, "/readyz")[0] == 503
     assert get(port, "/") == (404, "there are /metrics, /healthz, /readyz, /link.json\n")
 
 
@@ -241,19 +202,12 @@ def test_probes_of_both_address_families_are_answered():
 
 
 def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
+    """The oldest are closed."""
     waiting = [socket.create_connection((HOST, served[1]), timeout=0.9) for _ in range(200)]
-    for client in waiting[-2:]:
-        client.sendall(b"GET /metr")
+    waiting[-1].sendall(b"GET /metr")
     assert get(served[1], "/healthz")[0] == 200
-    closed = select.select(waiting, [], [], 0)[0]  # the oldest ones
+    closed = select.select(waiting, [], [], 0)[0]
     assert closed == waiting[: len(closed)]
     assert len(closed) == len(waiting) + 1 - exporters.CONNECTIONS_MAX
     for client in waiting:
         client.close()
-
-
-def test_a_client_that_hangs_is_cut(served, monkeypatch):
-    monkeypatch.setattr(exporters._Handler, "timeout", 0.05)
-    with socket.create_connection((HOST, served[1]), timeout=10) as client:
-        client.sendall(b"GET /metrics HT")
-        assert client.recv(100) == b""

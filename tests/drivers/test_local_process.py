@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,6 @@ from tests.drivers.conftest import WITHOUT_PAGE, start, wait_until_flying
 pytestmark = pytest.mark.process
 
 ENDS = ("world", "cloud")
-FLOWN = (0, 6)
-"""Exit codes of a finished run, in real time or not: the machine may be busy."""
 COMMAND = [sys.executable, "-m", "cloudrc"]
 WITHOUT_API = """
 from cloudrc.cli import extras
@@ -69,19 +68,6 @@ def test_ctrl_c_ends_all_processes_in_2_s_and_leaves_a_report(tmp_path, how):
     assert (tmp_path / "run" / "mission.mcap").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("victim", ["cloud", *nightly("world", "teleop", "relay")])
-def test_a_process_that_dies_ends_the_run_and_is_named(tmp_path, victim):
-    run = start(tmp_path / "run")
-    pids = wait_until_flying(run)
-    os.kill(pids[victim], signal.SIGKILL)
-    _, errors = run.communicate(timeout=60)
-    assert run.returncode == 6
-    assert f"the {victim} process died" in errors
-    assert "Traceback" not in errors
-    assert not any(alive(pid) for pid in pids.values())
-    assert report(tmp_path / "run")["verdict"] in ("interrupted", "invalid")
-
-
 def test_a_killed_supervisor_ends_all_and_leaves_a_recording(tmp_path):
     folder = tmp_path / "run"
     run = start(folder)
@@ -90,15 +76,27 @@ def test_a_killed_supervisor_ends_all_and_leaves_a_recording(tmp_path):
     run.kill()
     run.communicate()
     wait_until_ended(pids, 5.0)
-    assert not (folder / "mission.mcap").exists()
+    assert local.under_way() == {}, "nor does a file say that it flies"
     subprocess.run([*COMMAND, "report", str(folder)], check=False, capture_output=True)
     assert report(folder)["numbers"]["commands_applied"]["value"] > 10
     assert (folder / "mission.mcap").exists()
-    assert (folder / "report.html").exists()
 
 
-@pytest.mark.parametrize("victim", ["relay", *nightly("teleop", "world", "cloud")])
-def test_a_supervisor_that_stood_still_still_sees_who_hangs(tmp_path, victim):
+HANGS, DIES = signal.SIGSTOP, signal.SIGKILL
+
+
+@pytest.mark.parametrize(
+    ("victim", "how"),
+    [
+        ("relay", HANGS),
+        ("cloud", DIES),
+        *(
+            pytest.param(*other, marks=pytest.mark.full)
+            for other in (("teleop", HANGS), ("world", HANGS), ("cloud", HANGS), ("world", DIES))
+        ),
+    ],
+)
+def test_a_supervisor_that_stood_still_still_sees_who_hangs_or_dies(tmp_path, victim, how):
     run = start(tmp_path / "run", dwell=30.0)
     pids = wait_until_flying(run)
     os.kill(run.pid, signal.SIGSTOP)
@@ -106,80 +104,37 @@ def test_a_supervisor_that_stood_still_still_sees_who_hangs(tmp_path, victim):
     os.kill(run.pid, signal.SIGCONT)
     time.sleep(1.0)
     assert all(alive(pid) for pid in pids.values()), "the flight goes on"
-    os.kill(pids[victim], signal.SIGSTOP)
+    os.kill(pids[victim], how)
     wait_until_ended(pids, 10.0)
     _, errors = run.communicate(timeout=60)
-    assert run.returncode == 4
-    assert f"the {victim} process was silent" in errors
+    assert run.returncode == (4 if how == HANGS else 6)
+    assert f"the {victim} process {'was silent' if how == HANGS else 'died'}" in errors
+    assert "Traceback" not in errors
     notes = " ".join(report(tmp_path / "run")["notes"])
     stood = re.findall(r"supervisor of this run stood still for ([\d.]+) s", notes)
     assert max(map(float, stood)) >= local.SILENCE_LIMIT + 1.0
 
 
-PREDICTOR = '''
-"""A predictor that is slow and talks."""
-import time
-from cloudrc.cloud.predictors import Predictor
-print("loaded")
-class Odd(Predictor):
-    def predict(self, odometry, horizon):
-        print("hello")
-        time.sleep(0.05)
-        return odometry
-def build() -> Predictor:
-    """Make it."""
-    return Odd()
-'''
-
-
-def test_a_late_link_a_slow_plug_in_and_no_fastapi_end_no_run(tmp_path):
+def test_a_late_link_and_no_fastapi_end_no_run(tmp_path):
     """Before the link is up world has no telemetry to tell of, but it is alive."""
-    (tmp_path / "odd.py").write_text(PREDICTOR)
     late = f"blackouts=[{{start_s: 0, duration_s: {local.SILENCE_LIMIT + 1.0}}}]"
     links = (f"link.uplink.{late}", f"link.downlink.{late}")
     command = [sys.executable, "-c", WITHOUT_API + WITHOUT_PAGE]
-    run = start(
-        tmp_path / "run",
-        *(*links, f"cloud.predictor={tmp_path}/odd.py"),
-        dwell=2.0,
-        command=command,
-    )
-    output, errors = run.communicate(timeout=90)
-    document = report(tmp_path / "run")
-    assert run.returncode in FLOWN, errors
-    assert document["numbers"]["cloud_lateness_p99"]["value"] > 0.02
-    assert document["numbers"]["missed_periods"]["value"] > 100
-    assert "a plug-in is slow" in output
-    assert any("a plug-in is slow" in note for note in document["notes"])
-    log = (tmp_path / "run" / "cloud.log").read_text()
-    assert "loaded" in log
-    assert "hello" in log
+    run = start(tmp_path / "run", *links, dwell=2.0, command=command)
+    _, errors = run.communicate(timeout=90)
+    assert run.returncode in (0, 6), errors  # in real time or not: the machine may be busy
     assert "no operator's API in this run" in errors
     assert "pip install 'cloudrc[api]'" in errors
-
-
-WITHIN = 0.005
-"""Tolerance of a median one-way delay beside other tests [s]."""
-LEGS = (0.5, 8.9), (9.2, 9.95), (10.2, 12.0)
-"""Intervals of the profile `handover`: before the fading, during it, and in the next cell [s]."""
-EDGE = 0.01
-"""Uncertainty of the start of a time line, which is the next datagram [s]."""
 
 
 def call(folder, *words):
     return subprocess.run([*COMMAND, *words, "--run", str(folder)], capture_output=True, text=True)
 
 
-def set_link(folder, *words):
-    """Change the link; return how long it took to be in force [s]."""
-    return json.loads(call(folder, "link", "set", *words, "-o", "json").stdout)["seconds"]
-
-
 def operate(folder):
     """Hold, move and resume the mission of a run, found by its folder and from anywhere."""
     assert call(folder, "mission", "run", "hover").returncode == 5  # a mission already flies
     assert "held" in call(folder, "mission", "hold").stdout
-    assert call(folder, "mission", "goto", "0", "0", "99").returncode == 2
     assert call(folder, "mission", "goto", "0.3", "0", "0.8").returncode == 0
     time.sleep(3.0)
     status = json.loads(call(folder, "mission", "status", "-o", "json").stdout)
@@ -192,78 +147,48 @@ def operate(folder):
     assert json.loads(found.stdout)["mission"]["state"] == "flying"
 
 
+CAUSE = "downlink.delay_ms=120, downlink.jitter_ms=0"
+
+
 def test_an_operator_steers_a_run_and_sets_its_link(tmp_path, figure):
-    folder = tmp_path / "run"
+    folder, took = tmp_path / "run", []
     run = start(folder, dwell=30.0, command=COMMAND)
     wait_until_flying(run)
     assert json.loads((folder / "api.json").read_text())["url"] == local.under_way()[folder]
     time.sleep(2.0)
-    took = [set_link(folder, "downlink.delay_ms=120", "downlink.jitter_ms=0")]
-    time.sleep(2.0)
-    took.append(set_link(folder, "--profile", "handover"))
-    changed = time.monotonic()
+    for words in (CAUSE.split(", "), ["--profile", "handover"]):
+        made = call(folder, "link", "set", *words, "-o", "json")
+        took.append(json.loads(made.stdout)["seconds"])
+        time.sleep(2.0)
     operate(folder)
-    time.sleep(max(0.0, changed + LEGS[-1][1] + 0.5 - time.monotonic()))
     assert "INTERRUPTED" in call(folder, "mission", "cancel").stdout
     output, _ = run.communicate(timeout=60)
     assert run.returncode == 130
     assert report(folder)["failures"][0]["code"] == "cancelled"
     audit = [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
     said = [(line["action"].rpartition("/")[2], line["status"], line["client"]) for line in audit]
-    done = [("missions", 409), ("hold", 200), ("goto", 422), ("goto", 200), ("resume", 200)]
-    assert said[:5] == [(action, status, "local") for action, status in done]
-    assert said[5][0] == "cancel"
+    done = [("missions", 409), ("hold", 200), ("goto", 200), ("resume", 200), ("cancel", 200)]
+    assert said == [(action, status, "local") for action, status in done]
     assert local.under_way() == {}
-
-    assert "link: downlink 120 ms (downlink.delay_ms=120, downlink.jitter_ms=0)" in output
+    assert f"link: downlink 120 ms ({CAUSE})" in output
     assert not (folder / "link").exists()
     figure("link set, local: in force after", min(took), "<=", 1.0, "s")
     assert max(took) < 2.0, "on a busy machine"
-    numbers = report(folder)["numbers"]
-    for way in ("uplink", "downlink"):
-        late = {name: numbers[f"release_error_{name}_{way}"] for name in ("p50", "p99", "p999")}
-        assert 0.0 < late["p50"]["value"] <= late["p99"]["value"] <= late["p999"]["value"]
-        assert late["p50"]["value"] < WITHIN
-        assert numbers[f"released_early_{way}"] == {"value": 0.0, "unit": "1"}
-        assert numbers[f"relay_overflow_{way}"]["value"] == 0.0
     check_delays(Recording.read(folder / "mission.mcap"))
     page = (folder / "report.html").read_text()
     assert "Triangles: the link was set in flight (1: downlink.delay_ms=120" in page
 
 
 def check_delays(recording):
-    """Check that the delays of the downlink follow its changes."""
+    """Check that the median delays of the downlink follow its changes."""
     link, delays = recording["/link"], recording["/downlink_delay"]["delay"]
-    told = {cause: stamp - age * 1e9 for cause, stamp, age, uplink in
-            zip(link["cause"], link["stamp_ns"], link["age"], link["uplink"], strict=True)
-            if not uplink}  # fmt: skip
-    first, second = told["downlink.delay_ms=120, downlink.jitter_ms=0"], told["profile handover"]
+    ages = zip(link["cause"], link["stamp_ns"] - link["age"] * 1e9, link["uplink"], strict=True)
+    told = {cause: stamp for cause, stamp, uplink in ages if not uplink}
     sent_ns = recording["/downlink_delay"]["stamp_ns"] - delays * 1e9
-    assert np.median(delays[sent_ns < first]) == pytest.approx(0.045, abs=WITHIN)
-    between = (sent_ns > first + 1e8) & (sent_ns < second)
-    assert np.median(delays[between]) == pytest.approx(0.120, abs=WITHIN)
-    sent = (sent_ns - second) * 1e-9
-    steady, fading, after = (np.median(delays[(sent > a) & (sent < b)]) for a, b in LEGS)
-    assert steady == pytest.approx(0.025, abs=WITHIN)
-    assert 0.045 < fading < 0.080, "50 ms, and more to keep the order"
-    assert after == pytest.approx(0.035, abs=WITHIN)
-    dark = (sent > 10.0 + EDGE) & (sent < 10.05 - EDGE)
-    assert not dark.any(), "what was sent while the robot was handed over never arrives"
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("attempt", range(3))
-def test_real_time_takes_as_long_as_virtual_time(tmp_path, attempt):
-    reports = {}
-    for mode in ("virtual", "local"):
-        folder = tmp_path / mode
-        command = [sys.executable, "-m", "cloudrc", "run", "paper", "--mode", mode]
-        subprocess.run([*command, "--out", str(folder)], check=True, capture_output=True)
-        reports[mode] = report(folder)["numbers"]
-    local, virtual = (reports[mode]["contact_time"]["value"] for mode in ("local", "virtual"))
-    assert local == pytest.approx(virtual, rel=0.05)
-    for name in ("real_time_factor", "world_lateness_p99", "cloud_lateness_p99"):
-        assert reports["local"][name]["value"] > 0
+    edges = [0.0, told[CAUSE], told["profile handover"], told["profile handover"] + 8.9e9]
+    parts = [delays[(sent_ns > a + 1e8) & (sent_ns < b)] for a, b in pairwise(edges)]
+    asked = [0.045, 0.120, 0.025]
+    assert list(map(np.median, parts)) == pytest.approx(asked, abs=0.005), "beside other tests"
 
 
 def private_memory(pid):

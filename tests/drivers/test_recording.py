@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread, WallClock
+from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread
 from cloudrc.messages import GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import GuardChange, Lateness
@@ -19,7 +19,7 @@ class Slow(Shelf):
     def __init__(self):
         super().__init__()
         self.release, self.begun = threading.Event(), threading.Semaphore(0)
-        self.began, self.flushed = list[float](), threading.Semaphore(0)
+        self.began, self.flushed = [], threading.Semaphore(0)
 
     def flush(self):
         self.flushed.release()
@@ -42,8 +42,7 @@ def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path):
     for _ in range(3):
         assert shelf.begun.acquire(timeout=5.0)
     ages = [thread.sync_age(), thread.sync_age()]
-    assert all(age is not None and age >= shelf.began[2] - shelf.began[1] for age in ages)
-    assert ages[0] < ages[1], "it rises while the disk hangs"
+    assert shelf.began[2] - shelf.began[1] <= ages[0] < ages[1], "it rises while the disk hangs"
     recorder.put(counted(500))
     while shelf.flushed.acquire(blocking=False):
         pass
@@ -52,22 +51,6 @@ def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path):
     assert thread.stop(timeout=10.0)
     assert (len(shelf.records), recorder.dropped) == (500, 0)
     shelf.release.set()
-
-
-def test_a_hanging_disk_does_not_keep_the_process():
-    class Hanging(Shelf):
-        def write(self, records):
-            release.wait(10.0)
-
-    release, recorder = threading.Event(), Recorder(Path("x"), lambda path: Hanging(), capacity=5)
-    thread = RecordingThread(recorder)
-    recorder.put(counted(5))
-    thread.start()
-    recorder.put(counted(20))
-    assert not thread.stop(timeout=0.05)
-    assert recorder.dropped >= 15
-    release.set()
-    assert thread.stop(timeout=10.0)
 
 
 def test_a_pod_records_flights_whole_and_events_between_them():
@@ -84,45 +67,16 @@ def test_a_pod_records_flights_whole_and_events_between_them():
     assert choose([]) == []
 
 
-@pytest.mark.parametrize("by", [3600.0, -1.0])
-def test_a_step_of_the_wall_clock_is_noticed_once(by, monkeypatch):
+def test_a_step_of_the_wall_clock_is_noticed_once(monkeypatch):
     offset, true = [0.0], time.time
     monkeypatch.setattr(time, "time", lambda: true() + offset[0])
     thread = RecordingThread(Recorder(Path("x"), lambda path: Shelf()))
     thread.start()
-    offset[0] = by
-    steps, until = list[float](), time.monotonic() + 10.0
+    offset[0] = -1.0
+    steps, until = [], time.monotonic() + 10.0
     while not steps and time.monotonic() < until:
         time.sleep(0.01)
         steps = thread.take_steps()
-    assert steps == [pytest.approx(by, abs=0.1)]
+    assert steps == [pytest.approx(-1.0, abs=0.1)]
     assert thread.take_steps() == []
     assert thread.stop(10.0)
-
-
-def test_a_clock_that_drifts_has_not_been_set(monkeypatch):
-    boot = [0.0]
-    monkeypatch.setattr(time, "clock_gettime", lambda clock: boot[-1])
-    monkeypatch.setattr(time, "time", lambda: 1.7e9 + boot[-1] * 1.0005)
-    seen = WallClock()
-    for later in (1.0, 60.0, 3600.0, 86_400.0):
-        boot.append(later)
-        assert seen.step() == 0.0
-
-
-@pytest.mark.parametrize("stopped_before", [True, False])
-def test_nor_has_one_whose_reader_was_stopped_meanwhile(stopped_before, monkeypatch):
-    """A stop of a second between the reads of both clocks, by SIGSTOP or a CPU quota."""
-    true, stops = [0.0], iter([False, True])
-
-    def look():
-        stop = next(stops, False)
-        true[0] += stop and stopped_before
-        shown = 1.7e9 + true[0]
-        true[0] += stop and not stopped_before
-        return shown
-
-    monkeypatch.setattr(time, "clock_gettime", lambda clock: true[0])
-    monkeypatch.setattr(time, "time", look)
-    seen = WallClock()
-    assert [seen.step(), seen.step()] == [0.0, 0.0]

@@ -1,6 +1,5 @@
 """World, cloud and teleop as processes that are killed, frozen or ended in flight."""
 
-import json
 import resource
 import signal
 import time
@@ -9,10 +8,8 @@ import numpy as np
 import pytest
 
 from cloudrc.cli.client import Api, UnreachableError
-from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.record.columns import Recording
 from cloudrc.record.reader import recover
-from cloudrc.teleop.wire import ALARM, encode
 from tests.conftest import nightly
 from tests.drivers.conftest import LIMIT, TOKEN, Release, ages_at_hold
 
@@ -53,15 +50,6 @@ def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     assert (applied["stamp_ns"] - applied["basis_stamp_ns"]).max() <= 252_000_000
 
 
-def test_a_killed_world_ends_the_job_with_world_restarted(release):
-    job = release.fly()
-    release.kill("world")
-    release.start("world")
-    out, _ = job.communicate(timeout=LIMIT)
-    assert job.returncode == 1
-    assert "world_restarted" in out.splitlines()[-1]
-
-
 def test_an_ended_teleop_holds_and_its_waiting_successor_resumes(release):
     release.fly()
     first, old = release.running["teleop"], release.url
@@ -81,7 +69,7 @@ def test_an_ended_teleop_holds_and_its_waiting_successor_resumes(release):
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
-def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
+def test_an_emergency_stop_stops_the_rotors_and_fails_the_job(release):
     job = release.fly()
     release.post("/v1/estop")
     release.until_guard("ESTOP")
@@ -90,25 +78,6 @@ def test_an_emergency_stop_stops_the_rotors_and_is_audited(release):
     assert "emergency_stopped" in out.splitlines()[-1]
     release.post("/v1/acknowledge")
     release.until(lambda: release.ask("/v1/state")["seen"]["guard"] != "ESTOP")
-    release.stop()
-    lines = (release.folder / "audit.jsonl").read_text().splitlines()
-    actions = [json.loads(line)["action"] for line in lines]
-    assert actions[-2:] == ["POST /v1/estop", "POST /v1/acknowledge"]
-
-
-def test_an_emergency_stop_passes_while_teleop_waits_for_disk(release):
-    """Teleop's loop hangs in a write; the alarm goes directly to cloud, which numbers it."""
-    release.fly()
-    alarm = UnixPeer(release.folder / "mine.sock", release.folder / "cloud.sock")
-    release.running["teleop"].send_signal(signal.SIGSTOP)
-    assert alarm.send(encode(ALARM))
-    time.sleep(0.3)
-    release.running["teleop"].send_signal(signal.SIGCONT)
-    alarm.close()
-    release.until(lambda: release.mission()["state"] == "failed")
-    assert release.ask("/v1/state")["seen"]["guard"] == "ESTOP"
-    failures = release.mission()["verdict"]["failures"]
-    assert failures[0]["code"] == "guard_stopped"  # teleop itself never got the request
 
 
 def test_a_pod_that_ends_in_flight_holds_the_robot_by_its_word(release):

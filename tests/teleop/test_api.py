@@ -2,12 +2,11 @@
 
 import argparse
 import concurrent.futures
+import contextlib
 import json
-import socket
 import stat
+import statistics
 import time
-import urllib.error
-import urllib.request
 
 import pytest
 
@@ -21,7 +20,7 @@ from cloudrc.messages import GuardState
 from cloudrc.records import Counted
 from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
-from cloudrc.teleop.api import ApiServer, Bridge
+from cloudrc.teleop.api import ApiServer
 from cloudrc.teleop.auth import LOCAL
 from tests.teleop.conftest import DIRECT, OPERATOR, READER, A, B, C, connect, head, running
 
@@ -40,22 +39,12 @@ def finish(api, mission_id):
     api.until(lambda: api.state_of(mission_id) == "done")
 
 
-def ask(connection, *request, **how):
-    """Send a request on an own connection; return the whole answer."""
-    connection.sendall(head(*request, **how))
-    answer = b""
-    while not answer.endswith(b"}"):
-        answer += connection.recv(65_536)
-    return answer
-
-
 # Missions
 
 
 def test_a_mission_from_post_to_verdict(api):
     status, view = api.post("/v1/missions", {**MISSION, "key": "uid"})
     assert (status, view["id"], view["state"], view["waypoints"]) == (201, "m1", "starting", 3)
-    api.until(lambda: api.state_of("m1") == "flying")
     finish(api, "m1")
     view = api.get("/v1/missions/m1")
     assert (view["name"], view["verdict"]["outcome"]) == (NAME, "success")
@@ -98,20 +87,15 @@ def test_requests_and_refusals_become_metrics(api):
     assert api.post("/v1/acknowledge")[0] == 409  # refused, but no order
     assert api.post("/v1/hold", token=READER)[0] == 403
 
-    def readings():
+    def reading(name):
         live = LiveMetrics("teleop")
-        counts = {**api.server.counts, "api_events_dropped": 3, "journal_repaired": 1}
-        live.see([Counted(0, "teleop", name, count) for name, count in counts.items()])
-        return live.read()
+        live.see([Counted(0, "teleop", *count) for count in api.server.counts.items()])
+        return live.read().get(f"cloudrc_{name}_total")
 
-    def refusals():
-        return readings().get("cloudrc_missions_refused_total")
-
-    api.until(lambda: refusals() == {("invalid",): 3, ("conflict",): 1})  # counted after the answer
-    api.until(lambda: readings()["cloudrc_api_requests_total"][()] >= 6)
-    assert readings()["cloudrc_api_rejected_total"][("role",)] == 1
-    assert readings()["cloudrc_stream_dropped_events_total"] == {(): 3}
-    assert readings()["cloudrc_journal_repaired_total"] == {(): 1}
+    wanted = {("invalid",): 3, ("conflict",): 1}
+    api.until(lambda: reading("missions_refused") == wanted)  # counted after the answer
+    api.until(lambda: reading("api_requests")[()] >= 6)
+    assert reading("api_rejected")[("role",)] == 1
 
 
 # Events
@@ -231,29 +215,10 @@ def test_a_stop_during_the_start_is_the_first_call_unless_another_teleop_flies(l
             assert answer.result() == (200, {"id": None, "state": "stopping"})
 
 
-@emergency_stop
-def test_stop_and_hold_overtake_a_full_queue_of_calls():
-    bridge, made = Bridge(), []
-    bridge.open(object())
-
-    def noting(what):
-        return lambda service, now_ns: made.append(what)
-
-    for number in range(100):
-        bridge.submit(noting(number))
-    for what in ("hold", "stop", "hold"):
-        bridge.submit(noting(what), what)
-    for call in (*bridge.take_stops(), *bridge.take_stops()):
-        call(0)
-    assert made == ["stop"]
-    bridge.submit(noting("stop"), "stop")
-    for call in bridge.take():
-        call(0)
-    assert made == ["stop", "stop", "hold", "hold", *range(100)]
-
-
-@pytest.mark.parametrize("urgent", ["estop", "hold"])
-@pytest.mark.parametrize("overtaken", ["acknowledge", "resume", "goto", "missions"])
+@pytest.mark.parametrize(
+    ("urgent", "overtaken"),
+    [("estop", "acknowledge"), ("hold", "resume"), ("estop", "goto"), ("hold", "missions")],
+)
 def test_what_a_stop_or_a_hold_overtakes_does_not_move_the_robot(api, urgent, overtaken):
     if overtaken in ("resume", "goto"):
         api.fly(MISSION)
@@ -302,33 +267,35 @@ def test_an_internal_error_is_one_line_and_500(api):
 # The server
 
 
-def test_accepted_connections_have_tcp_nodelay(api):
-    """Without it a kept connection waits for delayed acknowledgements: 40 ms for each answer."""
-    with connect(api) as one:
-        ask(one, "GET", "/v1/state")
-        transports = [each.transport for each in api.server.server_state.connections]
-        sockets = [each.get_extra_info("socket") for each in transports]
-        assert {each.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) for each in sockets} == {1}
+def test_a_kept_connection_answers_like_a_fresh_one(api):
+    """Without TCP_NODELAY it would wait for delayed acknowledgements: 40 ms for each answer."""
+
+    def median_of_answers(connection):
+        times = []
+        for _ in range(25):
+            began, answer = time.monotonic(), b""
+            with connection() as one:
+                one.sendall(head("GET", "/v1/state"))
+                while not answer.endswith(b"}"):
+                    answer += one.recv(65_536)
+            times.append(time.monotonic() - began)
+        return statistics.median(times)
+
+    with connect(api) as kept:
+        took = median_of_answers(lambda: contextlib.nullcontext(kept))
+        assert took < median_of_answers(lambda: connect(api)) + 0.02
 
 
-@pytest.mark.parametrize("host", ["::1", "[::1]", "[::]"])
-def test_the_api_and_its_client_speak_ipv6(host):
-    with running(host=host) as api:
-        assert api.url.startswith(f"http://[{host.strip('[]')}]:")
-        assert Api(api.url, lambda: OPERATOR).get("/v1/state")
-        if host == "[::]":
-            url = api.url.replace("[::]", "127.0.0.1")
+def test_the_api_and_its_client_speak_both_address_families():
+    with running(host="[::]") as api:
+        assert api.url.startswith("http://[::]:")
+        for url in (api.url, *(api.url.replace("[::]", host) for host in ("[::1]", "127.0.0.1"))):
             assert Api(url, lambda: OPERATOR).get("/v1/state")
 
 
 @pytest.mark.parametrize(
     ("where", "host", "warns"),
-    [
-        ("0", "127.0.0.1", False),
-        ("localhost:0", "localhost", False),
-        ("[::1]:0", "::1", False),
-        ("0.0.0.0:0", "0.0.0.0", True),
-    ],
+    [("0", "127.0.0.1", False), ("[::1]:0", "::1", False), ("0.0.0.0:0", "0.0.0.0", True)],
 )
 def test_a_network_address_needs_tokens(where, host, warns, capsys):
     options = argparse.Namespace(api=api_address(where), tokens=None, audit=None, api_file=None)
@@ -341,10 +308,10 @@ def test_a_network_address_needs_tokens(where, host, warns, capsys):
 def test_an_unusable_address_is_one_sentence(api, tmp_path):
     thesis = tmp_path / "thesis"
     thesis.write_text("mine")
+    taken = ("127.0.0.1", int(api.url.rpartition(":")[2]))
     for address, said in (
-        (("127.0.0.1", int(api.url.rpartition(":")[2])), r"--api .*:\d+: Address already in use"),
+        (taken, r"--api .*:\d+: Address already in use"),
         (("a..b", 0), r"--api http://a\.\.b:0: .*; choose another address"),
-        (tmp_path / "no" / "folder", "choose another address"),
         (thesis, "in use; choose another"),
     ):
         with pytest.raises(BadInputError, match=said):
@@ -366,17 +333,6 @@ def test_a_socket_file_is_for_its_owner_and_needs_no_token(tmp_path):
         Api(f"unix:{tmp_path}/none").get("/v1/state")
 
 
-def test_no_proxy_is_asked_and_none_is_believed(monkeypatch):
-    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
-    assert urllib.request.getproxies()["http"] == "http://127.0.0.1:9"
-    with running() as api:
-        assert Api(api.url, lambda: OPERATOR).get("/v1/state")
-        named = {"X-Forwarded-For": "203.0.113.7", "X-Forwarded-Proto": "https"}
-        assert api.send(api.request("/v1/hold", b"", headers=named, method="POST"))[0] == 409
-        (line,) = api.audited()
-        assert line["client"].rpartition(":")[0] == "127.0.0.1"
-
-
 def test_the_openapi_document_describes_everything(api):
     document = api.get("/openapi.json")
     ((scheme, meaning),) = document["components"]["securitySchemes"].items()
@@ -385,7 +341,6 @@ def test_the_openapi_document_describes_everything(api):
     content = post["requestBody"]["content"]["application/json"]
     models.MissionRequest.model_validate_json(json.dumps(content["example"]))
     assert "[m]" in json.dumps(content["schema"]["properties"]["waypoints"])
-    assert "$ref" not in json.dumps(content["schema"])
     assert {"201", "200", "409", "413", "422", "503"} <= set(post["responses"])
     for path, verbs in document["paths"].items():
         for verb, operation in verbs.items():

@@ -1,14 +1,13 @@
-"""The mission machine: each transition, each early end, and who may move the robot."""
+"""The mission machine and its requests: transitions, early ends, and who may move the robot."""
 
 import pytest
 
-from cloudrc.messages import GuardState, Request, Setpoint, Start
-from cloudrc.teleop.mission import HELD_LOWEST
-from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
+from cloudrc.teleop.requests import REPEAT_NS
+from cloudrc.teleop.wire import ALARM, Leg, Plan
 from tests.teleop.conftest import AWAY, FROM_SPAWN, ID, PLAN, THREE, A, B, C, Flight, asked, flying
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-AT_ONCE = Plan((Leg(A, dwell=0.0),))
 
 
 def last_event(flight):
@@ -50,23 +49,14 @@ def test_a_mission_flies_its_legs_in_order_and_ends_in_a_hold():
     assert (flight.state, flight.guard) == ("DONE", HOLD)
 
 
-@pytest.mark.parametrize("away", [(1.11, 0.0, 1.0), (1.07, 0.07, 1.07)])
-def test_dwell_starts_again_outside_of_the_tolerance(away):
+def test_dwell_starts_again_outside_of_the_tolerance():
     flight = flying()
     flight.step(position=A, seconds=0.45)
-    flight.step(position=away)
+    flight.step(position=(1.07, 0.07, 1.07))
     flight.step(position=A, seconds=0.45)
     assert last_event(flight) == "started"
     flight.step(position=A, seconds=0.06)
     assert last_event(flight) == "reached"
-
-
-def test_legs_of_infinite_tolerance_last_their_dwell_time():
-    flight = flying(Plan(tuple(Leg(at, tolerance=float("inf"), dwell=0.4) for at in (A, B, C))))
-    flight.step(position=AWAY, seconds=1.3)
-    first, second, third = (e.stamp_ns for e in flight.events if e.event == "reached")
-    assert (second - first, third - second) == (400_000_000, 400_000_000)
-    assert flight.state == "DONE"
 
 
 def test_time_in_hold_or_unseen_is_no_dwell():
@@ -82,108 +72,36 @@ def test_time_in_hold_or_unseen_is_no_dwell():
     assert last_event(flight) == "reached"
 
 
-# Early ends
-
-
-def assert_failed(flight, code, text):
-    outcome = flight.teleop.outcome
-    assert (flight.state, outcome.event, outcome.text) == ("FAILED", code, text)
-    assert (flight.events[-1].event, flight.events[-1].text) == (code, text)
-    assert flight.setpoints[-1].waypoint == -1
-    flight.step(seconds=0.05)
-    assert flight.requests[-1].request is Request.END
-
-
 def test_a_leg_that_takes_too_long_fails_the_mission():
     """Neither the time before take-off counts, nor that in which the mission is held."""
     flight = flying(Plan((Leg(A, dwell=0.0), Leg(B, time_limit=2.0)), time_limit=60.0))
     flight.step(position=A)
-    flight.step(position=AWAY, seconds=0.5)
     flight.guard = GROUND
-    flight.step(seconds=2.5)
+    flight.step(position=AWAY, seconds=2.5)
     flight.guard = TRACK
     flight.operate("hold")
     flight.step(seconds=10.0)
     flight.operate("resume")
-    flight.step(seconds=1.4)
+    flight.step(seconds=1.9)
     assert flight.state == "FLYING"
     flight.step(seconds=0.2)
-    assert_failed(flight, "leg_timed_out", "waypoint 2 of 2 not reached in 2 s")
-    assert flight.events[-1].waypoint == 1
+    assert (flight.state, last_event(flight)) == ("FAILED", "leg_timed_out")
+    assert flight.events[-1].text == "waypoint 2 of 2 not reached in 2 s"
 
 
-def test_no_robot_is_held_where_it_would_scrape_along_the_floor():
-    flight = flying()
-    flight.step(position=(0.2, 0.1, 0.12))
-    for verb in ("hold", "cancel"):
-        flight.operate(verb)
-        assert flight.setpoints[-1] == Setpoint((0.2, 0.1, HELD_LOWEST), 0.3, -1)
-
-
-# The first setpoint: an armed robot flies to it at once
-
-
-@pytest.fixture
-def ended():
-    """A mission is done, but its end has not reached the robot, which tracks on."""
-    flight = flying(AT_ONCE)
-    flight.downlink = False
+def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
+    """One that was told to start does not: an armed robot flies to a setpoint at once."""
+    flight = flying(Plan((Leg(A, dwell=0.0),)))
     flight.step(position=A)
-    assert (flight.state, flight.guard) == ("DONE", TRACK)
-    return flight
-
-
-@pytest.mark.parametrize("acted_on", [None, False, True])
-def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once(ended, acted_on):
-    """Not after a request between end and start, which may have taken effect."""
-    ended.downlink = True
-    ended.step(seconds=0.15)
-    assert ended.guard is HOLD
-    if acted_on is not None:
-        ended.operate("start", Plan((Leg(B),), Start.HERE))
-        ended.uplink, ended.downlink = False, acted_on
-        ended.step(seconds=0.15)
-        ended.downlink = False
-        ended.operate("cancel")
-        ended.uplink = True
-        ended.step(seconds=0.15)
-    before = len(ended.setpoints)
-    ended.operate("start", PLAN)
-    assert ended.setpoints[before:] == ([Setpoint(A, 0.3, 0)] if acted_on is None else [])
-
-
-def test_cloud_is_told_the_setpoint_again_in_every_session():
-    flight = started()
-    told = flight.setpoints[-1]
-    flight.restart_cloud()
-    flight.step(seconds=0.02)
-    assert flight.setpoints.count(told) == 2
-    flight.operate("hold")
-    flight.operate("go_to", Leg(C))
-    flight.restart_cloud()
-    flight.step(position=A)
-    assert [setpoint.position for setpoint in flight.setpoints[-2:]] == [C, C]
-
-
-@pytest.mark.parametrize("before", ["cancel", "acknowledge"])
-def test_after_a_foreign_start_the_robot_counts_as_flying(before):
-    """A predecessor's late start moves it; it would leave for the next mission's point."""
-    flight = started() if before == "cancel" else Flight()
-    flight.onboard = (ID + 1, 2)
-    flight.step(position=AWAY)
-    if flight.state != "FAILED":
-        flight.operate(before)
-    flight.step(seconds=0.1)
-    flight.mission += 1
-    flight.guard = TRACK
-    flight.step()
-    flight.downlink = False
-    flight.operate("start", FROM_SPAWN, ID + 2)
-    flight.step(seconds=0.2)
-    assert flight.setpoints[-1].position == AWAY
-
-
-# What the robot stores on board
+    flight.step(seconds=0.15)
+    assert (flight.state, flight.guard) == ("DONE", HOLD)
+    before = len(flight.setpoints)
+    flight.operate("start", PLAN)
+    assert flight.setpoints[before:] == [Setpoint(A, 0.3, 0)]
+    flight.operate("cancel")
+    before = len(flight.setpoints)
+    flight.operate("start", PLAN)
+    assert flight.setpoints[before:] == []
 
 
 def started():
@@ -192,19 +110,6 @@ def started():
     flight.operate("start", THREE, ID)
     flight.step(seconds=0.05)
     return flight
-
-
-# Requests of others
-
-
-def test_a_predecessors_late_end_does_not_stop_the_mission():
-    flight = started()
-    flight.mission += 1
-    flight.guard = HOLD
-    flight.step(seconds=0.2)
-    assert flight.guard is TRACK
-    assert (flight.requests[-1].request, flight.requests[-1].start) == (Request.START, Start.HERE)
-    assert [event.event for event in flight.events] == ["started"]
 
 
 @pytest.mark.parametrize("guard", [HOLD, GROUND])
@@ -223,3 +128,36 @@ def test_a_robot_that_waits_during_its_mission_is_started_again(guard):
     flight.step(seconds=3.2)
     assert flight.requests[-1][1:3] == (Request.START, Start.HERE)
     assert (flight.guard, flight.state) == (TRACK, "FLYING")
+
+
+# Requests and the emergency stop: repeated until the robot has acted on them
+
+
+def test_each_copy_of_a_setpoint_or_request_names_the_current_session():
+    flight, said = Flight(), []
+    flight.step()
+    flight.operate("start", FROM_SPAWN, ID)
+    for epoch in (1, 1, 2):
+        flight.epoch = epoch
+        flight.now_ns += REPEAT_NS
+        flight.see()
+        flight.teleop.handle_deadline(flight.now_ns)
+        said += flight.teleop.take_outputs()
+    requests = [each for each in said if isinstance(each, OperatorRequest)]
+    assert len({(each.request, each.number) for each in requests}) == 1
+    assert [each.epoch for each in requests] == [1, 1, 2]
+    assert [each.epoch for each in said if isinstance(each, Setpoint)] == [2]
+
+
+def test_a_stop_leaves_at_once_and_is_told_until_it_is_seen():
+    """Cloud gives it a number, above all others, and repeats it towards the robot."""
+    flight = flying()
+    flight.uplink = False
+    flight.operate("stop")
+    assert flight.said[-1] == ALARM
+    flight.step(seconds=1.0)
+    assert 10 <= flight.said.count(ALARM) <= 11
+    flight.uplink = True
+    flight.step(seconds=0.5)
+    assert flight.said.count(ALARM) <= 11
+    assert flight.guard is ESTOP

