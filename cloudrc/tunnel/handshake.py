@@ -229,7 +229,7 @@ class ClientHandshake:
         `asks` tells whether cloud asks for a session. While it does not, cloud ignores another
         world process, because the ACCEPT may be a late datagram of a process that has ended. If
         cloud accepts a late ACCEPT while it asks, it takes the running process for an ended one.
-        When the running process answers again, cloud changes its nonce: late ACCEPTs are then invalid.
+        When the running process answers again, cloud takes a new nonce, which no late ACCEPT has.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):
