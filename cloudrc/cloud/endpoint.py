@@ -31,14 +31,13 @@ from cloudrc.tunnel.keys import Key
 from cloudrc.tunnel.session import NO_EPOCH
 
 MISSED_MAX = 50
-"""Number of missed periods of 10 ms at which cloud reports a fault. Forgiven periods do not
-count."""
+"""Cloud reports a fault when this many missed periods of 10 ms are not yet forgiven."""
 FORGIVEN_NS = 200_000_000
-"""Time in which one missed period is forgiven [ns]; 5 % of all periods may be missed."""
+"""One missed period is forgiven per this time [ns], so 5 % of all periods may be missed."""
 
 
 class MissedPeriods:
-    """Report a fault when cloud misses many periods, and again only after all were forgiven."""
+    """Report a fault when cloud misses many periods; report again after all were forgiven."""
 
     def __init__(self) -> None:
         self._missed, self._reported = 0, False
@@ -105,8 +104,8 @@ class CloudEndpoint(TunnelEnd):
             loop: Estimator, predictor and controller.
             teleop: Source of setpoints and operator requests.
             identity: Identity and keys of this end.
-            newest_wins: Whether telemetry is dropped that arrives after newer telemetry.
-            start_ns: Cloud's monotonic clock now [ns].
+            newest_wins: Whether to drop telemetry that arrives after newer telemetry.
+            start_ns: The present time on cloud's monotonic clock [ns].
         """
         super().__init__(identity, Direction.DOWNLINK, newest_wins)
         self._loop, self.teleop = loop, teleop
@@ -133,7 +132,7 @@ class CloudEndpoint(TunnelEnd):
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended, and the robot confirms it or GIVE_UP_NS have passed."""
+        """Whether the mission has ended and the robot confirms this, or GIVE_UP_NS have passed."""
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 
@@ -280,9 +279,9 @@ class CloudEndpoint(TunnelEnd):
     def _relay(self, request: OperatorRequest) -> None:
         """Relay an operator's request to world, or drop it; teleop repeats a dropped request.
 
-        Cloud drops every request while there is no session. Cloud drops a start before the first
-        telemetry, and while it repeats an emergency stop. An emergency stop without a number is not
-        relayed: cloud itself numbers and repeats it.
+        Cloud drops every request while there is no session. Cloud also drops a start before the
+        first telemetry, and a start while cloud repeats an emergency stop. Cloud itself numbers and
+        repeats an emergency stop that has no number.
         """
         if request.number > codec.NUMBER_MAX:  # somebody with the keys has used up the numbers
             self._counts["words_dropped"] += 1

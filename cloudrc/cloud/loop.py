@@ -4,10 +4,10 @@ If a plug-in raises an exception, or returns values that are not finite numbers,
 safe value: the last good horizon, the last sample, or zero velocity. The loop counts every failure,
 reports the first failure of each plug-in, and goes on.
 
-Telemetry echoes the stamp of the newest command that world has applied. While no new echo arrives,
-the robot does not fly the commands, and the loop freezes: it commands zero velocity and does not
-call the controller. No integral winds up, and no predictor assumes motion that the robot did not
-fly. The echo of a new command ends the freeze.
+Telemetry echoes the stamp of the newest command that world has applied. If no new echo arrives for
+some time, the robot does not fly the commands, and the loop freezes: it commands zero velocity and
+does not call the controller. So no integral winds up, and no predictor assumes a motion that the
+robot did not fly. The loop works normally again after the echo of a new command.
 
 The loop measures ages on cloud's clock, and subtracts stamps of world's clock only from each other.
 It needs no clock synchronisation.
@@ -31,14 +31,14 @@ from cloudrc.records import Control, Fault
 HORIZON_MAX = 1.0
 """Longest horizon of a prediction [s]. Source: docs/reference/control.md, "Predictors"."""
 FREEZE_NS = 400_000_000
-"""If no telemetry shows that the robot follows a new command, the loop freezes after the horizon
-plus this time [ns].
+"""The loop freezes if telemetry has shown no new command as applied for the horizon plus this time
+[ns].
 Source: docs/reference/plant.md, "Frozen reference"."""
 FRESH_ECHO_NS = 50_000_000
-"""Longest hold of an echo that is a delay sample [ns]: five command periods. While the downlink is
-silent, the hold grows, and the delay of the link does not."""
+"""Longest hold time of an echo that is a delay sample [ns]: five command periods. While no commands
+arrive at world, the hold time grows although the delay of the link does not change."""
 ECHOES = 32
-"""Number of echoes that cloud remembers, so that each command counts once."""
+"""Number of echoes that cloud remembers, so that `add_applied` is called once per command."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 INSTEAD = {
     "estimator": "cloud uses the last good horizon",
@@ -47,7 +47,7 @@ INSTEAD = {
 }
 """Kind of plug-in -> what cloud does when a plug-in of this kind fails."""
 TRACEBACK_MAX = 4000
-"""Longest recorded traceback [characters]; of a longer one the end is kept."""
+"""Largest size of a recorded traceback [characters]; the beginning of a longer one is cut off."""
 
 
 class InvalidResultError(ValueError):
@@ -61,8 +61,8 @@ class DelayMeter:
     """Feed a delay estimator with the delays of commands, and get the horizon from the estimator.
 
     Attributes:
-        rtt: Last round trip, without the hold time on world [s]; NaN before the first.
-        loop_delay: Last round trip, with the hold time on world [s]; NaN before the first.
+        rtt: Newest round-trip time, without the hold time on world [s]; NaN before the first.
+        loop_delay: Newest round-trip time, with the hold time [s]; NaN before the first.
         newest_echo_ns: Stamp of the newest command that telemetry shows as applied [ns], cloud's
             clock.
     """
@@ -75,10 +75,11 @@ class DelayMeter:
         self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process the telemetry to be used, at its arrival `now_ns` [ns].
+        """Process telemetry that arrived at `now_ns` [ns] and is newer than all before.
 
-        Each telemetry with a fresh echo is one sample of eq. (1), even if the echo is repeated.
-        Samples of new echoes alone would have the shortest holds, and the mean would be too small.
+        Every telemetry datagram with a short hold time gives one sample of eq. (1), even if its
+        echo was received before. New echoes alone have the shortest hold times, and would make the
+        mean too small.
         Source: docs/reference/control.md, "The delay sample".
         """
         self._stamp_ns = telemetry.stamp_ns
@@ -91,10 +92,10 @@ class DelayMeter:
         self._estimator.update(DelaySample(self.loop_delay, self.rtt))
 
     def observe_echo(self, telemetry: Telemetry) -> None:
-        """Process the echo of telemetry, which may be late: it shows when a command was applied.
+        """Process the echo of telemetry, which shows when a command was applied.
 
-        Late telemetry often has the only echo of a command that another one soon replaced. Without
-        these commands, which are the slow ones, the average delay would be too small.
+        A command with a long delay is soon replaced by the next command, so its only echo may be in
+        telemetry that arrives late. Without this echo the average delay would be too small.
         """
         echo_ns = telemetry.echo_stamp_ns
         if echo_ns == NEVER_NS or echo_ns in self._echoes:
@@ -201,7 +202,7 @@ class ControlLoop:
             self._note("predictor", error, now_ns)
 
     def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process telemetry that is older than the newest: only its echo counts."""
+        """Process telemetry that arrived after newer telemetry; only its echo is used."""
         try:
             self._delays.observe_echo(telemetry)
         except BaseException as error:

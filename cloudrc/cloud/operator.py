@@ -16,7 +16,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class Operator(Protocol):
-    """Teleop, in this process or in a process behind a socket."""
+    """Teleop, in this process or in another process that is connected by a socket."""
 
     @property
     def outputs(self) -> Sequence[Output | Fault]:
@@ -43,8 +43,9 @@ class Operator(Protocol):
 def is_for_session(epoch: int, output: Output | Fault) -> bool:
     """Return whether a message from teleop is valid in the session with this epoch.
 
-    Setpoints and starts are valid only in the session for which teleop made them, because another
-    cloud may have moved the robot since; teleop repeats both. No other message makes the robot fly.
+    Setpoints and starts, which make the robot fly, are valid only in the session for which teleop
+    made them: before the next session another cloud may have moved the robot. Teleop sends both
+    again. All other messages are valid in every session.
     """
     if isinstance(output, Setpoint) or (
         isinstance(output, OperatorRequest) and output.request is Request.START
@@ -82,12 +83,12 @@ class EmergencyStopRepeater:
         self._number = self._acted_on = self._due_ns = 0
 
     def sound(self) -> None:
-        """Start to repeat the stop."""
+        """Begin to send and repeat the stop."""
         if not self.sounds:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
     def restart_numbers(self) -> None:
-        """Start numbering from 0, because world numbers the requests of each session from 0."""
+        """Forget all numbers, because the numbers of requests begin again in each session."""
         self._number = self._acted_on = self._due_ns = 0
 
     def see(self, guard: GuardState, acted_on: int) -> None:

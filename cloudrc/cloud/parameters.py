@@ -29,7 +29,7 @@ def positive(name: str, value: object) -> float:
 
 
 def gain(name: str, value: object) -> float:
-    """Return `value` if it is a gain [1], above 0 and at most 1; else raise ValueError."""
+    """Return `value` if it is a gain, above 0 and at most 1; else raise ValueError."""
     number = positive(name, value)
     if number > 1:
         raise ValueError(f"{name}: {value!r} must be at most 1")

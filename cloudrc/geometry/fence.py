@@ -9,8 +9,8 @@ HIGH: Vector = (9.2, 5.5, 2.5)
 """Opposite corners LOW and HIGH of the fence [m], world frame.
 Source: docs/reference/plant.md, "Fence of the guard"."""
 FLOOR_MARGIN = 0.35
-"""Smallest height above the fence's floor at which the guard holds the robot [m]. Lower, a tilted
-robot would touch the ground or scrape along it."""
+"""Smallest height above the fence's floor at which the guard holds the robot [m]. At a smaller
+height a tilted robot would touch the ground."""
 WALL_MARGIN = 0.2
 """Distance from the walls and the ceiling of the fence at which the guard stops the robot [m]."""
 INNER_LOW: Vector = (LOW[0] + WALL_MARGIN, LOW[1] + WALL_MARGIN, LOW[2] + FLOOR_MARGIN)

@@ -14,7 +14,8 @@ CLEARANCE_MIN = 0.04
 """Smallest distance of the whole robot from a pipe's wall, at a waypoint and on the way to it [m].
 The value is above 32 mm, the steady error of a hover with the published gains."""
 STEP_MIN = 0.02
-"""Shortest step in which a straight way is checked [m], so that the check near a wall ends."""
+"""Shortest step in which a straight way is checked [m]. Near a wall, a check without a
+shortest step would not end."""
 _SEARCH = 1.5  # [m] largest distance of a suggested legal point
 _AT_ONCE = 50  # number of candidates whose ways are checked together
 _FAR = 1e3  # [m] limit of coordinates, so that no square overflows
@@ -23,8 +24,8 @@ _FAR = 1e3  # [m] limit of coordinates, so that no square overflows
 def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]:
     """Tell which positions are outside the box in which the guard lets the robot fly.
 
-    `positions` are in [m], world frame, shape (n, 3). Positions up to `slack` [m], shape () or
-    (n,), outside the box count as inside.
+    `positions` are in [m], world frame, shape (n, 3). A position counts as inside if its distance
+    from the box is at most `slack` [m], shape () or (n,).
     """
     positions = np.clip(positions, -_FAR, _FAR)
     nearest = np.clip(positions, fence.INNER_LOW, fence.INNER_HIGH)
@@ -35,7 +36,7 @@ def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]
 
 
 def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
-    """Return the index of the pipe within `CLEARANCE_MIN` of the robot, or -1, shape (n,).
+    """Return the index of the nearest pipe if it is within `CLEARANCE_MIN`, else -1, shape (n,).
 
     Args:
         scene: The scene; its board does not count.

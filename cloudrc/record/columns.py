@@ -100,7 +100,7 @@ class Recording:
         metadata: The file's metadata, such as its clock; empty if made from records.
         attachments: Name -> content of an attached file.
         note: What is missing, in words; "" if nothing is missing.
-        lacking: The part of `note` that a killed process does not explain; "" if there is none.
+        lacking: Damaged, removed or added messages, as in `Contents`; "" if there are none.
         remarks: What was ignored or sorted, as in `Contents`.
     """
 

@@ -30,8 +30,8 @@ from cloudrc.record.writer import MISSING
 from cloudrc.records import UNDER_WAY
 
 BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
-"""Durations before a mission's start and after its end that are kept [ns]. The beginning of the
-session and the guard's first change are before the start."""
+"""A cut recording begins BEFORE_NS before the mission's start and ends AFTER_NS after its end [ns].
+It then includes the beginning of the session and the guard's first change."""
 CUT_SHORT = "cut short"
 """Beginning of the reader's note about a file whose end is missing."""
 
@@ -170,9 +170,9 @@ def _join(world: Contents, cloud: Contents) -> Contents:
 def cut_to_last_mission(mission: Contents) -> bool:
     """Reduce a pod's recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If so, the mission counts as
-    complete although the end of the file is missing, because a pod still writes to its file while
-    the file is copied.
+    Return whether the recording contains the end of that mission. If so, the note no longer says
+    that the end of the file is missing. It is always missing, because the pod still writes to the
+    file when the file is copied.
     """
     began, ended = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0

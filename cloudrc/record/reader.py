@@ -64,7 +64,7 @@ class NothingReadableError(BadInputError):
 
 
 class _StopError(Exception):
-    """Reading stops for this reason, although the file may be intact."""
+    """Reading stops although the file may be intact; the text is the reason."""
 
 
 _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
@@ -229,8 +229,8 @@ class Contents:
         metadata: All metadata of the file; later values of a key replace earlier values.
         attachments: Name -> content of an attached file.
         note: What is missing, in words; "" if nothing is missing.
-        lacking: The part of `note` that a killed process does not explain, such as damaged or
-            removed messages; "" if there is none.
+        lacking: The part of `note` about damaged, removed or added messages. Messages that are
+            missing only because the process was killed are not in it. "" if there is none.
         remarks: What was ignored or sorted, although nothing is missing. Each remark continues "The
             recording ...".
     """
@@ -352,7 +352,7 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool], total: in
 
 
 def _changed(contents: Contents) -> Iterator[str]:
-    """Describe how the messages of a complete file differ from the counts of its writer."""
+    """Describe how the messages of a complete file differ from the counts stored by its writer."""
     metadata, read = contents.metadata, Counter(message[0] for message in contents.messages)
     counts: dict[str, int] = {}
     with suppress(ValueError):

@@ -200,8 +200,8 @@ class McapWriter:
 class _ChunkIndexes:
     """List of the chunks written so far, compressed in memory.
 
-    mcap's own list takes 12 MB for an hour of recording, this list a third of a megabyte. It stores
-    offsets relative to the end of their chunk, so most bytes repeat and compress well.
+    For an hour of recording, the list of `mcap` takes 12 MB; this list takes 0.33 MB, because it
+    stores offsets relative to the end of their chunk. Most bytes then repeat and compress well.
     """
 
     def __init__(self) -> None:
@@ -225,7 +225,7 @@ class _ChunkIndexes:
 def _moved(index: ChunkIndex, sign: int) -> ChunkIndex:
     """Add `sign` times the end of the chunk to the offsets in a chunk's index, modulo 2^64.
 
-    In a file without positions, such as /dev/null, every offset is 0, so the sum may be negative.
+    The sum may be negative: in a file without positions, such as /dev/null, every offset is 0.
     """
     end = sign * (index.chunk_start_offset + index.chunk_length)
     offsets = {name: (at + end) % 2**64 for name, at in index.message_index_offsets.items()}

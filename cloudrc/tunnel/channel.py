@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 WINDOW = 1024
-"""Number of counters before the newest counter that a channel remembers."""
+"""A channel remembers for this many counters, up to the newest, which datagrams have arrived. A
+datagram with a lower counter counts as repeated."""
 _MASK = (1 << WINDOW) - 1
 
 # Outcomes of a datagram, which name the counts.
@@ -14,9 +15,9 @@ class Channel:
     """Classify the datagrams of one kind and direction in one session."""
 
     def __init__(self, newest_wins: bool) -> None:
-        """Start without counters; with `newest_wins`, a datagram older than the newest is late.
+        """Set whether a datagram that arrives after a newer datagram is late, and thus not used.
 
-        Without `newest_wins`, every datagram that arrives for the first time is used, as in the
+        If `newest_wins` is False, every datagram that arrives for the first time is used, as in the
         published code. A repeated datagram is never used.
         """
         self._newest_wins = newest_wins
@@ -30,7 +31,10 @@ class Channel:
 
     @property
     def is_flooded(self) -> bool:
-        """Whether an attacker repeats datagrams: more were repeated than sent."""
+        """Whether more repeated datagrams have arrived than the sender has sent new datagrams.
+
+        Only an attacker repeats so many; the receiver then stops recording repeated datagrams.
+        """
         return self._repeats > self._newest + 1
 
     def take(self, counter: int) -> str:

@@ -37,7 +37,7 @@ NUMBER_MAX = 2**32 - 1
 
 
 class Kind(IntEnum):
-    """Kind of a datagram's content. In each direction, every kind has a counter of its own.
+    """Kind of a datagram's content. Each kind is counted separately in each direction.
 
     Kinds up to LAST_GREETING belong to the handshake and are authenticated with the pre-shared key.
     The other kinds belong to a session and are encrypted with the session's keys.
@@ -61,7 +61,7 @@ class Direction(IntEnum):
 
 
 class DecodeError(ValueError):
-    """Report an invalid datagram; the text is the name of the counter for such datagrams."""
+    """An invalid datagram; the text is the name under which the receiver counts the error."""
 
 
 Header: TypeAlias = tuple[int, int, int, int, int]
@@ -71,9 +71,9 @@ Header: TypeAlias = tuple[int, int, int, int, int]
 class Hello(NamedTuple):
     """Cloud's request for a session.
 
-    `nonce` identifies the cloud and `clock` its monotonic clock, each by 16 random bytes. `cookie`
-    has the 13 bytes of world's challenge, or zeros. World counts on from `epoch`, the newest
-    session number that cloud knows.
+    `nonce` has 16 random bytes that identify the cloud process. `clock` has 16 bytes that identify
+    cloud's monotonic clock. `cookie` has the 13 bytes of world's challenge, or zeros. `epoch` is
+    the newest session number that cloud knows; world gives the new session a higher number.
     """
 
     nonce: bytes
@@ -85,8 +85,8 @@ class Hello(NamedTuple):
 class Accept(NamedTuple):
     """World's answer that opens a session.
 
-    `nonce` is that of the answered hello. `world_nonce` and `clock` identify world's process and
-    monotonic clock by 16 random bytes each.
+    `nonce` is copied from the answered hello. `world_nonce` has 16 random bytes that identify the
+    world process. `clock` has 16 bytes that identify world's monotonic clock.
     """
 
     nonce: bytes
@@ -235,9 +235,9 @@ def decode_accept(body: bytes) -> Accept:
 
 
 encode_challenge: Callable[[bytes], bytes] = _CHALLENGE.pack
-"""Encode the body of a CHALLENGE datagram from a cookie; zeros follow the cookie."""
+"""Encode the body of a CHALLENGE datagram: a cookie, padded with zeros."""
 encode_busy: Callable[[bytes], bytes] = _BUSY.pack
-"""Encode the body of a BUSY datagram from the nonce of the answered hello."""
+"""Encode the body of a BUSY datagram: the nonce of the hello that it answers."""
 
 
 def decode_challenge(body: bytes) -> bytes:

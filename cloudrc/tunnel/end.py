@@ -52,7 +52,7 @@ class TunnelEnd:
         return self._session.sealed
 
     def take_datagrams(self) -> list[bytes]:
-        """Return the datagrams to send that were made since the last call."""
+        """Return the outgoing datagrams that were made since the last call."""
         datagrams, self._datagrams = self._datagrams, []
         return datagrams
 

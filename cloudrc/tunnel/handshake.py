@@ -7,18 +7,22 @@
                                         <--    ACCEPT (nonce, world's nonce, clock), a new epoch
                                             or BUSY (nonce)
 
-A pre-shared key authenticates each of these datagrams by a tag; world answers with the key of the
-hello. No answer is longer than its hello. The cookie is a MAC over a time slot: world stores
-nothing for a hello without a cookie, and a captured hello is useless after two slots. World answers
-a hello with a cookie once per counter. World sends at most ten challenges per second. A challenge
-names no receiver, so the true cloud can also use a challenge to a forger.
+Each of these datagrams has a tag made with a pre-shared key; world answers with the key of the
+hello. No answer is longer than its hello. The cookie is a MAC over the present time slot, so world
+stores nothing for a hello without a cookie. A captured hello is useless after two slots, because
+its cookie has expired. World ignores a hello whose counter is not higher than the last counter from
+the same cloud.
+
+World sends at most ten challenges per second. A challenge is not addressed to one cloud: the true
+cloud can also use a challenge that answers an attacker's hello.
 
 A cloud keeps its session while world receives at least one new encrypted datagram from this cloud
-per `command_age_max`. Otherwise another cloud can get a session. Each session has a higher number,
-the epoch, even after a restart of world: each hello contains the newest epoch that its cloud knows.
+per `command_age_max`. After a longer silence another cloud can get a session. Each session has a
+higher number than the last one, its epoch, even after a restart of world, because each hello
+contains the newest epoch that its cloud knows.
 
-Deviation: WireGuard also derives session keys by Diffie-Hellman. In this tunnel the pre-shared key
-is enough: one owner has both ends, and anybody with the key can command the robot anyway.
+Deviation: WireGuard also derives session keys by Diffie-Hellman. This tunnel uses only the
+pre-shared key: one owner has both ends, and anybody with the key can command the robot anyway.
 """
 
 from __future__ import annotations
@@ -41,28 +45,28 @@ CHALLENGE_NS = 100_000_000
 COOKIE_NS = 2_000_000_000
 """Length of the time slot of a cookie [ns]. A cookie is valid in its slot and in the next slot."""
 GRACE_NS = 1_000_000_000
-"""Time for which a cloud keeps a new session without having sent an encrypted datagram [ns]."""
+"""Time for which a cloud keeps a new session before world has its first encrypted datagram [ns]."""
 REPEATS_MAX = 3
-"""How often world repeats its ACCEPT to a cloud that sends hellos but no encrypted datagrams."""
+"""Number of times that world repeats its ACCEPT to a cloud that sends no encrypted datagrams."""
 CLOUDS_MAX = 64
-"""Number of cloud processes of which world remembers the newest hello's counter."""
+"""World remembers the counter of the newest hello for at most this many cloud processes."""
 NO_COOKIE = bytes(codec.COOKIE_SIZE)
-"""Cookie of the first hello."""
+"""Cookie in a hello for which cloud has no cookie from world."""
 REPLIES_MAX = 3
 """Largest number of challenges that cloud answers per periodic hello."""
 COOKIES_MAX = 4096
-"""Number of cookies that cloud remembers: one per time slot of 2 s, for more than two hours."""
+"""Number of cookies that cloud remembers: at one cookie every 2 s, those of more than two hours."""
 WORLDS_MAX = 64
-"""Number of earlier world processes that cloud remembers, whose late answers it ignores."""
+"""Cloud ignores late answers from at most this many earlier world processes."""
 
 
 def is_newer(epoch: int, than: int) -> bool:
-    """Return whether `epoch` is later than `than`; session numbers start again after the last."""
+    """Return whether `epoch` is later than `than`; after EPOCH_MAX the numbers begin again at 1."""
     return 0 < (epoch - than) % (EPOCH_MAX + 1) <= EPOCH_MAX // 2
 
 
 class HelloAnswer(NamedTuple):
-    """World's answer to a hello: name of the counter, datagrams, whether a session was opened."""
+    """World's answer to a hello: name of the outcome, datagrams, whether a session has begun."""
 
     outcome: str
     datagrams: list[bytes]
@@ -95,14 +99,15 @@ class ServerHandshake:
         }
 
     def hear(self, now_ns: int) -> None:
-        """Note at `now_ns` [ns] a new datagram of the session: its cloud keeps the session."""
+        """Extend the session at `now_ns` [ns], because a new datagram of its cloud has arrived."""
         self._fresh_until_ns = now_ns + self._age_max_ns
         self._repeated = 0
 
     def accept_once(self, kind: int, counter: int, now_ns: int) -> None:
-        """Check an ALIVE or OPERATOR datagram of the session at `now_ns` [ns] for repetition.
+        """Extend the session at `now_ns` [ns] by an ALIVE or OPERATOR datagram.
 
-        Raise the DecodeError "repeated" for a known counter, "malformed" for another kind.
+        Raise the DecodeError "repeated" if a datagram with this kind and counter has arrived
+        before, and "malformed" for any other kind.
         """
         window = self._windows.get(kind)
         if window is None:
@@ -147,11 +152,11 @@ class ServerHandshake:
         return self._accept()
 
     def _keeps_epoch(self, now_ns: int) -> bool:
-        """Decide whether the cloud with the session keeps its epoch, or gets the next epoch.
+        """Decide after a hello whether its cloud, which has the session, keeps the epoch.
 
-        The cloud gets the next epoch if the epoch has ended, or if the hello has a newer key. It
-        also gets the next epoch after more than REPEATS_MAX hellos if world has received no
-        encrypted datagram since the first of them, or if hello and epoch have different keys.
+        The next epoch begins if the epoch has ended, or if the key of the hello is newer than the
+        epoch's. It also begins after more than REPEATS_MAX hellos with no encrypted datagram among
+        them, if the session has become free for another cloud, or if the keys are different.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -221,10 +226,10 @@ class ClientHandshake:
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
-        Cloud accepts another world process only while cloud asks for a session (`asks`), because
-        the ACCEPT may be a late datagram of an ended process. If cloud has joined an ended process
-        anyway, the running process counts as ended; when it answers again, cloud asks under a new
-        nonce.
+        `asks` tells whether cloud asks for a session. While it does not, cloud ignores another
+        world process, because the ACCEPT may be a late datagram of a process that has ended. If
+        cloud accepts a late ACCEPT while it asks, it takes the running process for an ended one.
+        When the running process answers again, cloud takes a new nonce, which no late ACCEPT has.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):
@@ -264,7 +269,7 @@ class HandshakeLog:
         self._logged.clear()
 
     def about(self, outcome: str, data: bytes, now_ns: int) -> list[Fault]:
-        """Log at `now_ns` [ns] why a datagram was refused; `outcome` is its DecodeError's text."""
+        """Log at `now_ns` [ns] why `data` was refused; `outcome` is the text of the DecodeError."""
         if outcome == "version":
             return self.say("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)
         if outcome == "tag" and codec.peek(data)[0] <= codec.LAST_GREETING:
@@ -274,8 +279,8 @@ class HandshakeLog:
     def say(self, code: str, text: str, now_ns: int) -> list[Fault]:
         """Log a fault at `now_ns` [ns] unless the log already has the same text.
 
-        A new text with a known code is logged: otherwise a forged datagram with a wrong version
-        would hide the version of the true peer.
+        Faults with the same `code` and different texts are all logged. A forged datagram with a
+        wrong version therefore does not hide the version of the true peer.
         """
         if text in self._logged:
             return []

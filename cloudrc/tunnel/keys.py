@@ -46,7 +46,7 @@ class Key:
         object.__setattr__(self, "name", self.derive(b"", b"name")[:4].hex())
 
     def derive(self, salt: bytes, use: bytes) -> bytes:
-        """Derive a key of 32 bytes for one use, as the label `use` names it."""
+        """Derive a key of 32 bytes for one use; `use` is a label, different for every use."""
         return HKDF(SHA256(), KEY_SIZE, salt, _LABEL + use).derive(self._secret)
 
     def tag(self, data: bytes) -> bytes:
@@ -79,7 +79,7 @@ class KeySet(NamedTuple):
 
 @dataclass
 class KeyRing:
-    """The keys of one end. The driver replaces `keys` when the key file changes, also in flight."""
+    """The keys of one end. If the key file changes, even in flight, the driver replaces `keys`."""
 
     keys: KeySet
 

@@ -1,16 +1,16 @@
 """Encrypt outgoing datagrams and verify incoming datagrams with the keys of a session.
 
 Each direction of a session has one key. HKDF derives this key from a pre-shared key, the nonces of
-both ends, and the epoch (session number). One key is enough for a session: 2^32 datagrams take over
-a year. A datagram changes no state before its tag is verified.
+both ends, and the epoch (session number). The keys need no change within a session, because 2^32
+datagrams take more than a year. A datagram changes no state before its tag is verified.
 
-Counters restart with every session. The handshake comes before the session, so its counters
-continue: the link decides the loss of a datagram by epoch and counter, and would lose a handshake
-datagram with a repeated counter each time.
+Counters restart with every session, except those of handshake datagrams outside of a session. The
+link decides from epoch and counter whether a datagram is lost. With a restarted counter it would
+lose the same handshake datagrams in every attempt.
 
-Two ends in one process need no keys: their datagrams reach no network, and encryption would take a
-twentieth of the flight's time. Drivers with a socket refuse a session without keys
-(`Endpoint.sealed`), so a missing key never leads to plaintext in a network.
+Two ends in one process need no keys: their datagrams reach no network, and encryption would take
+5 % of the run time. Drivers with a socket refuse a session without keys (`Endpoint.sealed`), so a
+missing key never leads to plaintext in a network.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _NO_TAG = bytes(TAG_SIZE)
 
 
 class NoCipher:
-    """Stand in for the cipher if both ends are in one process: the tag is zeros."""
+    """Replaces the cipher if both ends are in one process: no encryption, and a tag of zeros."""
 
     def encrypt(self, nonce: bytes, body: bytes, header: bytes) -> bytes:
         """Return the body with a tag of zeros, not encrypted."""
@@ -63,9 +63,9 @@ class Session:
     """
 
     def __init__(self, sends: Direction, ring: KeyRing | None) -> None:
-        """Start without a session; this end sends in the direction `sends`.
+        """Set the direction in which this end sends, and the pre-shared keys.
 
-        `ring` has the pre-shared keys; it is None if both ends are in one process.
+        `ring` is None if both ends are in one process.
         """
         self.epoch, self.sealed = NO_EPOCH, ring is not None
         self.ring = ring or KeyRing(KeySet(Key(_PUBLIC_KEY)))
@@ -80,7 +80,7 @@ class Session:
         """Begin a session with the number `epoch`: derive its keys and restart its counters.
 
         `nonces` is cloud's nonce followed by world's nonce; `key` is the pre-shared key of the
-        handshake. A missing value stays as in the previous session.
+        handshake. If one is left out, that of the previous session is used.
         """
         self.epoch = epoch
         self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)
@@ -98,7 +98,7 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def greet(self, kind: int, body: bytes, key: Key | None = None) -> bytes:
-        """Make a handshake datagram with the tag of a pre-shared key, by default the session's."""
+        """Make a handshake datagram with a tag made with `key`, by default the session's key."""
         counter = self._counters[kind]
         self._counters[kind] = counter + 1
         epoch = NO_EPOCH if kind in TIMELESS else self.epoch
@@ -109,8 +109,8 @@ class Session:
         """Verify a datagram; return its kind, epoch, counter and decrypted body.
 
         Raises:
-            DecodeError: "malformed", "version", "direction" (a datagram in the direction in which
-                this end itself sends), "old_epoch" (another session), or "tag".
+            DecodeError: "malformed", "version", "direction" (this end itself sends in the direction
+                of the datagram), "old_epoch" (another session), or "tag" (a wrong tag).
         """
         _, direction, epoch, kind, counter = check(data)
         if direction != self._opens:

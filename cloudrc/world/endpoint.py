@@ -4,11 +4,11 @@ A datagram takes effect after all steps of the simulation that are due before it
 result therefore does not depend on when the driver (the program that calls this class) wakes up.
 
 World's clock follows the machine's monotonic clock, but may fall behind. After a stall of the
-process, world simulates at most 50 ms of the lost time; the rest is a permanent lag, the slip. So
-the guard runs in every step, and world's clock never jumps.
+process, world simulates at most 50 ms of the lost time, and its clock never jumps ahead. The
+remaining lag stays for good; it is called the slip. The guard runs in every simulated step.
 
-World numbers the sessions: a session's number is its epoch. A new epoch begins when a cloud takes
-control, and when a mission starts from the spawn.
+World numbers the sessions: a session's number is its epoch. A new epoch begins when a cloud gets a
+session, and when a mission starts from the spawn.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
 START_AGE_MAX_NS = 1_000_000_000
-"""Largest accepted age of a start request [ns], counted from cloud's newest odometry when cloud
-sent the request. A larger age limit for commands replaces this limit."""
+"""Largest accepted age of a start request [ns], unless the age limit for commands is larger. The
+age of a request is that of the newest odometry that cloud had when it sent the request."""
 
 
 class Orders:
@@ -57,7 +57,7 @@ class Orders:
     Attributes:
         number: Number of the newest request carried out in this session.
         mission_id: Number of the mission that was started last, in this or an earlier session.
-        reached: Number of waypoints of that mission that requests have reported as reached.
+        reached: Number of reached waypoints of that mission, as reported by the requests.
         pipes: Number of contacts with pipes since that mission started.
         touch_speed: Speed of the arm's tip when it first touched the board in that mission [m/s];
             NaN before the contact.
@@ -66,7 +66,7 @@ class Orders:
     def __init__(
         self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
     ) -> None:
-        """Begin without a request; count refused starts in `counts` as "start_refused".
+        """Set the guard and the counters; a refused start is counted as "start_refused".
 
         `command_age_max_ns` is the largest accepted age of a command [ns].
         """
@@ -85,8 +85,9 @@ class Orders:
     def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
         """Carry out a request at `now_ns` [ns], world's clock; return whether a mission begins.
 
-        `waited` tells whether the request may have waited in the socket during a stall. Raise the
-        DecodeError "stale" for a start that waited or is too old, "future" for a later stamp.
+        `waited` tells whether the request may have waited in the socket during a stall. For a
+        start, raise the DecodeError "stale" if the request waited or is too old, and "future" if
+        its odometry has a stamp later than `now_ns`.
         """
         kind, guard = request.request, self._guard
         starts = kind is Request.START
@@ -125,13 +126,13 @@ REPORT_AGAIN_NS = 10_000_000_000
 
 
 class PaceMonitor:
-    """Report that simulated time runs slower than real time, which looks like a slow network."""
+    """Report that simulated time runs slower than real time; cloud would blame the network."""
 
     def __init__(self) -> None:
         self._checked_ns = self._slip_ns = self._slow_ns = NEVER_NS
 
     def check(self, now_ns: int, slip_ns: int) -> list[Fault]:
-        """Return a fault if simulated time ran too slowly since the last call, about a second ago.
+        """Return a fault if simulated time ran too slowly since the last call; call once a second.
 
         `now_ns` is world's clock [ns], `slip_ns` its lag behind the machine's monotonic clock [ns].
         """
@@ -153,7 +154,7 @@ class PaceMonitor:
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
 CATCH_UP_NS = 50_000_000
-"""Largest lag of world's clock that world makes up after a stall [ns]; any further lag stays."""
+"""Largest lag of world's clock that world makes up after a stall [ns]; further lag stays."""
 COUNT_PERIOD_NS = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # looking up a member of an enum is slow
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
@@ -175,8 +176,9 @@ class WorldEndpoint(TunnelEnd):
     ) -> None:
         """Connect a robot with stopped rotors to the tunnel; there is no session yet.
 
-        With `newest_wins`, a command that arrives after a newer command is dropped. A command may
-        be `command_age_max_ns` old [ns]. `start_ns` is the monotonic clock now [ns].
+        With `newest_wins`, a command that arrives after a newer command is dropped.
+        `command_age_max_ns` is the largest accepted age of a command [ns]. `start_ns` is the
+        present time on the monotonic clock [ns].
         """
         super().__init__(identity, Direction.UPLINK, newest_wins)
         self.robot, self._sensors = robot, sensors
@@ -233,9 +235,9 @@ class WorldEndpoint(TunnelEnd):
                 self._records += self._complaints.about(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
-        """Return the time on world's clock [ns]; note whether a stall has just ended.
+        """Return the time on world's clock [ns]; remember `now_ns` if a stall has just ended.
 
-        Datagrams that arrive in the first call after a stall may have waited in the socket.
+        Datagrams that are received at this time may have waited in the socket during the stall.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns

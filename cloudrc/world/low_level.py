@@ -40,12 +40,12 @@ _HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
 _TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
 
 NOSE_COSINE_MIN, YAW_SINE_MAX = 0.5, 0.3
-"""Largest errors for which the controller uses the published attitude error [1], as the cosine of
-the roll error and the sine of the yaw error. For larger errors the published formula is wrong."""
+"""The cosine of the roll error and the sine of the yaw error up to which the controller uses the
+published formula of the attitude error. For larger errors the published formula is wrong."""
 
 
 class LowLevel:
-    """Make the robot follow a velocity with the yaw at 0, as the published controller does."""
+    """Make the robot follow a velocity at a yaw of 0, as the published controller does."""
 
     def __init__(
         self,

@@ -32,7 +32,7 @@ class Observer(Protocol):
         """Observe an operator request that the robot has carried out."""
 
     def see_session(self, now_ns: int) -> None:
-        """Observe that a new session begins: earlier commands no longer count."""
+        """Observe that a new session begins; the guard has forgotten all earlier commands."""
 
 
 class Robot:
@@ -51,7 +51,7 @@ class Robot:
         self.guard.put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run the steps that begin before `until_ns`; return the time of the next step [ns]."""
+        """Run steps from `tick_ns` [ns] up to `until_ns` [ns]; return when the next step begins."""
         simulator, guard, low_level = self.simulator, self.guard, self._low_level
         observers = self.observers
         ticks = range(tick_ns, until_ns, STEP_NS)

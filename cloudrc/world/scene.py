@@ -30,7 +30,7 @@ INERTIA = (0.0121, 0.0116, 0.0226)
 TIP = (0.40, 0.0, 0.17)
 """Position of the arm's tip that a robot model must have [m], body frame."""
 SHOWN = 6
-"""Largest number of differences that one error message lists."""
+"""Largest number of differences between model and assumption that one error message lists."""
 FOLDER = Path(__file__).parent
 
 
@@ -76,9 +76,9 @@ def compile_model(robot: str, scene: str) -> Any:
     """Attach the robot to the scene's frame `spawn` and compile both into an `MjModel`.
 
     Both arguments are names of shipped models or paths of files. In the result, names of the robot
-    begin with `robot/`. Static bodies are fused: a step takes half the time, but the bodies lose
-    their names. Therefore each geom of the scene gets the name BODY/NUMBER. Raise a BadInputError
-    if a file is missing, does not compile or does not fit the onboard controller.
+    begin with `robot/`. Static bodies are fused, so that a step takes half the time. Fused bodies
+    lose their names; therefore each geom of the scene gets the name BODY/NUMBER. Raise a
+    BadInputError if a file is missing, does not compile or does not fit the onboard controller.
     """
     robot_path, scene_path = model_path("robots", robot), model_path("scenes", scene)
     try:
@@ -143,8 +143,8 @@ def _compare(name: str, found: Iterable[float], wanted: Iterable[float], slack: 
 def _robot_differences(model: Any) -> list[str]:
     """List in words where a robot differs from what the onboard controller and the rotors assume.
 
-    The tolerances: the velocity loop compensates for a weight that differs by 1 N, and the attitude
-    gains work for an inertia that differs by half.
+    Differences that the controller can handle are accepted: the velocity loop compensates for a
+    weight that differs by 1 N, and the attitude gains work for an inertia that differs by 50 %.
     """
     base = model.jnt_bodyid[0]
     turned, centre = _axes(model.body_iquat[base]), model.body_ipos[base]

@@ -1,7 +1,7 @@
 """Simulate the physics: turn commanded rotor speeds into readings and contacts.
 
-The module writes to MuJoCo's arrays with `struct` through memory views. Four elements take a
-quarter of the time of a numpy slice assignment.
+The module writes to MuJoCo's arrays with `struct` and memory views: four elements take a quarter of
+the time that a numpy slice assignment takes.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ class Simulator:
         steps: Number of steps since the last reset.
         readings: State of the base after the last step.
         tip_force_peak: Largest force on the arm's tip since the last call of `take_tip_force` [N].
-        tip_impulse: Integral of that force over time since the last call [N s].
+        tip_impulse: Integral over time of the force on the tip since that call [N s].
         touches: Contacts that began since the last call of `take_contacts`.
-        tape: Controls of every step since the last reset, for `replay`; None if not recorded.
+        tape: Controls of every step since the last reset, for `replay`; None unless a caller sets
+            a list.
     """
 
     def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
@@ -114,7 +115,7 @@ class Simulator:
 
     @property
     def touch_age(self) -> float:
-        """Time since the robot last touched something [s]; a reset counts as a touch."""
+        """Time since the robot's last contact, or since the last reset [s]."""
         return (self.steps - max(self._last_touch.values())) * self.dt
 
     @property
@@ -133,14 +134,15 @@ class Simulator:
         return found
 
     def take_contacts(self) -> list[Contact]:
-        """Return the contacts that began since the last call, oldest first, with stamp 0."""
+        """Return the contacts that began since the last call, oldest first; each stamp is 0."""
         touches, self.touches = self.touches, []
         return touches
 
     def state(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return the state of the physics for `replay`: `mjSTATE_FULLPHYSICS`, shape (n,).
+        """Return two arrays for `replay`: the state of the physics, and accelerations.
 
-        The second array has the accelerations from which the contact solver starts, shape (nv,).
+        The state is `mjSTATE_FULLPHYSICS`, shape (n,). The contact solver of the next step starts
+        from the accelerations, shape (nv,).
         """
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
@@ -148,7 +150,7 @@ class Simulator:
         return physics, self._data.qacc_warmstart.copy()
 
     def _note_contacts(self, before: Readings) -> None:
-        """Note the new contacts; MuJoCo found all contacts in the state `before` the step."""
+        """Store the new contacts with the state of the robot before the step, `before`."""
         contact = self._data.contact
         tip = self._data.site_xpos[self._tip].tolist()
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
@@ -179,10 +181,10 @@ def _velocity_at(readings: Readings, offset: Vector) -> Vector:
 def replay(
     model: Any, physics: npt.ArrayLike, warmstart: npt.ArrayLike, tape: npt.ArrayLike
 ) -> npt.NDArray[np.float64]:
-    """Repeat the steps of a `Simulator.tape` at the speed of raw `mj_step`, for the benchmark.
+    """Repeat the steps of a `Simulator.tape` with MuJoCo alone, to measure its speed.
 
-    `physics` and `warmstart` are the result of `Simulator.state()` at the beginning of the tape.
-    Return the state of the physics at the end, which equals that of the simulator bit by bit.
+    `physics` and `warmstart` are the result of `Simulator.state()` before the first step. Return
+    the state of the physics after the last step; it equals the simulator's state bit by bit.
     """
     from mujoco import rollout
 

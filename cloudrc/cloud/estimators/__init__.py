@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """The delays that telemetry shows when world applied the echoed command shortly before.
+    """The delays that one telemetry datagram shows, if its hold time is at most 50 ms.
 
     Attributes:
         loop_delay: Arrival of the echo minus the command's stamp [s]. The loop delay includes the
@@ -27,14 +27,14 @@ class Estimator:
     """Estimates the horizon: the time from the measurement to the application of the command."""
 
     def update(self, sample: DelaySample) -> None:
-        """Add the delays of telemetry that cloud uses; most echoes come more than once."""
+        """Add the delays from one telemetry datagram, even if its echo was received before."""
 
     def add_applied(self, applied_minus_stamp: float) -> None:
         """Add a command that world has applied; called once for each command that an echo shows.
 
         Args:
             applied_minus_stamp: Instant of application on world's clock minus the command's stamp
-                on cloud's clock [s]: the downlink delay plus the unknown offset world - cloud.
+                on cloud's clock [s]: the downlink delay plus an unknown constant, the clock offset.
         """
 
     def horizon(self, age: float) -> float:

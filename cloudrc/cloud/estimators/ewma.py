@@ -11,10 +11,10 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 
 
 class Ewma(Estimator):
-    """Exponentially weighted moving average of the loop delay, from the first sample on."""
+    """Exponentially weighted moving average of the loop delay, which begins at the first sample."""
 
     def __init__(self, gain: float) -> None:
-        """Set `gain` [1], the weight of a new sample."""
+        """Set `gain`, the weight of a new sample, in [0, 1]."""
         self._gain = gain
         self._average: float | None = None
 

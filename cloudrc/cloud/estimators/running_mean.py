@@ -18,7 +18,7 @@ class RunningMean(Estimator):
     """
 
     def __init__(self, count_max: float = inf) -> None:
-        """Limit the count to `count_max` [1]: a new sample weighs at least 1/count_max."""
+        """Limit the count to `count_max` [samples]: the gain is at least 1/count_max."""
         self._count_max, self._count, self._mean = count_max, 0, 0.0
 
     def update(self, sample: DelaySample) -> None:

@@ -21,7 +21,7 @@ class Split(Estimator):
     """Adds the age of the newest odometry and the average of `applied_minus_stamp`."""
 
     def __init__(self, gain: float) -> None:
-        """Set `gain` [1], the weight of a new sample in the average."""
+        """Set `gain`, the weight of a new sample in the average, in [0, 1]."""
         self._gain = gain
         self._applied_minus_stamp: float | None = None
 

@@ -31,7 +31,7 @@ class Predictor:
         """Reset the predictor at the start of a session."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Return the newest sample, and its stamp, extrapolated by `horizon` [s], >= 0."""
+        """Return the newest sample extrapolated by `horizon` [s], >= 0, with a later stamp."""
         raise NotImplementedError
 
 

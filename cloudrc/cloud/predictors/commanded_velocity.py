@@ -14,7 +14,7 @@ class CommandedVelocity(Predictor):
     """Adds the last commanded velocity times the horizon to the position.
 
     With a proportional controller, u = -K · (p + u · tau) gives u = -K · p / (1 + K · tau): a
-    longer delay lowers the effective gain. The predictor therefore damps well, but predicts badly.
+    longer delay lowers the effective gain. This damps the motion, but the predictions are bad.
     """
 
     def __init__(self) -> None:

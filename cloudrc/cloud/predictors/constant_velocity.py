@@ -10,7 +10,7 @@ from cloudrc.messages import Odometry
 
 
 class ConstantVelocity(Predictor):
-    """Predicts with the measured velocity; the orientation turns on at the measured rate."""
+    """Predicts with the measured velocity; the orientation changes at the measured rate."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Extrapolate a sample by `horizon`, tau [s]: p + v · tau; the velocity stays as measured.

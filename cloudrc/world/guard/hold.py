@@ -1,8 +1,8 @@
 """Brake, hold a position, land and take off with the onboard sensors alone.
 
-Braking begins hard and ends gently, because the low-level controller follows late and overshoots.
-The robot always stops within the distance of the stop rule (time REACTION, then deceleration
-BRAKE).
+The deceleration falls towards the end of braking. The robot follows the velocity reference with a
+delay, so a constant deceleration would make the robot overshoot. The robot always stops within the
+distance of the stop rule, which assumes the deceleration BRAKE after the time REACTION.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ BRAKE_MAX, BRAKE_MIN = 5.5, 1.0
 BRAKE_TIME_CONSTANT = 0.25
 """Time constant with which the velocity reference decays to zero at the end of braking [s]."""
 BRAKE_LEAD, BRAKE_SHARE_MIN = 1.0, 0.2
-"""When braking begins, the velocity reference is BRAKE_LEAD [m/s] slower than the robot, but at
-least BRAKE_SHARE_MIN [1] times the robot's speed."""
+"""When braking begins, the velocity reference is the robot's speed minus BRAKE_LEAD [m/s], and at
+least BRAKE_SHARE_MIN times the robot's speed."""
 STILL_SPEED = 0.1
 """Speed below which the robot counts as at rest [m/s]."""
 LAND_SPEED = 0.5
 """Speed of the descent [m/s]. Source: docs/reference/plant.md, "Landing"."""
 STILL_SHARE = 0.2
-"""A descending robot is at rest below this share of the planned speed [1], and below STILL_SPEED.
-With a low speed cap, the planned speed itself may be below STILL_SPEED."""
+"""A descending robot counts as at rest if it is slower than STILL_SPEED, and slower than this share
+of the planned speed. With a low speed cap, the planned speed itself may be below STILL_SPEED."""
 TOUCH_DOWN_NS = 400_000_000
 """Time at rest after which a descending robot has touched down [ns]."""
 STILL_TICKS = 200
-"""Number of steps at rest after which the robot lies still (0.4 s). A robot that was thrown up is
-also at rest at its highest point, but for less time."""
+"""Number of steps at rest after which the robot counts as lying on the ground (0.4 s). A robot that
+was thrown up is also at rest at its highest point, but for less time."""
 POSITION_GAIN = 0.8
 """Gain of the position hold [1/s]: velocity reference per distance from the hold point."""
 DAMPING_GAIN = 1.6
-"""Damping of the position hold [1]: velocity reference per velocity of the robot, subtracted."""
+"""Damping of the position hold: the hold subtracts this factor times the robot's velocity."""
 HOLD_SPEED_MAX = 0.5
 """Largest velocity reference of the position hold [m/s]."""
 INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
 """Integral term of the position hold: gain [1/s^2], limit per axis [m/s], and largest distance from
-the hold point at which the term changes [m]. Without this term the robot, which the arm makes
-lopsided, would hover 30 mm off the hold point."""
+the hold point at which the term changes [m]. The arm makes the robot heavier on one side; without
+this term the robot would hover 30 mm away from the hold point."""
 TAKE_OFF_MARGIN = 0.5
 """Smallest distance from the fence's walls at which a robot may take off after its rotors were
-stopped [m]. A tilted robot slides along the floor before it rises, by at most 0.35 m:
-`pytest -m "" -k scrapes tests/world`."""
+stopped [m]. A tilted robot slides up to 0.35 m along the floor before it rises. This distance was
+measured with `pytest -m "" -k scrapes tests/world`."""
 LIFT_OFF_HEIGHT, GROUND_SPEED_MAX = 0.02, 0.2
 """The robot has left the ground once its height has changed by LIFT_OFF_HEIGHT [m]. Before that,
 the guard may stop the rotors if the robot is slower than GROUND_SPEED_MAX [m/s]."""
@@ -59,7 +59,7 @@ class PositionHold:
     """
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Hold between `low` and `high` [m], world frame, at no more than `speed_max` [m/s]."""
+        """Set the box for hold points, `low` and `high` [m], world frame, and `speed_max` [m/s]."""
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
         self._hold_point: Vector | None = None
@@ -109,8 +109,9 @@ class PositionHold:
 def brake_start(reference: Vector, velocity: Vector) -> Vector:
     """Return the velocity reference when braking begins [m/s]: slower than the robot.
 
-    With a faster reference, the robot would first speed up, because it follows late. `reference`
-    (of the last step, finite) and `velocity` (of the robot) are in [m/s], world frame, shape (3,).
+    With a reference at the robot's speed, the robot would first speed up, because it follows with a
+    delay. `reference`, of the last step, is finite. `velocity` is that of the robot. Both are in
+    [m/s], world frame, shape (3,).
     """
     start = velocity if hypot(*velocity) < hypot(*reference) else reference
     speed = hypot(*start)
@@ -127,10 +128,11 @@ def brake_rate(speed: float) -> float:
 
 
 class Descent:
-    """Detect the touch-down of a descent, and decide whether the descent may end in the air.
+    """Detect the touch-down of a descent, and decide whether the robot may stop above the ground.
 
-    After the operator's acknowledgement, a descent may end in the air if the robot sinks freely and
-    is high enough. Otherwise the robot would scrape along the ground or an obstacle.
+    After the operator's acknowledgement, the robot stops its descent and holds its position, if it
+    sinks freely and is high enough. Near the ground or on an obstacle it descends to touch-down,
+    because a robot that holds its position there would scrape along the ground or the obstacle.
 
     Attributes:
         speed: Planned speed of the descent [m/s].
@@ -138,24 +140,25 @@ class Descent:
     """
 
     def __init__(self, floor: float, speed_max: float) -> None:
-        """Set `floor`, the lowest z at which the robot may hold [m], and the `speed_max` [m/s]."""
+        """Set `floor` [m], the lowest z for a position hold, and `speed_max` [m/s]."""
         self._floor, self.speed = floor, min(LAND_SPEED, speed_max)
         self._still_speed = min(STILL_SPEED, STILL_SHARE * self.speed)
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Begin a descent at `now_ns` [ns]; an earlier acknowledgement no longer counts."""
+        """Begin a descent at `now_ns` [ns], not acknowledged by the operator."""
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
-        """Tell whether the descent may end in the air; the class describes the conditions."""
+        """Tell whether the robot may stop above the ground; the class describes the conditions."""
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
 
     def is_over(self, now_ns: int, reference: Vector, readings: Readings) -> bool:
-        """Note the motion at `now_ns` [ns]; tell whether the robot has touched down.
+        """Tell whether the robot has touched down; call in every step of a descent.
 
-        `reference` is the velocity reference of the last step [m/s], shape (3,).
+        `now_ns` is world's clock [ns]. `reference` is the velocity reference of the last step
+        [m/s], world frame, shape (3,).
         """
         if reference[2] > -0.5 * self.speed or abs(readings.velocity[2]) >= self._still_speed:
             self._moved_ns = now_ns
@@ -165,9 +168,9 @@ class Descent:
 class TakeOff:
     """Detect when the robot has left the ground (`over`), and decide whether it may take off.
 
-    A robot whose rotors were stopped in the air may still fall, or lie outside the fence, when the
-    operator acknowledges. Such a robot may take off once it lies still, at least TAKE_OFF_MARGIN
-    inside the fence.
+    After a stop of the rotors in the air, the robot is perhaps still falling, or outside the fence,
+    when the operator acknowledges. The robot may then take off only after it has come to rest on
+    the ground, at least TAKE_OFF_MARGIN inside the fence.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
@@ -185,20 +188,20 @@ class TakeOff:
 
     @property
     def condition(self) -> Cause:
-        """Cause of GROUND after an acknowledgement; STILL_FIRST if the robot has to lie still."""
+        """Cause to record for GROUND: ACKNOWLEDGED, or STILL_FIRST if take-off is not allowed."""
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
-        """Reset to the state before take-off: the robot stands or falls to the ground.
+        """Reset to the state before take-off, because the rotors stop.
 
-        `stopped` tells whether the rotors may have been stopped in the air or on an obstacle.
+        `stopped` tells whether the robot may now be in the air or on an obstacle.
         """
         self.over = False
         if stopped:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Update `over` if the robot `flies`; else note its height and whether it lies still."""
+        """Process a step: if the robot flies, update `over`; else, its height and time at rest."""
         height = readings.position[2]
         if flies:
             self.over, self._stopped = not abs(height - self._height) < LIFT_OFF_HEIGHT, False
@@ -211,5 +214,5 @@ class TakeOff:
                 self._still_ticks = self._still_ticks + 1 if at_rest else 0
 
     def may_end(self, readings: Readings) -> bool:
-        """Tell whether the robot is still on the ground, and slow enough to stop its rotors."""
+        """Tell whether the robot has not left the ground, and is slow enough to stop its rotors."""
         return not self.over and hypot(*readings.velocity) < GROUND_SPEED_MAX

@@ -15,7 +15,7 @@ from cloudrc.geometry.fence import FLOOR_MARGIN, WALL_MARGIN
 from cloudrc.messages import ZERO, Vector
 
 BRAKE = 3.0
-"""Deceleration that a braking robot reaches in any case [m/s^2].
+"""Deceleration that a braking robot always reaches or exceeds [m/s^2].
 Source: docs/reference/plant.md, "Stop rule"."""
 REACTION = 0.2
 """Time from the start of braking until the robot decelerates at BRAKE [s].
@@ -28,30 +28,30 @@ STOP_COEFFICIENT = 1.0 / (2.0 * BRAKE)
 FENCE_REACTION, FENCE_MARGIN = 0.6, WALL_MARGIN
 """Stop rule at the walls and the ceiling of the fence: reaction time [s] and margin [m]. The guard
 limits the speed v so that FENCE_REACTION · v + v^2/6 <= distance - FENCE_MARGIN. At the floor the
-guard uses REACTION and FLOOR_MARGIN, because the robot climbs readily.
+guard uses REACTION and FLOOR_MARGIN, because the robot can stop a descent quickly.
 Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With 0.2 s and 0.1 m a hostile
-cloud can move the robot 0.3 m beyond the fence, because the low-level controller follows late."""
+cloud can move the robot 0.3 m beyond the fence, because the robot reacts with a delay."""
 FAR = 1e6
 """Distance from a face of the fence beyond which the face limits no speed [m]."""
 RECHECK_DISTANCE, RECHECK_NS = 0.25, 10_000_000
-"""If the fence limits nothing within RECHECK_DISTANCE [m] of the robot, the guard checks the fence
-only once per RECHECK_NS [ns]. In that time the robot moves by less than RECHECK_DISTANCE, because
-the robot is never faster than 25 m/s."""
+"""If the fence limits no velocity within RECHECK_DISTANCE [m] of the robot, the guard checks the
+fence only once per RECHECK_NS [ns]. In this time the robot moves by less than RECHECK_DISTANCE,
+because it is never faster than 25 m/s."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
-"""Return of a robot that is too close to the fence, or outside: velocity per distance [1/s], and
-largest speed [m/s]."""
+"""Velocity with which a robot returns that is too near to a face of the fence, or outside: velocity
+per distance [1/s], and largest speed [m/s]."""
 LOW_HEIGHT, LOW_SPEED = 0.25, 1.0
-"""Largest horizontal speed, LOW_SPEED [m/s], of a robot that is less than LOW_HEIGHT [m] above the
-fence's floor."""
+"""The horizontal speed is limited to LOW_SPEED [m/s] while the robot is less than LOW_HEIGHT [m]
+above the fence's floor."""
 SINK_LEAD_MAX = 0.5
-"""Largest difference by which the velocity reference may sink faster than the robot [m/s]. With a
-larger difference the low-level controller would turn the robot over."""
+"""The velocity reference may sink at most this much faster than the robot [m/s]. With a larger
+difference the low-level controller would turn the robot over."""
 ROUNDING_FACTOR = 1.0 - 2.0**-45
-"""Factor on the speed cap [1] that leaves room for rounding errors."""
+"""Factor on the speed cap, just below 1, so that rounding errors never exceed the cap."""
 
 
 def stopping_distance(speed: float, reaction: float) -> float:
-    """Return the stopping distance [m] from `speed` [m/s]; braking begins after `reaction` [s]."""
+    """Return the stopping distance [m] from a `speed` [m/s] with a reaction time [s]."""
     return speed * (reaction + speed * STOP_COEFFICIENT)
 
 
@@ -65,8 +65,9 @@ def clamp(value: float, low: float, high: float) -> float:
 def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
     """Return the largest velocity towards a face of the fence [m/s].
 
-    The result v solves reaction · v + v^2/6 = distance, with the reaction time [s] and the distance
-    to the face minus the margin [m]. Beyond the margin v is negative: the robot returns.
+    The result v solves reaction · v + v^2/6 = distance, where `distance` is the distance to the
+    face minus the margin [m] and `reaction` the reaction time [s]. If `distance` is negative, v is
+    negative, so that the robot returns.
     """
     if distance > FAR:
         return inf
@@ -77,9 +78,9 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
 
 
 def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether `limit_to_fence` changes nothing within RECHECK_DISTANCE of `position`.
+    """Tell whether `limit_to_fence` changes nothing for a robot within RECHECK_DISTANCE.
 
-    `velocity` [m/s], `position` [m], `low` and `high` are those of `limit_to_fence`.
+    `velocity` [m/s], `position` [m], `low` and `high` [m] are the arguments of `limit_to_fence`.
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if vx > 0.0:
@@ -105,8 +106,8 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
     """Slow a finite `velocity` [m/s], axis by axis, so that the robot can stop before the fence.
 
     Near the floor the horizontal velocity is limited, too, because a rotor that touches the floor
-    at speed turns the robot over. `position` is that of the base [m]. `low` and `high` are the
-    corners of the fence minus the margins [m]. All are in the world frame, shape (3,).
+    at speed turns the robot over. `position` is that of the base [m]. `low` and `high` [m] are from
+    `Limits.inner_corners`. All are in the world frame, shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if not z >= az - FLOOR_MARGIN + LOW_HEIGHT:
@@ -148,10 +149,10 @@ def step_towards(start: Vector, end: Vector, step: float) -> Vector:
 
 
 def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
-    """Limit how much a velocity speeds up in one step to `step` [m/s]; it may slow down freely.
+    """Return `after`, changed so that no more than `step` [m/s] is gained in speed.
 
-    `before` and `after` are finite velocities [m/s]. The limit applies to all axes together,
-    because the fence may reverse one axis while another axis speeds up.
+    `before` and `after` are finite velocities before and after one step [m/s]. The limit applies to
+    all axes together, because the fence may reverse one axis while another axis gains speed.
     """
     (ax, ay, az), (bx, by, bz) = before, after
     x, y, z = growth(ax, bx), growth(ay, by), growth(az, bz)
@@ -167,7 +168,7 @@ def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
 
 
 def growth(before: float, after: float) -> float:
-    """Return by how much one axis speeds up from `before` to `after`, all in [m/s]; at least 0."""
+    """Return the gain in speed on one axis from `before` to `after`, all in [m/s]; at least 0."""
     if after < 0.0:
         before, after = -before, -after
     return max(after - max(before, 0.0), 0.0)
@@ -176,8 +177,8 @@ def growth(before: float, after: float) -> float:
 def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float) -> Vector:
     """Limit how fast the velocity `reference` [m/s] sinks, so that the robot does not turn over.
 
-    `before` is the reference of the last step, at most `speed_max` long. `climb` is the vertical
-    velocity of the robot. `speed_max` is the largest speed of the result. All are in [m/s].
+    `before` is the velocity reference of the last step. `climb` is the vertical velocity of the
+    robot, upwards. `speed_max` is the largest speed of `before` and of the result. All in [m/s].
     """
     x, y, z = reference
     lowest = min(before[2], climb - SINK_LEAD_MAX)
@@ -185,15 +186,14 @@ def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float
 
 
 AGE_MAX_NS = 10_000_000_000
-"""Largest command age limit that an experiment may set [ns]."""
+"""Largest value of `Limits.command_age_max_ns` that an experiment may set [ns]."""
 GROUND_WAIT_MIN_NS = 10_000_000_000
 """Shortest time for which a robot on the ground waits for the first command of its mission [ns]."""
 RAMP_MIN = 1.0
-"""Shortest time after the guard state HOLD in which the reference speeds up by at most BRAKE
-[s]."""
+"""Smallest value of `Limits.ramp_ns`, in [s]."""
 COMMAND_MAX = 1000.0
-"""Largest component of a command that the guard accepts [m/s, rad/s]. A larger component comes from
-a bug, and the direction of the command is then wrong, too.
+"""Largest component of a command that the guard accepts [m/s, rad/s]. A command with a larger
+component comes from a bug, so its direction cannot be trusted either.
 Source: docs/reference/faults.md, "F23"."""
 
 
@@ -204,7 +204,8 @@ class Limits:
     Attributes:
         fence_low: Lower corner of the box that the base may not leave [m], world frame, shape (3,).
         fence_high: Upper corner of the box [m], world frame, shape (3,).
-        command_age_max_ns: Largest accepted age of the odometry behind a command [ns].
+        command_age_max_ns: Largest accepted age of the odometry from which cloud computed a
+            command [ns].
         speed_max: Largest speed of the velocity reference [m/s].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
@@ -243,10 +244,10 @@ class Limits:
 
     @property
     def ramp_ns(self) -> int:
-        """Time after a HOLD in which the velocity reference speeds up by at most BRAKE [ns].
+        """Time after a HOLD in which the acceleration of the velocity reference is limited [ns].
 
-        The time is long enough to reach the speed cap. The limit ends by time, not by speed,
-        because the first commands after a silence may be zero.
+        The limit is BRAKE, and the time is long enough to reach the speed cap. A limit that ends at
+        the commanded velocity would end too early: the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
@@ -259,7 +260,7 @@ class Limits:
         return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
 
     def inner_corners(self) -> tuple[Vector, Vector]:
-        """Return the lower and upper corner of the fence minus its margins [m], shape (3,)."""
+        """Return the lower and upper corner of the fence made smaller by its margins [m]."""
         (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high
         low = (ax + FENCE_MARGIN, ay + FENCE_MARGIN, az + FLOOR_MARGIN)
         return low, (bx - FENCE_MARGIN, by - FENCE_MARGIN, bz - FENCE_MARGIN)

@@ -22,8 +22,8 @@ while its basis is at most `command_age_max` old.
 - In LAND, an acknowledgement in the air leads to HOLD. An acknowledgement near the ground or on an
   obstacle leads to GROUND at touch-down.
 - LAND and ESTOP end the mission. Afterwards only a new start arms the robot again.
-- HOLD before the robot has left the ground becomes GROUND: the rotors stop and the mission
-  continues. The robot then waits 60 s for cloud's commands.
+- If HOLD begins before the robot has left the ground, GROUND follows at once: the rotors stop, and
+  the mission continues. The robot then waits 60 s for cloud's commands.
 - HOLD within a mission has a time limit, because the operator may be gone. HOLD after a mission has
   no time limit: the robot waits for the next mission.
 
@@ -43,8 +43,8 @@ from cloudrc.world.guard.limits import COMMAND_MAX, Limits
 from cloudrc.world.readings import Readings
 
 OVERTURNED_COSINE = 0.2
-"""Cosine of the tilt below which the robot counts as turned over, so that its rotors stop [1].
-Commands tilt the robot to a cosine of 0.4 at worst; only a collision tilts it further."""
+"""Cosine of the tilt below which the robot counts as turned over, so that its rotors stop. Commands
+tilt the robot to a cosine of 0.4 at worst; only a collision can tilt it further."""
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # looking up a member of an enum is slow
 
@@ -53,7 +53,7 @@ RESUME_NS = 500_000_000
 """RESUME_COMMANDS fresh commands within RESUME_NS [ns] end a HOLD.
 Source: docs/reference/plant.md, "Leaving HOLD"."""
 SETTLE_NS = 1_000_000_000
-"""Shortest time between the beginnings of two HOLDs, and between those of two TRACKs [ns].
+"""Shortest time from the beginning of a HOLD to that of the next HOLD, and likewise for TRACK [ns].
 Source: docs/reference/plant.md, "Settling time"; docs/reference/faults.md, "F5"."""
 INVALID_COMMANDS = 5
 IMPOSSIBLE = f"{INVALID_COMMANDS} impossible commands within 1 s"
@@ -67,13 +67,13 @@ class Guard:
 
     Attributes:
         state: Current state.
-        cause: Why the guard is in this state; after touch-down in LAND, why the robot landed.
+        cause: Why the guard is in this state; in LAND always the reason of the landing.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
         yaw_rate: Limited yaw rate [rad/s]; the published low-level controller ignores it.
         changes: Changes of the state since the last `take_changes`.
-        counts: How often a limit changed a command: "limited_speed" and "limited_yaw_rate" count
-            commands, "limited_fence" counts steps.
+        counts: How often a limit was applied. "limited_speed" and "limited_yaw_rate" are numbers of
+            changed commands; "limited_fence" is the number of steps with a changed reference.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -154,10 +154,10 @@ class Guard:
         self._wanted, self.yaw_rate = ZERO, 0.0
 
     def accept_command(self, command: Command, now_ns: int) -> str | None:
-        """Accept or reject a command at `now_ns` [ns]; its numbers may have any value, even NaN.
+        """Accept a command at `now_ns` [ns] and return None, or return the reason to reject it.
 
-        Return None, or the reason of the rejection: "range" for a number that is too large or NaN;
-        "future" or "stale" for odometry (the basis) from the future or too old.
+        The reason is "range" if a number of the command is too large or NaN, "stale" if the basis
+        (the odometry of the command) is too old, and "future" if it is later than `now_ns`.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
@@ -281,7 +281,7 @@ class Guard:
             self._enter(GROUND, now_ns, Cause.NOT_OFF)
 
     def _enter(self, state: GuardState, now_ns: int, cause: Cause, text: str = "") -> None:
-        """Change the state and record the change, with `text` or the words of the cause."""
+        """Change the state and record the change with `text`, by default the text of the cause."""
         self.cause = self.cause if cause is Cause.DOWN and state is LAND else cause
         if self.state is not HOLD or state is not LAND:  # LAND descends from the hold point
             self._position_hold.forget()
