@@ -118,7 +118,6 @@ class FakeTeleop:
         self.posted: list[str] = []
         self.tokens: set[str | None] = set()
         self.server = serve(self._answer)
-        self.port = self.server.server_port
 
     def _answer(self, request, body):
         if request.path == "/metrics":
@@ -131,27 +130,27 @@ class FakeTeleop:
 
     def forwards(self):
         """Write a fake kubectl that forwards all ports of a pod to this server."""
-        ports = (8080, 9100, 9101, 9102)
-        lines = (f"echo 'Forwarding from 127.0.0.1:{self.port} -> {port}'" for port in ports)
+        here = f"Forwarding from 127.0.0.1:{self.server.server_port}"
+        lines = (f"echo '{here} -> {port}'" for port in (8080, 9100, 9101, 9102))
         return "\n".join([*lines, "exec sleep 60"])
 
 
 def kubeconfig(url):
     """Build a kubeconfig with two contexts: `here`, the current one, and `elsewhere`."""
-    contexts = [
-        {"name": "here", "context": {"cluster": "fake", "user": "me", "namespace": "demo"}},
-        {"name": "elsewhere", "context": {"cluster": "fake", "user": "me"}},
-    ]
-    return yaml.safe_dump(
-        {
-            "apiVersion": "v1",
-            "kind": "Config",
-            "clusters": [{"name": "fake", "cluster": {"server": url}}],
-            "users": [{"name": "me", "user": {"token": "none"}}],
-            "contexts": contexts,
-            "current-context": "here",
-        }
-    )
+    here = {"cluster": "fake", "user": "me", "namespace": "demo"}
+    elsewhere = {"cluster": "fake", "user": "me"}
+    config = {
+        "apiVersion": "v1",
+        "kind": "Config",
+        "clusters": [{"name": "fake", "cluster": {"server": url}}],
+        "users": [{"name": "me", "user": {"token": "none"}}],
+        "contexts": [
+            {"name": "here", "context": here},
+            {"name": "elsewhere", "context": elsewhere},
+        ],
+        "current-context": "here",
+    }
+    return yaml.safe_dump(config)
 
 
 def labels(component):
@@ -178,15 +177,7 @@ POD = {
 """Pod of a component, as in its Deployment."""
 
 
-def pod(
-    name,
-    component,
-    *,
-    state=None,
-    ready=True,
-    phase="Running",
-    **more,
-):
+def pod(name, component, *, state=None, ready=True, phase="Running", **more):
     """Build a pod with one container in a state that the kubelet writes."""
     status = {
         "name": component,
@@ -244,14 +235,11 @@ def running(api, release):
     for component in ("world", "cloud"):
         api.put("deployments", deployment(component))
         api.put("pods", pod(f"{component}-1", component))
-    service = {
-        "metadata": {"name": "cloudrc-api", "labels": labels("cloud")},
-        "spec": {"ports": [{"name": "api", "port": 8080, "targetPort": "api"}]},
-    }
-    api.put("services", service)
+    ports = [{"name": "api", "port": 8080, "targetPort": "api"}]
+    metadata = {"name": "cloudrc-api", "labels": labels("cloud")}
+    api.put("services", {"metadata": metadata, "spec": {"ports": ports}})
     token = base64.b64encode(TOKEN.encode()).decode()
-    tokens = {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}}
-    api.put("secrets", tokens)
+    api.put("secrets", {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}})
     return api
 
 
@@ -300,14 +288,14 @@ def terminated(exit_code, message):
     return {"terminated": {"exitCode": exit_code, "message": message}}
 
 
-def at_look(api, number, action):
-    """Call `action` at the n-th request for the Job."""
+def at_look(api, number, action, plural="jobs"):
+    """Call `action` at the n-th request for a Job, or another object."""
     original, looks = api.answer, iter(range(1, 1000))
     lock = threading.Lock()
 
     def answer(method, path, body):
         with lock:
-            if method == "GET" and "/jobs/" in path and next(looks) == number:
+            if method == "GET" and f"/{plural}" in path and next(looks) == number:
                 action()
         return original(method, path, body)
 

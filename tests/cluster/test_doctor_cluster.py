@@ -1,7 +1,6 @@
 """`cloudrc doctor --mode cluster` says "can run" if and only if `cloudrc run` can."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -56,16 +55,15 @@ def test_a_cluster_that_cannot_be_reached_blocks_the_mode(tmp_path, capsys, monk
     assert "kubectl cluster-info" in check["fix"]
 
 
-@pytest.mark.parametrize(("minor", "code"), [("28+", 3), ("29", 0), ("30+", 0), ("100", 0)])
+@pytest.mark.parametrize(("minor", "code"), [("28+", 3), ("29", 0), ("100", 0)])
 def test_a_cluster_that_is_too_old_is_reported(api, capsys, minor, code):
     api.version["minor"] = minor
     cluster = doctor(capsys, code)["cluster"]
     assert cluster["state"] == ("missing" if code else "ok")
     assert not code or "needs 1.29" in cluster["fix"]
     wanted = yaml.safe_load(CHART.read_text())["kubeVersion"]
-    assert re.findall(r"^>=(\d+)\.(\d+)\.0-0 ", wanted) == [tuple(map(str, OLDEST))]
+    assert wanted.startswith(">={}.{}.0-0 ".format(*OLDEST))
 
 
-@pytest.mark.parametrize("mode", ["local", "virtual"])
-def test_other_modes_contact_no_cluster(mode):
-    assert not {"cluster", "kubeconfig"} & {check.name for check in checks.all_checks(mode)}
+def test_other_modes_contact_no_cluster():
+    assert not {"cluster", "kubeconfig"} & {check.name for check in checks.all_checks("local")}

@@ -1,7 +1,5 @@
 """`cloudrc link set` in a cluster: the change in pods and ConfigMap, its answer and its rights."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -9,7 +7,6 @@ import threading
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -40,28 +37,24 @@ class Cluster:
         self.items = [
             item("ConfigMap", "demo-link", "link", data={"profile.yaml": PROFILE}),
             item("ConfigMap", "demo-experiment", "shared", data={"experiment.yaml": "{}"}),
-            item("Pod", "world-1", "world", **running),
-            item("Pod", "cloud-1", "cloud", **running),
-            item("Pod", "cloud-0", "cloud", **running),
+            *(item("Pod", name, name[:5], **running) for name in ("world-1", "cloud-1", "cloud-0")),
         ]
         self.items[-1]["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:01Z"
         self.states = {
             pod: asdict(LinkState("netem", "", "auto", way, {}, "", 1, asked={"delay": 0.12}))
             for pod, way in (("world-1", "uplink"), ("cloud-1", "downlink"))
         }
-        self.refused: dict[str, str] = {}  # verb of kubectl -> error message
-        self.broken, self.deaf = set[str](), set[str]()  # pods that are away, or apply nothing
-        self.cannot: dict[str, str] = {}  # pod -> word in a profile that it refuses
-        self.asked: list[list[str]] = []
-        self.handed: dict[str, dict[str, Any]] = {}
-        self.kept: dict[str, str] = {}
+        self.refused = set()  # verbs of kubectl
+        self.broken, self.deaf = set(), set()  # pods that are away, or apply nothing
+        self.cannot = {}  # pod -> word in a profile that it refuses
+        self.asked, self.handed, self.kept = [], {}, {}
 
     def run(self, name, words, *, timeout, given=""):
         assert name == "kubectl"
         self.asked.append(words)
         verb = next(word for word in words if word in ("get", "patch", "exec"))
         if verb in self.refused:
-            raise ClusterError(f"'kubectl {verb}' failed: {self.refused[verb]}")
+            raise ClusterError(f"'kubectl {verb}' failed: this is forbidden")
         if verb == "get":
             return json.dumps({"items": self.items})
         if verb == "patch":
@@ -88,10 +81,9 @@ def cluster(monkeypatch):
 
 def test_a_change_reaches_both_pods_and_the_configmap(cluster, capsys):
     assert main([*LINE, "--context", "kind"]) == 0
-    assert yaml.safe_load(cluster.kept["profile.yaml"]) == {
-        "uplink": {"delay_ms": 45.0, "jitter_ms": 25.0},
-        "downlink": {"delay_ms": 120.0, "jitter_ms": 25.0},
-    }
+    profile = yaml.safe_load(cluster.kept["profile.yaml"])
+    assert profile["uplink"] == {"delay_ms": 45.0, "jitter_ms": 25.0}
+    assert profile["downlink"] == {"delay_ms": 120.0, "jitter_ms": 25.0}
     change = json.loads(cluster.kept["change.json"])
     assert (change["cause"], change["restart"]) == ("downlink.delay_ms=120", False)
     for name in ("world-1", "cloud-1"):
@@ -102,8 +94,7 @@ def test_a_change_reaches_both_pods_and_the_configmap(cluster, capsys):
     verbs = [word for line in asked for word in line if word in ("get", "exec", "patch")]
     assert verbs == ["get", "exec", "exec", "patch"], "in force first, then for good"
     assert all(line[:2] == ["--context=kind", "--namespace=demo"] for line in asked)
-    shown = capsys.readouterr().out.splitlines()
-    assert shown[2].split()[:4] == ["downlink", "netem", "120", "ms"]
+    assert "downlink   netem" in capsys.readouterr().out
 
 
 def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypatch):
@@ -126,7 +117,6 @@ def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypat
         with_files({"profile.yaml": PROFILE}, None, setting)
 
 
-FORBIDDEN = "Error from server (Forbidden): this is forbidden"
 LATER = "; the ConfigMap has the change, and the pods apply it within 2 minutes"
 
 
@@ -136,23 +126,32 @@ def error(capsys):
     return line
 
 
-def test_an_unreachable_container_gets_the_change_later(cluster, capsys):
+def test_an_unreachable_or_silent_container_gets_the_change_later(cluster, capsys):
     cluster.broken.add("cloud-1")
     assert main(LINE) == 5
     said = error(capsys)
     assert said.count("the pod is gone") == 1
     assert said.endswith(LATER)
     assert cluster.kept
+    cluster.broken.clear()
+    cluster.deaf.add("cloud-1")
+    assert main(LINE) == 4
+    said = error(capsys)
+    assert "the downlink did not apply the change within 5 s; see the log" in said
+    assert said.endswith(f"container link of pod cloud-1{LATER}")
+    cluster.states["cloud-1"].clear()
+    assert main(LINE) == 5
+    assert "a link container has another version: not the state of a link" in error(capsys)
 
 
 def test_a_change_that_cannot_be_kept_says_where_it_is(cluster, capsys):
-    cluster.refused["patch"] = FORBIDDEN
+    cluster.refused.add("patch")
     assert main(LINE) == 5
     said = error(capsys)
     assert "the ConfigMap is unchanged: 'kubectl patch' failed" in said
     for way in ("uplink", "downlink"):
         assert f"the {way} has the change until its pod is replaced" in said
-    cluster.refused["exec"] = FORBIDDEN
+    cluster.refused.add("exec")
     assert main(LINE) == 5
     said = error(capsys)
     assert (said.count("this is forbidden"), "has the change" in said) == (3, False)
@@ -166,17 +165,6 @@ def test_a_change_that_one_direction_refuses_does_not_last(cluster, capsys):
         "change; the ConfigMap is unchanged, and restarted pods take it"
     )
     assert not cluster.kept
-
-
-def test_a_silent_or_strange_container_is_named(cluster, capsys):
-    cluster.deaf.add("cloud-1")
-    assert main(LINE) == 4
-    said = error(capsys)
-    assert "the downlink did not apply the change within 5 s; see the log" in said
-    assert said.endswith(f"container link of pod cloud-1{LATER}")
-    cluster.states["cloud-1"].clear()
-    assert main(LINE) == 5
-    assert "a link container has another version: not the state of a link" in error(capsys)
 
 
 def test_a_missing_release_or_pod_is_named(cluster, running, capsys):
@@ -232,9 +220,8 @@ def test_the_script_hands_over_a_change_and_prints_the_state(tmp_path, state):
 
 def test_a_silent_sidecar_leaves_the_old_state(tmp_path):
     told = tell(tmp_path, change="a1")
-    quick = APPLY_SCRIPT.replace("seq 250", "seq 3")
-    assert quick != APPLY_SCRIPT
-    out, _ = start(tmp_path, quick).communicate(DOCUMENT, timeout=APPLY_LIMIT)
+    assert "seq 250" in APPLY_SCRIPT
+    out, _ = start(tmp_path, APPLY_SCRIPT.replace("seq 250", "seq 3")).communicate(DOCUMENT)
     assert out == told
 
 

@@ -2,8 +2,8 @@
 
 import json
 import re
-import socket
 import sys
+from unittest.mock import Mock
 
 import pytest
 
@@ -79,17 +79,13 @@ def test_the_other_verbs_go_to_the_api_of_the_release(running, teleop, capsys):
 def test_a_mission_of_the_wrong_format_makes_no_job(running, folder, capsys):
     (folder / "wrong.yaml").write_text(f"time_limit_s: .nan\n{WAYPOINTS}")
     assert main(["mission", "run", "wrong.yaml"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("cloudrc: error: wrong.yaml")
-    assert "time_limit_s: nan: must be finite" in said
+    assert "wrong.yaml:1: time_limit_s: nan: must be finite" in capsys.readouterr().err
     assert made(running) == []
 
 
-@pytest.mark.parametrize(
-    ("mission", "limit"), [(f"time_limit_s: 20\n{WAYPOINTS}", 20), (WAYPOINTS, 86_400)]
-)
-def test_a_jobs_deadline_follows_the_missions_time_limit(lands, folder, mission, limit):
-    (folder / "one.yaml").write_text(mission)
+@pytest.mark.parametrize(("given", "limit"), [("time_limit_s: 20\n", 20), ("", 86_400)])
+def test_a_jobs_deadline_follows_the_missions_time_limit(lands, folder, given, limit):
+    (folder / "one.yaml").write_text(given + WAYPOINTS)
     for queue in ([], ["--queue"]):
         assert main(["mission", "run", "one.yaml", *queue]) == 0
         job = made(lands)[-1]
@@ -101,17 +97,8 @@ def test_a_jobs_deadline_follows_the_missions_time_limit(lands, folder, mission,
 
 def test_run_waits_until_the_release_is_ready(lands, capsys):
     """`helm install` does not wait for the pods."""
-    original, looks = lands.answer, 0
     lands.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending"))
-
-    def answer(method, path, body):
-        nonlocal looks
-        looks += "/pods" in path
-        if looks == 4:
-            lands.put("pods", pod("cloud-1", "cloud"))
-        return original(method, path, body)
-
-    lands.answer = answer
+    at_look(lands, 4, lambda: lands.put("pods", pod("cloud-1", "cloud")), plural="pods")
     assert main(["mission", "run", "pipes"]) == 0
     assert "container cloud is not ready yet" in capsys.readouterr().out
     (job,) = made(lands)
@@ -120,26 +107,18 @@ def test_run_waits_until_the_release_is_ready(lands, capsys):
 
 
 def test_an_interrupted_run_says_that_the_job_continues(running, capsys, monkeypatch):
-    def interrupted(*arguments, **more):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(jobs, "follow", interrupted)
+    monkeypatch.setattr(jobs, "follow", Mock(side_effect=KeyboardInterrupt))
     assert main(["mission", "run", "one.yaml"]) == 130
     (job,) = made(running)
     name = job["metadata"]["name"]
-    said = capsys.readouterr().err
-    assert f"kubectl --namespace=demo delete job {name}\n" in said
+    assert f"kubectl --namespace=demo delete job {name}\n" in capsys.readouterr().err
 
 
 @pytest.fixture
-def flies_here(tmp_path, monkeypatch):
-    """A run on this machine whose API accepts connections and never answers."""
-    monkeypatch.setattr("cloudrc.cli.client.REQUEST_TIMEOUT", 0.05)
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(f"{tmp_path}/silent.sock")
-        server.listen()
-        with local.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
-            yield
+def flies_here(tmp_path):
+    """A run on this machine whose API does not answer."""
+    with local.announced(tmp_path / "runs" / "latest", f"unix:{tmp_path}/silent.sock"):
+        yield
 
 
 @pytest.mark.usefixtures("flies_here")

@@ -1,6 +1,5 @@
 """Failures of pods are explained, ports are forwarded, tokens are read and never printed."""
 
-import base64
 import os
 import re
 
@@ -26,10 +25,7 @@ def unscheduled(message):
     ("given", "expected"),
     [
         ({"state": waiting("ImagePullBackOff")}, "cloudrc/cloud:0.1.0.*make kind-load"),
-        (
-            {"state": waiting("CreateContainerConfigError", 'secret "mine" not found')},
-            'cannot be created: secret "mine" not found',
-        ),
+        ({"state": waiting("CreateContainerConfigError", "no 'mine'")}, "cannot be created: no 'm"),
         (
             {
                 "state": waiting("CrashLoopBackOff"),
@@ -39,7 +35,6 @@ def unscheduled(message):
         ),
         ({"restarts": 5}, "ends repeatedly$"),
         ({"conditions": unscheduled("0/1 nodes: Insufficient cpu")}, "no node takes it.*cpu"),
-        ({}, "^$"),
         ({"state": waiting("ContainerCreating")}, "^$"),
         ({"conditions": unscheduled("pod has unbound immediate volume claims")}, "^$"),
         ({"restarts": 1}, "^$"),
@@ -81,8 +76,6 @@ def test_the_wait_for_a_release_ends_with_the_cause(running, release, body, erro
     ("said", "hint"),
     [
         ("Kubernetes cluster unreachable: Get https://10.0.0.1: refused", "kubectl cluster-info"),
-        ("chart requires >=1.29.0-0 which is incompatible with Kubernetes v1.28.3", "kind create"),
-        ("secrets is forbidden: User me cannot list", "kubectl auth can-i"),
         ("values don't meet the specifications of the schema(s)\n- link: mdoe", "helm show values"),
     ],
 )
@@ -94,12 +87,12 @@ def test_a_refusal_of_helm_has_a_hint(release, pretend, said, hint):
 
 
 @pytest.mark.parametrize("data", [{}, {"operator": "%%%"}, {"operator": "//4gc2VjcmV0"}])
-def test_a_secret_without_a_token_is_named(running, release, data):
+def test_a_secret_without_a_token_is_named_and_not_shown(running, release, data):
     assert operator_token(release) == TOKEN
     running.get("secrets", "cloudrc-tokens")["data"] = data
     with pytest.raises(ClusterError, match=r"'cloudrc-tokens' .* has no token under") as refused:
         operator_token(release)
-    assert base64.b64decode("c2VjcmV0").decode() + "'" not in str(refused.value)
+    assert "secret'" not in str(refused.value)
     running.refuse["GET", "secrets"] = (403, "secrets is forbidden")
     with pytest.raises(ClusterError, match="can-i get secrets"):
         operator_token(release)
@@ -127,11 +120,7 @@ def test_a_port_is_forwarded_while_the_block_runs(release, pretend, tmp_path):
 @pytest.mark.parametrize(
     ("script", "error", "words"),
     [
-        (
-            "echo 'error: unable to forward port: pod is gone' >&2; exit 1",
-            ClusterError,
-            "cannot forward ports of pod 'cloud-1'.*pod is gone",
-        ),
+        ("echo 'error: pod is gone' >&2; exit 1", ClusterError, "of pod 'cloud-1'.*pod is gone"),
         ("exec sleep 60", TimedOutError, "has not started within 0.5 s"),
     ],
 )
