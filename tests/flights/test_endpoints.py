@@ -18,7 +18,7 @@ from cloudrc.records import (
 )
 from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel import codec
-from tests.flights.conftest import HOVER, MS, Bare, fly_on, join, ring, talking
+from tests.flights.conftest import HOVER, MS, fly_on, join, talking
 
 SHORT = load_experiment("hover", ["link.profile=ideal", "mission.waypoints.0.dwell_s=0.5"])
 
@@ -26,16 +26,6 @@ SHORT = load_experiment("hover", ["link.profile=ideal", "mission.waypoints.0.dwe
 @pytest.fixture
 def talk():
     return talking()
-
-
-def test_every_cloud_process_gets_a_new_epoch():
-    talk, epochs = Bare(ring(), flies=True), []
-    talk.world.handle_deadline(100 * MS)
-    assert talk.world.take_datagrams() == [], "without a session world is silent"
-    for name in ("one", "one", "two", "two", "three"):
-        talk.wait(1_100)  # the previous cloud is silent by now
-        epochs.append(talk.hello(name))
-    assert epochs == [1, 1, 2, 2, 3]
 
 
 @pytest.mark.parametrize(
@@ -57,17 +47,11 @@ def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(talk, w
 @pytest.mark.parametrize(
     ("spoil", "outcome"),
     [
-        (lambda data: data[:-1], "malformed"),
-        (lambda data: data[:7], "malformed"),
         (lambda data: b"", "malformed"),
-        (lambda data: data + b"x", "malformed"),
         (lambda data: data.ljust(65_000, b"x"), "malformed"),
         (lambda data: bytes([codec.VERSION + 1]) + data[1:], "version"),
         (lambda data: data[:1] + b"\0" + data[2:], "direction"),
         (lambda data: data[:2] + b"\x09" + data[3:], "old_epoch"),
-        (lambda data: data[:6] + b"\x01" + data[7:], "tag"),
-        (lambda data: data[:8] + b"\x09" + data[9:], "tag"),
-        (lambda data: data[:30] + b"\x09" + data[31:], "tag"),
         (lambda data: data[:-1] + bytes([data[-1] ^ 1]), "tag"),
     ],
 )
@@ -77,14 +61,14 @@ def test_a_bad_datagram_is_dropped_and_counted(talk, spoil, outcome):
     assert talk.take(CommandApplied) == []
 
 
+ENDS = join(HOVER)[:2]
+
+
 @given(st.binary(max_size=300))
 @settings(max_examples=60, deadline=None)
 def test_no_bytes_make_an_end_raise(data):
-    for end in GARBAGE_TAKERS:
+    for end in ENDS:
         end.receive_datagram(data, 0)
-
-
-GARBAGE_TAKERS = join(HOVER)[:2]
 
 
 def test_after_a_stall_waiting_commands_are_stale(talk):

@@ -46,24 +46,21 @@ def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
     assert talk.take(GuardChange)[-1].state is GuardState.TRACK
 
 
-@pytest.mark.parametrize("start", Start)
 @pytest.mark.parametrize(
     ("held_back", "ahead", "outcome"),
     [(998 * MS, 0, ""), (1_003 * MS, 0, "stale"), (60_000 * MS, 0, "stale"), (0, 3 * MS, "future")],
 )
-def test_a_start_that_was_held_back_on_the_way_starts_nothing(
-    talk, start, held_back, ahead, outcome
-):
+def test_a_start_that_was_held_back_on_the_way_starts_nothing(talk, held_back, ahead, outcome):
     """Its mission may be over by then, so nobody expects the robot to take off."""
     talk.request(2, Request.END, Start.HERE)
     talk.now_ns += ahead
-    captured = talk.asked(3, Request.START, start)
+    captured = talk.asked(3, Request.START, Start.SPAWN)
     talk.wait((held_back - ahead) / MS)
     talk.send(captured)
     assert talk.world._counts[outcome] == (outcome != "")
     assert talk.world.robot.guard.armed == (outcome == "")
     if outcome:  # repeated, it is obeyed
-        talk.send(talk.asked(4, Request.START, start))
+        talk.send(talk.asked(4, Request.START, Start.SPAWN))
         assert talk.world.robot.guard.armed
 
 
@@ -73,7 +70,6 @@ def test_a_late_stop_still_stops_the_robot(talk, request_):
     talk.wait(20_000)
     talk.send(captured)
     assert not talk.world.robot.guard.armed
-    assert talk.world._orders.number == 2
 
 
 def test_a_start_that_waited_through_a_stall_starts_nothing(talk):

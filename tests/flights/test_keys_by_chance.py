@@ -3,12 +3,9 @@
 Both ends and their driver are the real ones, the robot does nothing: a minute takes 50 ms.
 """
 
-from __future__ import annotations
-
 import random
 from functools import partial
 from itertools import count
-from typing import Any
 
 import pytest
 
@@ -33,8 +30,7 @@ class Two:
 
     def __init__(self, seed):
         self.chance = chance = random.Random(seed)
-        self.files = dict.fromkeys(ENDS, KeySet(KEYS[0]))
-        self.rings: dict[str, KeyRing] = {}
+        self.files, self.rings = dict.fromkeys(ENDS, KeySet(KEYS[0])), {}
         self.numbers, self.lives = count(1), count(1)
         delay, jitter = chance.choice((0.001, 0.02, 0.15)), chance.choice((0.0, 0.01, 0.1))
         profile = DirectionProfile(delay=delay, jitter=min(jitter, delay))
@@ -42,17 +38,16 @@ class Two:
         ways = ("up", "down", "both")
         events = (Event(n, *self.when(), chance.random(), chance.choice(ways)) for n in kinds)
         schedule = Schedule(seed, events=tuple(events))
-        up, down = (
+        links = (
             LinkDirection(shaped(schedule, profile, way), seed, uplink=way == "up")
-            for way in ("up", "down")
+            for way in ways[:2]
         )
-        self.world, self.cloud = (
-            RestartableEndpoint(partial(self.build, end), Clock(), end) for end in ENDS
-        )
-        self.run = VirtualRun(self.world, self.cloud, up, down)
-        whatever = (self.rotate, self.leave, self.start)
-        for befalls in chance.choices(whatever, k=chance.randint(2, 12)):
-            befalls()
+        self.ends = {e: RestartableEndpoint(partial(self.build, e), Clock(), e) for e in ENDS}
+        self.run = VirtualRun(*self.ends.values(), *links)
+        for befalls in chance.choices(
+            (self.rotate, self.leave, self.start), k=chance.randint(2, 12)
+        ):
+            befalls(*self.when())
         # The last key files are the same, or have a key in common, as after a roll-back.
         common, alike = chance.choice(KEYS), chance.random() < 0.5
         other = chance.choice([key for key in KEYS if key != common])
@@ -72,45 +67,44 @@ class Two:
         """When something begins, and how long it lasts [s]."""
         return self.chance.uniform(0.2, CALM - 6.0), self.chance.uniform(0.02, 5.0)
 
-    def rotate(self):
-        """One end reads another key file, or both do, one after the other."""
-        chance, (time, later) = self.chance, self.when()
-        current, previous = chance.choice(KEYS[:3]), chance.choice((None, None, *KEYS[:2]))
-        ends = chance.sample(ENDS, chance.randint(1, 2))
-        for end, at in zip(ends, (time, time + later), strict=False):
-            self.read(end, at, KeySet(current, previous))
-
     def read(self, end, time, keys):
         def read(now_ns):
             self.files[end] = self.rings[end].keys = keys
 
-        getattr(self, end).at(time, read)
+        self.ends[end].at(time, read)
 
-    def leave(self):
+    def rotate(self, time, apart):
+        """One end reads another key file, or both do, one after the other."""
+        chance = self.chance
+        keys = KeySet(chance.choice(KEYS[:3]), chance.choice((None, None, *KEYS[:2])))
+        ends = chance.sample(ENDS, chance.randint(1, 2))
+        for end, at in zip(ends, (time, time + apart), strict=False):
+            self.read(end, at, keys)
+
+    def leave(self, time, lasts):
         """An end restarts or stands still."""
-        process, (time, lasts) = getattr(self, self.chance.choice(ENDS)), self.when()
+        process = self.ends[self.chance.choice(ENDS)]
         befalls = self.chance.choice((process.restart, process.freeze))
         process.at(time, lambda now_ns: befalls(now_ns, lasts))
 
-    def start(self):
+    def start(self, time, _):
         """A mission starts from the spawn: world moves on to the next epoch."""
+        cloud = self.ends["cloud"]
 
         def ask(now_ns):
-            if self.cloud.inner is not None:
+            if cloud.inner is not None:
                 request = OperatorRequest(next(self.numbers), Request.START, Start.SPAWN)
-                self.cloud.inner.teleop.outputs.append(request)  # type: ignore[attr-defined]
+                cloud.inner.teleop.outputs.append(request)
 
-        self.cloud.at(self.when()[0], ask)
+        cloud.at(time, ask)
 
     def hear_each_other(self):
         self.run.fly(lambda: False, round(END * 1e9), lambda of_world, of_cloud: None)
-        world: Any = self.world.inner
-        cloud: Any = self.cloud.inner
-        if world._session.epoch != cloud._session.epoch:
-            return False
+        world, cloud = (end.inner for end in self.ends.values())
         heard_ns = self.run.now_ns - cloud._heard_ns
         silent_ns = self.run.now_ns - world._door._fresh_until_ns  # beyond the age limit
-        return silent_ns < 300 * MS and heard_ns < 500 * MS
+        same = world._session.epoch == cloud._session.epoch
+        return same and silent_ns < 300 * MS and heard_ns < 500 * MS
 
 
 @pytest.mark.parametrize("first", [0, *nightly(1_000)])

@@ -80,15 +80,14 @@ def test_split_estimates_the_delay_better_than_the_running_mean():
     ("position", "scene"), [([9.2, 0.0, 1.0], "empty"), ([0.0, 0.0, 1.0], "pipes")]
 )
 def test_a_point_offered_for_one_that_the_guard_refuses_is_reached(position, scene):
-    def settings(point):
+    def load(point):
         waypoint = f"mission.waypoints=[{{position_m: {point}}}]"
-        return [waypoint, f"world.scene={scene}", "criteria.time_limit_s=25"]
+        settings = [waypoint, f"world.scene={scene}", "criteria.time_limit_s=25"]
+        return load_experiment("hover", settings)
 
     with pytest.raises(BadInputError) as caught:
-        load_experiment("hover", settings(position))
-    offered = re.search(r"nearest legal point found: \[(.*)\]", str(caught.value))
-    assert offered is not None
-    near = [float(word) for word in offered[1].split(",")]
-    _, cloud = records(load_experiment("hover", settings(near)))
+        load(position)
+    (offered,) = re.findall(r"nearest legal point found: (\[.*\])", str(caught.value))
+    _, cloud = records(load(offered))
     events = [record.event for record in cloud if isinstance(record, MissionEvent)]
     assert events == ["started", "reached", "done"]

