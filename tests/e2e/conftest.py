@@ -43,17 +43,13 @@ class CommandFailedError(AssertionError):
 
 def command(*words, given="", timeout=120.0):
     """Run a command and return its output; raise an error if its exit code is not 0."""
+    words = [str(word) for word in words]
     done = subprocess.run(
-        [str(word) for word in words],
-        input=given,
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        cwd=ROOT,
+        words, input=given, capture_output=True, text=True, timeout=timeout, cwd=ROOT
     )
     if done.returncode != 0:
-        line = " ".join(map(str, words))
-        raise CommandFailedError(f"{line}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+        said = f"exit code {done.returncode}\n{done.stdout}{done.stderr}"
+        raise CommandFailedError(f"{' '.join(words)}: {said}")
     return done.stdout
 
 
@@ -81,13 +77,8 @@ def helm(*words, timeout=180.0):
 
 def cloudrc(*words, timeout=240.0):
     """Run cloudrc; any exit code is accepted."""
-    return subprocess.run(
-        [sys.executable, "-m", "cloudrc", *words],
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        cwd=ROOT,
-    )
+    line = [sys.executable, "-m", "cloudrc", *words]
+    return subprocess.run(line, capture_output=True, text=True, timeout=timeout, cwd=ROOT)
 
 
 def in_release(*words, timeout=240.0):
@@ -334,22 +325,6 @@ def prometheus_image(cluster):
     """Name of an image with Prometheus and promtool."""
     found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
     return found.split()[0]
-
-
-def processor_times():
-    """Return the monotonic time [s], and the CPU time of each process of the release [s]."""
-    texts = {f"{end}/{name}": text for end in ENDS for name, text in scrapes(end).items()}
-    name = "process_cpu_seconds_total"
-    return time.monotonic(), {each: value(samples(t), name) for each, t in texts.items()}
-
-
-def memory():
-    """Return the memory of all containers of the release, as the kubelet counts it [bytes]."""
-    node = pod("world")["spec"]["nodeName"]
-    summary = command("kubectl", "get", "--raw", f"/api/v1/nodes/{node}/proxy/stats/summary")
-    found = {each["podRef"]["uid"]: each["containers"] for each in json.loads(summary)["pods"]}
-    mine = [found[pod(end)["metadata"]["uid"]] for end in ENDS]
-    return sum(each["memory"]["workingSetBytes"] for containers in mine for each in containers)
 
 
 @cache  # measured once, because later a test may have just replaced the pod

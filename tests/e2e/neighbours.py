@@ -1,11 +1,12 @@
 """Pods beside the release: a foreign pod that tries all ports, and an allowed Prometheus."""
 
 import json
+from contextlib import contextmanager
 from urllib.parse import urlencode
 
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.pods import NO_PROXY, forwarded
-from tests.e2e.conftest import CHART, NAMESPACE, ROOT, apply, kubectl, pod
+from tests.e2e.conftest import NAMESPACE, apply, kubectl, pod
 
 MONITORING = f"{NAMESPACE}-monitoring"
 TRY_PORTS = """\
@@ -28,17 +29,12 @@ print(json.dumps(answered))
 """
 
 
-def image():
-    """Return the image of the cloud pod, which has Python and is on the node."""
-    return str(pod("cloud")["spec"]["containers"][0]["image"])
-
-
 def stranger(name, ports):
     """Try ports from a pod without the release's labels; return the TCP ports that answer."""
     cloud = pod("cloud")["spec"]
     container = {
         "name": "stranger",
-        "image": image(),
+        "image": cloud["containers"][0]["image"],  # has Python and is on the node
         "command": ["python", "-c", TRY_PORTS, json.dumps(ports)],
         "securityContext": cloud["containers"][0]["securityContext"],
     }
@@ -84,33 +80,19 @@ def targets():
 def install_prometheus(prometheus_image):
     """Start a Prometheus in a namespace of its own, and wait until it is ready."""
     metadata = {"name": "prometheus", "namespace": MONITORING}
-    config = {"name": "config", "mountPath": "/etc/prometheus"}
     prometheus = {
         "name": "prometheus",
         "image": prometheus_image,
         "readinessProbe": {"httpGet": {"path": "/-/ready", "port": 9090}, "periodSeconds": 1},
-        "volumeMounts": [config],
+        "volumeMounts": [{"name": "config", "mountPath": "/etc/prometheus"}],
     }
     volume = {"name": "config", "configMap": {"name": "prometheus"}}
+    spec = {"containers": [prometheus], "volumes": [volume]}
+    data = {"prometheus.yml": CONFIG, "pods.json": targets()}
     apply(
         {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": MONITORING}},
-        {
-            "apiVersion": "v1",
-            "kind": "ConfigMap",
-            "metadata": metadata,
-            "data": {
-                "prometheus.yml": CONFIG,
-                "pods.json": targets(),
-                "rules.yaml": (CHART / "files" / "rules.yaml").read_text(),
-                "alerts.yaml": (ROOT / "tests" / "e2e" / "alerts.yaml").read_text(),
-            },
-        },
-        {
-            "apiVersion": "v1",
-            "kind": "Pod",
-            "metadata": metadata,
-            "spec": {"containers": [prometheus], "volumes": [volume]},
-        },
+        {"apiVersion": "v1", "kind": "ConfigMap", "metadata": metadata, "data": data},
+        {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": spec},
     )
     ready = ["wait", "pod/prometheus", "--for=condition=Ready", "--timeout=60s"]
     kubectl(f"--namespace={MONITORING}", *ready)
@@ -122,21 +104,16 @@ def promtool(*words, given=""):
     return kubectl(*where, "--", "promtool", *words, given=given)
 
 
-class Prometheus:
-    """Sends queries to the Prometheus of the tests while the block runs."""
+@contextmanager
+def queries():
+    """Give a function that returns the result of a PromQL query."""
+    with forwarded(connect(None, MONITORING), "prometheus", [9090]) as ports:
 
-    def __enter__(self):
-        self._way = forwarded(connect(None, MONITORING), "prometheus", [9090])
-        self._port = self._way.__enter__()[9090]
-        return self
+        def ask(query):
+            url = f"http://127.0.0.1:{ports[9090]}/api/v1/query?{urlencode({'query': query})}"
+            with NO_PROXY.open(url, timeout=10) as answer:
+                said = json.load(answer)
+            assert said["status"] == "success", said
+            return list(said["data"]["result"])
 
-    def __exit__(self, *error):
-        self._way.__exit__(*error)
-
-    def ask(self, query):
-        """Return the result of a PromQL query."""
-        url = f"http://127.0.0.1:{self._port}/api/v1/query?{urlencode({'query': query})}"
-        with NO_PROXY.open(url, timeout=10) as answer:
-            said = json.load(answer)
-        assert said["status"] == "success", said
-        return list(said["data"]["result"])
+        yield ask

@@ -1,11 +1,8 @@
 """One schedule, flown: what it is checked for, and that a broken part is found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -49,7 +46,7 @@ def test_a_hostile_cloud_causes_no_breach(policy):
 def test_a_hostile_cloud_makes_every_request():
     _, words = dishonesty(Schedule(27, policy="operators-voice"))
     assert words is not None
-    seen: list[Any] = [SimpleNamespace(guard=each, position=(1.0, 1.0, 1.0)) for each in GuardState]
+    seen = [SimpleNamespace(guard=each, position=(1.0, 1.0, 1.0)) for each in GuardState]
     said = [words(n * 10_000 * MS, robot) for n, robot in enumerate(seen * 300)]
     made = {(request.request, request.start) for request in said if request is not None}
     assert made == {(each, Start.SPAWN) for each in Request} | {(Request.START, Start.HERE)}
@@ -81,11 +78,6 @@ def test_a_schedule_is_checked_for_what_it_allows(events, policy, duration, kind
     schedule = Schedule(1, events=events, policy=policy, duration=duration)
     some = {"collision", "waypoint", "stuck", "alarm", "obeyed"}
     assert checked_in(schedule) & some == {*kinds.split()}
-
-
-def test_a_flight_without_faults_is_clean():
-    finding = fly(Schedule(1, "paper-p1", duration=45.0))
-    assert (finding.breaches, finding.missions) == ((), 1)
 
 
 HELD = Schedule(
@@ -121,7 +113,7 @@ def needs_no_start(patch):
 
 
 def applies_late_commands(patch):
-    take: Any = Channel.take
+    take = Channel.take
     patch.setattr(Channel, "take", lambda *_: USED if (said := take(*_)) == LATE else said)
 
 
@@ -171,14 +163,11 @@ def test_a_broken_part_is_found(breaks, kind, schedule, monkeypatch):
         ([(2, 0), (2, 1), (2, 5), (1, 7), (1, 6)], {"order"}),
         ([(2, 0), (2, 5), (3, 0)], set()),
         ([(2, 1), (2, 1)], {"order"}),
-        ([(2, 1), (2, 0)], {"order"}),
-        ([(3, 0), (2, 7)], {"order"}),
-        ([(3, None), (3, 0)], set()),
         ([(3, None), (2, 9)], {"order"}),
     ],
 )
 def test_a_command_is_applied_once_and_in_order(commands, kinds):
-    flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()), world_starts_ns=[0, 3])
+    flight = SimpleNamespace(listeners=[], watch=Watch(Limits()), world_starts_ns=[0, 3])
     order = OrderInvariant(flight)
     for at, (epoch, counter) in enumerate(commands):
         opened = SessionOpened(at, "world", epoch, "cloud said hello")
@@ -195,6 +184,6 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
     events.append({"mission": "n", "event": "reached", "waypoint": 0})
     book = SimpleNamespace(events_after=lambda number: events)
     teleop, run = SimpleNamespace(service=SimpleNamespace(book=book)), SimpleNamespace(now_ns=0)
-    flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()), teleop=teleop, run=run)
+    flight = SimpleNamespace(listeners=[], watch=Watch(Limits()), teleop=teleop, run=run)
     OrderInvariant(flight).check_waypoints()
     assert set(flight.watch.counts) == kinds
