@@ -77,9 +77,7 @@ def test_security_contexts_can_be_left_out_or_changed():
     """OpenShift gives each namespace its own user ids and refuses others."""
     values = {"podSecurityContext": None, "containerSecurityContext": None}
     objects = render({**values, "cloud": {"backgroundLoad": {"enabled": True}}})
-    for pod in pod_specs(objects).values():
-        assert "securityContext" not in pod
-        assert not any("securityContext" in part for part in containers(pod).values())
+    assert "securityContext" not in str(pod_specs(objects))
     for pod in pod_specs(render({"podSecurityContext": {"runAsUser": 12_345}})).values():
         assert pod["securityContext"]["runAsUser"] == 12_345
         assert pod["securityContext"]["runAsNonRoot"] is True
