@@ -7,7 +7,6 @@ import os
 import threading
 import uuid
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -26,10 +25,10 @@ class FakeApi:
     """Objects of a namespace by (plural, name); `refuse` maps a method and plural to an error."""
 
     def __init__(self):
-        self.objects: dict[tuple[str, str], dict[str, Any]] = {}
-        self.logs: dict[str, str] = {}
-        self.refuse: dict[tuple[str, str], tuple[int, str]] = {}
-        self.seen: list[str] = []
+        self.objects = {}
+        self.logs = {}
+        self.refuse = {}
+        self.seen = []
         self.version = {"major": "1", "minor": "33"}
         self.lock = threading.RLock()
         self._clock = itertools.count()
@@ -80,6 +79,45 @@ class FakeApi:
                 return 200, self.objects.pop((plural, name))
             return 200, self.objects[plural, name]
 
+    def jobs(self):
+        return [body for (kind, _), body in self.objects.items() if kind == "jobs"]
+
+    def end(self, job, kind, **condition):
+        """End a Job: `kind` is "Complete" or "Failed"."""
+        ended = {"type": kind, "status": "True", **condition}
+        self.get("jobs", job)["status"] = {"conditions": [ended]}
+
+    def start_pod(self, job, **given):
+        """Create the pod of a Job as Kubernetes does."""
+        uid = self.get("jobs", job)["metadata"]["uid"]
+        self.put("pods", pod(f"{job}-x", "mission", labels={UID_LABEL: uid}, **given))
+
+    def at_look(self, number, action, plural="jobs"):
+        """Call `action` at the n-th request for a Job, or another object."""
+        original, looks = self.answer, iter(range(1, 1000))
+
+        def answer(method, path, body):
+            with self.lock:
+                if method == "GET" and f"/{plural}" in path and next(looks) == number:
+                    action()
+            return original(method, path, body)
+
+        self.answer = answer
+
+    def away(self, plural, code, times):
+        """Refuse a number of read requests; return a function that counts those left."""
+        original, left = self.answer, times
+
+        def answer(method, path, body):
+            nonlocal left
+            if method == "GET" and f"/{plural}" in path and left:
+                left -= 1
+                return code, {"message": "etcdserver: leader changed", "code": code}
+            return original(method, path, body)
+
+        self.answer = answer
+        return lambda: left
+
 
 def serve(answer):
     """Serve HTTP on a free port; `answer` gets the request and its JSON, and returns a reply."""
@@ -114,9 +152,9 @@ class FakeTeleop:
     """The API and the metrics of a cloud pod, with a record of its requests."""
 
     def __init__(self):
-        self.mission: dict[str, str] | None = None
-        self.posted: list[str] = []
-        self.tokens: set[str | None] = set()
+        self.mission = None
+        self.posted = []
+        self.tokens = set()
         self.server = serve(self._answer)
 
     def _answer(self, request, body):
@@ -272,36 +310,5 @@ def teleop(running, pretend):
 MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
 
 
-def end(api, name, kind, **condition):
-    """End a Job: `kind` is "Complete" or "Failed"."""
-    ended = {"type": kind, "status": "True", **condition}
-    api.get("jobs", name)["status"] = {"conditions": [ended]}
-
-
-def start_pod(api, name, **given):
-    """Create the pod of a Job as Kubernetes does."""
-    uid = api.get("jobs", name)["metadata"]["uid"]
-    api.put("pods", pod(f"{name}-x", "mission", labels={UID_LABEL: uid}, **given))
-
-
 def terminated(exit_code, message):
     return {"terminated": {"exitCode": exit_code, "message": message}}
-
-
-def at_look(api, number, action, plural="jobs"):
-    """Call `action` at the n-th request for a Job, or another object."""
-    original, looks = api.answer, iter(range(1, 1000))
-    lock = threading.Lock()
-
-    def answer(method, path, body):
-        with lock:
-            if method == "GET" and f"/{plural}" in path and next(looks) == number:
-                action()
-        return original(method, path, body)
-
-    api.answer = answer
-
-
-def made(api):
-    """Return the Jobs."""
-    return [body for (kind, _), body in api.objects.items() if kind == "jobs"]

@@ -9,15 +9,7 @@ from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import find_pod, list_pods
 from cloudrc.errors import MissingPrerequisiteError, TimedOutError
-from tests.cluster.conftest import (
-    CONFIG_PLACE,
-    MISSION,
-    end,
-    kubeconfig,
-    pod,
-    start_pod,
-    terminated,
-)
+from tests.cluster.conftest import CONFIG_PLACE, MISSION, kubeconfig, pod, terminated
 
 
 def test_flags_override_the_kubeconfig(api):
@@ -80,42 +72,27 @@ def test_the_newest_pod_of_the_release_is_found(api, release):
     assert find_pod(release, "cloud").metadata.name == "new"
 
 
-def away(api, plural, code, times):
-    """Refuse a number of read requests; return a function that counts those left."""
-    original, left = api.answer, times
-
-    def answer(method, path, body):
-        nonlocal left
-        if method == "GET" and f"/{plural}" in path and left:
-            left -= 1
-            return code, {"message": "etcdserver: leader changed", "code": code}
-        return original(method, path, body)
-
-    api.answer = answer
-    return lambda: left
-
-
 def test_only_a_short_outage_is_waited_for(running, release, monkeypatch):
     run_job(release, MISSION, name="first")
-    start_pod(running, "first", state=terminated(0, "done"))
+    running.start_pod("first", state=terminated(0, "done"))
     running.logs["first-x"] = "waypoint 1 of 1 reached\n"
-    end(running, "first", "Complete")
+    running.end("first", "Complete")
     for plural, code in (("jobs", 429), ("pods", 500)):
-        left, lines = away(running, plural, code, 3), []
+        left, lines = running.away(plural, code, 3), []
         assert follow(release, "first", lines.append, timeout=10.0).exit_code == 0
         assert left() == 0
         told, last = lines
         assert "leader changed" in told
         assert last == "waypoint 1 of 1 reached"
-    left = away(running, "deployments", 500, 2)
+    left = running.away("deployments", 500, 2)
     wait_ready(release, timeout=10.0)
     assert left() == 0
     monkeypatch.setattr(client, "OUTAGE_MAX", 0.05)
-    left = away(running, "jobs", 403, 5)
+    left = running.away("jobs", 403, 5)
     with pytest.raises(ClusterError, match="can-i get jobs"):
         follow(release, "first", print, timeout=10.0)
     assert left() == 4, "a refusal is not repeated"
-    away(running, "jobs", 500, 1_000_000)
+    running.away("jobs", 500, 1_000_000)
     with pytest.raises(UnavailableError, match="leader changed"):
         follow(release, "first", print, timeout=10.0)
 

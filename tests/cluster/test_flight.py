@@ -16,7 +16,7 @@ from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
-from tests.cluster.conftest import at_look, end, start_pod, terminated
+from tests.cluster.conftest import terminated
 from tests.flights.conftest import records
 
 SECOND = 1_000_000_000
@@ -107,11 +107,11 @@ def ends(api, kind="Complete", exit_code=0, message="done"):
 
     def action():
         (name,) = [key[1] for key in api.objects if key[0] == "jobs"]
-        start_pod(api, name, state=terminated(exit_code, message))
+        api.start_pod(name, state=terminated(exit_code, message))
         api.logs[f"{name}-x"] = "waypoint 1 of 1 reached at 3.00 s\n"
-        end(api, name, kind)
+        api.end(name, kind)
 
-    at_look(api, 2, action)
+    api.at_look(2, action)
 
 
 def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, capsys):

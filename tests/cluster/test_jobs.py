@@ -9,17 +9,7 @@ from cloudrc.cluster import jobs
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import delete_job, find_flight, follow, follow_limit, run_job
 from cloudrc.errors import TimedOutError
-from tests.cluster.conftest import (
-    MISSION,
-    SECURE,
-    TELEOP,
-    TOKEN,
-    at_look,
-    end,
-    made,
-    start_pod,
-    terminated,
-)
+from tests.cluster.conftest import MISSION, SECURE, TELEOP, TOKEN, terminated
 
 
 def pod_of(api, name):
@@ -76,18 +66,18 @@ def test_follow_writes_each_line_once_and_returns_the_verdict(running, release):
     run_job(release, MISSION, name="first")
 
     def fly():
-        start_pod(running, "first")
+        running.start_pod("first")
         running.logs["first-x"] = "waypoint 1 of 2 reached\n"
 
     def land():
-        start_pod(running, "first", state=terminated(1, "the\nverdict"))
+        running.start_pod("first", state=terminated(1, "the\nverdict"))
         statuses = running.get("pods", "first-x")["status"]["containerStatuses"]
         statuses.append({**statuses[0], "name": "mesh", "state": terminated(0, "bye")})
         running.logs["first-x"] = "waypoint 1 of 2 reached\nwaypoint 2 of 2 reached\n"
-        end(running, "first", "Failed")
+        running.end("first", "Failed")
 
-    at_look(running, 2, fly)
-    at_look(running, 5, land)
+    running.at_look(2, fly)
+    running.at_look(5, land)
     lines: list[str] = []
     ended = follow(release, "first", lines.append, timeout=10.0)
     assert lines == ["waypoint 1 of 2 reached", "waypoint 2 of 2 reached"]
@@ -103,14 +93,14 @@ def test_follow_ends_when_the_pod_cannot_run(running, release):
     running.put("events", {"metadata": {"name": "first.1"}, **about, **said})
     with pytest.raises(ClusterError, match="violates PodSecurity"):
         follow(release, "first", print, timeout=10.0)
-    start_pod(running, "first", state={"waiting": {"reason": "ErrImagePull"}}, ready=False)
+    running.start_pod("first", state={"waiting": {"reason": "ErrImagePull"}}, ready=False)
     with pytest.raises(ClusterError, match=r"cannot start: the image.*make kind-load"):
         follow(release, "first", print, timeout=10.0)
 
 
 def test_a_deadline_is_named_and_bounded(running, release):
     run_job(release, MISSION, name="first")
-    end(running, "first", "Failed", reason="DeadlineExceeded", message="...")
+    running.end("first", "Failed", reason="DeadlineExceeded", message="...")
     assert "activeDeadlineSeconds" in follow(release, "first", print, timeout=10.0).message
     assert follow_limit(1e300, queue=True) < 2**31 + 100
 
@@ -122,7 +112,7 @@ def test_a_job_that_cannot_be_made_leaves_nothing(running, release):
     running.refuse["POST", "jobs"] = 403, "jobs.batch is forbidden"
     with pytest.raises(ClusterError, match="can-i create jobs"):
         run_job(release, MISSION)
-    assert made(running) == []
+    assert running.jobs() == []
 
 
 def test_a_job_is_under_way_until_it_has_ended_or_is_deleted(running, teleop, release, monkeypatch):
@@ -131,7 +121,7 @@ def test_a_job_is_under_way_until_it_has_ended_or_is_deleted(running, teleop, re
 
     for name in ("one", "two"):
         run_job(release, MISSION, name=name)
-    end(running, "one", "Complete")
+    running.end("one", "Complete")
     assert under_way() == ("Job 'two'", "kubectl --namespace=demo delete job two")
     delete_job(release, "two")
     assert under_way() is None

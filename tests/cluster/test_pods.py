@@ -10,7 +10,7 @@ from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.flight import install, wait_ready
 from cloudrc.cluster.pods import list_pods, operator_token, pod_failure
 from cloudrc.errors import TimedOutError
-from tests.cluster.conftest import TOKEN, deployment, pod
+from tests.cluster.conftest import TOKEN, deployment, pod, terminated
 
 
 def waiting(reason, message=""):
@@ -27,10 +27,7 @@ def unscheduled(message):
         ({"state": waiting("ImagePullBackOff")}, "cloudrc/cloud:0.1.0.*make kind-load"),
         ({"state": waiting("CreateContainerConfigError", "no 'mine'")}, "cannot be created: no 'm"),
         (
-            {
-                "state": waiting("CrashLoopBackOff"),
-                "last": {"terminated": {"exitCode": 3, "message": "port 9100 is\ntaken"}},
-            },
+            {"state": waiting("CrashLoopBackOff"), "last": terminated(3, "port 9100 is\ntaken")},
             r"ends repeatedly \(exit code 3\): port 9100 is taken",
         ),
         ({"restarts": 5}, "ends repeatedly$"),
@@ -54,7 +51,6 @@ REFUSED = {"type": "ReplicaFailure", "status": "True", "message": "violates PodS
     ("body", "error", "words"),
     [
         (deployment("cloud", updatedReplicas=0), TimedOutError, "its pod is being created"),
-        (deployment("cloud", replicas=2), TimedOutError, "its pod is being created"),
         (deployment("cloud", observedGeneration=0), TimedOutError, "its pod is being created"),
         (deployment("cloud", conditions=[REFUSED]), ClusterError, "violates PodSecurity"),
         (pod("world-1", "world", ready=False), TimedOutError, "container world is not ready"),
@@ -101,7 +97,7 @@ def test_a_secret_without_a_token_is_named_and_not_shown(running, release, data)
         operator_token(release)
 
 
-def test_a_port_is_forwarded_while_the_block_runs(release, pretend, tmp_path):
+def test_ports_are_forwarded_while_the_block_runs(release, pretend, monkeypatch, tmp_path):
     pretend(
         "kubectl",
         f"echo $$ > {tmp_path}/pid; echo $@ > {tmp_path}/line\n"
@@ -111,22 +107,14 @@ def test_a_port_is_forwarded_while_the_block_runs(release, pretend, tmp_path):
     with pods.forwarded(release, "world-1", [9100, 9102]) as ports:
         assert ports == {9100: 40001, 9102: 40002}
         pid = int((tmp_path / "pid").read_text())
-        os.kill(pid, 0)
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
     assert "--namespace=demo port-forward pod/world-1" in (tmp_path / "line").read_text()
-
-
-@pytest.mark.parametrize(
-    ("script", "error", "words"),
-    [
+    monkeypatch.setattr(pods, "START_LIMIT", 0.5)
+    for script, error, words in (
         ("echo 'error: pod is gone' >&2; exit 1", ClusterError, "of pod 'cloud-1'.*pod is gone"),
         ("exec sleep 60", TimedOutError, "has not started within 0.5 s"),
-    ],
-)
-def test_a_failed_port_forward_is_reported(release, pretend, monkeypatch, script, error, words):
-    if error is TimedOutError:
-        monkeypatch.setattr(pods, "START_LIMIT", 0.5)
-    pretend("kubectl", script)
-    with pytest.raises(error, match=words), pods.forwarded(release, "cloud-1", [8080]):
-        pytest.fail("there is no way")
+    ):
+        pretend("kubectl", script)
+        with pytest.raises(error, match=words), pods.forwarded(release, "cloud-1", [8080]):
+            pytest.fail("there is no way")

@@ -7,12 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.config.load import load_experiment
-from cloudrc.messages import GuardState, Start
+from cloudrc.messages import Start
 from cloudrc.records import (
     CommandApplied,
     Contact,
     GroundTruth,
-    GuardChange,
     SessionOpened,
     TelemetrySent,
 )
@@ -89,10 +88,7 @@ def test_one_mission_can_follow_another_from_here():
     ends = join(SHORT)
     of_world, _ = fly_on(ends.run, 20_000 * MS, lambda: ends.cloud.mission_over)
     opened = [record for record in of_world if isinstance(record, SessionOpened)]
-    assert [record.epoch for record in opened] == [1, 2]
-    assert opened[1].cause == "mission starts from spawn"
-    states = [record.state for record in of_world if isinstance(record, GuardChange)]
-    assert states == [GuardState.GROUND, GuardState.TRACK, GuardState.HOLD]
+    assert [record.epoch for record in opened] == [1, 2], "the second for the start from the spawn"
     ends.cloud.teleop.start(ends.run.now_ns, Plan((Leg((0.5, 0.0, 1.0)),), Start.HERE))
     of_world, _ = fly_on(ends.run, 40_000 * MS, lambda: ends.cloud.mission_over)
     assert ends.cloud.teleop.outcome.event == "done"

@@ -47,15 +47,14 @@ def test_a_start_is_refused_until_the_stop_is_acknowledged(talk, start):
 
 
 @pytest.mark.parametrize(
-    ("held_back", "ahead", "outcome"),
-    [(998 * MS, 0, ""), (1_003 * MS, 0, "stale"), (60_000 * MS, 0, "stale"), (0, 3 * MS, "future")],
+    ("held_back", "ahead", "outcome"), [(998, 0, ""), (1_003, 0, "stale"), (0, 3, "future")]
 )
 def test_a_start_that_was_held_back_on_the_way_starts_nothing(talk, held_back, ahead, outcome):
     """Its mission may be over by then, so nobody expects the robot to take off."""
     talk.request(2, Request.END, Start.HERE)
-    talk.now_ns += ahead
+    talk.now_ns += ahead * MS
     captured = talk.asked(3, Request.START, Start.SPAWN)
-    talk.wait((held_back - ahead) / MS)
+    talk.wait(held_back - ahead)
     talk.send(captured)
     assert talk.world._counts[outcome] == (outcome != "")
     assert talk.world.robot.guard.armed == (outcome == "")
@@ -64,21 +63,16 @@ def test_a_start_that_was_held_back_on_the_way_starts_nothing(talk, held_back, a
         assert talk.world.robot.guard.armed
 
 
-@pytest.mark.parametrize("request_", [Request.END, Request.ESTOP])
-def test_a_late_stop_still_stops_the_robot(talk, request_):
-    captured = talk.asked(2, request_, Start.HERE)
-    talk.wait(20_000)
-    talk.send(captured)
-    assert not talk.world.robot.guard.armed
-
-
-def test_a_start_that_waited_through_a_stall_starts_nothing(talk):
-    """World's clock stood still in the meantime, so the age of its basis is meaningless."""
-    captured = talk.asked(2, Request.START, Start.SPAWN)
+@pytest.mark.parametrize("request_", [Request.START, Request.END, Request.ESTOP])
+def test_after_a_stall_a_stop_counts_and_a_start_does_not(talk, request_):
+    """World's clock stood still in the meantime, so the age of a start's basis means nothing."""
+    captured = talk.asked(2, request_, Start.SPAWN)
     talk.now_ns += 60_000 * MS
     talk.send(captured)
-    assert talk.world._counts["stale"] == 1
-    assert talk.world._orders.number == 1
+    started = request_ is Request.START
+    assert talk.world._counts["stale"] == started
+    assert talk.world._orders.number == (1 if started else 2)
+    assert talk.world.robot.guard.armed is started
 
 
 def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
@@ -94,19 +88,6 @@ def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
     talk.request(2, Request.ESTOP, Start.HERE)
     talk.wait(20)
     assert len(talk.take(CommandApplied)) == applied + 1
-
-
-def test_limited_commands_and_a_missions_holds_are_counted(talk):
-    for _ in range(10):
-        talk.send(talk.command((0.0, 0.0, 9.0)))
-        talk.wait(10)
-    assert talk.counts()["limited_speed"] == 10
-    talk.wait(3_000)
-    held = talk.counts()["held_seconds"]
-    assert 4 <= held <= 5
-    ask(talk, 2, Request.END)
-    talk.wait(4_000)
-    assert talk.counts()["held_seconds"] == held
 
 
 def test_contacts_are_reported_until_the_next_mission_starts(talk):

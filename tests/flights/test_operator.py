@@ -7,7 +7,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import GuardChange
 from cloudrc.teleop.wire import ALARM
-from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
+from cloudrc.tunnel.codec import Kind, peek
 from cloudrc.tunnel.end import Identity
 from tests.flights.conftest import HOVER, SHARED_CLOCK, fly_on, join
 
@@ -59,19 +59,6 @@ def test_requests_that_arm_nothing_are_always_passed_on(ends):
     ends.cloud._loop.reset()  # as a new session does: no telemetry yet
     start, stop = OperatorRequest(99, Request.START), OperatorRequest(99, Request.END)
     assert (say(ends, start), say(ends, stop)) == ([], [Kind.OPERATOR])
-
-
-def test_used_up_numbers_last_until_the_next_session(ends):
-    """A sender with the keys has used the highest number of all."""
-    said = OperatorRequest(NUMBER_MAX, Request.END)
-    assert say(ends, said) == [Kind.OPERATOR]
-    assert say(ends, said._replace(number=NUMBER_MAX + 1), ALARM) == []
-    fly_on(ends.run, 5 * S)
-    assert ends.cloud._counts["words_dropped"] > 2
-    identity = Identity(SHARED_CLOCK, b"another".ljust(16))
-    world = ends.run._world = assembly.build_world(HOVER, identity, lambda: ends.run.now_ns)
-    fly_on(ends.run, 7 * S)
-    assert world.robot.guard.state is ESTOP
 
 
 def test_without_a_session_only_an_alarm_waits():
