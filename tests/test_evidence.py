@@ -13,8 +13,6 @@ from tools import evidence
     ("measured", "relation", "asked", "said"),
     [
         (0.252 + 1e-10, "<=", 0.252, ""),
-        (0.12, ">=", 0.12, ""),
-        (0, "==", 0, ""),
         (0.253, "<=", 0.252, "number: 0.253 s, asked <= 0.252 s"),
         (0.1, ">=", 0.12, "number: 0.1 s, asked >= 0.12 s"),
         (1, "==", 0, "number: 1 s, asked == 0 s"),
@@ -45,19 +43,16 @@ def test_the_nightly_page_shows_the_worst_of_each_number(figure, tmp_path, monke
 
 
 def test_the_nightly_page_shows_all_kinds_of_results(tmp_path, capsys):
-    for name, words in (
-        ("faults", "faults run F17"),
-        ("search-random", "faults search --minutes 0.001"),
-    ):
-        assert main([*words.split(), "-o", "json"]) == 0
-        (tmp_path / f"{name}.json").write_text(capsys.readouterr().out)
-    (tmp_path / "search-adversarial.json").touch()  # its command failed
-    (tmp_path / "tests.xml").write_text(
-        '<testsuite tests="9" failures="1" errors="0" skipped="2"/>'
-    )
-    (tmp_path / "mutants.txt").write_text(
-        "  a.x_b__mutmut_1: killed\n  a.x_b__mutmut_2: survived\n"
-    )
+    files = {
+        "search-adversarial.json": "",  # its command failed
+        "tests.xml": '<testsuite tests="9" failures="1" errors="0" skipped="2"/>',
+        "mutants.txt": "  a.x_b__mutmut_1: killed\n  a.x_b__mutmut_2: survived\n",
+    }
+    for name, words in (("faults", "run F17"), ("search-random", "search --minutes 0.001")):
+        assert main(["faults", *words.split(), "-o", "json"]) == 0
+        files[f"{name}.json"] = capsys.readouterr().out
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
     evidence.write(tmp_path)
     page = (tmp_path / "index.md").read_text()
     assert "| F17 | world-restarted | passed |" in page

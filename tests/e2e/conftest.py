@@ -119,6 +119,10 @@ def pod(component):
     return found
 
 
+def pod_name(component):
+    return str(pod(component)["metadata"]["name"])
+
+
 def identity():
     """Return UID and restart counts, which change if a pod is replaced or a container restarts."""
     found = {}
@@ -330,5 +334,5 @@ def prometheus_image(cluster):
 @cache  # measured once, because later a test may have just replaced the pod
 def pace():
     """Return how much slower than nominal Python is in the world container [1]; at least 1."""
-    words = ("exec", pod("world")["metadata"]["name"], "--container=world", "--")
+    words = ("exec", pod_name("world"), "--container=world", "--")
     return slower(kubectl(*words, "python", "-c", WORK))

@@ -7,20 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.e2e.conftest import (
-    EXAMPLES,
-    TIMES,
-    eventually,
-    fly,
-    job_end,
-    job_log,
-    kubectl,
-    metrics,
-    missions,
-    pod,
-    scrapes,
-    value,
-)
+from tests.e2e import conftest as e2e
 from tests.e2e.neighbours import install_prometheus, promtool, queries, stranger
 
 MISSION = "paper-mission"
@@ -33,23 +20,23 @@ PORTS = {"world": (9100, 9102), "cloud": (8080, 9100, 9101, 9102)}
 def first(installed, prometheus_image):
     """Observations of the first mission; two counts of malformed datagrams, by their sender."""
     install_prometheus(prometheus_image)
-    kubectl("apply", f"--filename={EXAMPLES / 'mission-paper.yaml'}")
-    eventually(lambda: "waypoint 1 of 7" in job_log(MISSION), "the mission flies", 60.0)
-    fly("second", [{"position_m": [0.5, 0.0, 0.7]}])
-    second, _ = job_end("second", 30.0)
+    e2e.kubectl("apply", f"--filename={e2e.EXAMPLES / 'mission-paper.yaml'}")
+    e2e.eventually(lambda: "waypoint 1 of 7" in e2e.job_log(MISSION), "the mission flies", 60.0)
+    e2e.fly("second", [{"position_m": [0.5, 0.0, 0.7]}])
+    second, _ = e2e.job_end("second", 30.0)
     tried = {
         "tcp": [(ip(component), port) for component, ports in PORTS.items() for port in ports],
         "udp": [(ip("world"), 7400), (ip("cloud"), 7400)],
     }
     opened, foreign = stranger("stranger", tried), malformed()
-    paper, log = job_end(MISSION)
-    seconds = time.monotonic() - TIMES["create"]
+    paper, log = e2e.job_end(MISSION)
+    seconds = time.monotonic() - e2e.TIMES["create"]
     # Show that such a datagram is counted: the cloud pod may send to world's tunnel.
     code = (
         "import socket; s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM);"
         f" s.sendto(b'not a datagram', ('{ip('world')}', 7400))"
     )
-    kubectl("exec", pod("cloud")["metadata"]["name"], "-c", "cloud", "--", "python", "-c", code)
+    e2e.kubectl("exec", e2e.pod_name("cloud"), "-c", "cloud", "--", "python", "-c", code)
     return SimpleNamespace(
         paper=paper, log=log, second=second, opened=opened, seconds=seconds,
         foreign_malformed=foreign, own_malformed=malformed(),
@@ -57,14 +44,14 @@ def first(installed, prometheus_image):
 
 
 def ip(component):
-    return str(pod(component)["status"]["podIP"])
+    return str(e2e.pod(component)["status"]["podIP"])
 
 
 def malformed():
     """Count the malformed datagrams that have reached both ends."""
     name, outcome = "cloudrc_datagrams_total", "malformed"
     time.sleep(1.2)  # the metric is updated once a second
-    return sum(value(metrics(end), name, outcome=outcome) for end in ("world", "cloud"))
+    return sum(e2e.value(e2e.metrics(end), name, outcome=outcome) for end in ("world", "cloud"))
 
 
 def test_the_papers_mission_ends_complete(first, note):
@@ -75,13 +62,13 @@ def test_the_papers_mission_ends_complete(first, note):
         assert first.log.count(f"waypoint {number} of 7 reached") == 1
     said = first.paper.message
     assert "touched" in said or "success" in said.lower()
-    described = kubectl("describe", f"--selector=batch.kubernetes.io/job-name={MISSION}", "pod")
+    described = e2e.kubectl("describe", f"--selector=batch.kubernetes.io/job-name={MISSION}", "pod")
     assert said in " ".join(described.split())
 
 
 def test_a_second_mission_is_refused_with_the_id_of_the_first(first):
     assert (first.second.state, first.second.exit_code != 0) == ("failed", True)
-    assert re.search(rf"\b{missions()[0]['id']}\b", first.second.message), first.second.message
+    assert re.search(rf"\b{e2e.missions()[0]['id']}\b", first.second.message), first.second.message
 
 
 def test_a_stranger_reaches_neither_tunnel_nor_metrics_nor_api(first):
@@ -91,7 +78,7 @@ def test_a_stranger_reaches_neither_tunnel_nor_metrics_nor_api(first):
 
 
 def test_all_metrics_are_well_formed_and_of_one_configuration(first):
-    texts = scrapes("world") | scrapes("cloud")
+    texts = e2e.scrapes("world") | e2e.scrapes("cloud")
     for container, text in texts.items():
         assert promtool("check", "metrics", given=text) == "", container
     found = {name: re.findall(r'build_info{config="(\w*)"', text) for name, text in texts.items()}

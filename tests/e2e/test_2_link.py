@@ -9,25 +9,7 @@ import yaml
 
 from cloudrc.cluster.link import send_change
 from cloudrc.link.follow import PROFILE, Handed
-from tests.e2e.conftest import (
-    CHART,
-    NAME,
-    CommandFailedError,
-    eventually,
-    fly,
-    helm,
-    identity,
-    in_release,
-    job_end,
-    job_log,
-    kubectl,
-    metrics,
-    place,
-    pod,
-    read,
-    set_link,
-    value,
-)
+from tests.e2e import conftest as e2e
 
 SET_WITHIN = 1.0
 """Time limit for `link set` until the change is in force [s]. The fastest of three calls counts,
@@ -52,29 +34,29 @@ LONG = [
     {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
 ]
 """A mission that waits at its second point for longer than the tests of this module take."""
-LINK_TEST = f"{NAME}-test-link"
+LINK_TEST = f"{e2e.NAME}-test-link"
 """Pod of `helm test` that verifies the link; Helm keeps the pod after a failure."""
 
 
 @pytest.fixture(scope="module")
 def flight(installed):
     """A mission that flies while the profiles change, and is cancelled afterwards."""
-    before = identity()
-    fly("long", LONG, limit=300.0)
-    eventually(lambda: "waypoint 1 of" in job_log("long"), "the robot is in the air", 60.0)
+    before = e2e.identity()
+    e2e.fly("long", LONG, limit=300.0)
+    e2e.eventually(lambda: "waypoint 1 of" in e2e.job_log("long"), "the robot is in the air", 60.0)
     yield
-    assert read("job", "long")["status"].get("active") == 1, "it flies still"
-    assert identity() == before, "a profile's change must not restart anything"
-    in_release("mission", "cancel")
-    end, _ = job_end("long", 30.0)
+    assert e2e.read("job", "long")["status"].get("active") == 1, "it flies still"
+    assert e2e.identity() == before, "a profile's change must not restart anything"
+    e2e.in_release("mission", "cancel")
+    end, _ = e2e.job_end("long", 30.0)
     assert (end.state, end.exit_code) == ("failed", INTERRUPTED), end
 
 
 def counts(direction):
     """Return the sum [s] and the number of the one-way delays measured so far."""
-    samples = metrics(DIRECTIONS[direction])
+    samples = e2e.metrics(DIRECTIONS[direction])
     name = f"cloudrc_{direction}_delay_seconds"
-    return value(samples, f"{name}_sum"), value(samples, f"{name}_count")
+    return e2e.value(samples, f"{name}_sum"), e2e.value(samples, f"{name}_count")
 
 
 def check_delays(wanted, seconds, what, note):
@@ -93,20 +75,17 @@ def check_delays(wanted, seconds, what, note):
 
 def changes(component):
     """Count the profiles that the link container of a pod has applied."""
-    return kubectl("logs", pod(component)["metadata"]["name"], "-c", "link").count("in force")
+    return e2e.kubectl("logs", e2e.pod_name(component), "-c", "link").count("in force")
 
 
 def change_profile(name):
-    before = {component: changes(component) for component in ("world", "cloud")}
-    helm("upgrade", NAME, str(CHART), "--reuse-values", f"--set=link.profile={name}")
-    # The kubelet updates volumes about once a minute; after a change of the pod, at once.
-    for component in before:
-        one = pod(component)["metadata"]["name"]
-        kubectl("annotate", "pod", one, "--overwrite", f"cloudrc-e2e/profile={name}")
-    for component, number in before.items():
-        eventually(
-            lambda c=component, n=number: changes(c) > n, f"{component}'s link follows", 90.0
-        )
+    before = {component: changes(component) for component in e2e.ENDS}
+    e2e.helm("upgrade", e2e.NAME, str(e2e.CHART), "--reuse-values", f"--set=link.profile={name}")
+    for end, number in before.items():
+        # The kubelet updates volumes about once a minute; after a change of the pod, at once.
+        note = f"cloudrc-e2e/profile={name}"
+        e2e.kubectl("annotate", "pod", e2e.pod_name(end), "--overwrite", note)
+        e2e.eventually(lambda e=end, n=number: changes(e) > n, f"{end}'s link follows", 90.0)
 
 
 @pytest.mark.parametrize(("profile", "wanted", "seconds"), PROFILES)
@@ -121,12 +100,12 @@ def test_the_link_is_set_by_hand_and_read_back(flight, note):
     took = []
     try:
         for delay in (80, 120):
-            told = set_link(f"downlink.delay_ms={delay}", "downlink.jitter_ms=0")
+            told = e2e.set_link(f"downlink.delay_ms={delay}", "downlink.jitter_ms=0")
             took.append(told["seconds"])
         assert told["links"]["downlink"]["asked"]["delay"] == 0.12
         check_delays({"downlink": 0.12}, 5.0, "set by hand", note)
     finally:
-        told = set_link("--profile", "paper-p2")
+        told = e2e.set_link("--profile", "paper-p2")
         took.append(told["seconds"])
     seconds = ", ".join(f"{each:.2f} s" for each in took)
     note(f"link set: asked {SET_WITHIN:g} s | in force after {seconds}")
@@ -134,8 +113,8 @@ def test_the_link_is_set_by_hand_and_read_back(flight, note):
     assert told["links"]["downlink"]["asked"]["delay"] == 0.045
     # Cloud notes a change of the downlink for its recording. The uplink has not changed.
     said = "link: downlink 45 ± 25 ms (profile paper-p2)"
-    log = ("logs", pod("cloud")["metadata"]["name"], "-c", "cloud")
-    eventually(lambda: said in kubectl(*log), "cloud notes the change", 5.0)
+    log = ("logs", e2e.pod_name("cloud"), "-c", "cloud")
+    e2e.eventually(lambda: said in e2e.kubectl(*log), "cloud notes the change", 5.0)
 
 
 @pytest.mark.full
@@ -143,19 +122,22 @@ def test_helm_test_refuses_a_link_whose_delay_was_doubled(flight, note):
     """Only cloud's link container gets the doubled delay; the profile of the release stays."""
     began = time.monotonic()
     try:
-        told = set_link("downlink.delay_ms=46")  # earlier datagrams are not judged after a change
+        # Earlier datagrams are not judged after a change.
+        told = e2e.set_link("downlink.delay_ms=46")
         profile = told["links"]["downlink"]["profile"]
         profile["downlink"]["delay_ms"] = 92
         change = {"number": str(time.time_ns()), "cause": "a seeded fault", "restart": False}
         handed = Handed(json.dumps(change), {PROFILE: yaml.safe_dump(profile)})
-        state = json.loads(send_change(place(), str(pod("cloud")["metadata"]["name"]), handed))
+        state = json.loads(send_change(e2e.place(), e2e.pod_name("cloud"), handed))
         assert state["change"] == change["number"], state
-        with pytest.raises(CommandFailedError):
-            helm("test", NAME, f"--filter=name={LINK_TEST}", "--timeout=300s", timeout=320.0)
-        said = kubectl("logs", LINK_TEST)
+        with pytest.raises(e2e.CommandFailedError):
+            e2e.helm(
+                "test", e2e.NAME, f"--filter=name={LINK_TEST}", "--timeout=300s", timeout=320.0
+            )
+        said = e2e.kubectl("logs", LINK_TEST)
     finally:
-        set_link("--profile", "paper-p2")
-        kubectl("delete", "pod", LINK_TEST, "--ignore-not-found", "--wait=false")
+        e2e.set_link("--profile", "paper-p2")
+        e2e.kubectl("delete", "pod", LINK_TEST, "--ignore-not-found", "--wait=false")
     note(f"helm test, a doubled downlink: refused within {time.monotonic() - began:.0f} s")
     assert "NOT BELIEVED" in said
     causes = set(re.findall(r"^ *(\w+): .*  \[(\w+)\]$", said, re.MULTILINE))
