@@ -42,12 +42,6 @@ def test_the_configmap_loads_as_the_same_experiment(name, experiment, profile):
     assert (link.uplink, link.downlink) == (resolved.uplink, resolved.downlink)
 
 
-def test_the_default_experiment_is_the_papers_scheme(experiment):
-    loaded, paper = experiment(), load_experiment("paper")
-    for key in ("mission", "world", "guard", "tunnel", "link", "cloud", "criteria"):
-        assert getattr(loaded, key) == getattr(paper, key)
-
-
 def test_a_profile_replaces_the_experiments_link(profile):
     loss = {"bad_start": 0.1, "bad_end": 0.5}
     link = {"profile": "wifi", "uplink": {"delay_ms": 80, "loss": loss}}

@@ -80,23 +80,6 @@ def test_annotations_and_placement_of_the_user_are_used():
         assert pod["metadata"]["annotations"].items() > inject.items()
 
 
-def test_the_link_is_a_native_sidecar_for_its_pods_egress():
-    pods = pod_specs(render())
-    for end, direction, peer in (("world", "uplink", "cloud"), ("cloud", "downlink", "world")):
-        (link,) = pods[end]["initContainers"]
-        assert (link["name"], link["restartPolicy"]) == ("link", "Always")
-        mounts = {mount["mountPath"]: mount["name"] for mount in link["volumeMounts"]}
-        assert mounts["/etc/cloudrc-link"] == "link"
-        assert "--route=/run/cloudrc/route" in containers(pods[end])[end]["args"]
-        assert {
-            f"--direction={direction}",
-            f"--peer=demo-cloudrc-{peer}:7400",
-            "--end=127.0.0.1:7400",
-            "--route=/run/cloudrc/route",
-            "--profile=/etc/cloudrc-link/profile.yaml",
-        } <= set(link["args"])
-
-
 def test_the_command_line_accepts_every_containers_arguments():
     load = {"backgroundLoad": {"enabled": True, "workers": 3}}
     pods = pod_specs(render({"mission": {"enabled": True, "queue": True}, "cloud": load}))

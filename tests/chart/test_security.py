@@ -83,15 +83,6 @@ def test_security_contexts_can_be_left_out_or_changed():
         assert pod["securityContext"]["runAsNonRoot"] is True
 
 
-def test_service_accounts_are_made_or_named():
-    made = render()
-    names = {thing["metadata"]["name"] for thing in of_kind(made, "ServiceAccount").values()}
-    assert names == {pod["serviceAccountName"] for pod in pod_specs(made).values()}
-    taken = render({"serviceAccount": {"create": False, "name": "robots"}})
-    assert not of_kind(taken, "ServiceAccount")
-    assert {pod["serviceAccountName"] for pod in pod_specs(taken).values()} == {"robots"}
-
-
 def test_probes_use_the_metrics_port_and_liveness_needs_no_peer():
     asked = {"startupProbe": "/healthz", "livenessProbe": "/healthz", "readinessProbe": "/readyz"}
     for thing in of_kind(render(), "Deployment").values():

@@ -31,21 +31,6 @@ def test_the_schema_is_closed_at_every_level():
         assert extra is False or (isinstance(extra, dict) and extra.get("type")), path
 
 
-UNITS = {"_m": "[m]", "_ms": "[ms]", "_s": "[s]", "_deg": "[deg]", "_kbit": "[kbit/s]"}
-OF_NO_UNIT = ("[", "port", "Number of", "Packets", "random")
-
-
-def test_every_value_has_a_description_with_its_unit():
-    for path, part in parts(SCHEMA):
-        for name, value in part.get("properties", {}).items():
-            target = SCHEMA["$defs"].get(value.get("$ref", "").rpartition("/")[2], {})
-            text = value.get("description") or target.get("description")
-            assert text, (*path, name)
-            assert all(unit in text for end, unit in UNITS.items() if name.endswith(end)), name
-            if value.get("type") == "integer" and path[:2] != ("$defs", "Experiment"):
-                assert any(word in text for word in OF_NO_UNIT), (*path, name)
-
-
 def test_the_defaults_are_valid_and_written_out():
     assert render({"global": {"anything": {"goes": True}}}), "values of a parent chart"
     assert DEFAULTS.keys() == SCHEMA["properties"].keys() - {"global"}

@@ -40,15 +40,6 @@ def test_a_dump_loads_to_the_same(experiment, profile, tmp_path):
     assert changed == load_experiment(experiment, ["link.profile=paper-p3"])
 
 
-def test_a_dump_needs_no_profile_file(tmp_path):
-    profile = tmp_path / "mine.yaml"
-    profile.write_text("uplink: {delay_ms: 12}\n")
-    loaded = load_experiment("paper", [f"link.profile={profile}"])
-    profile.unlink()
-    assert again(loaded, tmp_path) == loaded
-    assert loaded.uplink.delay_ms == 12
-
-
 def test_paper_is_the_published_scheme():
     paper = load_experiment("paper")
     assert (paper.link.profile, paper.tunnel.order) == ("paper-p2", "newest")
@@ -90,11 +81,6 @@ def test_single_values_override_the_profile(tmp_path):
     assert (other.uplink.delay_ms, other.uplink.jitter_ms) == (120, 10)
 
 
-def test_set_turns_a_name_into_a_mapping():
-    controller = load_experiment("paper", ["cloud.controller.speed_max=2"]).cloud.controller
-    assert (controller.name, controller.model_extra["speed_max"]) == ("pid", 2.0)
-
-
 def test_set_reaches_into_lists_by_index():
     waypoints = load_experiment("paper", ["mission.waypoints.0.tolerance_m=.2"]).mission.waypoints
     assert [point.tolerance_m for point in waypoints[:2]] == [0.2, 0.3]
@@ -116,11 +102,6 @@ def test_a_value_may_be_a_number_a_list_or_quoted():
     values = {"1e-3": 0.001, "true": True, "": None, "[1, 'a #']": [1, "a #"], '"5"': "5"}
     assert {text: parse_value(text, "x") for text in values} == values
     assert parse_value("a: 1\nb: 2", "x") == {"a": 1, "b": 2}
-
-
-def test_the_order_of_settings_does_not_matter():
-    texts = ["mission.steps.count=3", "mission=steps", "world.scene=empty"]
-    assert load_experiment("paper", texts) == load_experiment("paper", texts[::-1])
 
 
 def test_paths_start_at_the_file_that_names_them(tmp_path, monkeypatch):
@@ -169,16 +150,6 @@ plain = st.recursive(
 @given(plain)
 def test_written_yaml_parses_to_equal_values(value):
     assert document.parse_yaml(document.write_yaml(value), "text")[0] == value
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [("1e-3", 1e-3), ("on", "on"), ("12:30", "12:30"), ("~", None), ("true", True),
-     ("2024-01-01", "2024-01-01"), ("010", 10), ("'1'", "1")],
-)  # fmt: skip
-def test_scalars_follow_yaml_1_2(text, value):
-    found = document.parse_yaml(text, "text")[0]
-    assert (found, type(found)) == (value, type(value))
 
 
 def test_a_configuration_has_the_hash_of_its_file(tmp_path):

@@ -9,7 +9,6 @@ from cloudrc import plugins
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.schema import PlugIn
-from cloudrc.errors import BadInputError
 from tests.config.conftest import refused
 
 SOURCE = '''"""Looks ahead by a share of the horizon.
@@ -46,12 +45,6 @@ def test_every_shipped_plug_in_has_a_line(kind):
         assert not name.startswith("_")
         assert not plugins.describe(kind, name).startswith(("(not usable", " "))
         assert plugins.describe(kind, name)
-
-
-@pytest.mark.parametrize("name", ["_rotation", "os", "..", ""])
-def test_helpers_and_other_modules_are_refused(name):
-    with pytest.raises(BadInputError):
-        plugins.load("predictors", name)
 
 
 def test_a_plug_in_is_loaded_by_path(share):

@@ -197,8 +197,8 @@ def save(folder):
     """Save objects, events, logs and recordings after a failure."""
     names = f"--namespaces={','.join(NAMESPACES)}"
     command("kubectl", "cluster-info", "dump", names, f"--output-directory={folder}")
-    for component in ENDS:
-        fetch_recording(place(), component, folder / f"{component}.mcap")
+    for end in ENDS:
+        fetch_recording(place(), end, folder / f"{end}.mcap")
 
 
 CLUSTER = "cloudrc-e2e"

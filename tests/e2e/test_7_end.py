@@ -1,23 +1,8 @@
 """The commands in helm's notes work, `helm test` passes, uninstalling leaves only Secrets."""
 
-import shlex
-
-import pytest
-
-from tests.e2e.conftest import EXAMPLES, NAME, cloudrc, command, eventually, helm, kubectl, read
+from tests.e2e.conftest import EXAMPLES, NAME, eventually, helm, kubectl, read
 
 KINDS = "deployment,service,configmap,networkpolicy,secret,serviceaccount,pvc,job,pod"
-
-
-@pytest.mark.full
-def test_the_commands_of_the_notes_work_as_printed(installed):
-    """Each command ends by itself; the second one flies `pipes`, for half a minute."""
-    printed = [line for line in helm("get", "notes", NAME).splitlines() if line.startswith("  ")]
-    wait, mission, logs = (shlex.split(line) for line in printed)
-    assert "condition met" in command(*wait)
-    done = cloudrc(*mission[1:])
-    assert (mission[0], done.returncode) == ("cloudrc", 0), done.stdout + done.stderr
-    assert command(*logs).strip(), "the link names its shaper"
 
 
 def test_helm_test_flies_and_passes(installed):

@@ -6,18 +6,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.faults import invariants
-from cloudrc.faults.adversary import POLICIES, choose, dishonesty
+from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import FORGETFUL, OrderInvariant, checked_in, fly
-from cloudrc.messages import ZERO, GuardState, Request, Start
+from cloudrc.messages import ZERO
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
-from cloudrc.world.guard import state
 from cloudrc.world.guard.limits import Limits as GuardLimits
-from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
 
 MS = 1_000_000
@@ -41,23 +38,6 @@ def test_random_faults_break_no_invariant(seed):
 def test_a_hostile_cloud_causes_no_breach(policy):
     seed = next(seed for seed in range(1, 30) if choose(seed).policy == policy)
     assert fly(replace(choose(seed), duration=8.0)).breaches == ()
-
-
-def test_a_hostile_cloud_makes_every_request():
-    _, words = dishonesty(Schedule(27, policy="operators-voice"))
-    assert words is not None
-    seen = [SimpleNamespace(guard=each, position=(1.0, 1.0, 1.0)) for each in GuardState]
-    said = [words(n * 10_000 * MS, robot) for n, robot in enumerate(seen * 300)]
-    made = {(request.request, request.start) for request in said if request is not None}
-    assert made == {(each, Start.SPAWN) for each in Request} | {(Request.START, Start.HERE)}
-
-
-@pytest.mark.promise("stays-inside-the-fence")
-@pytest.mark.parametrize("seed", [2, *nightly(*range(3, 40))])
-def test_it_causes_none_with_a_stiffer_low_level_controller(seed):
-    """Three times the default integral removes the steady error of 32 mm."""
-    hostile = replace(choose(seed), events=(), duration=15.0)
-    assert fly(hostile, "world.low_level.integral_limit_xy=0.30").breaches == ()
 
 
 BLACKOUT, STOPPED = Event("blackout", 44.0, 8.0), Event("stopped", 5.0)
@@ -86,30 +66,14 @@ HELD = Schedule(
         *(Event("blackout", at, lasts) for at, lasts in ((6.0, 0.4), (6.8, 0.3), (9.5, 1.5))),
         *(Event("stopped", 12.0), Event("blackout", 15.0, 3.0)),
     ),
-    duration=21.0,
+    duration=30.0,
     hold_max=2.0,
 )
 """Several HOLDs, a stop, and a LAND."""
 
 
-def limits(**changes):
-    """Judge by other limits than those of the guard."""
-    wrong = Limits(hold_ns=2000 * MS)._replace(**changes)
-    return lambda patch: patch.setattr(Limits, "of", lambda guard: wrong)
-
-
 def ignores(owner, name, value=lambda *_: None):
     return lambda patch: patch.setattr(owner, name, value)
-
-
-def needs_no_start(patch):
-    accept = Guard.accept_command
-
-    def arm(guard, command, now_ns):
-        guard.armed = guard.armed or guard.state is GuardState.GROUND
-        return accept(guard, command, now_ns)
-
-    patch.setattr(Guard, "accept_command", arm)
 
 
 def applies_late_commands(patch):
@@ -128,20 +92,11 @@ def fails_to_shut_down(patch):
     ("breaks", "kind", "schedule"),
     [
         (lambda patch: None, "", HELD),
-        (
-            ignores(invariants, "HIGH", (1.2, 1.2, 1.2)),
-            "fence",
-            Schedule(8, "ideal", policy="towards-a-face", duration=8.0),
-        ),
-        (limits(age_ns=50 * MS), "stale", replace(HELD, duration=3.0)),
-        (limits(speed=0.1), "cap", replace(HELD, duration=3.0)),
         (ignores(GuardLimits, "ramp_ns", 0), "cap", replace(HELD, duration=9.0)),
-        (ignores(state, "SETTLE_NS", 0), "hold", replace(HELD, duration=9.0)),
         (ignores(GuardLimits, "alone_max_ns", lambda *_: 3_600_000 * MS), "hold", HELD),
-        (needs_no_start, "latch", HELD),
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
-        (ignores(MissionService, "stop_rotors"), "obeyed", replace(HELD, duration=30.0)),
-        (ignores(MissionService, "acknowledge"), "stuck", replace(HELD, duration=30.0)),
+        (ignores(MissionService, "stop_rotors"), "obeyed", HELD),
+        (ignores(MissionService, "acknowledge"), "stuck", HELD),
         (
             fails_to_shut_down,
             "error",

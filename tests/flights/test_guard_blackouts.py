@@ -5,14 +5,11 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from cloudrc.config.load import load_experiment
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, silent
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import load_scene
-from cloudrc.records import GuardChange
 from tests.conftest import nightly
-from tests.flights.conftest import MS, fly_on, join
 
 COUNT = 200
 LAST = 27.0
@@ -91,11 +88,10 @@ def test_without_its_cloud_the_robot_stops_wherever_it_is(k, kill, figure):
 
 
 @pytest.mark.parametrize(
-    ("way", "at", "duration"),
-    [("uplink", 11.3, 0.3), ("uplink", 22.1, 5.0), ("downlink", 28.85, 20.0)],
+    ("way", "at", "duration"), [("uplink", 22.1, 5.0), ("downlink", 28.85, 20.0)]
 )
 def test_a_silence_of_one_direction_touches_nothing(way, at, duration):
-    """In pipe 1 at speed, at the second bend, and before the board."""
+    """At the second bend, and before the board."""
     flight = cut_off(at, duration, "cloud.controller.speed_max=2", ways=(way,)).fly_mission(200.0)
     is_flown(flight)
     assert len(measures.held(flight)) == 1
@@ -114,17 +110,6 @@ def test_a_silence_of_one_direction_touches_nothing(way, at, duration):
 def test_a_start_without_commands(settings, until, states):
     flight = Flight(*settings).fly(until)
     assert [change.state.name for change in flight.changes] == states
-
-
-def test_a_lost_downlink_lands_the_robot_and_ends_the_run():
-    lost = "link.downlink.blackouts=[{start_s: 3, duration_s: 1000}]"
-    ends = join(load_experiment("paper", [lost, "guard.hold_max_s=1"]))
-    of_world, _ = fly_on(ends.run, 30_000 * MS, lambda: ends.cloud.mission_over)
-    changes = [r for r in of_world if isinstance(r, GuardChange)]
-    assert [r.state.name for r in changes[-3:]] == ["HOLD", "LAND", "LAND"]
-    assert changes[-1].cause == "touched down, rotors stopped"
-    assert ends.cloud.teleop.outcome.event == "guard_stopped"
-    assert ends.cloud.mission_over
 
 
 def test_a_flight_without_faults_never_meets_the_fence():

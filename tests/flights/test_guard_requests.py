@@ -90,18 +90,6 @@ def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
     assert len(talk.take(CommandApplied)) == applied + 1
 
 
-def test_contacts_are_reported_until_the_next_mission_starts(talk):
-    """Cloud may die right after the touch; the next cloud must learn of it."""
-    ask(talk, 2, Request.END)
-    talk.world._orders.pipes = 1
-    talk.wait(300)
-    talk.hello("another")
-    for number, mission_id, contacts in ((3, 0, 1), (4, 7, 0)):
-        talk.request(number, Request.START, Start.HERE, mission_id)
-        talk.wait(20)
-        assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == contacts
-
-
 def test_commands_of_an_earlier_cloud_do_not_count(talk):
     """Nine fresh commands of one cloud and one of another do not prove a link."""
     fly(talk, 100)

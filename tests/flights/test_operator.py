@@ -8,8 +8,7 @@ from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Sta
 from cloudrc.records import GuardChange
 from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel.codec import Kind, peek
-from cloudrc.tunnel.end import Identity
-from tests.flights.conftest import HOVER, SHARED_CLOCK, fly_on, join
+from tests.flights.conftest import HOVER, fly_on, join
 
 S = 1_000_000_000
 ELSEWHERE = (5.0, 5.0, 1.0)
@@ -59,14 +58,6 @@ def test_requests_that_arm_nothing_are_always_passed_on(ends):
     ends.cloud._loop.reset()  # as a new session does: no telemetry yet
     start, stop = OperatorRequest(99, Request.START), OperatorRequest(99, Request.END)
     assert (say(ends, start), say(ends, stop)) == ([], [Kind.OPERATOR])
-
-
-def test_without_a_session_only_an_alarm_waits():
-    cloud = assembly.build_cloud(HOVER, Identity(SHARED_CLOCK, b"cloud".ljust(16)))
-    cloud.teleop.outputs += [OperatorRequest(3, Request.START), ALARM]
-    for now_ns in range(0, S, 10_000_000):
-        cloud.handle_deadline(now_ns)
-    assert {peek(data)[0] for data in cloud.take_datagrams()} == {Kind.HELLO}
 
 
 def test_an_early_alarm_keeps_the_robot_on_the_ground():

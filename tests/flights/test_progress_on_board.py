@@ -1,24 +1,12 @@
 """Flights in virtual time: the robot stores its mission's progress, and a stuck leg fails."""
 
 from cloudrc import assembly
-from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Mission
 from cloudrc.messages import Request, Start
-from cloudrc.records import MissionEvent, TelemetrySent
-from tests.flights.conftest import MS, Bare, records, ring
+from cloudrc.records import TelemetrySent
+from tests.flights.conftest import Bare, ring
 
 ID = 2**62 + 5
-
-
-def test_the_robot_stores_every_waypoint_reached():
-    world, cloud = records(load_experiment("paper"))
-    reached = [r.stamp_ns for r in cloud if isinstance(r, MissionEvent) and r.event == "reached"]
-    shown = {}
-    for record in world:
-        if isinstance(record, TelemetrySent):
-            shown.setdefault(record.telemetry.reached, record.stamp_ns)
-    assert sorted(shown) == list(range(len(reached) + 1))
-    assert all(0 < shown[n] - when_ns < 300 * MS for n, when_ns in enumerate(reached, 1))
 
 
 def ask(talk, request, number=0, *, start=Start.HERE, **fields):
