@@ -5,10 +5,7 @@ import copy
 import pytest
 import yaml
 
-import cloudrc
 from cloudrc.config.load import load_experiment
-from cloudrc.config.mission_check import check_mission
-from cloudrc.geometry.scene import load_scene
 from tests.chart.conftest import CHART, of_kind, pod_specs, render
 
 EXAMPLES = {
@@ -84,22 +81,6 @@ def test_only_another_mission_makes_another_job():
     names = [job["metadata"]["name"] for values in given for job in jobs(values)]
     assert names[0] == names[1]
     assert len(set(names)) == 3
-
-
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_an_example_fits_the_release_of_the_readme(name, tmp_path):
-    release = {t["metadata"]["name"]: t for t in render(release="cloudrc") if t["kind"] != "Secret"}
-    config, job = EXAMPLES[name]
-    pod = job["spec"]["template"]
-    (container,) = pod["spec"]["containers"]
-    assert "cloudrc-api" in release
-    assert "--api=http://cloudrc-api:8080" in container["args"]
-    assert container["image"] == f"cloudrc/cloud:{cloudrc.__version__}"
-    assert pod["spec"]["volumes"][0]["configMap"]["name"] == config["metadata"]["name"]
-    selected = release["cloudrc-mission"]["spec"]["podSelector"]["matchLabels"]
-    assert selected.items() <= pod["metadata"]["labels"].items()
-    (tmp_path / "mission.yaml").write_text(config["data"]["mission.yaml"])
-    assert check_mission(load(tmp_path / "mission.yaml"), load_scene("pipes")) == []
 
 
 def test_the_chart_makes_the_job_of_the_example():

@@ -81,15 +81,3 @@ def test_security_contexts_can_be_left_out_or_changed():
     for pod in pod_specs(render({"podSecurityContext": {"runAsUser": 12_345}})).values():
         assert pod["securityContext"]["runAsUser"] == 12_345
         assert pod["securityContext"]["runAsNonRoot"] is True
-
-
-def test_probes_use_the_metrics_port_and_liveness_needs_no_peer():
-    asked = {"startupProbe": "/healthz", "livenessProbe": "/healthz", "readinessProbe": "/readyz"}
-    for thing in of_kind(render(), "Deployment").values():
-        for container in containers(thing["spec"]["template"]["spec"]).values():
-            ports = {port["name"] for port in container["ports"]}
-            for probe, path in asked.items():
-                get = container[probe]["httpGet"]
-                assert get["path"] == path
-                assert get["port"] in ports
-                assert get["port"].endswith("metrics")

@@ -61,7 +61,3 @@ def test_a_cluster_that_is_too_old_is_reported(api, capsys, minor, code):
     assert not code or "needs 1.29" in cluster["fix"]
     wanted = yaml.safe_load(CHART.read_text())["kubeVersion"]
     assert wanted.startswith(">={}.{}.0-0 ".format(*OLDEST))
-
-
-def test_other_modes_contact_no_cluster():
-    assert not {"cluster", "kubeconfig"} & {check.name for check in checks.all_checks("local")}

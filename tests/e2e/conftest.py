@@ -31,8 +31,6 @@ NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring", f"{NAMESPACE}-bad")
 NAME = "cloudrc"
 ENDS = ("world", "cloud")
 RESTRICTED = {"pod-security.kubernetes.io/enforce": "restricted"}
-SUMMARY: list[str] = []
-"""Lines that pytest prints after the tests."""
 TIMES: dict[str, float] = {}
 """Event of the test session -> its time on the monotonic clock [s]."""
 
@@ -225,12 +223,6 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(scope="session")
-def note():
-    """A function that adds a line to the summary."""
-    return SUMMARY.append
-
-
-@pytest.fixture(scope="session")
 def cluster(request):
     """A cluster with the images: the one of KUBECONFIG, or else a new kind cluster."""
     own = "KUBECONFIG" not in os.environ
@@ -268,9 +260,9 @@ def cluster(request):
 def _create():
     if CLUSTER in command("kind", "get", "clusters").split():
         command("kind", "export", "kubeconfig", f"--name={CLUSTER}")
-        return
-    config = ROOT / "kind-config.yaml"
-    command("kind", "create", "cluster", f"--name={CLUSTER}", "--config", config, timeout=300)
+    else:
+        line = ("kind", "create", "cluster", f"--name={CLUSTER}", "--config")
+        command(*line, ROOT / "kind-config.yaml", timeout=300)
 
 
 def _load():
@@ -289,16 +281,9 @@ def pytest_runtest_makereport(item, call):
         try:
             save(folder)
         except (AssertionError, CloudrcError, subprocess.SubprocessError, OSError) as error:
-            SUMMARY.append(f"nothing more could be saved of {item.name}: {error}")
-        SUMMARY.append(f"{item.name} FAILED: see {folder.relative_to(ROOT)}")
+            report.sections.append(("end to end", f"nothing more could be saved: {error}"))
+        report.sections.append(("end to end", f"see {folder.relative_to(ROOT)}"))
     return report
-
-
-def pytest_terminal_summary(terminalreporter):
-    if SUMMARY:
-        terminalreporter.section("end to end")
-        for line in SUMMARY:
-            terminalreporter.write_line(line)
 
 
 @pytest.fixture(scope="session")
@@ -318,10 +303,8 @@ def values(tmp_path_factory):
 def installed(cluster, values):
     """The release that most tests use."""
     kubectl("delete", "jobs", "--all")  # of an earlier session, where the cluster was kept
-    began = time.monotonic()
     helm("upgrade", "--install", NAME, str(CHART), f"--values={values}")
     wait_ready(place(), timeout=120.0)
-    SUMMARY.append(f"helm install until both pods are ready: {time.monotonic() - began:.0f} s")
 
 
 @pytest.fixture(scope="session")

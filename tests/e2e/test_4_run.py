@@ -27,10 +27,9 @@ print(json.dumps(found))
 
 
 @pytest.mark.parametrize(("role", "holds"), [("world", ["mujoco"]), ("cloud", [])])
-def test_an_image_is_small_and_holds_no_more_than_its_role_needs(cluster, note, role, holds):
+def test_an_image_is_small_and_holds_no_more_than_its_role_needs(cluster, role, holds):
     image = f"cloudrc/{role}:{__version__}"
     size = int(command("docker", "image", "inspect", "--format={{.Size}}", image)) / 1e6
-    note(f"image {role}: asked {SIZES[role]} MB | {size:.0f} MB")
     assert size <= SIZES[role]
     look = ["docker", "run", "--rm", "--user=0", "--entrypoint=python", image, "-c", LOOK]
     assert json.loads(command(*look)) == holds
@@ -43,9 +42,7 @@ def test_an_image_is_small_and_holds_no_more_than_its_role_needs(cluster, note, 
         pytest.param("paper", "seed=1", "contact_time", marks=pytest.mark.full),
     ],
 )
-def test_a_run_in_a_cluster_is_that_of_virtual_time(
-    installed, tmp_path, note, name, setting, instant
-):
+def test_a_run_in_a_cluster_is_that_of_virtual_time(installed, tmp_path, name, setting, instant):
     done = cloudrc("doctor", "--mode", "cluster", "-o", "json")
     found = {check["name"]: check["state"] for check in json.loads(done.stdout)["checks"]}
     assert (done.returncode, found["kubeconfig"], found["cluster"]) == (0, "ok", "ok")
@@ -61,7 +58,6 @@ def test_a_run_in_a_cluster_is_that_of_virtual_time(
     assert (document["shaper"], document["complete"]) == ("relay", True)
     real = {name: entry["value"] for name, entry in document["numbers"].items()}
     virtual = numbers(fly(name, setting))
-    note(f"{name}: {instant} {real[instant]:.2f} s, in virtual time {virtual[instant]:.2f} s")
     assert real[instant] == pytest.approx(virtual[instant], rel=TIME_TOLERANCE)
     for mean in ("uplink_delay_mean", "downlink_delay_mean"):
         assert real[mean] == pytest.approx(virtual[mean], abs=DELAY_TOLERANCE)

@@ -53,21 +53,14 @@ def scaled(name, component):
     ("name", "component"),
     [("constrained-drone", "world"), pytest.param("loaded-cloud", "cloud", marks=pytest.mark.full)],
 )
-def test_a_constrained_part_is_throttled_yet_keeps_real_time(constrained, note, name, component):
+def test_a_constrained_part_is_throttled_yet_keeps_real_time(constrained, name, component):
     plain = throttled(component)
     code, report = constrained(name, *scaled(name, component))
     assert (code, report["verdict"]) == (0, "success"), report
-    numbers = {key: entry["value"] for key, entry in report["numbers"].items()}
     stopped = throttled(component)
-    note(
-        f"{name}: throttled {stopped:.2f} s (unconstrained: {plain:.2f} s),"
-        f" lateness p99 {numbers[f'{component}_lateness_p99'] * 1e3:.1f} ms,"
-        f" prediction error {numbers['prediction_error_rms'] * 1e3:.1f} mm,"
-        f" real-time factor {numbers['real_time_factor']:.3f}"
-    )
     assert stopped > RATIO_MIN * plain
     assert stopped > 0
-    assert numbers["real_time_factor"] >= 0.95
+    assert report["numbers"]["real_time_factor"]["value"] >= 0.95
 
 
 @pytest.mark.full

@@ -1,7 +1,5 @@
 """Each problem of a cluster ends in one sentence and the right exit code."""
 
-import subprocess
-
 import pytest
 
 from tests.e2e.conftest import CHART, NAMESPACE, apply, cloudrc, command
@@ -33,21 +31,3 @@ def test_an_image_that_is_not_loaded_is_named(namespace):
     assert code == 5
     assert "cloudrc/world:0.0.0-missing" in line or "cloudrc/cloud:0.0.0-missing" in line
     assert "make kind-load" in line
-
-
-@pytest.mark.full
-def test_netem_without_kernel_support_is_refused_with_advice(namespace):
-    if has_netem():
-        pytest.skip("this kernel has sch_netem")
-    code, line = refused("no-netem", "--set=link.mode=netem")
-    assert code == 5
-    assert "sch_netem" in line
-    assert "relay" in line
-
-
-def has_netem():
-    nodes = command("kubectl", "get", "nodes", "--output=jsonpath={.items[0].metadata.name}")
-    probe = "ip link add probe0 type dummy && tc qdisc add dev probe0 root netem delay 1ms"
-    done = subprocess.run(["docker", "exec", nodes, "sh", "-c", probe], capture_output=True)
-    subprocess.run(["docker", "exec", nodes, "ip", "link", "delete", "probe0"], capture_output=True)
-    return done.returncode == 0

@@ -4,8 +4,6 @@ import os
 import re
 import subprocess
 import sys
-import time
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -47,24 +45,6 @@ def test_the_clocks_of_the_ends_need_not_agree():
         assert np.array_equal(ours[topic]["stamp_ns"], theirs[topic]["stamp_ns"])
     assert np.array_equal(ours["/ground_truth"]["position"], theirs["/ground_truth"]["position"])
     assert np.isnan(theirs["/uplink_delay"]["delay"]).all()
-
-
-CLOCKS = (
-    lambda call, now: now + 3600.0 * (-1) ** call,  # steps at every look
-    lambda call, now: 0.0,
-    lambda call, now: 2e9 - now,  # runs backwards
-)
-
-
-@pytest.mark.promise("wall-clock-does-not-matter")
-def test_the_flight_is_the_same_whatever_the_wall_clock_does(monkeypatch, figure):
-    experiment = load_experiment("hover", ["mission.waypoints.0.dwell_s=0.5", "link.profile=wifi"])
-    undisturbed, true, calls = digest(experiment), time.time, count()
-    for clock in CLOCKS:
-        monkeypatch.setattr(time, "time", lambda clock=clock: clock(next(calls), true()))
-        monkeypatch.setattr(time, "time_ns", lambda: int(time.time() * 1e9))
-        differs = int(digest(experiment) != undisturbed)
-        figure("steps and drifts of the wall clock: flights that differ", differs, "==", 0)
 
 
 WALL = re.compile(

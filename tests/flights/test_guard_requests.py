@@ -88,19 +88,3 @@ def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
     talk.request(2, Request.ESTOP, Start.HERE)
     talk.wait(20)
     assert len(talk.take(CommandApplied)) == applied + 1
-
-
-def test_commands_of_an_earlier_cloud_do_not_count(talk):
-    """Nine fresh commands of one cloud and one of another do not prove a link."""
-    fly(talk, 100)
-    ask(talk, 2, Request.END)
-    talk.request(3, Request.START, Start.HERE)
-    talk.wait(1_000)
-    fly(talk, 9)
-    talk.wait(260)
-    assert talk.hello("another") > 0
-    fly(talk, 2)
-    assert talk.take(GuardChange)[-1].state is GuardState.HOLD
-    fly(talk, 8)
-    talk.wait(10)
-    assert talk.take(GuardChange)[-1].state is GuardState.TRACK

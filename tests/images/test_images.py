@@ -1,6 +1,5 @@
 """Dockerfiles and locks: pinned versions, and small images."""
 
-import os
 import re
 import shutil
 import subprocess
@@ -55,18 +54,6 @@ def test_every_package_has_a_hash_and_no_address(lock):
     assert "://" not in text
 
 
-@pytest.mark.parametrize("role", ROLES)
-def test_a_dockerfile_has_stages_and_an_unprivileged_user(role):
-    text = (ROOT / "images" / role / "Dockerfile").read_text()
-    build, final = text.split("\nFROM ")[1:]
-    assert "ARG BASE=python:3.11-slim-bookworm\n" in text
-    assert "--require-hashes" in build
-    assert "USER 10001:10001" in final
-    assert 'ENTRYPOINT ["cloudrc"]' in final
-    for label in ("version", "source", "licenses", "revision"):
-        assert f"org.opencontainers.image.{label}=" in final
-
-
 def test_hadolint_is_silent():
     hadolint = shutil.which("hadolint", path=str(Path(sys.executable).parent))
     if hadolint is None:
@@ -83,12 +70,3 @@ def test_the_build_context_has_only_what_images_need():
         for sources in re.findall(r"^COPY (?!--from)(.*) \S+$", path.read_text(), re.MULTILINE):
             copied |= {source.split("/")[0] for source in sources.split()}
     assert copied == kept
-
-
-def test_e2e_names_the_missing_programs(tmp_path):
-    command = [sys.executable, "-m", "pytest", "-m", "e2e", "tests/e2e/test_7_end.py", "-q"]
-    environ = {**os.environ, "PATH": str(tmp_path), "KUBECONFIG": str(tmp_path / "none")}
-    done = subprocess.run(command, cwd=ROOT, env=environ, capture_output=True, text=True)
-    assert done.returncode == 3
-    for tool in ("docker", "kind", "helm", "kubectl"):
-        assert f"{tool}: https://" in done.stdout + done.stderr
