@@ -29,6 +29,7 @@ class FakeApi:
         self.logs = {}
         self.refuse = {}
         self.seen = []
+        self.hooks = []  # each gets the path that is read; what it returns is the reply
         self.version = {"major": "1", "minor": "33"}
         self.lock = threading.RLock()
         self._clock = itertools.count()
@@ -62,6 +63,9 @@ class FakeApi:
             code, message = self.refuse[method, plural]
             return code, {"kind": "Status", "message": message, "code": code}
         with self.lock:
+            replies = [hook(path) for hook in self.hooks if method == "GET"]
+            if refused := next(filter(None, replies), None):
+                return refused
             if method == "POST":
                 return 201, self.put(plural, body)
             if not name:
@@ -94,29 +98,19 @@ class FakeApi:
 
     def at_look(self, number, action, plural="jobs"):
         """Call `action` at the n-th request for a Job, or another object."""
-        original, looks = self.answer, iter(range(1, 1000))
+        looks = itertools.count(1)
 
-        def answer(method, path, body):
-            with self.lock:
-                if method == "GET" and f"/{plural}" in path and next(looks) == number:
-                    action()
-            return original(method, path, body)
+        def look(path):
+            if f"/{plural}" in path and next(looks) == number:
+                action()
 
-        self.answer = answer
+        self.hooks.append(look)
 
     def away(self, plural, code, times):
-        """Refuse a number of read requests; return a function that counts those left."""
-        original, left = self.answer, times
-
-        def answer(method, path, body):
-            nonlocal left
-            if method == "GET" and f"/{plural}" in path and left:
-                left -= 1
-                return code, {"message": "etcdserver: leader changed", "code": code}
-            return original(method, path, body)
-
-        self.answer = answer
-        return lambda: left
+        """Refuse a number of read requests; return those left, as a list."""
+        left = [(code, {"message": "etcdserver: leader changed", "code": code})] * times
+        self.hooks.append(lambda path: left.pop() if left and f"/{plural}" in path else None)
+        return left
 
 
 def serve(answer):

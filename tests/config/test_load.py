@@ -22,11 +22,6 @@ def again(experiment, folder, *settings):
     return load_experiment(path, settings)
 
 
-def test_every_shipped_file_is_described():
-    for kind in ("experiment", "mission", "profile"):
-        assert all(shipped.describe(kind, name) for name in shipped.names(kind))
-
-
 @pytest.mark.parametrize("experiment", ["paper", "paper-verbatim", "steps", "hover"])
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_dump_loads_to_the_same(experiment, profile, tmp_path):

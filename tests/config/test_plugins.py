@@ -37,16 +37,6 @@ def share(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("kind", ["estimators", "predictors", "controllers"])
-def test_every_shipped_plug_in_has_a_line(kind):
-    names = plugins.names(kind)
-    assert names == sorted(names) != []
-    for name in names:
-        assert not name.startswith("_")
-        assert not plugins.describe(kind, name).startswith(("(not usable", " "))
-        assert plugins.describe(kind, name)
-
-
 def test_a_plug_in_is_loaded_by_path(share):
     assert plugins.describe("predictors", str(share)) == "Looks ahead by a share of the horizon."
     predictor = load_experiment("paper", [f"cloud.predictor={share}"]).cloud.predictor

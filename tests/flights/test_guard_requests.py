@@ -4,7 +4,7 @@ import pytest
 
 from cloudrc.messages import GuardState, Request, Start
 from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
-from tests.flights.conftest import MS, talking
+from tests.flights.conftest import MS, Bare, ring, talking
 
 
 @pytest.fixture
@@ -88,3 +88,36 @@ def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
     talk.request(2, Request.ESTOP, Start.HERE)
     talk.wait(20)
     assert len(talk.take(CommandApplied)) == applied + 1
+
+
+ID = 2**62 + 5
+
+
+def progress(talk, request, number=0, *, start=Start.HERE, **fields):
+    """Return the mission and the progress that the robot shows after a request."""
+    talk.send(talk.speaker.ask(number, request, start, basis_ns=talk.now_ns, **fields))
+    talk.wait(20)
+    telemetry = talk.take(TelemetrySent)[-1].telemetry
+    return telemetry.mission_id, telemetry.reached
+
+
+def test_progress_rises_and_belongs_to_the_mission_started_last():
+    talk = Bare(ring(), flies=True)
+    talk.hello("cloud")
+    for expected, request, number, fields in (
+        ((0, 0), Request.PROGRESS, 0, {"mission_id": ID, "reached": 3}),
+        ((ID, 0), Request.START, 1, {"mission_id": ID}),
+        ((ID, 2), Request.PROGRESS, 0, {"mission_id": ID, "reached": 2}),
+        ((ID, 2), Request.PROGRESS, 0, {"mission_id": ID, "reached": 1}),
+        ((ID, 2), Request.PROGRESS, 0, {"mission_id": ID + 1, "reached": 9}),
+        ((ID, 2), Request.END, 2, {}),
+        ((ID, 2), Request.START, 3, {"mission_id": ID}),  # the same mission continues
+    ):
+        assert progress(talk, request, number, **fields) == expected
+    talk.wait(2_000)  # the first cloud is not fresh any more
+    talk.hello("another")
+    assert progress(talk, Request.END, 1) == (ID, 2)
+    assert progress(talk, Request.START, 2, mission_id=ID + 1) == (ID + 1, 0)
+    progress(talk, Request.PROGRESS, mission_id=ID + 1, reached=2)
+    # From the spawn a mission begins anew.
+    assert progress(talk, Request.START, 3, mission_id=ID + 1, start=Start.SPAWN) == (ID + 1, 0)

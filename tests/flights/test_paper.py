@@ -5,7 +5,9 @@ from statistics import mean
 
 import pytest
 
+from cloudrc import assembly
 from cloudrc.config.load import load_experiment
+from cloudrc.config.schema import Mission
 from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
 from tests.conftest import nightly
@@ -82,3 +84,12 @@ def test_a_point_offered_for_one_that_the_guard_refuses_is_reached(position, sce
     _, cloud = records(load(offered))
     events = [record.event for record in cloud if isinstance(record, MissionEvent)]
     assert events == ["started", "reached", "done"]
+
+
+def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
+    points = [{"position_m": (0.0, 0.0, 1.0)}, {"position_m": (3.0, 4.0, 1.0), "dwell_s": 2.0}]
+    points.append({**points[1], "time_limit_s": 7.5})
+    mission = Mission.model_validate({"start": "here", "waypoints": tuple(points)})
+    for options, second in (({}, 33.0), ({"speed_max": 0.5}, 48.0)):
+        legs = assembly.mission_plan(mission, 60.0, **options).legs
+        assert [leg.time_limit for leg in legs][1:] == [second, 7.5]
