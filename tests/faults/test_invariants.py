@@ -66,19 +66,19 @@ MOTION = [
     # The reference grows slowly, may drop at once, and can be stopped before the fence.
     (set(), fly((0.02, 0.013, 0.0))),
     ({"cap"}, fly((0.02, 0.014, 0.0))),
-    (set(), fly((0.02, 0.0, 0.0), ZERO, (0.0, -0.02, 0.0))),
     ({"cap"}, fly((0.02, 0.0, 0.0), (-0.025, 0.0, 0.0))),
     (set(), holds(HOLD, (8.9, 1.0, 1.0), (0.64, 0.0, 0.0))),  # 0.2 v + v^2/6 <= 0.2: 0.647 m/s
     ({"stop"}, holds(HOLD, (8.9, 1.0, 1.0), (0.66, 0.0, 0.0))),
-    (set(), holds(ESTOP, (8.9, 1.0, 1.0), (0.66, 0.0, 0.0))),
+    ({"cap"}, fly((6.001, 0.0, 0.0))),
     ({"stop"}, holds(HOLD, (1.0, 1.0, 0.5), (0.0, 0.0, -1.07))),  # <= 0.4: 1.061 m/s
+    (set(), holds(LAND, (1.0, 1.0, 0.5), (0.0, 0.0, -1.07))),
+    ({"fence"}, holds(LAND, (1.0, 1.0, -0.01), ZERO)),
     # Commands are fresh; each step has its tick.
     (set(), (offer(basis_ms=0), step(TRACK, ms=252, fresh=False))),
     ({"stale"}, (offer(), step(TRACK, ms=254, fresh=False))),
     ({"stale"}, (offer(basis_ms=-251),)),
     ({"stale"}, (offer(basis_ms=1),)),
     ({"tick"}, (step(TRACK), STEPPED, step(TRACK))),
-    ({"tick"}, (step(GROUND), skip(2), step(GROUND))),
     (set(), (step(GROUND), SPAWN, step(GROUND))),
     # Without commands it stops within its stopping distance.
     (set(), rest(2.0, 1.56)),
@@ -128,13 +128,11 @@ OPERATOR = [
     *(({"stale"}, resumes(*each)) for each in ((10, 56), (9, 10))),
     ({"stale"}, (*NINE, lambda robot: robot.observer.see_session(0), offer(), step(TRACK))),
     ({"stale"}, (*NINE, offer(9, "stale"), step(TRACK, fresh=False), offer())),
-    (set(), (step(HOLD), SPAWN, step(TRACK))),  # from the spawn one command is enough
     # TRACK and HOLD for silence begin a second apart, unless commands go back.
     ({"hold"}, (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=898), offer(10), step(TRACK))),
     (set(), (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=900), offer(10), step(TRACK))),
     ({"hold"}, held_again(Cause.SILENCE, 998)),
     (set(), held_again(Cause.SILENCE, 1000)),
-    (set(), held_again(Cause.SESSION, 998)),
     ({"hold"}, held_again(Cause.SILENCE, 998, offer(basis_ms=1990), offer(basis_ms=1991))),
     (set(), held_again(Cause.SILENCE, 998, offer(basis_ms=1991), offer(basis_ms=1990))),
     # After a HOLD the reference grows slowly at first.
