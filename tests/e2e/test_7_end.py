@@ -1,4 +1,4 @@
-"""The commands in helm's notes work, `helm test` passes, uninstalling leaves only Secrets."""
+"""`helm test` passes, uninstalling leaves only Secrets."""
 
 from tests.e2e.conftest import EXAMPLES, NAME, eventually, helm, kubectl, read
 

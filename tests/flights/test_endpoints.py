@@ -1,4 +1,4 @@
-"""The contract of both endpoints without a link: sessions, bad datagrams, restarts, stalls."""
+"""The contract of both endpoints without a link: ticks, bytes of any kind, stalls."""
 
 from itertools import pairwise
 
@@ -6,11 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.records import (
-    CommandApplied,
-    GroundTruth,
-    TelemetrySent,
-)
+from cloudrc.records import CommandApplied, GroundTruth, TelemetrySent
 from tests.flights.conftest import HOVER, MS, join, talking
 
 
