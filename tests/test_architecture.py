@@ -124,11 +124,8 @@ def test_a_file_imports_only_allowed_modules():
     ("place", "code"),
     [
         ("world/guard/state.py", "from cloudrc.cloud import endpoint"),
-        ("cloud/endpoint.py", "import cloudrc.world.guard.state"),
         ("link/model.py", "def f():\n    import random"),
-        ("world/sensors.py", "from time import monotonic_ns"),
         ("record/mcap.py", "eval('1')"),
-        ("metrics/rtt.py", "print('x')"),
     ],
 )
 def test_a_forbidden_import_is_found(place, code):
@@ -156,14 +153,10 @@ def test_no_file_and_no_function_is_too_long():
     long = {str(path.relative_to(ROOT)) for path in files if path.read_text().count("\n") > 700}
     for path, tree in TREES.items():
         assert not tree.body or ast.get_docstring(tree), f"{place_of(path)}: no docstring"
-        functions = (
-            n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)
-        )
-        long |= {
-            f"{place_of(path)}: {node.name}"
-            for node in functions
-            if (node.end_lineno or 0) - node.lineno >= 50
-        }
+        for node in ast.walk(tree):
+            function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            if function and node.end_lineno - node.lineno >= 50:
+                long.add(f"{place_of(path)}: {node.name}")
     assert long == set()
 
 

@@ -111,7 +111,6 @@ def test_every_source_resolves():
         ('X = 1\n"""A limit. Source:\nDESIGN, section 5."""', ["DESIGN", "DESIGN, section 5."]),
         ('# Source: docs/reference/plant.md, "Robot",\n# "Wings".', ["Wings"]),
         ("# Source: plant.md", ["plant.md"]),
-        ('def f():\n    """Do.\n\n    Source: measured.\n\n    RFC 1"""', ["measured."]),
         ('# Source: docs/reference/faults.md, "F5"; RFC 791. Deviation: DESIGN', []),
     ],
 )

@@ -21,13 +21,9 @@ def test_base_dependencies_are_those_of_a_pod():
     assert names == {"numpy", "pyyaml", "pydantic", "cryptography", "prometheus-client", "rich"}
 
 
-def test_cloudrc_is_a_plugin_of_kubectl():
+def test_cloudrc_is_a_plugin_of_kubectl_and_names_one_version():
     assert PROJECT["scripts"]["kubectl-cloudrc"] == PROJECT["scripts"]["cloudrc"]
-
-
-def test_all_files_name_the_same_version():
-    citation = (ROOT / "CITATION.cff").read_text()
-    assert f"\nversion: {cloudrc.__version__}\n" in citation
+    assert f"\nversion: {cloudrc.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_the_wheel_holds_every_file_of_the_package(tmp_path):

@@ -39,6 +39,7 @@ SLOW = [command for command in COMMANDS if is_slow(command)]
 SWEEPS = [command for command in SLOW if "--seeds" in command]
 # The demo is a step of .ci/run by itself; of the sweeps, a push flies the first.
 NIGHTLY = [*(command for command in SLOW if command.startswith("make")), *SWEEPS[1:]]
+STEPS = "run steps --mode virtual -o json --set mission.steps.count=3".split()
 FLIGHTS = [command for command in QUICK if command.startswith("cloudrc run")]
 
 
@@ -112,9 +113,8 @@ def test_the_readme_s_predictor_works(capsys):
     """Check that a share of 1 is `constant_velocity`, and that a share of 0.5 predicts worse."""
     errors = []
     for share in ("0.5", "1.0"):
-        line = "run steps --mode virtual -o json --set mission.steps.count=3"
-        plugin = ["cloud.predictor=./my_predictor.py", f"cloud.predictor.share={share}"]
-        assert main([*line.split(), *(word for key in plugin for word in ("--set", key))]) == 0
+        plugin = f"--set cloud.predictor=./my_predictor.py --set cloud.predictor.share={share}"
+        assert main([*STEPS, *plugin.split()]) == 0
         numbers = json.loads(capsys.readouterr().out)["numbers"]
         assert numbers["fault_count"]["value"] == 0
         errors.append(numbers["prediction_error_rms"]["value"])
@@ -123,12 +123,9 @@ def test_the_readme_s_predictor_works(capsys):
 
 @pytest.mark.usefixtures("numbers_only")
 def test_the_metric_is_measured_by_a_run_and_by_a_report(capsys):
-    line = "run steps --mode virtual -o json --set mission.steps.count=3"
+    report = "report runs/latest --metric ./overshoot.py -o json"
     values = []
-    for command in (
-        f"{line} --set report.metrics=./overshoot.py",
-        "report runs/latest --metric ./overshoot.py -o json",
-    ):
-        assert main(command.split()) == 0
+    for words in ([*STEPS, "--set", "report.metrics=./overshoot.py"], report.split()):
+        assert main(words) == 0
         values.append(json.loads(capsys.readouterr().out)["numbers"]["overshoot"]["value"])
     assert values[0] == values[1]

@@ -131,11 +131,12 @@ def pod_specs(objects):
     """Return all pod specs: those of Deployments and Jobs by component, a Pod's by container."""
     specs = {}
     for thing in objects:
+        spec = thing.get("spec", {})
         if thing["kind"] in ("Deployment", "Job"):
             component = thing["metadata"]["labels"]["app.kubernetes.io/component"]
-            specs[component] = thing["spec"]["template"]["spec"]
+            specs[component] = spec["template"]["spec"]
         elif thing["kind"] == "Pod":
-            specs[thing["spec"]["containers"][0]["name"]] = thing["spec"]
+            specs[spec["containers"][0]["name"]] = spec
     return specs
 
 

@@ -16,13 +16,7 @@ def modes(lookup, values=None):
 
 @pytest.mark.parametrize(
     ("lookup", "mode"),
-    [
-        (nothing, "relay"),
-        (a_namespace(), "auto"),
-        (a_namespace("privileged"), "auto"),
-        (a_namespace("baseline"), "relay"),
-        (a_namespace("restricted"), "relay"),
-    ],
+    [(nothing, "relay"), (a_namespace(), "auto"), (a_namespace("restricted"), "relay")],
 )
 def test_auto_follows_the_label_of_the_namespace(lookup, mode):
     assert modes(lookup) == {f"--mode={mode}"}
@@ -36,36 +30,25 @@ def test_an_upgrade_keeps_the_mode_unless_the_label_is_new():
     assert render(lookup=a_namespace(objects=installed)) == installed
     installed = render(lookup=a_namespace())
     assert modes(a_namespace("restricted", installed)) == {"--mode=relay"}
-    for deployment in of_kind(installed, "Deployment").values():
-        annotations = deployment["spec"]["template"]["metadata"]["annotations"]
-        assert annotations["cloudrc/link-mode"] == "auto"
 
 
 def test_the_notes_show_mode_and_label_command():
     label = "kubectl label namespace lab pod-security.kubernetes.io/enforce=privileged --overwrite"
-    assert "mode relay" in notes()
     assert label not in notes()
-    for mode in ("netem", "auto"):
-        text = notes({"link": {"mode": mode}}, lookup=a_namespace())
-        assert f"mode {mode}" in text
-        assert label in text
+    text = notes({"link": {"mode": "netem"}}, lookup=a_namespace())
+    assert "mode netem" in text
+    assert label in text
 
 
 def test_helm_test_verifies_the_link_of_this_release():
     objects = render()
     (test,) = (t for name, t in of_kind(objects, "Pod").items() if name.endswith("test-link"))
     annotations, spec = test["metadata"]["annotations"], test["spec"]
-    assert annotations["helm.sh/hook"] == "test"
     assert int(annotations["helm.sh/hook-weight"]) > 0, "commands flow once a mission has flown"
     assert "hook-failed" not in annotations["helm.sh/hook-delete-policy"]
-    assert spec["restartPolicy"] == "Never"
     # Helm waits 300 s for one hook.
     assert RELEASE_TIMEOUT + 10.0 <= spec["activeDeadlineSeconds"] < 300.0
     (container,) = spec["containers"]
     hosts = build_parser(["link"]).parse_args(container["args"]).ends.split(",")
-    assert set(hosts) <= {
-        thing["metadata"]["name"] for thing in of_kind(objects, "Service").values()
-    }
-    assert {name.rsplit("-", 1)[-1] for name in hosts} == {"world", "cloud"}
-    cloud = containers(pod_specs(objects)["cloud"])["cloud"]
-    assert container["securityContext"] == cloud["securityContext"]
+    services = of_kind(objects, "Service")
+    assert hosts == [services[end]["metadata"]["name"] for end in ("world", "cloud")]

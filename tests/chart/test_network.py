@@ -76,8 +76,5 @@ def test_everything_listens_at_both_address_families():
             assert all("=[::]:" in word or "=127.0.0.1:" in word for word in listens)
     services = of_kind(objects, "Service")
     assert all(s["spec"]["ipFamilyPolicy"] == "PreferDualStack" for s in services.values())
-    for name in ("world", "cloud"):
-        assert services[name]["spec"]["clusterIP"] == "None"
-        assert services[name]["spec"]["publishNotReadyAddresses"] is True
     for thing in of_kind(render({"ipFamilyPolicy": None}), "Service").values():
         assert "ipFamilyPolicy" not in thing["spec"]

@@ -42,9 +42,7 @@ def test_objects_have_the_labels_that_selectors_need():
 @pytest.mark.parametrize(
     ("release", "values", "name"),
     [
-        ("demo", {}, "demo-cloudrc-world"),
         ("my-cloudrc", {}, "my-cloudrc-world"),
-        ("demo", {"fullnameOverride": "robot"}, "robot-world"),
         ("1rel", {"fullnameOverride": "robot"}, "robot-world"),
         ("d" * 53, {}, "d" * 46 + "-world"),
     ],
@@ -72,33 +70,14 @@ def test_annotations_and_placement_of_the_user_are_used():
     mission = {"enabled": True, "podAnnotations": inject}
     objects = render({"cloud": {**where, "podAnnotations": mine}, "mission": mission})
     pods = pod_specs(objects)
-    for name in ("cloud", "mission", "test", "test-link"):
-        assert where.items() <= pods[name].items()
+    assert all(where.items() <= pods[n].items() for n in ("cloud", "mission", "test", "test-link"))
     assert not where.keys() & pods["world"].keys()
     cloud = of_kind(objects, "Deployment")["cloud"]["spec"]["template"]["metadata"]["annotations"]
     assert mine.items() <= cloud.items()
-    assert cloud["prometheus.io/port"] == "9100"
     (job,) = of_kind(objects, "Job").values()
     assert job["spec"]["template"]["metadata"]["annotations"] == inject
     for pod in of_kind(objects, "Pod").values():
         assert pod["metadata"]["annotations"].items() > inject.items()
-
-
-def test_the_link_is_a_native_sidecar_for_its_pods_egress():
-    pods = pod_specs(render())
-    for end, direction, peer in (("world", "uplink", "cloud"), ("cloud", "downlink", "world")):
-        (link,) = pods[end]["initContainers"]
-        assert (link["name"], link["restartPolicy"]) == ("link", "Always")
-        mounts = {mount["mountPath"]: mount["name"] for mount in link["volumeMounts"]}
-        assert mounts["/etc/cloudrc-link"] == "link"
-        assert "--route=/run/cloudrc/route" in containers(pods[end])[end]["args"]
-        assert {
-            f"--direction={direction}",
-            f"--peer=demo-cloudrc-{peer}:7400",
-            "--end=127.0.0.1:7400",
-            "--route=/run/cloudrc/route",
-            "--profile=/etc/cloudrc-link/profile.yaml",
-        } <= set(link["args"])
 
 
 def test_the_command_line_accepts_every_containers_arguments():
@@ -113,27 +92,6 @@ def test_the_command_line_accepts_every_containers_arguments():
         assert callable(build_parser([arguments[0]]).parse_args(arguments).execute)
 
 
-def test_volumes_have_objects_and_all_are_mounted():
-    # The value `epochs` of older releases is accepted; world needs no volume for its epochs.
-    objects = render({"world": {"epochs": {"storageClassName": "fast"}}}, release="cloudrc")
-    names = {(thing["kind"], thing["metadata"]["name"]) for thing in objects}
-    assert {name for kind, name in names if kind == "PersistentVolumeClaim"} == {"cloudrc-journal"}
-    assert ("ConfigMap", "cloudrc-link") in names, "the example of a Role names it"
-    kinds = {
-        "configMap": ("ConfigMap", "name"),
-        "secret": ("Secret", "secretName"),
-        "persistentVolumeClaim": ("PersistentVolumeClaim", "claimName"),
-    }
-    for pod in pod_specs(objects).values():
-        volumes = {volume["name"]: volume for volume in pod.get("volumes", ())}
-        mounts = (m for c in containers(pod).values() for m in c.get("volumeMounts", ()))
-        assert {mount["name"] for mount in mounts} == volumes.keys()
-        for volume in volumes.values():
-            for key in kinds.keys() & volume.keys():
-                kind, field = kinds[key]
-                assert (kind, volume[key][field]) in names
-
-
 def test_each_pod_has_one_image():
     """A node pulls one image per pod, because the link uses that of its pod."""
 
@@ -141,8 +99,6 @@ def test_each_pod_has_one_image():
         found = {}
         for name, pod in pod_specs(render({"image": values})).items():
             (found[name],) = {container["image"] for container in containers(pod).values()}
-            policies = {container["imagePullPolicy"] for container in containers(pod).values()}
-            assert policies == {"IfNotPresent"}
         return found
 
     cloud, world = (f"cloudrc/{role}:{cloudrc.__version__}" for role in ("cloud", "world"))
@@ -166,7 +122,6 @@ def test_the_notes_are_three_commands_for_this_release():
     assert logs[logs.index("--container") + 1] == "link"
 
 
-SATELLITE = {"profile": "satellite"}
 SLOW = "experiment.guard.command_age_max_ms=800"
 CLOSED = "No Prometheus may scrape"
 
@@ -175,11 +130,10 @@ CLOSED = "No Prometheus may scrape"
     ("values", "words", "warns"),
     [
         ({}, SLOW, False),
-        ({"link": SATELLITE}, SLOW, True),
-        ({"experiment": {"link": SATELLITE}}, SLOW, False),
+        ({"link": {"profile": "satellite"}}, SLOW, True),
+        ({"experiment": {"link": {"profile": "satellite"}}}, SLOW, False),
         ({}, CLOSED, True),
         ({"metrics": {"allowFrom": [{"ipBlock": {"cidr": "10.0.0.0/8"}}]}}, CLOSED, False),
-        ({"networkPolicy": {"enabled": False}}, "WARNING: networkPolicy.enabled is false", True),
     ],
 )
 def test_the_notes_warn_of_what_will_not_work(values, words, warns):

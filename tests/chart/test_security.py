@@ -77,30 +77,7 @@ def test_security_contexts_can_be_left_out_or_changed():
     """OpenShift gives each namespace its own user ids and refuses others."""
     values = {"podSecurityContext": None, "containerSecurityContext": None}
     objects = render({**values, "cloud": {"backgroundLoad": {"enabled": True}}})
-    for pod in pod_specs(objects).values():
-        assert "securityContext" not in pod
-        assert not any("securityContext" in part for part in containers(pod).values())
+    assert "securityContext" not in str(pod_specs(objects))
     for pod in pod_specs(render({"podSecurityContext": {"runAsUser": 12_345}})).values():
         assert pod["securityContext"]["runAsUser"] == 12_345
         assert pod["securityContext"]["runAsNonRoot"] is True
-
-
-def test_service_accounts_are_made_or_named():
-    made = render()
-    names = {thing["metadata"]["name"] for thing in of_kind(made, "ServiceAccount").values()}
-    assert names == {pod["serviceAccountName"] for pod in pod_specs(made).values()}
-    taken = render({"serviceAccount": {"create": False, "name": "robots"}})
-    assert not of_kind(taken, "ServiceAccount")
-    assert {pod["serviceAccountName"] for pod in pod_specs(taken).values()} == {"robots"}
-
-
-def test_probes_use_the_metrics_port_and_liveness_needs_no_peer():
-    asked = {"startupProbe": "/healthz", "livenessProbe": "/healthz", "readinessProbe": "/readyz"}
-    for thing in of_kind(render(), "Deployment").values():
-        for container in containers(thing["spec"]["template"]["spec"]).values():
-            ports = {port["name"] for port in container["ports"]}
-            for probe, path in asked.items():
-                get = container[probe]["httpGet"]
-                assert get["path"] == path
-                assert get["port"] in ports
-                assert get["port"].endswith("metrics")

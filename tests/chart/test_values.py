@@ -31,21 +31,6 @@ def test_the_schema_is_closed_at_every_level():
         assert extra is False or (isinstance(extra, dict) and extra.get("type")), path
 
 
-UNITS = {"_m": "[m]", "_ms": "[ms]", "_s": "[s]", "_deg": "[deg]", "_kbit": "[kbit/s]"}
-OF_NO_UNIT = ("[", "port", "Number of", "Packets", "random")
-
-
-def test_every_value_has_a_description_with_its_unit():
-    for path, part in parts(SCHEMA):
-        for name, value in part.get("properties", {}).items():
-            target = SCHEMA["$defs"].get(value.get("$ref", "").rpartition("/")[2], {})
-            text = value.get("description") or target.get("description")
-            assert text, (*path, name)
-            assert all(unit in text for end, unit in UNITS.items() if name.endswith(end)), name
-            if value.get("type") == "integer" and path[:2] != ("$defs", "Experiment"):
-                assert any(word in text for word in OF_NO_UNIT), (*path, name)
-
-
 def test_the_defaults_are_valid_and_written_out():
     assert render({"global": {"anything": {"goes": True}}}), "values of a parent chart"
     assert DEFAULTS.keys() == SCHEMA["properties"].keys() - {"global"}
@@ -55,31 +40,18 @@ def test_the_defaults_are_valid_and_written_out():
     ("values", "named"),
     [
         ({"lnk": {}}, "lnk"),
-        ({"link": {"mod": "netem"}}, "mod"),
         ({"link": {"mode": "tc"}}, "tc"),
         ({"link": {"profile": {"uplink": {"delay": 40}}}}, "delay"),
-        ({"experiment": {"seeds": 4}}, "seeds"),
         ({"experiment": {"guard": {"command_age_max_ms": -1}}}, "-1"),
-        ({"experiment": {"world": {"low_level": {"gain_p": [1, 2]}}}}, "[1, 2]"),
         ({"experiment": {"cloud": {"predictor": {"share": 1}}}}, "share"),
-        ({"world": {"resources": {"limits": {"cpus": 1}}}}, "cpus"),
-        ({"world": {"resources": {"limits": {"cpu": -1}}}}, "-1"),
+        ({"experiment": {"seed": 2**53}}, "9007199254740992"),
+        ({"experiment": None}, "experiment"),
         ({"world": {"resources": {"limits": {"memory": "64MB"}}}}, "64MB"),
         ({"world": {"podLabels": {"app.kubernetes.io/name": "x"}}}, "app.kubernetes.io/name"),
         ({"link": {"traces": {"profile.yaml": ""}}}, "profile.yaml"),
-        ({"link": {"traces": {"change.json": ""}}}, "change.json"),
-        ({"link": {"traces": {"experiment.yaml": ""}}}, "experiment.yaml"),
-        ({"link": {"traces": {"a b": ""}}}, "a b"),
-        ({"experiment": {"seed": 2**53}}, "9007199254740992"),
         ({"fullnameOverride": "1abc"}, "1abc"),
-        ({"experiment": None}, "experiment"),
         ({"metrics": {"allowFrom": [{"namespace": {"name": "x"}}]}}, "namespace"),
-        ({"metrics": {"allowFrom": "all"}}, "all"),
         ({"image": {"world": {"digest": "sha256:12"}}}, "sha256:12"),
-        ({"image": {"tag": "a b"}}, "a b"),
-        ({"cloud": {"backgroundLoad": {"workers": 0}}}, "0"),
-        ({"cloud": {"backgroundLoad": None}}, "backgroundLoad"),
-        ({"secret": {"existingSecret": "Lab Key"}}, "Lab Key"),
         ({"teleop": {"service": {"port": 70_000}}}, "70000"),
     ],
 )

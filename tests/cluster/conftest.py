@@ -7,7 +7,6 @@ import os
 import threading
 import uuid
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
@@ -26,10 +25,11 @@ class FakeApi:
     """Objects of a namespace by (plural, name); `refuse` maps a method and plural to an error."""
 
     def __init__(self):
-        self.objects: dict[tuple[str, str], dict[str, Any]] = {}
-        self.logs: dict[str, str] = {}
-        self.refuse: dict[tuple[str, str], tuple[int, str]] = {}
-        self.seen: list[str] = []
+        self.objects = {}
+        self.logs = {}
+        self.refuse = {}
+        self.seen = []
+        self.hooks = []  # each gets the path that is read; what it returns is the reply
         self.version = {"major": "1", "minor": "33"}
         self.lock = threading.RLock()
         self._clock = itertools.count()
@@ -63,6 +63,9 @@ class FakeApi:
             code, message = self.refuse[method, plural]
             return code, {"kind": "Status", "message": message, "code": code}
         with self.lock:
+            replies = [hook(path) for hook in self.hooks if method == "GET"]
+            if refused := next(filter(None, replies), None):
+                return refused
             if method == "POST":
                 return 201, self.put(plural, body)
             if not name:
@@ -79,6 +82,35 @@ class FakeApi:
             if method == "DELETE":
                 return 200, self.objects.pop((plural, name))
             return 200, self.objects[plural, name]
+
+    def jobs(self):
+        return [body for (kind, _), body in self.objects.items() if kind == "jobs"]
+
+    def end(self, job, kind, **condition):
+        """End a Job: `kind` is "Complete" or "Failed"."""
+        ended = {"type": kind, "status": "True", **condition}
+        self.get("jobs", job)["status"] = {"conditions": [ended]}
+
+    def start_pod(self, job, **given):
+        """Create the pod of a Job as Kubernetes does."""
+        uid = self.get("jobs", job)["metadata"]["uid"]
+        self.put("pods", pod(f"{job}-x", "mission", labels={UID_LABEL: uid}, **given))
+
+    def at_look(self, number, action, plural="jobs"):
+        """Call `action` at the n-th request for a Job, or another object."""
+        looks = itertools.count(1)
+
+        def look(path):
+            if f"/{plural}" in path and next(looks) == number:
+                action()
+
+        self.hooks.append(look)
+
+    def away(self, plural, code, times):
+        """Refuse a number of read requests; return those left, as a list."""
+        left = [(code, {"message": "etcdserver: leader changed", "code": code})] * times
+        self.hooks.append(lambda path: left.pop() if left and f"/{plural}" in path else None)
+        return left
 
 
 def serve(answer):
@@ -114,11 +146,10 @@ class FakeTeleop:
     """The API and the metrics of a cloud pod, with a record of its requests."""
 
     def __init__(self):
-        self.mission: dict[str, str] | None = None
-        self.posted: list[str] = []
-        self.tokens: set[str | None] = set()
+        self.mission = None
+        self.posted = []
+        self.tokens = set()
         self.server = serve(self._answer)
-        self.port = self.server.server_port
 
     def _answer(self, request, body):
         if request.path == "/metrics":
@@ -131,27 +162,27 @@ class FakeTeleop:
 
     def forwards(self):
         """Write a fake kubectl that forwards all ports of a pod to this server."""
-        ports = (8080, 9100, 9101, 9102)
-        lines = (f"echo 'Forwarding from 127.0.0.1:{self.port} -> {port}'" for port in ports)
+        here = f"Forwarding from 127.0.0.1:{self.server.server_port}"
+        lines = (f"echo '{here} -> {port}'" for port in (8080, 9100, 9101, 9102))
         return "\n".join([*lines, "exec sleep 60"])
 
 
 def kubeconfig(url):
     """Build a kubeconfig with two contexts: `here`, the current one, and `elsewhere`."""
-    contexts = [
-        {"name": "here", "context": {"cluster": "fake", "user": "me", "namespace": "demo"}},
-        {"name": "elsewhere", "context": {"cluster": "fake", "user": "me"}},
-    ]
-    return yaml.safe_dump(
-        {
-            "apiVersion": "v1",
-            "kind": "Config",
-            "clusters": [{"name": "fake", "cluster": {"server": url}}],
-            "users": [{"name": "me", "user": {"token": "none"}}],
-            "contexts": contexts,
-            "current-context": "here",
-        }
-    )
+    here = {"cluster": "fake", "user": "me", "namespace": "demo"}
+    elsewhere = {"cluster": "fake", "user": "me"}
+    config = {
+        "apiVersion": "v1",
+        "kind": "Config",
+        "clusters": [{"name": "fake", "cluster": {"server": url}}],
+        "users": [{"name": "me", "user": {"token": "none"}}],
+        "contexts": [
+            {"name": "here", "context": here},
+            {"name": "elsewhere", "context": elsewhere},
+        ],
+        "current-context": "here",
+    }
+    return yaml.safe_dump(config)
 
 
 def labels(component):
@@ -178,15 +209,7 @@ POD = {
 """Pod of a component, as in its Deployment."""
 
 
-def pod(
-    name,
-    component,
-    *,
-    state=None,
-    ready=True,
-    phase="Running",
-    **more,
-):
+def pod(name, component, *, state=None, ready=True, phase="Running", **more):
     """Build a pod with one container in a state that the kubelet writes."""
     status = {
         "name": component,
@@ -244,14 +267,11 @@ def running(api, release):
     for component in ("world", "cloud"):
         api.put("deployments", deployment(component))
         api.put("pods", pod(f"{component}-1", component))
-    service = {
-        "metadata": {"name": "cloudrc-api", "labels": labels("cloud")},
-        "spec": {"ports": [{"name": "api", "port": 8080, "targetPort": "api"}]},
-    }
-    api.put("services", service)
+    ports = [{"name": "api", "port": 8080, "targetPort": "api"}]
+    metadata = {"name": "cloudrc-api", "labels": labels("cloud")}
+    api.put("services", {"metadata": metadata, "spec": {"ports": ports}})
     token = base64.b64encode(TOKEN.encode()).decode()
-    tokens = {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}}
-    api.put("secrets", tokens)
+    api.put("secrets", {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}})
     return api
 
 
@@ -284,36 +304,5 @@ def teleop(running, pretend):
 MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}
 
 
-def end(api, name, kind, **condition):
-    """End a Job: `kind` is "Complete" or "Failed"."""
-    ended = {"type": kind, "status": "True", **condition}
-    api.get("jobs", name)["status"] = {"conditions": [ended]}
-
-
-def start_pod(api, name, **given):
-    """Create the pod of a Job as Kubernetes does."""
-    uid = api.get("jobs", name)["metadata"]["uid"]
-    api.put("pods", pod(f"{name}-x", "mission", labels={UID_LABEL: uid}, **given))
-
-
 def terminated(exit_code, message):
     return {"terminated": {"exitCode": exit_code, "message": message}}
-
-
-def at_look(api, number, action):
-    """Call `action` at the n-th request for the Job."""
-    original, looks = api.answer, iter(range(1, 1000))
-    lock = threading.Lock()
-
-    def answer(method, path, body):
-        with lock:
-            if method == "GET" and "/jobs/" in path and next(looks) == number:
-                action()
-        return original(method, path, body)
-
-    api.answer = answer
-
-
-def made(api):
-    """Return the Jobs."""
-    return [body for (kind, _), body in api.objects.items() if kind == "jobs"]

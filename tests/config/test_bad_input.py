@@ -1,5 +1,6 @@
 """Bad input gives one message with place, reason and remedy, for all problems of a file at once."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -24,39 +25,35 @@ def test_all_problems_are_listed_with_their_lines(mine):
         mine,
         "seed: one\n"
         "guard: {speed_max: 2}\n"
-        "link:\n"
-        "  profile: paper-p2\n"
-        "  uplink:\n"
-        "    delay_ms: -3\n"
-        "    loss: 1.2\n"
+        "link: {profile: paper-p2, uplink: {delay_ms: -3}}\n"
         "cloud:\n"
         "  predictor: last_sampel\n"
         "  controller: {name: pid, sped_max: 2}\n"
         "world: {scene: pipe}\n",
     )
     first, *rest = text.splitlines()
-    assert first == "mine.yaml has 7 problems:"
+    assert first == "mine.yaml has 6 problems:"
     assert sorted(line.strip() for line in rest) == sorted([
         "mine.yaml:1: seed: 'one': must be a whole number >= 0 and < 9007199254740992",
         "mine.yaml:2: guard.speed_max: unknown key; did you mean speed_max_mps [m/s]?",
-        "mine.yaml:6: link.uplink.delay_ms: -3: must be a number >= 0 [ms]",
-        "mine.yaml:7: link.uplink.loss: 1.2: "
-        "must be a number >= 0 and <= 1 or a mapping of keys",
-        "mine.yaml:9: cloud.predictor: no predictor named 'last_sampel'; available: "
+        "mine.yaml:3: link.uplink.delay_ms: -3: must be a number >= 0 [ms]",
+        "mine.yaml:5: cloud.predictor: no predictor named 'last_sampel'; available: "
         "commanded_velocity, constant_acceleration, constant_velocity, last_sample; "
         "did you mean last_sample?",
-        "mine.yaml:10: cloud.controller.sped_max: unknown key; did you mean speed_max?",
-        "mine.yaml:11: world.scene: no scene named 'pipe'; available: empty, pipes; "
+        "mine.yaml:6: cloud.controller.sped_max: unknown key; did you mean speed_max?",
+        "mine.yaml:7: world.scene: no scene named 'pipe'; available: empty, pipes; "
         "did you mean pipes?",
     ])  # fmt: skip
 
 
-def test_at_most_fifty_problems_are_listed(mine):
+def test_at_most_fifty_problems_and_ten_thousand_waypoints_are_listed(mine):
     points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 2000)
     text = refused_text(mine, f"mission: {{waypoints: [{points}]}}\n")
     assert "mine.yaml has 2000 problems:" in text
     assert text.endswith("and 1950 more")
     assert len(text.splitlines()) == 52
+    mine.write_text("waypoints:\n" + "- {position_m: [0.5, 0.0, 0.7], dwell_s: 0}\n" * 10_001)
+    assert "at most 10000 entries" in refused("paper", f"mission={mine}")
 
 
 @pytest.mark.parametrize(
@@ -65,59 +62,33 @@ def test_at_most_fifty_problems_are_listed(mine):
         ("seed: 1\nseed: 2", "mine.yaml:2: the key 'seed' is given twice"),
         ("seed: [", "mine.yaml:"),
         ("", "mine.yaml: must be a mapping"),
-        ("seed: !!python/name:os.system x", "mine.yaml:1"),
+        ("seed: 1\nname: !!python/name:os.system x", "mine.yaml:2: could not determine a constr"),
         ("{<<: {seed: 1}}", "mine.yaml:1: <<: unknown key; known here: name"),
         ("{[a]: 1}", "mine.yaml:1: a key must be text"),
-        ("seed: !!bool foo", "mine.yaml: not readable as YAML"),
-        ("seed: 1\nname: !!binary eA==", "mine.yaml:2: could not determine a constructor for"),
-        ("a: " + "[" * 600 + "]" * 600, "mine.yaml:1: nested too deep"),
         ("[" * 100_000, "nest"),  # libyaml's own limit and message
         ("a: &a [*a]", "mine.yaml:1: nested too deep"),
         ("a: " + "9" * 5000, "not readable"),
         (r'name: "a\0b"', "mine.yaml:1: text with the character NUL"),
-        ("world: 3", "mine.yaml:1: world: 3: must be a mapping"),
         ("mission: 3", "mine.yaml:1: mission: 3: must be text or a mapping"),
         ("tunnel: {order: newset}", "did you mean newest?"),
         ("link: {profile: paper-p9}", "link.profile: no profile named 'paper-p9'; available: 5g"),
         ("name: ../../x", "name: '../../x': must be text without slashes"),
         ("mission: ./nowhere.yaml", "mission: no such file:"),
-        ("link: {uplink: {delay: 3}}", "did you mean delay_ms [ms]?"),
         ("delay_ms: 3", "did you mean link.uplink.delay_ms?"),
-        ("missoin: pipes", "did you mean mission?"),
         ("zzz: 3", "known here: name, description, seed, mission"),
-        ("mission: {waypoints: [{position_m: [0, 0, 1], dwell_s: 1.0e+308}]}",
-         "dwell_s: 1e+308: must be a number >= 0 and <= 1000000 [s]"),
         ("guard: {speed_max_mps: 7}", "must be at most 6 m/s: above it the robot does not stop"),
     ],
-)  # fmt: skip
+)
 def test_an_invalid_file_is_one_line(mine, text, reason):
     found = refused_text(mine, text)
     assert reason in found
     assert "\n" not in found
 
 
-def test_a_missing_parameter_is_reported_once(mine):
-    (mine.parent / "strict.py").write_text("def build(share: float): ...")
-    text = refused_text(mine, "seed: 1\ncloud: {predictor: ./strict.py}\n")
-    assert text == "mine.yaml:2: cloud.predictor.share: is missing; must be a number"
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("command_age_max_ms", "true"), ("command_age_max_ms", "x"), ("speed_max_mps", "1e-320"),
-     ("acceleration_max_mps2", "0"), ("yaw_rate_max_radps", "0"), ("hold_max_s", "1e-10")],
-)  # fmt: skip
-def test_a_guard_limit_cannot_be_switched_off(key, value):
-    text = refused("hover", f"guard.{key}={value}")
-    assert text.startswith(f"--set: guard.{key}: ")
-    assert "\n" not in text
-
-
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
         ("./", "./: cannot be read: "),
-        ("papr", "did you mean paper?"),
         ("nosuch.yaml", "nosuch.yaml; names of shipped experiments: hover, paper"),
         ("no/papper.yaml", "did you mean paper?"),
         ("latin.yaml", "is not UTF-8 text"),
@@ -135,46 +106,40 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("seed", "--set seed: must be key=value"),
         ("a..b=1", "--set"),
         ("seed=[", "--set seed"),
-        ('name="a" # b"', "--set name"),
         ("seed=[1], [2]", "--set seed: [1], [2]: text behind the value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
         ("mission.waypoints.2.yaw_deg=90", "holds yaw at 0"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: pelican"),
         ("world.robot=/x/q", "world.robot: not an .xml file: /x/q"),
+        # A limit of the guard cannot be switched off.
+        ("guard.command_age_max_ms=true", "--set: guard.command_age_max_ms: "),
+        ("guard.speed_max_mps=1e-320", "--set: guard.speed_max_mps: "),
+        ("guard.hold_max_s=1e-10", "--set: guard.hold_max_s: "),
     ],
 )
 def test_an_invalid_setting_is_refused(text, reason):
     assert reason in refused("paper", text)
-
-
-def test_a_key_that_is_set_twice_is_refused():
     assert "--set seed: is set twice; keep one" in refused("paper", "seed=1", "name=x", "seed=2")
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("uplink: {delay_ms: -1}", "mine.yaml:1: uplink.delay_ms: -1: must be a number >= 0 [ms]"),
         ("uplink: {loss: {bad_start: .1, bad_end: 0}}", "uplink.loss: bad_end must be above 0"),
         ("uplink: {loss: {bad_start: .1}}", "uplink.loss.bad_end: is missing; must be a number"),
         ("uplink: {jitter_ms: 3, distribution: gauss}", "'normal', 'pareto' or 'table'"),
         ("uplink: {distribution: table}", "uplink: distribution: table needs the key table"),
-        ("uplink: {table: nowhere.csv}", "uplink.table: trace "),
         ("uplink: {changes: [{at_s: 5}, {at_s: 5}]}", "uplink.changes: at_s must rise: entry 1"),
-        ("uplink: {queue_packets: 1.5}", "must be a whole number >= 1"),
-        ("uplink: {keep_order: yes}", "must be true or false"),
         ("uplink: {trace: falling.csv}", "falling.csv, line 3"),
         ("command_age_max_ms: 1e-9", "command_age_max_ms: 1e-09: must be a number >= 1 and <= 1"),
-        ('"<": 3', "<: unknown key; known here: "),
         ('uplink: {"<chance>": 3}', "uplink.<chance>: unknown key; "),
     ],
 )
 def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
     (mine.parent / "falling.csv").write_text("time_s,delay_ms\n1,20\n0,20\n")
     mine.write_text(text)
-    with pytest.raises(BadInputError) as caught:
+    with pytest.raises(BadInputError, match=re.escape(reason)):
         load_profile(mine)
-    assert reason in str(caught.value)
     text = refused("paper", f"link.profile={mine}")
     assert reason in text
     assert f"{mine}:1: " in text
@@ -185,7 +150,6 @@ def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
     [
         ("[]", "mission.waypoints: none given; give at least one, or steps"),
         ("[{position_m: [.nan, 0, 1]}]", "waypoints.0.position_m.0: nan: must be finite"),
-        ("[{position_m: [0, 1]}]", "position_m.2: is missing; must be a number"),
         ("[{position_m: [0, 0, 1, 2]}]", "at most 3 entries"),
         ("[{tolerance_m: 1}]", "position_m: is missing; must be a list of 3 numbers [m]"),
         ("[{position_m: [0, 0, 3]}]",
@@ -200,8 +164,3 @@ def test_an_invalid_mission_is_refused_with_the_reason(mine, waypoints, reason):
     found = refused_text(mine, f"mission: {{waypoints: {waypoints}}}")
     assert reason in found
     assert found.startswith("mine.yaml:1: mission.waypoints")
-
-
-def test_too_many_waypoints_are_refused(mine):
-    mine.write_text("waypoints:\n" + "- {position_m: [0.5, 0.0, 0.7], dwell_s: 0}\n" * 10_001)
-    assert "at most 10000 entries" in refused("paper", f"mission={mine}")

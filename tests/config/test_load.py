@@ -22,12 +22,6 @@ def again(experiment, folder, *settings):
     return load_experiment(path, settings)
 
 
-@pytest.mark.parametrize("kind", ["experiment", "mission", "profile"])
-def test_every_shipped_file_is_described(kind):
-    for name in shipped.names(kind):
-        assert shipped.describe(kind, name), f"{kind} {name} has no description"
-
-
 @pytest.mark.parametrize("experiment", ["paper", "paper-verbatim", "steps", "hover"])
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_dump_loads_to_the_same(experiment, profile, tmp_path):
@@ -41,24 +35,13 @@ def test_a_dump_loads_to_the_same(experiment, profile, tmp_path):
     assert changed == load_experiment(experiment, ["link.profile=paper-p3"])
 
 
-def test_a_dump_needs_no_profile_file(tmp_path):
-    profile = tmp_path / "mine.yaml"
-    profile.write_text("uplink: {delay_ms: 12}\n")
-    loaded = load_experiment("paper", [f"link.profile={profile}"])
-    profile.unlink()
-    assert again(loaded, tmp_path) == loaded
-    assert loaded.uplink.delay_ms == 12
-    changed = again(loaded, tmp_path, "link.profile=paper-p3")
-    assert changed == load_experiment("paper", ["link.profile=paper-p3"])
-
-
 def test_paper_is_the_published_scheme():
     paper = load_experiment("paper")
-    assert (paper.name, paper.link.profile, paper.tunnel.order) == ("paper", "paper-p2", "newest")
+    assert (paper.link.profile, paper.tunnel.order) == ("paper-p2", "newest")
     assert (paper.uplink.delay_ms, paper.uplink.jitter_ms) == (45, 25)
     assert paper.cloud.estimator.name == "running_mean"
     assert paper.cloud.predictor.name == "constant_velocity"
-    assert (paper.cloud.controller.model_extra or {})["gain_p"] == [0.8, 0.8, 1.5]
+    assert paper.cloud.controller.model_extra["gain_p"] == [0.8, 0.8, 1.5]
     assert len(paper.mission.waypoints) == 7
     assert paper.mission.waypoints[-1].position_m == (8.235, -6.422, 0.7)
     assert (paper.guard.command_age_max_ms, paper.criteria.contact) == (250, True)
@@ -70,7 +53,6 @@ def test_paper_is_the_published_scheme():
     ("experiment", "settings", "age", "cap"),
     [
         ("paper", (), 250, 6.0),
-        ("paper", ("guard.command_age_max_ms=400",), 400, 5.645805),
         ("paper", ("link.profile=satellite",), 800, 4.823043),
         ("paper", ("link.profile=satellite", "guard.speed_max_mps=2"), 800, 2.0),
         ("paper-verbatim", ("link.profile=satellite",), 400, 5.645805),
@@ -94,32 +76,15 @@ def test_single_values_override_the_profile(tmp_path):
     assert (other.uplink.delay_ms, other.uplink.jitter_ms) == (120, 10)
 
 
-def test_set_turns_a_name_into_a_mapping(tmp_path):
-    experiment = load_experiment("paper", ["cloud.controller.speed_max=2"])
-    assert experiment.cloud.controller.name == "pid"
-    assert (experiment.cloud.controller.model_extra or {})["speed_max"] == 2.0
-    empty = tmp_path / "short.yaml"
-    empty.write_text("seed: 3\n")
-    assert load_experiment(empty, ["cloud.controller.speed_max=2"]).cloud == experiment.cloud
-
-
 def test_set_reaches_into_lists_by_index():
     waypoints = load_experiment("paper", ["mission.waypoints.0.tolerance_m=.2"]).mission.waypoints
     assert [point.tolerance_m for point in waypoints[:2]] == [0.2, 0.3]
-    before = load_profile("handover").uplink.changes
-    texts = ["link.profile=handover", "link.uplink.changes.1.delay_ms=99"]
-    changes = load_experiment("paper", texts).uplink.changes
-    assert [change.delay_ms for change in changes[:2]] == [before[0].delay_ms, 99]
-    assert len(changes) == len(before)
-    gains = load_experiment("paper", ["world.low_level.gain_p.1=5"]).world.low_level.gain_p
-    assert gains == (4, 5, 10)
     longer = load_experiment("hover", ["mission.waypoints.1.position_m=[0, 1, 1]"])
     assert longer.mission.waypoints[1].position_m == (0, 1, 1)
 
 
-@pytest.mark.parametrize("text", ["exp #2", "exp: 2", "*x", "exp ", "12:30"])
+@pytest.mark.parametrize("text", ["exp #2", "exp: 2", "*x", "12:30"])
 def test_a_value_is_the_whole_rest_of_its_argument(text):
-    assert parse_value(text, "--set name") == text
     assert load_experiment("hover", [f"name={text}"]).name == text
 
 
@@ -129,48 +94,35 @@ def test_a_value_may_be_a_number_a_list_or_quoted():
     assert parse_value("a: 1\nb: 2", "x") == {"a": 1, "b": 2}
 
 
-def test_the_order_of_settings_does_not_matter():
-    texts = ["mission.steps.count=3", "mission=steps", "world.scene=empty"]
-    assert load_experiment("paper", texts) == load_experiment("paper", texts[::-1])
-
-
 def test_paths_start_at_the_file_that_names_them(tmp_path, monkeypatch):
     links = tmp_path / "links"
     links.mkdir()
-    (links / "trace.csv").write_text("time_s,delay_ms\n0,20\n1,40\n")
-    (links / "traced.yaml").write_text(
-        "uplink: {trace: trace.csv}\n"
-        "downlink: {distribution: table, table: trace.csv, delay_ms: 30, jitter_ms: 10}\n"
-    )
-    (tmp_path / "there.yaml").write_text("waypoints: [{position_m: [0.5, 0, 0.7]}]\n")
-    (tmp_path / "still.py").write_text(
-        "from cloudrc.cloud.predictors import Predictor\n\ndef build() -> Predictor:\n"
-        "    return Predictor()\n"
-    )
-    pipes = Path(shipped.FOLDERS["scene"]) / "pipes.xml"
-    (tmp_path / "mine.xml").write_text(pipes.read_text())
-    (tmp_path / "mine.yaml").write_text(
-        "world: {robot: ./mine.xml, scene: mine.xml}\nmission: ./there.yaml\n"
+    for path, text in {
+        "links/trace.csv": "time_s,delay_ms\n0,20\n1,40\n",
+        "links/traced.yaml": "uplink: {trace: trace.csv}\n"
+        "downlink: {distribution: table, table: trace.csv, delay_ms: 30, jitter_ms: 10}\n",
+        "there.yaml": "waypoints: [{position_m: [0.5, 0, 0.7]}]\n",
+        "still.py": "def build(): ...\n",
+        "mine.xml": (Path(shipped.FOLDERS["scene"]) / "pipes.xml").read_text(),
+        "mine.yaml": "world: {robot: ./mine.xml, scene: mine.xml}\nmission: ./there.yaml\n"
         "link: {profile: links/traced.yaml}\ncloud: {predictor: still.py}\n"
-        "report: {metrics: [a.py, duration]}\n"
-    )
+        "report: {metrics: [a.py, duration]}\n",
+    }.items():
+        (tmp_path / path).write_text(text)
     monkeypatch.chdir(links)
     experiment = load_experiment(tmp_path / "mine.yaml", ["report.metrics.2=./b.py"])
-    assert experiment.uplink.trace == str(links / "trace.csv")
-    assert experiment.downlink.table == str(links / "trace.csv")
+    assert experiment.uplink.trace == experiment.downlink.table == str(links / "trace.csv")
     assert link_profile(experiment.downlink).table == pytest.approx((-1.0, 1.0))
     assert experiment.link.profile == str(links / "traced.yaml")
     assert experiment.cloud.predictor.name == str(tmp_path / "still.py")
     assert experiment.mission.waypoints[0].position_m == (0.5, 0, 0.7)
-    assert experiment.mission.waypoints[0].tolerance_m == 0.10
     assert experiment.world.robot == experiment.world.scene == str(tmp_path / "mine.xml")
     assert load_scene(experiment.world.scene).pipes == load_scene("pipes").pipes
     assert experiment.report.metrics == (str(tmp_path / "a.py"), "duration", str(links / "b.py"))
     assert again(experiment, links) == experiment
-    texts = ["link.downlink.trace=trace.csv", "report.metrics=b.py", "mission=../there.yaml"]
+    texts = ["link.downlink.trace=trace.csv", "mission=../there.yaml"]
     from_here = load_experiment("hover", texts)
     assert from_here.downlink.trace == str(links / "trace.csv")
-    assert from_here.report.metrics == (str(links / "b.py"),)
     assert from_here.mission == experiment.mission
 
 
@@ -190,19 +142,9 @@ def test_written_yaml_parses_to_equal_values(value):
     assert document.parse_yaml(document.write_yaml(value), "text")[0] == value
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [("1e-3", 1e-3), (".2", 0.2), ("-3", -3), ("on", "on"), ("12:30", "12:30"), ("~", None),
-     ("true", True), ("2024-01-01", "2024-01-01"), ("010", 10), ("'1'", "1")],
-)  # fmt: skip
-def test_scalars_follow_yaml_1_2(text, value):
-    found = document.parse_yaml(text, "text")[0]
-    assert (found, type(found)) == (value, type(value))
-
-
-@pytest.mark.parametrize("settings", [[], ["link.profile=satellite", "seed=7"]])
-def test_a_configuration_has_the_hash_of_its_file(settings, tmp_path):
-    experiment, path = load_experiment("paper", settings), tmp_path / "config.yaml"
+def test_a_configuration_has_the_hash_of_its_file(tmp_path):
+    experiment = load_experiment("paper", ["link.profile=satellite", "seed=7"])
+    path = tmp_path / "config.yaml"
     path.write_text(dump(experiment), "utf-8")
     expected = hashlib.sha256(path.read_bytes()).hexdigest()
     assert fingerprint(experiment) == expected

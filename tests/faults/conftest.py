@@ -1,21 +1,9 @@
 """A robot for the invariants to watch, which does whatever a test has it do."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
-from typing import Any
 
 from cloudrc.faults.invariants import FLOWN, TRACK, Limits, Watch
-from cloudrc.messages import (
-    ZERO,
-    Cause,
-    Command,
-    GuardState,
-    OperatorRequest,
-    Request,
-    Start,
-    Vector,
-)
+from cloudrc.messages import ZERO, Cause, Command, OperatorRequest, Request, Start
 from cloudrc.records import Contact
 from cloudrc.world.rotors import STOPPED
 
@@ -26,58 +14,51 @@ TURNING = (900.0,) * 4
 class FakeRobot:
     """A robot in a mission; it is in whatever state and place a test puts it."""
 
-    def __init__(self, *, yaw_rate: float = 0.0, honest: bool = False, hold_ms: int = 60_000):
-        self.guard: Any = SimpleNamespace(
+    def __init__(self, *, yaw_rate=0.0, honest=False, hold_ms=60_000):
+        self.guard = SimpleNamespace(
             state=TRACK, reference=ZERO, yaw_rate=yaw_rate, cause=Cause.ENDED
         )
-        self.simulator: Any = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
-        self.observers: list[Any] = []
+        self.simulator = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
+        self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0
         self.watch = Watch(Limits(hold_ns=hold_ms * MS))
-        self.watch.attach(self, 0, honest=honest)  # type: ignore[arg-type]
+        self.watch.attach(self, 0, honest=honest)
         (self.observer,) = self.observers
         self.request(Request.START)
 
-    def request(self, *requests: Request, start: Start = Start.HERE) -> None:
+    def request(self, *requests, start=Start.HERE):
         """Carry out operator requests; the guard's state stays what a test says."""
         for request in requests:
             if start is Start.SPAWN:
                 self.simulator.steps = 0
             self.observer.see_request(OperatorRequest(1, request, start), self.now_ns)
 
-    def offer(
-        self, count: int = 1, rejection: str | None = None, basis_ms: float | None = None
-    ) -> None:
+    def offer(self, count=1, rejection=None, basis_ms=None):
         """Let commands come now; without `basis_ms` they are fresh."""
         basis_ns = self.now_ns if basis_ms is None else round(basis_ms * MS)
         for _ in range(count):
             command = Command(0, basis_ns, 0, ZERO, 0.0)
             self.observer.see_command(command, rejection, self.now_ns)
 
-    def touch(self, body: str, *, tip: bool = False) -> None:
+    def touch(self, body, *, tip=False):
         """Let a contact begin in the next step."""
         self.simulator.touches.append(Contact(0, body, self.position, ZERO, ZERO, tip))
 
-    def put(self, velocity: Vector = ZERO, touch_age: float = float("inf")) -> None:
+    def put(self, velocity=ZERO, touch_age=float("inf")):
         """Let the robot move [m/s], and have touched something some time ago [s]."""
         self.velocity, self.simulator.touch_age = velocity, touch_age
 
-    def skip(self, ms: float) -> None:
+    def skip(self, ms):
         """Let time pass without a step [ms]."""
         self.now_ns += round(ms * MS)
 
-    def step(
-        self,
-        state: GuardState,
-        *,
-        ms: int = 2,
-        reference: Vector | None = None,
-        position: Vector | None = None,
-        turns: bool | None = None,  # whether the rotors turn; by default in flight
-        fresh: bool = True,  # whether a fresh command comes before each step in TRACK
-    ) -> set[str]:
-        """Be in a state for some time; return the kinds of breaches so far."""
+    def step(self, state, *, ms=2, reference=None, position=None, turns=None, fresh=True):
+        """Be in a state for some time.
+
+        `turns` says whether the rotors turn (by default in flight), `fresh` whether a fresh command
+        comes before each step in TRACK.
+        """
         self.guard.state = state
         self.guard.reference = reference or self.guard.reference
         self.position = position or self.position
@@ -89,4 +70,3 @@ class FakeRobot:
             readings = SimpleNamespace(position=self.position, velocity=self.velocity)
             self.observer.see_step(self.now_ns, readings, speeds)
             self.now_ns += 2 * MS
-        return set(self.watch.counts)

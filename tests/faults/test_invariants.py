@@ -1,11 +1,7 @@
 """The invariants: what is a breach, and what is not. Each row is a story and the breaches in it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import partial
 from operator import methodcaller
-from typing import TypeAlias
 
 import pytest
 
@@ -13,7 +9,6 @@ from cloudrc.faults.invariants import ESTOP, GROUND, HOLD, LAND, RAMP, TRACK
 from cloudrc.messages import ZERO, Cause, Request, Start
 from tests.faults.conftest import FakeRobot
 
-Deed: TypeAlias = Callable[[FakeRobot], object]
 step, offer, request, touch, put, skip = (
     partial(methodcaller, name) for name in ("step", "offer", "request", "touch", "put", "skip")
 )
@@ -52,19 +47,13 @@ def rest(speed, way):
     return (put(velocity=(0.0, speed, 0.0)), step(TRACK), step(HOLD), moved)
 
 
-MOTION: list[tuple[set[str], tuple[Deed, ...]]] = [
+MOTION = [
     # The base is inside the fence, except after a stop or a hit.
-    *(({"fence"}, (IMPOSSIBLE, step(each, position=OUTSIDE))) for each in (GROUND, TRACK, LAND)),
+    ({"fence"}, (IMPOSSIBLE, step(LAND, position=OUTSIDE))),
     (set(), (step(TRACK), STOP, step(ESTOP, position=OUTSIDE))),
-    (set(), (step(TRACK), step(ESTOP, position=OUTSIDE))),
     ({"fence"}, (step(TRACK), STOP, step(ESTOP, position=FAR))),
-    ({"fence"}, (step(TRACK), step(ESTOP, position=FAR))),
-    ({"fence"}, (step(GROUND), STOP, step(GROUND, position=OUTSIDE))),
     (set(), (touch("pipe_1"), step(TRACK), step(TRACK, ms=4000, position=OUTSIDE))),
-    (
-        {"fence"},
-        (touch("pipe_1"), step(TRACK, ms=4000), step(TRACK, position=OUTSIDE)),
-    ),
+    ({"fence"}, (touch("pipe_1"), step(TRACK, ms=4000), step(TRACK, position=OUTSIDE))),
     # After a stop it takes off only where it lies still inside.
     *(
         (kinds, (step(TRACK), STOP, put(velocity), step(ESTOP, ms=2000, position=position),
@@ -72,20 +61,16 @@ MOTION: list[tuple[set[str], tuple[Deed, ...]]] = [
         for velocity, position, kinds in (
             ((0.0, 0.0, -0.11), None, set()),
             ((0.0, 0.0, -0.13), None, {"fence"}),
-            (ZERO, OUTSIDE, {"fence"}),
         )
     ),
     # The reference grows slowly, may drop at once, and can be stopped before the fence.
     (set(), fly((0.02, 0.013, 0.0))),
     ({"cap"}, fly((0.02, 0.014, 0.0))),
-    ({"cap"}, fly((6.001, 0.0, 0.0))),
-    (set(), fly((0.02, 0.0, 0.0), ZERO, (0.0, -0.02, 0.0))),
     ({"cap"}, fly((0.02, 0.0, 0.0), (-0.025, 0.0, 0.0))),
     (set(), holds(HOLD, (8.9, 1.0, 1.0), (0.64, 0.0, 0.0))),  # 0.2 v + v^2/6 <= 0.2: 0.647 m/s
     ({"stop"}, holds(HOLD, (8.9, 1.0, 1.0), (0.66, 0.0, 0.0))),
-    (set(), holds(ESTOP, (8.9, 1.0, 1.0), (0.66, 0.0, 0.0))),
-    (set(), holds(HOLD, (1.0, 1.0, 0.5), (0.0, 0.0, -1.06))),  # <= 0.4: 1.061 m/s
-    ({"stop"}, holds(HOLD, (1.0, 1.0, 0.5), (0.0, 0.0, -1.07))),
+    ({"cap"}, fly((6.001, 0.0, 0.0))),
+    ({"stop"}, holds(HOLD, (1.0, 1.0, 0.5), (0.0, 0.0, -1.07))),  # <= 0.4: 1.061 m/s
     (set(), holds(LAND, (1.0, 1.0, 0.5), (0.0, 0.0, -1.07))),
     ({"fence"}, holds(LAND, (1.0, 1.0, -0.01), ZERO)),
     # Commands are fresh; each step has its tick.
@@ -94,28 +79,21 @@ MOTION: list[tuple[set[str], tuple[Deed, ...]]] = [
     ({"stale"}, (offer(basis_ms=-251),)),
     ({"stale"}, (offer(basis_ms=1),)),
     ({"tick"}, (step(TRACK), STEPPED, step(TRACK))),
-    ({"tick"}, (step(GROUND), skip(2), step(GROUND))),
     (set(), (step(GROUND), SPAWN, step(GROUND))),
     # Without commands it stops within its stopping distance.
-    *((set(), rest(*each)) for each in ((0.0, 0.49), (2.0, 1.56))),
-    *(({"rest"}, rest(*each)) for each in ((0.0, 0.51), (2.0, 1.58))),
+    (set(), rest(2.0, 1.56)),
+    ({"rest"}, rest(2.0, 1.58)),
     # Rotors stand still on the ground and after a stop; they stop where the robot stands.
     *((set(), (step(each),)) for each in (GROUND, ESTOP)),
     *(({"latch"}, (step(each, turns=True),)) for each in (GROUND, ESTOP)),
     (set(), (step(HOLD), put((0.19, -0.2, 0.2)), step(GROUND))),
     ({"rest"}, (step(HOLD), put((0.0, -0.21, 0.0)), step(GROUND))),
-    ({"rest"}, (step(HOLD), put((NAN, 0.0, 0.0)), step(GROUND))),
     *((set(), (step(HOLD), put((0.0, 0.0, -3.0)), each, step(GROUND, ms=4)))
       for each in (STOP, SPAWN)),
-    (set(), (step(TRACK), put((0.0, 0.0, -3.0)), step(ESTOP, ms=4))),  # after a hit
     (set(), (step(HOLD), step(GROUND), put((0.0, 0.0, -0.9)), step(GROUND))),
     ({"rest"}, (step(HOLD), step(GROUND), put((0.0, 0.0, -1.1)), step(GROUND))),
     (set(), (step(HOLD), step(GROUND), put((0.0, 0.0, -1.1), 0.9), step(GROUND))),
 ]  # fmt: skip
-
-
-def wait(state, ms, then=None):
-    return (step(state, ms=ms), step(then or state))
 
 
 def resumes(count, apart_ms):
@@ -137,34 +115,29 @@ def ramp(growth):
 
 NINE = (offer(10), step(HOLD, ms=1000), offer(9))
 """A HOLD with nine fresh commands in it, and ten before."""
-OPERATOR: list[tuple[set[str], tuple[Deed, ...]]] = [
+OPERATOR = [
     # What is latched ends by an acknowledgement only; one of nothing counts for no later landing.
-    *((kinds, (IMPOSSIBLE, request(Request.ACKNOWLEDGE), step(latched), *release, step(after)))
-      for latched in (LAND, ESTOP) for after in (GROUND, HOLD)
-      for kinds, release in ((set(), RELEASE), ({"latch"}, ()))),
+    *((kinds, (IMPOSSIBLE, request(Request.ACKNOWLEDGE), step(latched), *release, step(HOLD)))
+      for latched in (LAND, ESTOP) for kinds, release in ((set(), RELEASE), ({"latch"}, ()))),
     # TRACK needs a mission; nobody has to wait for its end.
-    *((set(), (step(TRACK), each, step(HOLD, ms=60_100))) for each in (STOP, END)),
+    (set(), (step(TRACK), END, step(HOLD, ms=60_100))),
     *(({"latch"}, (each, step(TRACK))) for each in (STOP, END)),
     *((set(), (each, request(Request.START), step(TRACK))) for each in (STOP, END)),
     # A HOLD ends after ten fresh commands in half a second, of one session and mission.
-    *((set(), resumes(*each)) for each in ((10, 55), (30, 55))),
-    *(({"stale"}, resumes(*each)) for each in ((10, 56), (9, 10), (0, 10))),
+    (set(), resumes(10, 55)),
+    *(({"stale"}, resumes(*each)) for each in ((10, 56), (9, 10))),
     ({"stale"}, (*NINE, lambda robot: robot.observer.see_session(0), offer(), step(TRACK))),
-    ({"stale"}, (*NINE, request(Request.END, Request.START), offer(), step(TRACK, fresh=False))),
     ({"stale"}, (*NINE, offer(9, "stale"), step(TRACK, fresh=False), offer())),
-    (set(), (step(HOLD), SPAWN, step(TRACK))),  # from the spawn one command is enough
     # TRACK and HOLD for silence begin a second apart, unless commands go back.
     ({"hold"}, (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=898), offer(10), step(TRACK))),
     (set(), (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=900), offer(10), step(TRACK))),
     ({"hold"}, held_again(Cause.SILENCE, 998)),
     (set(), held_again(Cause.SILENCE, 1000)),
-    *((set(), held_again(each, 998)) for each in (Cause.SESSION, Cause.ENDED)),
     ({"hold"}, held_again(Cause.SILENCE, 998, offer(basis_ms=1990), offer(basis_ms=1991))),
     (set(), held_again(Cause.SILENCE, 998, offer(basis_ms=1991), offer(basis_ms=1990))),
     # After a HOLD the reference grows slowly at first.
     (set(), ramp(RAMP)),
     ({"cap"}, ramp(1.01 * RAMP)),
-    (set(), (*ramp(RAMP), step(TRACK, ms=2000, reference=ZERO), *fly((0.024, 0.0, 0.0)))),
     # Five impossible commands just now justify a landing.
     *((kinds, (step(TRACK, ms=100), step(HOLD, ms=100), offer(count, "range"),
                step(HOLD, ms=wait), step(LAND)))
@@ -184,21 +157,18 @@ def test_the_reference_turns_no_faster_than_the_cap(yaw_rate):
 
 @pytest.mark.parametrize(
     ("state", "hold_ms", "wait_ms"),
-    [
-        (HOLD, 60_000, 60_000),
-        (GROUND, 60_000, 60_000),
-        (HOLD, 2_000, 2_000),
-        (GROUND, 2_000, 10_000),
-    ],
+    [(HOLD, 60_000, 60_000), (GROUND, 60_000, 60_000), (GROUND, 2_000, 10_000)],
 )
 def test_a_mission_waits_for_its_cloud_as_long_as_configured(state, hold_ms, wait_ms):
     assert play(step(state, ms=wait_ms), hold_ms=hold_ms) == set()
     assert play(step(state, ms=wait_ms + 6), hold_ms=hold_ms) == {"hold"}
-    assert play(*wait(state, wait_ms, LAND), hold_ms=hold_ms) == {"hold"}
-    assert play(*wait(state, wait_ms + 2, LAND), hold_ms=hold_ms) == set()
+    assert play(step(state, ms=wait_ms), step(LAND), hold_ms=hold_ms) == {"hold"}
+    assert play(step(state, ms=wait_ms + 2), step(LAND), hold_ms=hold_ms) == set()
 
 
 FALLS = (step(TRACK), STOP, touch("pipe_3"), step(ESTOP), touch("pipe_2"), step(ESTOP))
+ENDING = (IMPOSSIBLE, step(LAND), *RELEASE)
+"""An acknowledged landing ends within a brake."""
 
 
 @pytest.mark.parametrize(
@@ -207,26 +177,16 @@ FALLS = (step(TRACK), STOP, touch("pipe_3"), step(ESTOP), touch("pipe_2"), step(
         (set(), (touch("board", tip=True), step(TRACK))),
         ({"collision"}, (touch("board"), step(TRACK))),
         ({"collision"}, (touch("pipe_1", tip=True), step(TRACK))),
-        ({"collision"}, (touch("floor"), step(HOLD))),
-        (set(), (IMPOSSIBLE, touch("floor"), step(LAND))),
         ({"collision"}, (touch("pipe_1"), step(GROUND))),
         # A robot that comes down may touch what is below, until it flies again.
-        (set(), (IMPOSSIBLE, touch("pipe_3"), step(LAND), touch("pipe_2"), step(LAND))),
+        (set(), (IMPOSSIBLE, touch("pipe_3"), step(LAND), touch("floor"), step(LAND))),
         (set(), FALLS),
         ({"collision"}, (*FALLS, *RELEASE, step(TRACK), touch("pipe_3"), step(TRACK))),
-        # An acknowledged landing ends within a brake.
-        (
-            set(),
-            (IMPOSSIBLE, step(LAND), *RELEASE, step(HOLD, ms=198), touch("pipe_3"), step(HOLD)),
-        ),
-        (
-            {"collision"},
-            (IMPOSSIBLE, step(LAND), *RELEASE, step(HOLD, ms=204), touch("pipe_3"), step(HOLD)),
-        ),
+        (set(), (*ENDING, step(HOLD, ms=198), touch("pipe_3"), step(HOLD))),
+        ({"collision"}, (*ENDING, step(HOLD, ms=204), touch("pipe_3"), step(HOLD))),
         # No hit is felt without a touch.
         ({"collision"}, (step(TRACK), put(touch_age=9.0), step(ESTOP))),
         (set(), (step(TRACK), put(touch_age=0.5), step(ESTOP))),
-        (set(), (step(TRACK), put(touch_age=9.0), STOP, step(ESTOP))),
     ],
 )
 def test_an_honest_cloud_touches_only_the_board_and_only_by_the_tip(kinds, story):

@@ -1,13 +1,12 @@
 """The models of processes, clocks and teleop."""
 
 from functools import partial
-from unittest.mock import Mock
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.models import FAR_NS, SOCKET_MAX, Clock, RestartableEndpoint
+from cloudrc.faults.models import Clock
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.faults.trial import inject
 from cloudrc.messages import GuardState
@@ -19,24 +18,6 @@ def test_a_clock_reaches_a_time_exactly_when_it_says(offset_ns, drift_ppm, now_n
     when_ns = clock.when(clock.at(now_ns))
     assert when_ns <= now_ns
     assert clock.at(when_ns - 1) < clock.at(now_ns) <= clock.at(when_ns)
-
-
-def test_datagrams_wait_during_a_freeze_and_are_lost_after_a_kill():
-    inner = Mock(next_deadline_ns=lambda: FAR_NS, take_records=list)
-    process, sent = RestartableEndpoint(lambda start_ns: inner, Clock()), []
-    process.freeze(0, 0.1)
-    for n in range(SOCKET_MAX + 5):
-        sent.append(b"%d" % n)
-        process.receive_datagram(sent[-1], n)
-    assert (process.take_datagrams(), inner.receive_datagram.mock_calls) == ([], [])
-    assert process.next_deadline_ns() == 100_000_000
-    process.handle_deadline(100_000_000)
-    heard = [call.args for call in inner.receive_datagram.call_args_list]
-    assert heard == [(data, 100_000_000) for data in sent[:SOCKET_MAX]]
-    process.kill(100_000_000)
-    process.receive_datagram(b"lost", 100_000_000)
-    assert (process.take_datagrams(), process.next_deadline_ns()) == ([], FAR_NS)
-    assert len(heard) == inner.receive_datagram.call_count
 
 
 def separate(*events, start=True):

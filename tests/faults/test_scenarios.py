@@ -1,25 +1,18 @@
 """The named faults: each passes, one seed is one run, and the results are told."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import re
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
 from cloudrc.cli import faults as command
 from cloudrc.cli.main import main
-from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import Check, Outcome
 from cloudrc.faults.scenarios import SCENARIOS, find
 from cloudrc.faults.scenarios.intruder import HostileSender
-from cloudrc.records import Counted
 from tests.conftest import nightly
 
 NUMBERS = (*range(1, 14), 15, 17, *range(20, 26), 27, 28, 40)
@@ -40,13 +33,6 @@ def test_a_fault_passes_its_checks(scenario):
     assert outcome.passed, outcome.error
 
 
-@pytest.mark.promise("one-seed-one-run")
-def test_one_seed_is_one_run():
-    first, second, other = (find("F13").run(seed) for seed in (3, 3, 4))
-    assert first.sha256 == second.sha256 != other.sha256
-    assert first.checks == second.checks
-
-
 @pytest.mark.parametrize(
     ("name", "broken", "value", "said"),
     [
@@ -62,39 +48,6 @@ def test_a_check_fails_if_its_promise_is_broken(name, broken, value, said, monke
     assert any(said in text for text in failed)
 
 
-@pytest.mark.parametrize(("since", "passed"), [(0.0, True), (10.0, False), (12.0, True)])
-def test_a_metric_that_moves_late_is_noticed(since, passed):
-    flight: Any = SimpleNamespace(
-        world=SimpleNamespace(clock=SimpleNamespace(at=lambda now_ns: now_ns)),
-        of_world=[Counted(round(n * 1e9), "world", "late", n) for n in (1, 16)],
-    )
-    outcome = Outcome()
-    measures.moves(outcome, flight, "world datagrams_total downlink late", since=since)
-    assert outcome.passed is passed
-
-
-@pytest.mark.parametrize("taken", [False, True])
-def test_a_hostile_datagram_that_has_an_effect_is_noticed(taken):
-    flight, heard = Flight().fly(3.0), list[bytes]()
-
-    def tamper(data, now_ns):
-        heard.append(data)
-        return [data] if now_ns < 3.1e9 else []
-
-    flight.world.tamper = tamper
-    flight.fly(3.2 if taken else 3.09)  # then world has not heard the last one yet
-    sender = HostileSender()
-    sender.send(flight.world, heard[-1], flight.run.now_ns)
-    assert (sender.sent, sender.taken) == (1, taken)
-
-
-@pytest.mark.parametrize("relation", ["<=", ">=", "=="])
-def test_what_is_not_measured_has_not_passed(relation):
-    assert Check("", 1.0, relation, 1.0).passed
-    assert not any(Check("", float(n), relation, 1.0).passed for n in ("nan", "inf"))
-    assert not Outcome().passed
-
-
 def test_the_command_prints_json(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "F17").mkdir()  # a folder is no schedule
@@ -102,10 +55,7 @@ def test_the_command_prints_json(tmp_path, monkeypatch, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert (printed["schemaVersion"], printed["faults"][0]["result"]) == (1, "passed")
     assert {check["unit"] for check in printed["faults"][0]["checks"]} == {"", "m", "m/s", "yes"}
-
-
-def test_a_result_comes_back_from_another_process():
-    assert pickle.dumps(command._run(("F27", 1)))
+    assert pickle.dumps(command._run(("F27", 1))), "a result comes back from another process"
 
 
 def test_a_failed_check_ends_in_exit_code_1(monkeypatch, capsys):
@@ -118,9 +68,8 @@ def test_a_failed_check_ends_in_exit_code_1(monkeypatch, capsys):
     monkeypatch.setattr("cloudrc.faults.scenarios.SCENARIOS", fakes)
     assert main(["faults", "run", "--all"]) == 1
     out = capsys.readouterr().out
-    assert "x collisions: 2 (0)" in out
-    assert "22 of 24 passed, 2 failed" in out
-    assert "ValueError: broken" in out
+    for said in ("x collisions: 2 (0)", "22 of 24 passed, 2 failed", "ValueError: broken"):
+        assert said in out
 
 
 def test_the_list_names_every_fault(capsys):
@@ -134,18 +83,12 @@ def test_the_list_names_every_fault(capsys):
     ("words", "said"),
     [
         ("", "an action is missing: list, run, search"),
-        ("run", "required"),
-        ("run F13 --seed -1", "'-1' is not a whole number"),
         ("run F1 --seed 9007199254740992", "argument --seed: '9007199254740992' is not a whole"),
-        ("run none.yaml", "none.yaml: "),
         ("run /dev/null", "/dev/null: not a regular file"),
-        ("run F99", "no fault 'F99'; there are: F1 short-blackout, F2 "),
+        ("run cloud-kiled", "no fault 'cloud-kiled'; there are: F1 short-blackout, F2 "),
         ("run cloud-kiled", "; did you mean cloud-killed?"),
-        ("search --first -5", "'-5' is not a whole number"),
-        ("search --minutes 0", "'0' is not a number of minutes"),
         ("search --minutes nan", "'nan' is not a number of minutes"),
         ("search --store /dev/null/found", "cannot be written"),
-        ("search --store /dev/null", "/dev/null: cannot be written"),
     ],
 )
 def test_bad_input_is_told_in_one_line(words, said, capsys):
@@ -153,3 +96,18 @@ def test_bad_input_is_told_in_one_line(words, said, capsys):
     out, err = capsys.readouterr()
     assert said in err
     assert (out, err.count("\n")) == ("", 1)
+
+
+@pytest.mark.parametrize("taken", [False, True])
+def test_a_hostile_datagram_that_has_an_effect_is_noticed(taken):
+    flight, heard = Flight().fly(3.0), []
+
+    def tamper(data, now_ns):
+        heard.append(data)
+        return [data] if now_ns < 3.1e9 else []
+
+    flight.world.tamper = tamper
+    flight.fly(3.2 if taken else 3.09)  # then world has not heard the last one yet
+    sender = HostileSender()
+    sender.send(flight.world, heard[-1], flight.run.now_ns)
+    assert (sender.sent, sender.taken) == (1, taken)

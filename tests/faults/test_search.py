@@ -11,11 +11,9 @@ from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.invariants import Breach
-from cloudrc.faults.schedule import CALM, KINDS, Event, Schedule, compose, dump, load, shaped
+from cloudrc.faults.schedule import CALM, KINDS, Event, Schedule, compose, dump, load
 from cloudrc.faults.search import shrink
-from cloudrc.faults.trial import Finding, fly
-from cloudrc.link.profile import Change, DirectionProfile
-from tests.conftest import nightly
+from cloudrc.faults.trial import Finding
 
 
 @pytest.mark.parametrize("draw", [compose, choose])
@@ -39,23 +37,13 @@ def test_random_schedules_have_all_faults_and_calm_at_the_end():
     assert hostile == {(policy, alone) for policy in POLICIES for alone in (True, False)}
 
 
-@pytest.mark.parametrize("kind", nightly(*KINDS))
-def test_each_kind_of_fault_is_survived(kind):
-    _, longest, low, high = KINDS[kind]
-    events = (Event(kind, 8.0, longest / 2, (low + high) / 2), Event(kind, 14.0, 0.02, high))
-    assert fly(Schedule(3, events=events, duration=26.0)).breaches == ()
-
-
 @pytest.mark.parametrize(
     "text",
     [
-        *("", "[1, 2]", "{{", "[" * 2000, "seed: one", "seed: -1", "seed: 1\nwind: 3"),
-        *("seed: 1\nduration: .inf", "seed: 1\nreorder: 2"),
+        *("", "[1, 2]", "{{", "[" * 2000, "seed: one", "seed: 1\nwind: 3", "seed: 1\nreorder: 2"),
         "seed: 1\nevents: [{kind: rain, at: 1}]",
         "seed: 1\nevents: [{kind: blackout, at: .nan}]",
-        "seed: 1\nevents: [{kind: blackout, at: 1, duration: -3}]",
         "seed: 1\nevents: [{kind: loss, at: 1, duration: 3, value: 1.5}]",
-        "seed: 1\nevents: [{kind: blackout, at: 1, way: left}]",
     ],
 )
 def test_a_file_that_is_no_schedule_is_bad_input(tmp_path, text):
@@ -63,24 +51,6 @@ def test_a_file_that_is_no_schedule_is_bad_input(tmp_path, text):
     path.write_text(text)
     with pytest.raises(BadInputError, match=r"schedule\.yaml: is no schedule of faults"):
         load(path)
-
-
-@pytest.mark.parametrize("line", ["policy: nope", "profile: nope"])
-def test_an_unknown_name_in_a_schedule_is_bad_input(line, tmp_path, capsys):
-    path = tmp_path / "schedule.yaml"
-    path.write_text(f"seed: 1\n{line}\n")
-    assert main(["faults", "run", str(path)]) == 2
-    error = capsys.readouterr().err
-    assert f"{path}: " in error
-    assert "nope" in error
-
-
-def test_a_link_fault_keeps_the_time_line_of_the_profile():
-    profile = DirectionProfile(changes=(Change(5.0, delay=0.1),))
-    silence, waves = Event("blackout", 1.0, 1.0), Event("loss", 1.0, 1.0, 0.5)
-    assert shaped(Schedule(1, events=(silence,)), profile, "up").changes == profile.changes
-    with pytest.raises(BadInputError, match="has a time line, on which loss cannot be laid"):
-        shaped(Schedule(1, events=(waves,)), profile, "up")
 
 
 def test_a_failing_schedule_is_shrunk_to_what_it_takes():

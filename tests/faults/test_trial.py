@@ -1,26 +1,20 @@
 """One schedule, flown: what it is checked for, and that a broken part is found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
-from cloudrc.faults import invariants
-from cloudrc.faults.adversary import POLICIES, choose, dishonesty
+from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.invariants import Limits, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import FORGETFUL, OrderInvariant, checked_in, fly
-from cloudrc.messages import ZERO, GuardState, Request, Start
+from cloudrc.messages import ZERO
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
-from cloudrc.world.guard import state
 from cloudrc.world.guard.limits import Limits as GuardLimits
-from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
 
 MS = 1_000_000
@@ -46,23 +40,6 @@ def test_a_hostile_cloud_causes_no_breach(policy):
     assert fly(replace(choose(seed), duration=8.0)).breaches == ()
 
 
-def test_a_hostile_cloud_makes_every_request():
-    _, words = dishonesty(Schedule(27, policy="operators-voice"))
-    assert words is not None
-    seen: list[Any] = [SimpleNamespace(guard=each, position=(1.0, 1.0, 1.0)) for each in GuardState]
-    said = [words(n * 10_000 * MS, robot) for n, robot in enumerate(seen * 300)]
-    made = {(request.request, request.start) for request in said if request is not None}
-    assert made == {(each, Start.SPAWN) for each in Request} | {(Request.START, Start.HERE)}
-
-
-@pytest.mark.promise("stays-inside-the-fence")
-@pytest.mark.parametrize("seed", [2, *nightly(*range(3, 40))])
-def test_it_causes_none_with_a_stiffer_low_level_controller(seed):
-    """Three times the default integral removes the steady error of 32 mm."""
-    hostile = replace(choose(seed), events=(), duration=15.0)
-    assert fly(hostile, "world.low_level.integral_limit_xy=0.30").breaches == ()
-
-
 BLACKOUT, STOPPED = Event("blackout", 44.0, 8.0), Event("stopped", 5.0)
 
 
@@ -83,45 +60,24 @@ def test_a_schedule_is_checked_for_what_it_allows(events, policy, duration, kind
     assert checked_in(schedule) & some == {*kinds.split()}
 
 
-def test_a_flight_without_faults_is_clean():
-    finding = fly(Schedule(1, "paper-p1", duration=45.0))
-    assert (finding.breaches, finding.missions) == ((), 1)
-
-
 HELD = Schedule(
     3,
     events=(
         *(Event("blackout", at, lasts) for at, lasts in ((6.0, 0.4), (6.8, 0.3), (9.5, 1.5))),
         *(Event("stopped", 12.0), Event("blackout", 15.0, 3.0)),
     ),
-    duration=21.0,
+    duration=30.0,
     hold_max=2.0,
 )
 """Several HOLDs, a stop, and a LAND."""
-
-
-def limits(**changes):
-    """Judge by other limits than those of the guard."""
-    wrong = Limits(hold_ns=2000 * MS)._replace(**changes)
-    return lambda patch: patch.setattr(Limits, "of", lambda guard: wrong)
 
 
 def ignores(owner, name, value=lambda *_: None):
     return lambda patch: patch.setattr(owner, name, value)
 
 
-def needs_no_start(patch):
-    accept = Guard.accept_command
-
-    def arm(guard, command, now_ns):
-        guard.armed = guard.armed or guard.state is GuardState.GROUND
-        return accept(guard, command, now_ns)
-
-    patch.setattr(Guard, "accept_command", arm)
-
-
 def applies_late_commands(patch):
-    take: Any = Channel.take
+    take = Channel.take
     patch.setattr(Channel, "take", lambda *_: USED if (said := take(*_)) == LATE else said)
 
 
@@ -136,20 +92,11 @@ def fails_to_shut_down(patch):
     ("breaks", "kind", "schedule"),
     [
         (lambda patch: None, "", HELD),
-        (
-            ignores(invariants, "HIGH", (1.2, 1.2, 1.2)),
-            "fence",
-            Schedule(8, "ideal", policy="towards-a-face", duration=8.0),
-        ),
-        (limits(age_ns=50 * MS), "stale", replace(HELD, duration=3.0)),
-        (limits(speed=0.1), "cap", replace(HELD, duration=3.0)),
         (ignores(GuardLimits, "ramp_ns", 0), "cap", replace(HELD, duration=9.0)),
-        (ignores(state, "SETTLE_NS", 0), "hold", replace(HELD, duration=9.0)),
         (ignores(GuardLimits, "alone_max_ns", lambda *_: 3_600_000 * MS), "hold", HELD),
-        (needs_no_start, "latch", HELD),
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
-        (ignores(MissionService, "stop_rotors"), "obeyed", replace(HELD, duration=30.0)),
-        (ignores(MissionService, "acknowledge"), "stuck", replace(HELD, duration=30.0)),
+        (ignores(MissionService, "stop_rotors"), "obeyed", HELD),
+        (ignores(MissionService, "acknowledge"), "stuck", HELD),
         (
             fails_to_shut_down,
             "error",
@@ -171,14 +118,11 @@ def test_a_broken_part_is_found(breaks, kind, schedule, monkeypatch):
         ([(2, 0), (2, 1), (2, 5), (1, 7), (1, 6)], {"order"}),
         ([(2, 0), (2, 5), (3, 0)], set()),
         ([(2, 1), (2, 1)], {"order"}),
-        ([(2, 1), (2, 0)], {"order"}),
-        ([(3, 0), (2, 7)], {"order"}),
-        ([(3, None), (3, 0)], set()),
         ([(3, None), (2, 9)], {"order"}),
     ],
 )
 def test_a_command_is_applied_once_and_in_order(commands, kinds):
-    flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()), world_starts_ns=[0, 3])
+    flight = SimpleNamespace(listeners=[], watch=Watch(Limits()), world_starts_ns=[0, 3])
     order = OrderInvariant(flight)
     for at, (epoch, counter) in enumerate(commands):
         opened = SessionOpened(at, "world", epoch, "cloud said hello")
@@ -195,6 +139,6 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
     events.append({"mission": "n", "event": "reached", "waypoint": 0})
     book = SimpleNamespace(events_after=lambda number: events)
     teleop, run = SimpleNamespace(service=SimpleNamespace(book=book)), SimpleNamespace(now_ns=0)
-    flight: Any = SimpleNamespace(listeners=[], watch=Watch(Limits()), teleop=teleop, run=run)
+    flight = SimpleNamespace(listeners=[], watch=Watch(Limits()), teleop=teleop, run=run)
     OrderInvariant(flight).check_waypoints()
     assert set(flight.watch.counts) == kinds

@@ -1,15 +1,12 @@
 """Endpoints without robot and loop; flights in virtual time; a world and the test's own cloud."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from unittest.mock import Mock
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint
-from cloudrc.config.load import ResolvedExperiment, load_experiment
+from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import (
     UPRIGHT,
@@ -23,8 +20,8 @@ from cloudrc.messages import (
 )
 from cloudrc.record.columns import Recording
 from cloudrc.record.hash import RecordHash
-from cloudrc.records import Counted, Record
-from cloudrc.report.document import Assessment, Run
+from cloudrc.records import Counted
+from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
@@ -40,7 +37,7 @@ CLOCK = bytes(16)
 KEY = Key(b"k" * 32)
 
 
-def bare_robot() -> Mock:
+def bare_robot():
     """A robot that flies every accepted command."""
     guard = Mock(state=GuardState.TRACK, cause=Cause.COMMAND, latched=False, armed=True)
     guard.configure_mock(counts={}, changes=[], reference=ZERO)
@@ -52,22 +49,19 @@ def bare_robot() -> Mock:
     return Mock(guard=guard, simulator=simulator, observers=[], run=run)
 
 
-def bare_world(
-    nonce: bytes = b"w", ring: KeyRing | None = None, start_ns: int = 0
-) -> WorldEndpoint:
+def bare_world(nonce=b"w", ring=None, start_ns=0):
     """Make world's end, sealed if it gets keys."""
-    identity = Identity(CLOCK, nonce.ljust(16), ring)
     return WorldEndpoint(
         bare_robot(),
         SimpleNamespace(measure=lambda truth: truth),
-        identity,
+        Identity(CLOCK, nonce.ljust(16), ring),
         newest_wins=True,
         command_age_max_ns=250 * MS,
         start_ns=start_ns,
     )
 
 
-def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
+def bare_cloud(nonce, keys, start_ns=0):
     """Make cloud's end; it sends the messages in its `teleop.outputs`."""
     teleop = SimpleNamespace(
         outputs=[], outcome=None, settled=True,
@@ -78,37 +72,37 @@ def bare_cloud(nonce: bytes, keys: KeyRing, start_ns: int = 0) -> CloudEndpoint:
     return CloudEndpoint(loop(), teleop, identity, newest_wins=True, start_ns=start_ns)
 
 
-def ring() -> KeyRing:
+def ring():
     return KeyRing(KeySet(KEY))
 
 
 class BareCloud:
     """A cloud process that sends hellos and commands on request."""
 
-    def __init__(self, nonce: bytes, keys: KeyRing | None) -> None:
+    def __init__(self, nonce, keys):
         self.session = Session(Direction.DOWNLINK, keys)
         self.handshake = ClientHandshake(nonce.ljust(16), CLOCK)
-        self.heard: list[str] = []
+        self.heard = []
 
-    def hello(self) -> bytes:
+    def hello(self):
         return self.session.greet(Kind.HELLO, self.handshake.make_hello())
 
-    def command(self, now_ns: int = 0, basis_ns: int | None = None, velocity=ZERO) -> bytes:
+    def command(self, now_ns=0, basis_ns=None, velocity=ZERO):
         basis_ns = now_ns if basis_ns is None else basis_ns
         body = codec.encode_command(Command(now_ns, basis_ns, 0, velocity, 0.0))
         return self.session.seal(Kind.COMMAND, body)
 
-    def ask(self, number, request, start, mission_id=0, basis_ns=0, reached=0) -> bytes:
+    def ask(self, number, request, start, mission_id=0, basis_ns=0, reached=0):
         asked = OperatorRequest(
             number, request, start, mission_id, reached, basis_stamp_ns=basis_ns
         )
         return self.session.seal(Kind.OPERATOR, codec.encode_operator(asked))
 
-    def start(self, number: int, basis_ns: int = 0) -> bytes:
+    def start(self, number, basis_ns=0):
         """Ask for a mission from the spawn: world opens an epoch."""
         return self.ask(number, Request.START, Start.SPAWN, basis_ns=basis_ns)
 
-    def receive(self, data: bytes) -> bytes | None:
+    def receive(self, data):
         """Take an answer of world; what is to be sent because of it, if anything."""
         try:
             kind, epoch, _, body = self.session.open(data)
@@ -136,28 +130,28 @@ class Bare:
     The last cloud that said `hello` is `speaker`: requests and commands come from it.
     """
 
-    def __init__(self, keys: KeyRing, *, flies: bool = False) -> None:
+    def __init__(self, keys, *, flies=False):
         """Start world, with a simulated robot if it `flies`."""
         identity = Identity(CLOCK, b"world".ljust(16), keys)
         self.world = assembly.build_world(HOVER, identity) if flies else bare_world(ring=keys)
         self.keys, self.now_ns, self.born = keys, 0, 0
-        self.clouds: dict[str, BareCloud] = {}
-        self.sent: list[bytes] = []  # everything that any cloud has ever sent
-        self.records: list[Record] = []
+        self.clouds = {}
+        self.sent = []  # everything that any cloud has ever sent
+        self.records = []
 
-    def cloud(self, name: str) -> BareCloud:
+    def cloud(self, name):
         if name not in self.clouds:
             self.born += 1
             self.clouds[name] = BareCloud(b"%d" % self.born, self.keys)
         return self.clouds[name]
 
-    def hello(self, name: str) -> int:
+    def hello(self, name):
         """Greet as this cloud; return the epoch that it got, 0 if none."""
         self.speaker = self.cloud(name)
         self.send(self.speaker.hello())
         return self.speaker.session.epoch
 
-    def send(self, data: bytes) -> None:
+    def send(self, data):
         """Deliver to world, and every answer to every cloud, until all is quiet."""
         waiting = [data]
         while waiting:
@@ -167,34 +161,34 @@ class Bare:
             replies = [cloud.receive(each) for each in answers for cloud in self.clouds.values()]
             waiting += filter(None, replies)
 
-    def wait(self, ms: float) -> None:
+    def wait(self, ms):
         """Let time pass in world; its telemetry is lost."""
         self.now_ns += round(ms * MS)
         while self.world.next_deadline_ns() <= self.now_ns:
             self.world.handle_deadline(self.world.next_deadline_ns())
         self.world.take_datagrams()
 
-    def asked(self, number: int, request: Request, start: Start, mission_id: int = 0) -> bytes:
+    def asked(self, number, request, start, mission_id=0):
         """A request that is passed on now."""
         world_ns = self.now_ns - self.world.slip_ns
         return self.speaker.ask(number, request, start, mission_id, world_ns)
 
-    def request(self, number: int, request: Request, start: Start, mission_id: int = 0) -> None:
+    def request(self, number, request, start, mission_id=0):
         self.send(self.asked(number, request, start, mission_id))
 
-    def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None) -> bytes:
+    def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None):
         return self.speaker.command(self.now_ns, basis_ns, velocity)
 
-    def take(self, kind: type) -> list:
+    def take(self, kind):
         self.records += self.world.take_records()
         return [record for record in self.records if isinstance(record, kind)]
 
-    def counts(self) -> dict[str, int]:
+    def counts(self):
         self.wait(1000)
         return {record.name: record.total for record in self.take(Counted)}
 
 
-def talking() -> Bare:
+def talking():
     """A cloud that has a session, and a mission that has been started where the robot stands."""
     talk = Bare(ring(), flies=True)
     talk.hello("cloud")
@@ -215,7 +209,7 @@ class Ends(NamedTuple):
     run: VirtualRun
 
 
-def join(experiment: ResolvedExperiment, *, offset_ns: int = 0, keys: KeyRing | None = None):
+def join(experiment, *, offset_ns=0, keys=None):
     """Assemble an experiment; with an offset the two ends have different clocks."""
     world_clock = b"another clock..." if offset_ns else SHARED_CLOCK
     world = assembly.build_world(experiment, Identity(world_clock, b"world".ljust(16), keys))
@@ -225,13 +219,11 @@ def join(experiment: ResolvedExperiment, *, offset_ns: int = 0, keys: KeyRing | 
     return Ends(world, cloud, VirtualRun(world, cloud, *links, cloud_clock_offset_ns=offset_ns))
 
 
-def fly_on(
-    run: VirtualRun, until_ns: int, over: Callable[[], bool] = lambda: False
-) -> tuple[list[Record], list[Record]]:
+def fly_on(run, until_ns, over=lambda: False):
     """Fly on; return the new records of world and of cloud."""
-    of_world, of_cloud = list[Record](), list[Record]()
+    of_world, of_cloud = [], []
 
-    def sink(new_of_world: list[Record], new_of_cloud: list[Record]) -> None:
+    def sink(new_of_world, new_of_cloud):
         of_world.extend(new_of_world)
         of_cloud.extend(new_of_cloud)
 
@@ -239,26 +231,24 @@ def fly_on(
     return of_world, of_cloud
 
 
-def records(experiment: ResolvedExperiment, **options: Any) -> tuple[list[Record], list[Record]]:
+def records(experiment, **options):
     """Fly and return the records of world and of cloud."""
     _, cloud, run = join(experiment, **options)
     return fly_on(run, LIMIT_NS, lambda: cloud.mission_over)
 
 
-def fly(name: str, *settings: str) -> Assessment:
+def fly(name, *settings):
     """Fly and return numbers and verdict."""
     experiment = load_experiment(name, settings)
-    return assess(
-        Recording.from_records(*records(experiment)), experiment, Run("virtual", "virtual")
-    )
+    flown = Recording.from_records(*records(experiment))
+    return assess(flown, experiment, Run("virtual", "virtual"))
 
 
-def numbers(assessment: Assessment) -> dict[str, float]:
-    """Return only the values of the numbers."""
+def numbers(assessment):
     return {name: number.value for name, number in assessment.numbers.items()}
 
 
-def digest(experiment: ResolvedExperiment, **options: Any) -> str:
+def digest(experiment, **options):
     """Compute the SHA-256 of all records of a flight."""
     digest = RecordHash()
     for each in records(experiment, **options):

@@ -1,14 +1,10 @@
-"""Captured datagrams are refused: in the same run, in the next one, and while ends greet."""
-
-from __future__ import annotations
+"""Captured datagrams are refused in the next run."""
 
 import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.faults.flight import Flight
-from cloudrc.records import Arrival, CommandApplied, SessionOpened
 from cloudrc.tunnel.codec import Kind, peek
-from cloudrc.tunnel.handshake import COOKIE_NS
 from tests.flights.conftest import digest, ring
 
 HOVER = (
@@ -45,14 +41,11 @@ class Tapped(Flight):
 
 @pytest.fixture(scope="module")
 def first():
-    flight = Tapped()
-    flight.fly(6.0)
-    assert any(isinstance(record, CommandApplied) for record in flight.of_world)
-    return flight
+    return Tapped().fly(6.0)
 
 
 @pytest.mark.promise("old-datagrams-do-nothing")
-@pytest.mark.parametrize("seconds", [0, 0.05, 1, 3])
+@pytest.mark.parametrize("seconds", [0, 1])
 def test_a_run_replayed_after_both_restarts_is_not_accepted(first, seconds, figure):
     flight = Tapped(life=2)
     flight.fly(seconds)
@@ -67,52 +60,6 @@ def test_a_run_replayed_after_both_restarts_is_not_accepted(first, seconds, figu
     assert len(drawn) <= 4, "a captured run of seconds makes nobody talk"
     flight.fly_mission(flight.now + 20.0)
     assert flight.mission.state == "done"
-
-
-def test_a_run_replayed_during_the_run_is_all_repeated():
-    flight = Tapped()
-    flight.fly(4.0)
-    epoch, heard = flight.world.inner.epoch, flight.heard
-    hellos = flight.greetings(Kind.HELLO, "world")
-    heard["world"] = [data for data in heard["world"] if data not in hellos]
-    for _ in range(10):
-        flight.replay(heard)
-    told = flight.world.take_records() + flight.cloud.take_records()
-    arrivals = [r for r in flight.of_world + flight.of_cloud + told if isinstance(r, Arrival)]
-    used = [(r.uplink, r.epoch, r.counter) for r in arrivals if r.used]
-    # A datagram still on the link counts once, if its copy arrives first.
-    assert len(set(used)) == len(used)
-    assert flight.world.inner.epoch == epoch
-    # A flood is counted but not recorded.
-    flowing = [data for each in heard.values() for data in each if peek(data)[0] in FLOWING]
-    assert sum(end.inner.counts["repeated"] for end in flight.ends.values()) > 8 * len(flowing)
-    assert len([r for r in told if isinstance(r, Arrival)]) <= len(flowing) + 500
-
-
-@pytest.mark.parametrize("rate", [0, 18, 100, 500])
-@pytest.mark.parametrize("which", ["old hello", "fresh hello", "all"])
-def test_captured_greetings_do_not_delay_a_restarted_cloud(first, which, rate):
-    """Captured greetings keep valid tags; they must not keep out an honest cloud."""
-    flight = Tapped(life=2)
-    flight.fly(4.0)
-    hellos = first.greetings(Kind.HELLO, "world")
-    fresh = flight.greetings(Kind.HELLO, "world")[-1:]
-    challenges = first.greetings(Kind.CHALLENGE, "cloud") if which == "all" else []
-    assert len(hellos) == 2, "with a cookie and without"
-    to_world = {"old hello": hellos[:1], "fresh hello": fresh}.get(which, hellos + fresh)
-    restarted_ns = flight.run.now_ns
-    flight.cloud.restart(restarted_ns, 0.0)
-    for _ in range((4 if challenges else 2) * rate):
-        flight.replay({"world": to_world, "cloud": challenges})
-        flight.fly(flight.now + 1.0 / rate)
-    flight.fly(restarted_ns * 1e-9 + 4.0)
-    opened = [r for r in flight.of_world if isinstance(r, SessionOpened)][-1]
-    used = [r for r in flight.of_world if isinstance(r, Arrival) and r.used and r.epoch == 3]
-    assert opened.epoch == 3
-    # An old challenge may replace a new one until the next time slot.
-    within_ns = 1_000_000_000 + (COOKIE_NS if challenges else 0)
-    assert opened.stamp_ns - restarted_ns <= within_ns
-    assert used[0].stamp_ns - restarted_ns <= within_ns + 200_000_000
 
 
 def test_sealed_and_unsealed_flights_are_the_same_flight():

@@ -5,13 +5,11 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from cloudrc.config.load import load_experiment
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, silent
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import load_scene
-from cloudrc.records import Control, GuardChange
-from tests.flights.conftest import MS, fly_on, join
+from tests.conftest import nightly
 
 COUNT = 200
 LAST = 27.0
@@ -36,11 +34,10 @@ def mid_pipe(*settings):
     """200 instants [s], evenly over the time in which the undisturbed robot is in a pipe."""
     flight = undisturbed(*settings)
     path = flight.trajectory()
-    scene = load_scene(flight.experiment.world.scene)
-    pipes = pipe_index(scene, [record.odometry.position for record in path])
-    ended = flight.events("done")[0].stamp_ns - 100_000_000
+    pipes = pipe_index(load_scene("pipes"), [record.odometry.position for record in path])
+    ended = flight.events("done")[0].stamp_ns * 1e-9 - 0.1
     inside = [r.stamp_ns * 1e-9 for r, pipe in zip(path, pipes, strict=True) if pipe >= 0]
-    early = [time for time in inside if time < ended * 1e-9]
+    early = [time for time in inside if time < ended]
     return [early[round(k)] for k in np.linspace(0, len(early) - 1, COUNT)]
 
 
@@ -82,73 +79,27 @@ def is_flown(flight):
 
 @pytest.mark.promise("brakes-without-commands")
 @pytest.mark.parametrize("kill", [False, True], ids=["silent", "killed"])
-@pytest.mark.parametrize("k", [13, 93, 173])
-def test_without_its_cloud_the_robot_stops_in_a_pipe(k, kill, figure):
-    interrupt(figure, kill, mid_pipe(*SLOW)[k], *SLOW)
-
-
-@pytest.mark.parametrize("kill", [False, True], ids=["silent", "killed"])
-@pytest.mark.parametrize("at", ANYWHERE[13::160])
-def test_without_its_cloud_it_stops_outside_too(at, kill, figure):
-    interrupt(figure, kill, at, *SLOW)
-
-
-@pytest.mark.parametrize("k", [13, 133])
-def test_without_the_cap_stopping_takes_a_little_longer(k, figure):
-    interrupt(figure, False, mid_pipe()[k], calm=1.4)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("kill", [False, True], ids=["silent", "killed"])
-@pytest.mark.parametrize("k", range(COUNT))
-def test_it_stops_at_any_instant(k, kill, figure):
+@pytest.mark.parametrize("k", [13, 173, *nightly(*sorted({*range(COUNT)} - {13, 173}))])
+def test_without_its_cloud_the_robot_stops_wherever_it_is(k, kill, figure):
     for at in (mid_pipe(*SLOW)[k], ANYWHERE[k]):
         interrupt(figure, kill, at, *SLOW)
-    if not kill:
-        for at in (mid_pipe()[k], ANYWHERE[k]):
-            interrupt(figure, kill, at, calm=1.4)
+    if not kill:  # without the cap stopping takes a little longer
+        interrupt(figure, kill, mid_pipe()[k], calm=1.4)
 
 
 @pytest.mark.parametrize(
-    ("way", "at", "duration"),
-    [("uplink", 11.3, 0.3), ("uplink", 22.1, 5.0), ("downlink", 28.85, 20.0)],
+    ("way", "at", "duration"), [("uplink", 22.1, 5.0), ("downlink", 28.85, 20.0)]
 )
 def test_a_silence_of_one_direction_touches_nothing(way, at, duration):
-    """In pipe 1 at speed, at the second bend, and before the board."""
+    """At the second bend, and before the board."""
     flight = cut_off(at, duration, "cloud.controller.speed_max=2", ways=(way,)).fly_mission(200.0)
     is_flown(flight)
     assert len(measures.held(flight)) == 1
     assert measures.number(flight, "min_clearance") >= 0.12
 
 
-def test_a_silence_at_the_missions_end_lets_the_robot_hold():
-    (done,) = undisturbed(*SLOW).events("done")
-    flight = cut_off(done.stamp_ns * 1e-9 - 0.02, SILENT, *SLOW).fly_mission(200.0)
-    is_flown(flight)
-    (hold,) = measures.held(flight)
-    assert measures.calm_after(flight, hold.stamp_ns * 1e-9, flight.now) <= 1.0
-
-
-def test_a_silent_downlink_freezes_until_the_echo_is_back():
-    """It uses an integral and `commanded_velocity`, which would both drift."""
-    flight = Flight(
-        *PATIENCE,
-        "cloud.predictor=commanded_velocity",
-        "cloud.controller={name: pid, gain_i: [0.1, 0.1, 0.1], speed_max: 2}",
-        "link.downlink.blackouts=[{start_s: 11.3, duration_s: 20}]",
-    ).fly_mission()
-    control = [r for r in flight.of_cloud if isinstance(r, Control)]
-    silence = [r for r in control if 12.5e9 < r.stamp_ns < 31.3e9]
-    assert len(silence) > 1800
-    assert {r.command for r in silence} == {(0.0, 0.0, 0.0)}
-    before = [r for r in control if 11.0e9 < r.stamp_ns < 11.3e9][-1]
-    after = next(r for r in control if r.stamp_ns > 31.3e9 and any(r.command))
-    assert max(abs(a - b) for a, b in zip(after.integral, before.integral, strict=True)) < 0.1
-    assert flight.mission.state == "done"
-
-
 @pytest.mark.parametrize(
-    ("setting", "until", "states"),
+    ("settings", "until", "states"),
     [
         # It receives the start but not the end of the mission.
         (("link.downlink.blackouts=[{start_s: 0.29, duration_s: 100}]",), 110, ["GROUND", "LAND"]),
@@ -156,22 +107,10 @@ def test_a_silent_downlink_freezes_until_the_echo_is_back():
         (("link.profile=satellite", "guard.hold_max_s=0.1"), 4, ["GROUND", "TRACK"]),
     ],
 )
-def test_a_start_without_commands(setting, until, states):
-    flight = Flight(*setting).fly(until)
+def test_a_start_without_commands(settings, until, states):
+    flight = Flight(*settings).fly(until)
     assert [change.state.name for change in flight.changes] == states
-    assert flight.guard_now()[0].name == states[-1]
-
-
-def test_a_lost_downlink_lands_the_robot_and_ends_the_run():
-    lost = "link.downlink.blackouts=[{start_s: 3, duration_s: 1000}]"
-    ends = join(load_experiment("paper", [lost, "guard.hold_max_s=1"]))
-    of_world, _ = fly_on(ends.run, 30_000 * MS, lambda: ends.cloud.mission_over)
-    changes = [r for r in of_world if isinstance(r, GuardChange)]
-    assert [r.state.name for r in changes[-3:]] == ["HOLD", "LAND", "LAND"]
-    assert changes[-1].cause == "touched down, rotors stopped"
-    assert ends.cloud.teleop.outcome.event == "guard_stopped"
-    assert ends.cloud.mission_over
 
 
 def test_a_flight_without_faults_never_meets_the_fence():
-    assert dict(undisturbed().robot.guard.counts) == {}
+    assert undisturbed().robot.guard.counts == {}

@@ -7,9 +7,8 @@ from cloudrc.config.load import load_experiment
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.records import GuardChange
 from cloudrc.teleop.wire import ALARM
-from cloudrc.tunnel.codec import NUMBER_MAX, Kind, peek
-from cloudrc.tunnel.end import Identity
-from tests.flights.conftest import HOVER, SHARED_CLOCK, fly_on, join
+from cloudrc.tunnel.codec import Kind, peek
+from tests.flights.conftest import HOVER, fly_on, join
 
 S = 1_000_000_000
 ELSEWHERE = (5.0, 5.0, 1.0)
@@ -46,51 +45,25 @@ def test_setpoints_and_starts_are_for_their_own_session(ends):
         assert say(ends, said._replace(epoch=epoch - 1), said._replace(epoch=epoch + 1)) == []
     assert ends.cloud._setpoint is before
     assert ends.cloud._counts["words_dropped"] == 6
-    for said in (start, start._replace(epoch=epoch)):
-        assert say(ends, said) == [Kind.OPERATOR]
+    assert say(ends, start, start._replace(epoch=epoch)) == [Kind.OPERATOR] * 2
     for said in (setpoint, setpoint._replace(epoch=epoch)):
         say(ends, said)
         assert ends.cloud._setpoint == said
 
 
-@pytest.mark.parametrize("request_", [each for each in Request if each is not Request.START])
-def test_requests_that_arm_nothing_are_always_passed_on(ends, request_):
-    epoch = ends.cloud._session.epoch
-    said = OperatorRequest(99, request_, epoch=epoch - 1)
-    assert say(ends, said, said._replace(epoch=epoch)) == [Kind.OPERATOR] * 2
-
-
-def test_nothing_starts_before_the_first_telemetry(ends):
-    ends.cloud._loop.reset()  # as a new session does
-    assert say(ends, OperatorRequest(99, Request.START)) == []
-    assert say(ends, OperatorRequest(99, Request.END)) == [Kind.OPERATOR]
-
-
-def test_used_up_numbers_last_until_the_next_session(ends):
-    """A sender with the keys has used the highest number of all."""
-    said = OperatorRequest(NUMBER_MAX, Request.END)
-    assert say(ends, said) == [Kind.OPERATOR]
-    assert say(ends, said._replace(number=NUMBER_MAX + 1), ALARM) == []
-    fly_on(ends.run, 5 * S)
-    assert ends.cloud._counts["words_dropped"] > 2
-    identity = Identity(SHARED_CLOCK, b"another".ljust(16))
-    world = ends.run._world = assembly.build_world(HOVER, identity, lambda: ends.run.now_ns)
-    fly_on(ends.run, 7 * S)
-    assert world.robot.guard.state is ESTOP
-
-
-def test_without_a_session_only_an_alarm_waits():
-    cloud = assembly.build_cloud(HOVER, Identity(SHARED_CLOCK, b"cloud".ljust(16)))
-    cloud.teleop.outputs += [OperatorRequest(3, Request.START), ALARM]
-    for now_ns in range(0, S, 10_000_000):
-        cloud.handle_deadline(now_ns)
-    assert {peek(data)[0] for data in cloud.take_datagrams()} == {Kind.HELLO}
+def test_requests_that_arm_nothing_are_always_passed_on(ends):
+    old = ends.cloud._session.epoch - 1
+    said = [OperatorRequest(99, each, epoch=old) for each in Request if each != Request.START]
+    assert say(ends, *said) == [Kind.OPERATOR] * len(said)
+    ends.cloud._loop.reset()  # as a new session does: no telemetry yet
+    start, stop = OperatorRequest(99, Request.START), OperatorRequest(99, Request.END)
+    assert (say(ends, start), say(ends, stop)) == ([], [Kind.OPERATOR])
 
 
 def test_an_early_alarm_keeps_the_robot_on_the_ground():
     ends = join(HOVER)
     ends.cloud.teleop.outputs.append(ALARM)
-    assert [each for each in states(ends, 3) if each is not GuardState.GROUND] == [ESTOP]
+    assert states(ends, 3) == [ESTOP]
 
 
 @pytest.mark.promise("emergency-stop-gets-through")

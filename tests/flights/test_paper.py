@@ -5,7 +5,9 @@ from statistics import mean
 
 import pytest
 
+from cloudrc import assembly
 from cloudrc.config.load import load_experiment
+from cloudrc.config.schema import Mission
 from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
 from tests.conftest import nightly
@@ -46,13 +48,6 @@ def test_the_paper_flies_under_other_conditions_too(setting):
     assert fly("paper", setting).verdict.failures == ()
 
 
-@pytest.mark.parametrize(("limit", "low", "high"), [(0.10, 0.030, 0.034), (0.30, 0.0, 0.001)])
-def test_the_steady_error_is_that_of_the_integral_limit(limit, low, high):
-    n = numbers(fly("hover", f"world.low_level.integral_limit_xy={limit}"))
-    assert low <= n["steady_error_x"] <= high
-    assert max(n["steady_error_y"], n["steady_error_z"]) < 1e-4
-
-
 def prediction_error(predictor, seeds):
     settings = ("link.profile=paper-p3", f"cloud.predictor={predictor}")
     flights = [fly("steps", *settings, f"seed={seed}") for seed in seeds]
@@ -69,10 +64,8 @@ def test_constant_velocity_predicts_far_better_than_nothing(seeds):
 
 
 def test_split_estimates_the_delay_better_than_the_running_mean():
-    split, mean_ = (
-        numbers(fly("steps", f"cloud.estimator={name}"))["delay_estimate_error_rms"]
-        for name in ("split", "running_mean")
-    )
+    flights = (fly("steps", f"cloud.estimator={name}") for name in ("split", "running_mean"))
+    split, mean_ = (numbers(flight)["delay_estimate_error_rms"] for flight in flights)
     assert split < 0.8 * mean_
 
 
@@ -80,15 +73,23 @@ def test_split_estimates_the_delay_better_than_the_running_mean():
     ("position", "scene"), [([9.2, 0.0, 1.0], "empty"), ([0.0, 0.0, 1.0], "pipes")]
 )
 def test_a_point_offered_for_one_that_the_guard_refuses_is_reached(position, scene):
-    def settings(point):
+    def load(point):
         waypoint = f"mission.waypoints=[{{position_m: {point}}}]"
-        return [waypoint, f"world.scene={scene}", "criteria.time_limit_s=25"]
+        settings = [waypoint, f"world.scene={scene}", "criteria.time_limit_s=25"]
+        return load_experiment("hover", settings)
 
     with pytest.raises(BadInputError) as caught:
-        load_experiment("hover", settings(position))
-    offered = re.search(r"nearest legal point found: \[(.*)\]", str(caught.value))
-    assert offered is not None
-    near = [float(word) for word in offered[1].split(",")]
-    _, cloud = records(load_experiment("hover", settings(near)))
+        load(position)
+    (offered,) = re.findall(r"nearest legal point found: (\[.*\])", str(caught.value))
+    _, cloud = records(load(offered))
     events = [record.event for record in cloud if isinstance(record, MissionEvent)]
     assert events == ["started", "reached", "done"]
+
+
+def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
+    points = [{"position_m": (0.0, 0.0, 1.0)}, {"position_m": (3.0, 4.0, 1.0), "dwell_s": 2.0}]
+    points.append({**points[1], "time_limit_s": 7.5})
+    mission = Mission.model_validate({"start": "here", "waypoints": tuple(points)})
+    for options, second in (({}, 33.0), ({"speed_max": 0.5}, 48.0)):
+        legs = assembly.mission_plan(mission, 60.0, **options).legs
+        assert [leg.time_limit for leg in legs][1:] == [second, 7.5]

