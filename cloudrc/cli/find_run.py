@@ -66,7 +66,7 @@ def find_local_run(
 def no_run_error(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
-    """Add to `error`, which says that there is no cluster, that no run is in flight here either.
+    """Add to `error` (no cluster was found) that no run is in flight on this machine either.
 
     If the flags name a cluster, return `error` unchanged. `flags` lists the flags that name a
     local run, for the error text.

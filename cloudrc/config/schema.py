@@ -143,7 +143,7 @@ class Direction(Section):
     """Changes of the conditions over time; at_s must rise from entry to entry"""
     trace: str | None = None
     """CSV file with the columns time_s,delay_ms[,loss], which replace the keys delay_ms and loss. A
-    relative path starts at the folder of the configuration file"""
+    relative path starts at the folder of the file that contains this key"""
     loop: bool = False
     """Whether trace, changes and blackouts begin again after the end of the trace; netem refuses
     it"""
