@@ -103,7 +103,7 @@ OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run the chosen action; return 1 if a check failed, 130 after Ctrl-C."""
+    """Run the chosen action; return 1 if a check failed, 130 after an interrupt signal."""
     if options.action is None:
         names = ", ".join(ACTIONS)
         raise BadInputError(f"an action is missing: {names}; see 'cloudrc faults --help'")
