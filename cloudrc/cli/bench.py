@@ -1,7 +1,7 @@
 """`cloudrc bench`: measure how much processor time the closed loop needs on this machine.
 
-For comparison, the command also replays the physics of the same flight alone: `mj_step` in C
-(`mujoco.rollout`, one thread). It repeats every measurement and prints the shortest times.
+The command flies the experiment `paper`. For comparison, it also replays only the physics of this
+flight, in C (`mujoco.rollout`, one thread). Of repeated measurements it prints the shortest times.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class Api:
             return json.loads(answer.read())
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
-        """Yield the events of all missions that follow the event id `after`, until teleop ends."""
+        """Yield the events with an id above `after`, of all missions, until teleop ends."""
         with self._answer("GET", f"/v1/events?after={after}", None, STREAM_TIMEOUT) as stream:
             for line in stream:
                 if line.startswith(b"data: "):

@@ -16,7 +16,7 @@ READY_LIMIT = 300.0
 
 
 def release_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags that name a release: context and namespace, as in kubectl, and release."""
+    """Declare `--context` and `--namespace`, as in kubectl, and `--release`."""
     group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
     group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
     group.add_argument(

@@ -76,7 +76,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _settings() -> Iterator[str]:
-    """Yield the completions of `--set`: KEY=NAME for a key that accepts names, else KEY=."""
+    """Yield the completions of `--set`: KEY=NAME if the key accepts names, KEY= if it does not."""
     from cloudrc import plugins
     from cloudrc.config import problems, shipped
     from cloudrc.config.overrides import KINDS
@@ -103,7 +103,7 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 
 
 def _candidates(name: str, words: Sequence[str], *, files: bool = False) -> dict[str, Any]:
-    """Return code for shtab that completes one of `words`, in the syntax of each shell.
+    """Return what shtab needs to complete `words`, in the syntax of each shell.
 
     `name` becomes part of the name of the shell function. With `files`, complete paths, too.
     """

@@ -30,8 +30,8 @@ PROGRAMS = {
 kind, because the cluster may be on other machines."""
 MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 LATE_SLEEP = 2e-3
-"""Largest lateness at the end of a sleep [s] with which flights in real time still work. For
-comparison: the control loop has a period of 10 ms."""
+"""If sleeps end later than this after their planned end [s], the check `timer` warns: flights in
+real time may not work. For comparison: the control loop has a period of 10 ms."""
 MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
     "mujoco.mj_step(m, mujoco.MjData(m))"
@@ -42,7 +42,7 @@ COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 class Check(NamedTuple):
     """The result of one check, with a text `found` and the advice `fix`.
 
-    If `state` is "missing", the modes in `modes` cannot run. If `state` is "warn", all modes can.
+    If `state` is "missing", the modes in `modes` cannot run. With "warn", all modes can run.
     """
 
     name: str
@@ -85,7 +85,7 @@ def packages(extra: str) -> Check:
 
 
 def mujoco_steps() -> Check:
-    """Run a step of MuJoCo in a separate process, because a broken library can abort a process."""
+    """Check whether MuJoCo works, in a separate process: a broken library can abort its process."""
     answer = subprocess.run(interpreter("-c", MUJOCO_PROGRAM), capture_output=True, text=True)
     ok = answer.returncode == 0
     lines = answer.stderr.strip().splitlines() or [f"exit code {answer.returncode}"]

@@ -32,9 +32,9 @@ examples:
 exit codes: 0 all checks passed, 1 a check failed, 2 bad input,
   6 a worker was killed, 130 interrupted"""
 SEED_MAX = 2**52
-"""Largest value of --seed and --first; a search counts up from --first, to seeds below 2^53."""
+"""Largest value of --seed and --first. A search counts up from --first, and seeds end at 2^53."""
 MINUTES_MAX = 10_000.0
-"""Longest duration of a search [min]: a week."""
+"""Longest duration of a search [min]: about a week."""
 ACTIONS = {
     "list": "list all faults with their injection and the expected reaction",
     "run": "inject faults, or those of a schedule's file, and check the reaction",
@@ -103,7 +103,7 @@ OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run the chosen action; return 1 if a check failed, 130 if it was interrupted."""
+    """Run the chosen action; return 1 if a check failed, 130 after an interrupt signal."""
     if options.action is None:
         names = ", ".join(ACTIONS)
         raise BadInputError(f"an action is missing: {names}; see 'cloudrc faults --help'")
@@ -199,7 +199,7 @@ def fly_file(options: argparse.Namespace) -> int:
 
 
 def search(options: argparse.Namespace) -> int:
-    """Fly random schedules of faults; print the failures and the command to continue."""
+    """Fly random schedules of faults; print the failures, and how to continue the search."""
     from cloudrc.faults.search import Search, search_rows, search_summary
 
     kind, shown = "adversarial" if options.adversarial else "random", options.output == "table"

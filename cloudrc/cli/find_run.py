@@ -27,11 +27,11 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
 def find_local_run(
     options: argparse.Namespace, look: Callable[[Path, str], _Found | None], nobody: str
 ) -> _Found | None:
-    """Find a run in flight: the run of `--run`, else ./runs/latest, else the only run in flight.
+    """Find a run in flight: the folder of `--run`, else ./runs/latest, else the only run in flight.
 
     Call `look` with the run's folder and the URL of its API ("" if the run has no API), and return
-    the result of `look`. Return None if no run is in flight or if the flags name a cluster. If the
-    run of `--run` is not in flight, raise an error with the text `nobody`.
+    the result of `look`. Return None if no run is in flight or if the flags name a cluster. If
+    `--run` names a run that is not in flight, raise an error with the text `nobody`.
     """
     from cloudrc.drivers.local import under_way
 
@@ -66,7 +66,7 @@ def find_local_run(
 def no_run_error(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
-    """Extend the `error` that no cluster was found: no run is in flight on this machine either.
+    """Add to `error` (no cluster was found) that no run is in flight on this machine either.
 
     If the flags name a cluster, return `error` unchanged. `flags` lists the flags that name a
     local run, for the error text.

@@ -1,7 +1,8 @@
 """Run `cloudrc link ACTION`.
 
-This module contains the action `show`; the modules `cli/link_<action>.py` contain all others. The
-arguments of `verify` are here, too, because the module of `verify` imports large packages.
+This module contains the action `show`; the modules `cli/link_<action>.py` contain the others. The
+arguments of `verify` are here, too: the module of `verify` imports large packages, which would slow
+down `cloudrc link --help`.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ RANGES: dict[str, tuple[float, float]] = {
 }
 """Option of `show` -> its least and largest value."""
 ROWS = 1000
-"""Smallest number of packets in the picture of a trace, which may have fewer rows."""
+"""Smallest number of packets in the picture of a trace. If the trace has fewer rows,
+several packets follow each row."""
 SECONDS = 30.0
 """Shortest time that the picture shows by default [s]; a longer time line is shown in full."""
 KINDS = ("png", "svg", "pdf")
@@ -168,7 +170,7 @@ def show_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def show(options: argparse.Namespace) -> int:
-    """Draw a profile into a file; print statistics and, in the last line, the path of the file."""
+    """Write a picture of a profile; print statistics and, in the last line, the file's path."""
     require("a picture of a link", ("report",))
     output = options.output or Path(f"{Path(options.profile).stem}.png")
     if output.suffix[1:] not in KINDS:
@@ -209,7 +211,10 @@ def _profile(name: str) -> tuple[Profile, bool]:
 def _way(
     asked: Direction, name: str, options: argparse.Namespace
 ) -> tuple[DirectionSample, Numbers]:
-    """Simulate one direction; if its conditions are constant, use more packets than are drawn."""
+    """Simulate one direction; return the packets for the figure, and statistics.
+
+    If the conditions are constant, the statistics come from more packets than the figure shows.
+    """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import numbers
     from cloudrc.link.profile import Timeline
@@ -236,7 +241,7 @@ def _way(
 
 
 def _row_times(times: Sequence[float]) -> list[int]:
-    """Return when to send packets [ns]: at each row of a trace, and between rows if it is short."""
+    """Return times [ns] to send packets: at each row of a trace, and between rows if few exist."""
     rows = [round(time * 1e9) for time in times]
     share = -(-ROWS // len(rows))
     if len(rows) == 1 or share == 1:

@@ -40,8 +40,8 @@ DIRECTIONS: tuple[Direction, ...] = ("uplink", "downlink")
 UNPACKED_MAX = 64 << 20
 """Largest size of an unpacked log [bytes]: 10 min of irtt at 100 Hz."""
 SETTLING_NS = 2_000_000_000
-"""Length of the part at the end of a session in which no datagram counts as lost [ns]: a missing
-datagram may still have been on its way."""
+"""Length of the last part of a session [ns]. A datagram sent in this part never counts as lost: it
+may have been on its way when the session ended."""
 TOPICS = {
     "uplink": ("/telemetry", "/uplink_delay"),
     "downlink": ("/delay_estimate", "/downlink_delay"),
@@ -195,9 +195,9 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
 
 
 def _halves(recording: Recording, path: Path) -> Packets:
-    """Estimate one-way delays as halves of the measured round trips, at the time when they began.
+    """Estimate each one-way delay as half of a round trip, at the time when the round trip began.
 
-    A round trip does not show which datagrams were lost.
+    The result contains no losses: round trips do not show which datagrams were lost.
     """
     from cloudrc.link.logs import Log
 

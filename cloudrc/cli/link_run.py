@@ -1,4 +1,4 @@
-"""Run `cloudrc link run`: the process that shapes one direction of the link, a sidecar in a pod.
+"""Run `cloudrc link run`: the process in a pod's link container, which shapes one direction.
 
 GET /link.json on the metrics port returns the state of the shaper. The process calls tc and ip for
 this answer, and caches the answer for one second.
@@ -44,7 +44,8 @@ TOOL_TIMEOUT = 5.0
 """Time limit of one call of tc or ip [s]."""
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
-"""Command sent to tc after every command: the answer to `_END` marks the end of the answer."""
+"""Command that is sent to tc after each other command. When its answer arrives, the answer to the
+other command is complete; tc itself does not mark the end of an answer."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -247,7 +248,10 @@ class Programs:
             self._tc = None
 
     def _ask(self, line: str, *, lists: bool) -> Answer:
-        """Send a command to the open tc process; raise an OSError if tc does not answer."""
+        """Send a command to the open tc process; `lists` tells whether the command lists qdiscs.
+
+        Raise an OSError if tc does not answer.
+        """
         from cloudrc.link.netem import Answer
 
         tc, pipe = self._tc, subprocess.PIPE

@@ -82,7 +82,7 @@ WAYS = {
 KEYS = ("asked", "measured", "low", "high")
 """Keys of the values in a row of the report, in the order of the table's columns."""
 NOT_JUDGED = "NOT JUDGED"
-"""Mark in the notes on quantities of the profile that the command could not verify."""
+"""Words in a note about a quantity of the profile that the command could not verify."""
 TOLD = {
     "correlation": f"correlation {NOT_JUDGED}: netem realises almost none of it",
     "rate": f"rate {NOT_JUDGED}: only trains of probes measure it, up to 100 Mbit/s",
@@ -95,12 +95,12 @@ VERDICTS = {
     "open": ("undecided", "yellow", "was not measured for long enough: give more --seconds"),
     "ok": ("believed", "green", "matches its profile"),
 }
-"""Worst verdict on a quantity of the link -> verdict on the link, its colour and text."""
+"""Worst verdict on any quantity of the link -> verdict on the whole link, with colour and text."""
 _CLONE_NEWNET = 0x40000000  # linux include/uapi/linux/sched.h
 
 Report: TypeAlias = dict[str, Any]
 Pods: TypeAlias = Mapping[str, Sequence[str]]
-"""World or cloud -> URLs of the metrics ports: of the process itself, and of its link container."""
+"""World or cloud -> two URLs: the metrics port of the process, and that of its link container."""
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -138,7 +138,7 @@ def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
 
 @dataclass(slots=True)
 class Way:
-    """One direction of a link under test: socket for its probes, shaper's process and files."""
+    """One direction of a link under test: socket of the probes, process and files of the shaper."""
 
     own: socket.socket
     ports: tuple[int, int]  # port at which a relay receives, and metrics port
@@ -214,7 +214,9 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, 
 def run_link(
     experiment: ResolvedExperiment, shaper: str, applied: Profile | None = None
 ) -> Iterator[dict[str, Way]]:
-    """Run both directions of a link while the block runs: on loopback, netem in two namespaces.
+    """Run both directions of a link while the `with` block runs.
+
+    The relay runs on loopback; netem runs in two network namespaces.
 
     `applied` is for tests: the profile of the link's processes if it differs from the experiment's.
 
@@ -313,7 +315,7 @@ def _ip(*words: str) -> None:
 def inside(namespace: str) -> Iterator[None]:
     """Move this thread into a network namespace while the block runs; "" changes nothing.
 
-    Sockets and processes from the block stay in the namespace after the block.
+    Sockets and processes that the block makes stay in the namespace after the block.
     """
     if not namespace:
         yield
@@ -383,7 +385,7 @@ def fetch(url: str) -> str:
 
 
 def _may_change(found: Mapping[str, Any]) -> bool:
-    """Return whether a verdict is "open" and may change; with a looping time line it never does."""
+    """Return whether an "open" verdict may change; with a looping time line it stays "open"."""
     loops = any(row["quantity"] == "time_line" and row.get("measured") for row in found["rows"])
     return bool(found["verdict"] == "open") and not loops
 

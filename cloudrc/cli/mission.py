@@ -371,7 +371,7 @@ def _print_state(mission: Json) -> None:
 
 
 def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
-    """Print the robot's state by the newest telemetry, and the age of cloud's last message [s]."""
+    """Print the robot's newest known state, and the age of cloud's last message [s]."""
     heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
     if seen is None:
         print(f"no telemetry from the robot yet; is the link up? cloud heard {heard}")

@@ -81,7 +81,7 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
 
 
 def escape(text: str) -> str:
-    """Escape unprintable characters: a text must neither break its line nor control a terminal."""
+    """Escape unprintable characters, which could break the line or control the terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

@@ -56,7 +56,7 @@ def _isolated_start() -> Iterator[None]:
     """Isolate worker processes that start inside the block.
 
     The workers ignore SIGINT and SIGHUP, because the parent process ends them. They import no
-    module from the working folder, whose files may come from somebody else.
+    module from the working folder: a file there may be somebody else's, and importing runs it.
     """
     before = {n: signal.signal(n, signal.SIG_IGN) for n in (signal.SIGINT, signal.SIGHUP)}
     safe_path = os.environ.get("PYTHONSAFEPATH", "")
@@ -74,7 +74,7 @@ def map_in_order(
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    At most `jobs` worker processes run, and at most one per core. In place of a single worker, this
+    At most `jobs` worker processes run, and at most one per core. Instead of a single worker, this
     process makes all calls. The function has to be at module level: a worker imports the function.
     Ctrl-C or closing the generator kills the workers and drops all calls that have not ended.
     """

@@ -184,8 +184,8 @@ def _addresses(name: str, family: int) -> list[str]:
 def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0)) -> Address:
     """Resolve an address, before the control loop starts: the loop must not wait for DNS.
 
-    The result is IPv4 or IPv6, like the address `listen` of this process; if `listen` is [::], the
-    result may be either. `flag` names the command-line flag in the error text.
+    The result is IPv4 or IPv6, like the address `listen` of this process; if `listen` is [::], both
+    are possible. `flag` names the command-line flag in the error text.
 
     Raises:
         BadInputError: If the host cannot be resolved.
@@ -222,7 +222,7 @@ def _listening(flag: str, listen: Address) -> Iterator[None]:
 
 
 def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
-    """Serve the metrics of this process at the address of `--metrics`; None without the flag."""
+    """Serve the metrics of this process at the address of `--metrics`; without it, return None."""
     if options.metrics is None:
         return None
     from cloudrc.drivers.exporter import Exporter

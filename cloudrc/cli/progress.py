@@ -70,7 +70,7 @@ class FlightView:
                     self._event(in_words(record))
 
     def line(self) -> Text:
-        """Return the status line; its end is least important, as a narrow terminal crops it."""
+        """Return the status line, with the least important part last: narrow terminals crop it."""
         elapsed, flown = self._seen - self._began, (self._now_ns - self._first_ns) * 1e-9
         number = self._waypoint + 1
         cells = (

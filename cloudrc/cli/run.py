@@ -41,7 +41,7 @@ See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
 
 GRACE = 30.0
-"""Time from the mission's time limit until this program itself stops the flight [s]."""
+"""If the mission goes on for this time after its time limit [s], this program stops the flight."""
 CLOCK = bytes(16)
 """Identity of the virtual clock, which world and cloud share."""
 EPILOG = """\
@@ -271,7 +271,8 @@ def _record_virtual(
 ) -> Iterator[tuple[Recording, Run]]:
     """Fly in virtual time, and yield the recording and facts about the run.
 
-    The block writes the report; after the block, attach the report to the recording's file.
+    Use as a context manager, in whose block the caller writes the report. When the block ends, this
+    function attaches the report to the file of the recording.
     """
     from cloudrc.record.columns import Recording, merged
     from cloudrc.record.hash import RecordHash
@@ -313,7 +314,8 @@ def _record_local(
 ) -> Iterator[tuple[Recording, Run]]:
     """Fly in real time, and yield the merged recording and facts about the run.
 
-    The block writes the report; after the block, attach the report to the recording's file.
+    Use as a context manager, in whose block the caller writes the report. When the block ends, this
+    function attaches the report to the file of the recording.
     """
     from cloudrc.drivers.local import LocalRun
     from cloudrc.record.hash import messages_sha256

@@ -1,4 +1,4 @@
-"""`cloudrc run --seeds N`: fly seeds 1 to N on all cores; print medians with their confidence."""
+"""`cloudrc run --seeds N`: fly seeds 1 to N on all cores; print medians and their intervals."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def as_csv(reports: Sequence[Report]) -> str:
 def fly_seeds(options: argparse.Namespace) -> int:
     """Fly seeds 1 to N and print one table; return 0 if all runs succeed.
 
-    If Ctrl-C or a killed worker process ends the command early, the table has the finished seeds.
+    If Ctrl-C or a killed worker ends the command early, the table shows the finished seeds only.
     """
     # Load the experiment here too, so that a mistake is reported once, not N times.
     name = load(options.experiment, options.set).name

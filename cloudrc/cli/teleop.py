@@ -34,7 +34,7 @@ emergency stop."""
 LOCK_PERIOD = 0.2
 """Time between two attempts to open the journal while another teleop process locks it [s]."""
 PAUSE_LIMIT_NS = 500_000_000
-"""Longest time for which teleop, asked to end, waits until the robot holds its position [ns]."""
+"""When asked to end, teleop waits at most this time [ns] until the robot holds its position."""
 EPILOG = """\
 teleop talks to 'cloudrc cloud --teleop DIR' through two sockets in DIR. It ends
 on SIGTERM, on Ctrl-C and when its parent process has ended; with --start also

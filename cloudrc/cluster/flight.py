@@ -30,7 +30,8 @@ LOOK_PERIOD = 1.0
 HELM_LIMIT = 120.0
 """Time limit for one helm command [s]; helm does not wait for pods."""
 FAILURE_TIME = 5.0
-"""Time after which a pod's failure is reported [s]; objects that the pod needs may come late."""
+"""A pod's failure is reported if it lasts for this time [s]: objects that the pod needs may still
+be missing before."""
 FLUSH = 1.0
 """Time after which a recorder has certainly written its buffer of half a second [s]."""
 FETCHES = 4
@@ -134,7 +135,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
 
 
 def refuse_second_flight(release: Release, ask: Ask) -> None:
-    """Raise a ClusterError if a mission is under way; an installation would replace both pods."""
+    """Raise a ClusterError if a mission is under way: installing would replace the pods."""
     if found := find_flight(release, ask):
         raise ClusterError(
             f"{found[0]} is under way on release '{release.name}' {release.where}; wait for it, "
@@ -235,7 +236,7 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Contents:
     """Fetch recordings, metrics and logs into a folder; return the merged recording.
 
-    The report does not need metrics and logs: `tell` receives their errors. With `want_end`, fetch
+    If metrics or logs cannot be fetched, `tell` receives the error. With `want_end`, fetch
     the recordings again until they contain the end of the mission.
     """
     from cloudrc.record.merge import cut_to_last_mission, merge

@@ -96,7 +96,7 @@ def run_job(
         mission: Mission in the API's format: name, start, time_limit_s, waypoints.
         name: Name of the Job; default: an unused name.
         limit: Time limit of the mission [s].
-        queue: Whether to wait while another mission flies; otherwise the API refuses the mission.
+        queue: Whether to wait while another mission flies; if False, the API then refuses it.
 
     Raises:
         ClusterError: If the cluster refuses the Job, or if the release does not exist.
@@ -179,8 +179,8 @@ def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
     """Find a Job that has not ended, or else the mission that the API shows as under way.
 
     Returns:
-        The flight in words, and the command that ends the flight. None if nothing flies, or if the
-            API does not answer: then the user must be able to repair the release.
+        The flight in words, and the command that ends the flight. None if nothing flies; also if
+            the API does not answer, so that the user may still upgrade and repair the release.
     """
     for job in release.find("jobs", COMPONENT):
         if (status := _status(job, None)).state not in ENDED:
@@ -194,7 +194,7 @@ def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
 
 
 def delete_job(release: Release, name: str) -> None:
-    """Delete a Job with its pod and ConfigMap; the pod cancels the mission before it ends."""
+    """Delete a Job with its pod and ConfigMap; before the pod ends, it cancels the mission."""
     release.request("delete", "jobs", name=name, propagation_policy="Foreground")
     until, jobs = time.monotonic() + DELETE_LIMIT, partial(release.find, "jobs", COMPONENT)
     while any(job.metadata.name == name for job in retry(jobs, lambda text: None)):

@@ -1,7 +1,7 @@
 """Access the pods of a release: find them, explain failures, forward ports, fetch files.
 
 A recording grows while it is copied. Its copy may therefore end in the middle of a record, like the
-recording of a killed process; everything before is readable.
+recording of a killed process; everything before this record is readable.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def api_url(release: Release) -> Iterator[str]:
 
 @contextmanager
 def forwarded(release: Release, pod: str, ports: Sequence[int]) -> Iterator[dict[int, int]]:
-    """Forward ports of a pod to this machine during the `with` block, also loopback ports.
+    """Forward ports of a pod, also loopback ports of the pod, during the `with` block.
 
     Yields:
         Port in the pod -> port on 127.0.0.1 of this machine.

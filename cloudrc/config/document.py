@@ -23,7 +23,8 @@ KeyPath = tuple[str, ...]
 SIZE_MAX = 8 << 20
 """Largest size of a configuration file [bytes]."""
 VALUES_MAX = 300_000
-"""Largest number of values in a document. A short file with nested aliases can have far more."""
+"""Largest number of values in a document. The limit refuses a short file in which nested
+aliases make far more."""
 SET_LABEL = "--set"
 """`Source.label` of a value from the command line."""
 
@@ -159,7 +160,7 @@ class Source(NamedTuple):
     folder: Path  # a relative path in the value starts here
 
     def absolute(self, path: str) -> Path:
-        """Make the `path` from a configuration file absolute; the target need not exist."""
+        """Make `path`, a value in a configuration file, absolute; no file has to exist there."""
         return Path(os.path.realpath(self.folder / os.path.expanduser(path)))
 
 
@@ -195,7 +196,7 @@ class Document:
         return value
 
     def set_value(self, path: KeyPath, value: Any, source: Source) -> None:
-        """Set the value at `path`, whose parents exist; an index equal to the length appends."""
+        """Set the value at `path`, whose parents exist; at a list's length as index, append it."""
         parent = self.get(*path[:-1])
         if isinstance(parent, list):
             parent[int(path[-1]) : int(path[-1]) + 1] = [value]

@@ -158,9 +158,10 @@ def load_experiment(
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment without importing or checking its plug-ins, for processes without cloud.
+    """Load an experiment without importing or checking its plug-ins, for all processes but cloud.
 
-    The plug-ins have only the parameters that the file gives. The config.yaml of a run gives all.
+    The plug-ins have only the parameters that the file gives. The config.yaml of a run gives all
+    parameters.
     """
     return load_experiment(name, settings, build=False)
 
@@ -178,8 +179,8 @@ def check_profile(document: Document, name: str) -> Profile:
 def dump(experiment: ResolvedExperiment) -> str:
     """Format an experiment as YAML; loading this YAML returns an equal experiment.
 
-    The YAML contains mission and link profile. Of traces and of plug-ins outside the package, it
-    contains the absolute paths only.
+    The YAML contains mission and link profile. Traces, and plug-ins outside the
+    package, appear as absolute paths.
     """
     return write_yaml(experiment.model_dump(mode="json"))
 
@@ -190,7 +191,7 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Whether a key is inside the mission or the profile, for which a file may give a name."""
+    """Whether a key is inside mission or profile, instead of which a file may give a name."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
@@ -219,7 +220,7 @@ def _default(document: Document, path: KeyPath, value: Any) -> None:
 
 @contextmanager
 def _collect(found: list[Problem], path: KeyPath) -> Iterator[None]:
-    """If the block raises a BadInputError, add a problem of the value at `path` to `found`."""
+    """If the block raises a BadInputError, add a problem with the value at `path` to `found`."""
     try:
         yield
     except BadInputError as error:
@@ -238,7 +239,7 @@ def _inline_mission(document: Document) -> None:
 
 
 def _inline_profile(document: Document) -> None:
-    """Insert values of the link profile for keys of a direction that the experiment lacks."""
+    """Insert the link profile's values for all keys of a direction that the experiment omits."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
     if not isinstance(name, str) or _has_all_values(document):
@@ -271,7 +272,7 @@ def _has_all_values(document: Document) -> bool:
 
 
 def _remove_profile_values(document: Document) -> None:
-    """Remove the values of the present profile, before another profile replaces this profile."""
+    """Remove the values of the present profile, before another profile replaces it."""
     if not _has_all_values(document):
         return
     for way in DIRECTIONS:
@@ -331,7 +332,7 @@ def _default_contact(document: Document) -> None:
 CHANGEABLE_KEYS = Change.model_fields.keys() - {"at_s"}
 """Keys of a direction that an entry of its list `changes` may set."""
 TIME_LINE_KEYS = ("changes", "trace", "blackouts")
-"""Keys of a direction by which the conditions of the link depend on time: the time line."""
+"""Keys of a direction that make up its time line: how the link's conditions change over time."""
 _HERE = "link set"
 _EXAMPLE = "for example downlink.delay_ms=120, or --profile handover"
 
@@ -385,7 +386,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
 
 
 def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:
-    """Remove `key` from the time line of a direction; return notes for the user about effects."""
+    """Remove `key` from the time line of a direction; return notes about side effects."""
     direction = document.get(way)
     if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:
         return []

@@ -2,7 +2,7 @@
 
 Each waypoint must be in the region in which the guard lets the robot fly. The robot must keep a
 distance from the walls of pipes at each waypoint, and on the straight path to the waypoint from the
-spawn point or from the previous waypoint. The board may be in the way, as in the paper's mission.
+spawn point or from the previous waypoint. The board may be on this path, as in the paper's mission.
 """
 
 from __future__ import annotations

@@ -96,7 +96,8 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
     """Replace each plug-in of an experiment by a mapping with its name and its parameters.
 
     With `build`, check the parameters, add defaults, and build each plug-in once as a test. Without
-    `build`, import no plug-in, because it may come from somebody else. Return the problems.
+    `build`, import no plug-in: importing runs its code, which may be somebody else's. Return the
+    problems.
     """
     found: list[Problem] = []
     for key, kind in KINDS.items():

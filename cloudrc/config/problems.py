@@ -149,7 +149,7 @@ class Problem(NamedTuple):
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[Problem]:
-    """Convert validation errors of `model`, at most `limit`; `prefix` is the path of the model."""
+    """Convert validation errors of `model`, at most `limit`; `prefix` leads to the model's part."""
     details = error.errors(include_url=False)[:limit]
     return [_problem(detail, model, prefix) for detail in details]
 

@@ -94,7 +94,7 @@ class Blackout(Section):
 
 
 class Change(Section):
-    """New conditions from `at_s` on; every key that is not given keeps its value."""
+    """A change of the conditions; a key that is not given keeps its value."""
 
     at_s: NotNegative
     """Start, in time since the link came up [s]"""
@@ -114,13 +114,13 @@ class Direction(Section):
     delay_ms: NotNegative = 0.0
     """Mean one-way delay [ms]; a round trip is the sum of both directions"""
     jitter_ms: NotNegative = 0.0
-    """Spread of the delay [ms]; half the width of uniform, the standard deviation of the other
-    distributions. A delay below 0 becomes 0, which raises the mean"""
+    """Spread of the delay [ms]; half the width of a uniform distribution, the standard
+    deviation of another. A delay below 0 becomes 0, which raises the mean"""
     distribution: Literal["uniform", "normal", "pareto", "table"] = "uniform"
     """Distribution of the jitter; pareto has a long tail; table: the delays in the file `table`"""
     table: str | None = None
-    """CSV file as for `trace`; its delays, shifted to mean 0 and scaled to `jitter_ms`, are the
-    distribution. Needed with distribution: table"""
+    """CSV file in the format of `trace`. Its delays, shifted to mean 0 and scaled to `jitter_ms`,
+    are the distribution. Needed with distribution: table"""
     correlation: Probability = 0.0
     """Correlation between the jitter of a packet and of the next packet"""
     loss: Loss = 0.0
@@ -128,21 +128,22 @@ class Direction(Section):
     duplicate: Probability = 0.0
     """Chance that a packet arrives twice; the copy has its own delay"""
     reorder: Probability = 0.0
-    """Chance that a packet has no delay and so arrives before earlier ones; no effect with
+    """Chance that a packet has no delay and so overtakes earlier packets; no effect with
     keep_order"""
     corrupt: Probability = 0.0
     """Chance that one bit of a packet is flipped; the receiver refuses such a packet"""
     keep_order: bool = False
     """Whether packets arrive in the order of sending, as from a queue"""
     rate_kbit: Positive | None = None
-    """Rate of the bottleneck [kbit/s]; a packet has 28 bytes of headers; null: no bottleneck"""
+    """Rate of the bottleneck [kbit/s]; each packet counts with 28 bytes of headers;
+    null: no bottleneck"""
     queue_packets: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
     """Packets that the bottleneck holds; further packets are dropped"""
     changes: tuple[Change, ...] = ()
     """Changes of the conditions over time; at_s must rise from entry to entry"""
     trace: str | None = None
     """CSV file with the columns time_s,delay_ms[,loss], which replace the keys delay_ms and loss. A
-    relative path starts at the folder of the file that names it"""
+    relative path starts at the folder of the file that contains this key"""
     loop: bool = False
     """Whether trace, changes and blackouts begin again after the end of the trace; netem refuses
     it"""
@@ -209,12 +210,12 @@ class Waypoint(Section):
     dwell_s: Dwell = 0.5
     """Time that the robot must stay within the tolerance [s]; 0: the robot flies on at once"""
     time_limit_s: TimeLimit | None = None
-    """Time limit for the flight to this point [s], without time in HOLD. Beyond it the mission
-    fails. null: 3 times the expected time"""
+    """Time limit for the flight to this point [s], not counting time in HOLD; after it the
+    mission fails. null: 3 times the expected time"""
 
 
 class Steps(Section):
-    """Random setpoints in sequence, drawn from the seed, to compare predictors."""
+    """A sequence of random setpoints, made from the seed, to compare predictors."""
 
     count: Annotated[int, Field(ge=1, le=1000)] = 10
     """Number of setpoints"""
@@ -242,7 +243,7 @@ class Mission(Section):
 
 
 class LowLevel(Section):
-    """The onboard velocity loop: the published gains at the true time step."""
+    """The onboard velocity loop; the defaults are the published gains."""
 
     gain_p: NotNegatives = (4.0, 4.0, 10.0)
     """Proportional gain per axis [N/(m/s)]"""
@@ -281,27 +282,28 @@ class Guard(Section):
     """Limits of the onboard guard; only world reads them."""
 
     command_age_max_ms: CommandAge | None = None
-    """Largest age of the odometry from which a command was computed [ms]. If the newest command is
-    older, the robot holds its position. null: the link profile's value, else 250"""
+    """Largest age of the odometry from which a command was computed [ms]. If this age of the
+    newest command is larger, the robot holds its position. null: the link
+    profile's value, else 250"""
     speed_max_mps: Speed | None = None
-    """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest value
-    allowed, with which the robot stops within 8.7 m; 6 if command_age_max_ms is 250"""
+    """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest speed
+    from which the robot stops within 8.7 m, 6 m/s if command_age_max_ms is 250"""
     acceleration_max_mps2: Acceleration = 12.0
     """Cap on the acceleration that the guard lets the onboard controller follow [m/s^2]"""
     yaw_rate_max_radps: YawRate = 1.0
     """Cap on the commanded yaw rate [rad/s]; a faster command is shortened"""
     hold_max_s: HoldTime = 60.0
     """Time in HOLD during a mission after which the robot lands [s]. On the ground, a mission ends
-    after the same time without a fresh command, but not before 10 s. If the value is below 1 s
-    minus guard.command_age_max_ms, every silence in flight ends in LAND"""
+    after this time without a fresh command, but at the earliest after 10 s. With a value below 1 s
+    minus guard.command_age_max_ms, the robot lands after every silence in flight"""
 
 
 class Tunnel(Section):
-    """How both ends treat late datagrams."""
+    """How both ends treat datagrams that arrive out of order."""
 
     order: Literal["newest", "arrival"] = "newest"
-    """newest: the datagram sent last counts, late datagrams are dropped; arrival: the datagram that
-    arrived last counts"""
+    """newest: a datagram that arrives after a newer one is dropped; arrival: the datagram that
+    arrived last is used"""
 
 
 class Link(Section):
@@ -339,7 +341,7 @@ class Cloud(Section):
 
 
 class Criteria(Section):
-    """What a flight needs to count as a success."""
+    """Conditions for the success of a flight."""
 
     contact: bool | None = None
     """Whether the tip of the arm must touch the board; null: only in a scene that has a board, and

@@ -1,4 +1,4 @@
-"""Run the endpoints, world and cloud. Only drivers use clocks, sockets and threads for them.
+"""Run the endpoints, world and cloud. Endpoints themselves use no clocks, sockets or threads.
 
 Drivers call endpoints only through the interface in `cloudrc/endpoint.py`.
 """

@@ -35,13 +35,13 @@ clients cannot use up the files or threads of the process."""
 KEPT = 0.25
 """Time for which a page of metrics is reused [s]: making a page may delay the control loop."""
 CONFIG_DIGITS = 12
-"""Number of hexadecimal digits that the metrics show of the hash of the configuration."""
+"""Number of hexadecimal digits of the configuration's hash in the metrics."""
 STILL_MAX = 5.0
 """Time without a record after which the control loop counts as stopped [s]. A running loop makes at
 least one record per second."""
 CGROUP = Path("/sys/fs/cgroup")
 CPU_COUNTS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
-"""Files below `CGROUP` that may contain a container's CPU counts, first of cgroup v2, then v1."""
+"""Files below `CGROUP` that may contain a container's CPU counts: one for cgroup v2, two for v1."""
 
 
 class Answer(NamedTuple):
@@ -138,7 +138,7 @@ class Exporter:
     def __init__(self, role: str, *, missions: bool = True) -> None:
         """Set the role of the process: "world", "cloud", "teleop" or "link".
 
-        `missions` is False in a cloud whose separate teleop exports the metrics of missions.
+        `missions` is False in cloud if a separate teleop process exports the metrics of missions.
         """
         self._role, self._metrics = role, of_role(role)
         self._live = LiveMetrics(role, missions=missions)
@@ -236,7 +236,7 @@ class Exporter:
         return generate_latest(self._registry).decode()
 
     def _page(self) -> Answer:
-        """Return the page of metrics, at most `KEPT` old; one thread at a time makes a new page."""
+        """Return the page of metrics, at most 0.25 s old; one thread at a time makes a new page."""
         with self._page_lock:
             now = time.monotonic()
             if now - self._made_at >= KEPT:

@@ -42,9 +42,9 @@ SILENCE_LIMIT = 5.0
 line at least once a second."""
 PAUSE = 1.0
 """Longest turn of the supervisor's loop [s]. After a longer turn, the supervisor itself was paused,
-for example because this machine is overloaded; that time does not count for time limits."""
+perhaps by an overload of the machine; the time of this turn does not count for time limits."""
 SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
-"""Longest path of a run's socket, relative to the folder for temporary files."""
+"""A socket's path, relative to the folder for temporary files, is at most as long as this text."""
 API_FILE = "api.json"
 """File in a run's folder with the address of the run's API, for programs of other authors."""
 AUDIT_FILE = "audit.jsonl"
@@ -96,7 +96,7 @@ def _write_flight(place: Path, flight: str, stack: contextlib.ExitStack) -> bool
 
 
 def under_way() -> dict[Path, str]:
-    """Return the flights of this user: folder of the run -> address of its API ("" without)."""
+    """Return the flights of this user: folder of the run -> address of its API ("" for none)."""
     found = {}
     for path in (path for place in places() if _is_private(place) for path in place.glob("*.json")):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:

@@ -16,8 +16,8 @@ MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 def clock_id() -> bytes:
     """Return 16 bytes that identify this machine's monotonic clock: the boot id of the kernel.
 
-    World and cloud measure one-way delays only if their bytes are equal. If the kernel has no boot
-    id, the bytes are random, and therefore differ.
+    World and cloud measure one-way delays only if both have the same bytes. If the kernel has no
+    boot id, the bytes are random: world and cloud differ, and measure no one-way delays.
     """
     try:
         boot = bytes.fromhex(_boot_id().replace("-", "").strip())
@@ -54,7 +54,7 @@ class Deadline:
     ) -> None:
         """Start a time limit of `limit` [s] by a monotonic `clock` [s].
 
-        If more than `turn_max` [s] pass between two calls of `passed`, the process was suspended.
+        If more than `turn_max` [s] pass between two calls of `passed`, this process was suspended.
         """
         self._left, self._turn_max, self._clock = limit, turn_max, clock
         self._before = clock()

@@ -54,7 +54,7 @@ ALIVE_PERIOD = 1.0
 EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
 """Types of records that are always part of the feed."""
 SAMPLED = (TelemetrySent, Control)
-"""Types of records of which the feed contains at most one record per `PERIOD_NS`."""
+"""Types of records of which the feed contains at most one record per type and `PERIOD_NS`."""
 PERIOD_NS = 100_000_000
 """Shortest time between two records of a type in `SAMPLED`, and between two checks of the link's
 state [ns]."""
@@ -62,7 +62,7 @@ RELEASED_PERIOD_NS = 2_000_000_000
 """Time between two records of the lateness with which the relay sends datagrams [ns]."""
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
 """Types of records at which a mission may begin. The state of the link is recorded again after such
-a record, so that a recording cut at the record contains the state."""
+a record, so that a recording whose earlier part is cut off contains the state, too."""
 NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 """Errors that an unreadable or malformed file can raise."""
 
@@ -215,7 +215,7 @@ class LinkNotes:
         """Return records about the link that are due at `now_ns` [ns, machine's monotonic clock].
 
         `records` are new records of world or cloud; some types make the state due at once.
-        `slip_ns` is the time by which the clock of the records lags behind the machine's [ns].
+        `slip_ns` is the lag of the records' clock behind the machine's clock [ns].
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))
@@ -336,7 +336,8 @@ class EndProcess:
         """Return records about steps of the wall clock, new keys, and the state of the link.
 
         `records` are the newest records of the endpoint. `slip_ns` is the lag of the endpoint's
-        clock behind the machine's monotonic clock [ns]. `clock_steps` are in seconds.
+        clock behind the machine's monotonic clock [ns]. `clock_steps` are steps
+        of the wall clock [s].
         """
         now_ns = time.monotonic_ns()
         noted: list[Record] = [

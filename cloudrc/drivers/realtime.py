@@ -33,9 +33,10 @@ BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
 """Largest number of datagrams in a wake after a stall: more than fit into the receive buffer. Linux
 doubles the requested size, and each datagram takes at least 768 bytes."""
 STALL_NS = 50_000_000
-"""Lateness of a wake above which the loop was stalled, and takes all datagrams at once [ns]."""
+"""If a wake is later than this [ns], the loop was stalled, and takes all waiting datagrams."""
 STALL_AGAIN_NS = 1_000_000_000
-"""Limit that replaces `STALL_NS` after a stall [ns], when taking all datagrams takes long."""
+"""Replaces `STALL_NS` in the wake after a stall [ns]: that wake is late, because the loop has just
+taken many datagrams."""
 SINK_PERIOD_NS = 20_000_000
 """Longest time between two calls of `sink` while there are records [ns]."""
 WAIT_MAX_NS = 100_000_000
@@ -103,7 +104,7 @@ class Peer:
     def receive(self, most: int = DRAIN_MAX) -> list[bytes]:
         """Return at most `most` of the datagrams that have arrived.
 
-        A datagram longer than DATAGRAM_MAX is cut to DATAGRAM_MAX + 1 bytes: decoding refuses it.
+        A datagram longer than DATAGRAM_MAX is cut to DATAGRAM_MAX + 1 bytes; decoding refuses it.
         """
         datagrams: list[bytes] = []
         while len(datagrams) < most:

@@ -31,7 +31,7 @@ STEP = 0.1
 DRIFT_MAX = 1e-3
 """Largest relative drift between the two clocks that does not count as a step."""
 AFTERWARDS_NS = 90_000_000_000
-"""Time after the robot last followed cloud for which all records are kept [ns]. It is long enough
+"""When the robot stops following cloud, all records are kept for this time [ns]. It is long enough
 for the landing after a loss of the link."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
 """Types of records that world and cloud make all the time, even between flights."""

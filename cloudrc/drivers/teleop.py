@@ -32,9 +32,9 @@ PERIOD_NS = 20_000_000
 TELL_NS = PERIOD_NS - 5_000_000
 """Shortest time between two telemetry messages that cloud forwards to teleop [ns]."""
 ALIVE_NS = 200_000_000
-"""Period of the empty datagrams that show teleop that cloud runs if no telemetry arrives [ns]."""
+"""Period of empty datagrams [ns]. Without telemetry, cloud sends them to show that it runs."""
 STALL_NS = 100_000_000
-"""Lateness above which a loop counts as stalled [ns]: its socket is full of old datagrams."""
+"""If a loop is later than this [ns], it was stalled: its socket may be full of old datagrams."""
 BLIND_WAKES = 5
 """Largest number of periods for which teleop waits for a new state of the robot after a stall."""
 SILENCE_NS = 1_000_000_000
@@ -56,7 +56,7 @@ class UnixPeer:
     """Exchanges datagrams with another process over two Unix sockets."""
 
     def __init__(self, own: Path, other: Path) -> None:
-        """Bind the path `own`, also if a socket of an earlier process exists; send to `other`.
+        """Bind the path `own`, in place of an earlier process's socket; send to the path `other`.
 
         Raise a BadInputError if `own` cannot be bound.
         """
@@ -156,7 +156,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud's process in flight, to forward teleop's request to hold."""
+    """Delays the end of cloud's process in flight, so that it forwards teleop's request to hold."""
 
     def __init__(
         self,
@@ -222,10 +222,10 @@ def turn(
 ) -> int:
     """Run one period of teleop's loop: receive states of the robot, and make the queued calls.
 
-    The period begins at `now_ns`, which is `late_ns` late [ns]. The other arguments are as in
-    `serve_teleop`. After a stall, teleop does nothing until a new state of the robot arrives, for
-    at most `BLIND_WAKES` periods. Return the number of periods for which teleop still waits, and
-    pass it as `blind` in the next period; `blind` is 0 at first.
+    The period begins at `now_ns`, later than planned by `late_ns` [ns]. For the other arguments
+    see `serve_teleop`. After a stall, teleop waits for a new state of the robot, for at most
+    `BLIND_WAKES` periods. Return the number of periods for which teleop still waits, and pass it as
+    `blind` in the next period; `blind` is 0 at first.
     """
     arrived, was_blind = peer.receive(), blind
     states = [data for data in arrived if data]  # an empty datagram carries no state

@@ -81,7 +81,7 @@ class Assessment:
 
 
 def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
-    """Describe how the stamps of cloud were shifted to world's clock; None if they were not."""
+    """Describe how the stamps of cloud were shifted to world's clock; None if unshifted."""
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
         return None

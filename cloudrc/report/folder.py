@@ -88,7 +88,7 @@ def _read_merged(folder: Path) -> Contents | None:
 
 
 def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str]:
-    """Yield the reasons why a recording is not sufficient for a report, the clearest first.
+    """Yield the reasons why a recording is not sufficient for a report, the clearest reason first.
 
     `config` is the path of config.yaml. `whole` tells whether the earlier report was made from a
     complete recording.
@@ -131,7 +131,7 @@ def _earlier_report(source: Path | bytes | None) -> _EarlierReport | None:
 def _describe(recording: Recording, earlier: _EarlierReport | None, contents: Contents) -> Run:
     """Describe a run, with values from its earlier report.
 
-    Without an earlier report, infer mode and shaper: only runs in real time record lateness.
+    Without an earlier report, infer mode and shaper: only recordings of real time contain lateness.
     """
     if earlier is None:
         real_time = len(recording["/lateness"]) > 0

@@ -16,9 +16,9 @@ from cloudrc.record.columns import Recording
 from cloudrc.report.document import Assessment, Run, environment_document, write_json
 
 DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
-"""Start of the note that the verdict at the end of the mission differs from the report's."""
+"""First words of a note: the verdict at the mission's end differs from the report's verdict."""
 RECORDING_NOTE = "The recording "
-"""Start of the notes about a recording, by which a new report recognises and drops old notes."""
+"""First words of each note about a recording; a new report drops old notes with these words."""
 
 
 def assess(
@@ -26,8 +26,8 @@ def assess(
 ) -> Assessment:
     """Measure and judge a run without writing files or drawing figures.
 
-    `own` are names or paths of the user's own metrics; files are executed. Metric files that the
-    experiment names are not executed: the experiment may come from somebody else.
+    `own` are names or paths of the user's metrics; the files at these paths are executed. Metric
+    files that only the experiment names are not executed: somebody else may have written them.
     """
     scene = load_scene(experiment.world.scene)
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)

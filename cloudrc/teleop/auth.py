@@ -37,7 +37,7 @@ TOKEN_SIZE_MAX = 4096
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 READS = ("GET", "HEAD")
 URGENT = ("/v1/estop", "/v1/hold")
-"""Paths of commands that are never refused as too many requests."""
+"""Paths of commands that are accepted even if too many requests are open."""
 ORDERS = ("/v1/missions", "/v1/goto")
 """Paths of orders (to fly a mission, to fly to a point); refused orders are counted by reason."""
 COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
@@ -84,7 +84,7 @@ class Tokens:
     def caller(self, token: str) -> Caller | None:
         """Return the caller with this token; None if the token is not valid.
 
-        A changed file counts at once. While a file has no valid token, no token is valid.
+        A change of a file takes effect at once. While a file has no valid token, no token is valid.
         """
         versions = [version(path) for path in self._paths]
         if versions != self._versions:
@@ -181,7 +181,7 @@ class Gate:
         self.counts: Counter[str] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse a request or pass it to the application, without a slash at its path's end."""
+        """Refuse a request, or remove a slash at its path's end and pass it to the application."""
         scope["path"] = scope["path"].rstrip("/") or "/"
         # An event stream calls `caller` again, because the stream can outlast its token.
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)

@@ -48,7 +48,7 @@ NO_WAYPOINT = -1
 UNDER_WAY = FLYING, STARTING, HELD
 """States of a mission that has begun and has not ended."""
 GAP_MAX_NS = 500_000_000
-"""Largest part of a gap between two telemetry messages that counts as time of flight [ns]."""
+"""If telemetry was missing for longer, only this time counts as time of flight [ns]."""
 UNSEEN_MAX_NS = 2_000_000_000
 """Time without telemetry after which the dwell time at a waypoint starts again [ns]."""
 # Looking up a member of an enum is slow.
@@ -371,7 +371,7 @@ class Teleop:
             self._select_leg(leg)
 
     def _repeat_setpoint(self) -> None:
-        """Send the setpoint again in a new session, because cloud has forgotten it.
+        """Send the setpoint again in a new session, for which cloud does not have it.
 
         If the mission has not started and the robot may move, the setpoint is the robot's position.
         """

@@ -183,14 +183,14 @@ class StateView(_Answer):
 
 
 class Stopped(_Answer):
-    """Answer to an emergency stop, which is under way to the robot."""
+    """Answer to a command for an emergency stop; the robot may not have received the stop yet."""
 
     id: str | None = _field("The mission that was under way and has failed")
     state: Literal["stopping"] = _field("Lasts until the guard on board is in ESTOP")
 
 
 class Acknowledged(_Answer):
-    """Answer to an acknowledgement, which is under way to the robot."""
+    """Answer to an acknowledgement; the robot may not have received it yet."""
 
     state: Literal["acknowledged"] = _field(
         "The next mission can fly. A landing near the ground ends first. The robot takes off again "

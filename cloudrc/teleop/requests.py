@@ -15,8 +15,8 @@ IDLE_NS = 3_000_000_000
 """Longest time for which a robot may hold or stand during a mission [ns]. After this time teleop
 sends the start again, because somebody else has probably stopped the robot."""
 PREDECESSORS = 1_000
-"""Gap between the newest request number in telemetry and the first number of a new teleop process,
-for requests of the earlier process that telemetry does not show yet."""
+"""A new teleop process starts at least this far above the newest request number in telemetry. The
+earlier process may have sent requests that telemetry does not show yet."""
 CLOCK_MAX = 65_536
 """The first number of a new teleop process also contains the time in units of 100 ms, modulo this
 value, so that two new processes have different numbers."""
@@ -25,7 +25,7 @@ value, so that two new processes have different numbers."""
 class RequestSender:
     """Repeat the newest request at 10 Hz until telemetry shows that the robot has carried it out.
 
-    A new request replaces the previous request. It gets a higher number, because the robot carries
+    A new request replaces the previous request and gets a higher number, because the robot carries
     out requests with rising numbers only. Before the first telemetry, nothing is sent. While no
     request is pending, the sender repeats the mission's progress until the robot has stored the
     progress. Emergency stops are not sent here: cloud numbers and repeats them.

@@ -198,7 +198,7 @@ class MissionService:
             self._operate(self._teleop.pause, now_ns)
 
     def hear(self, now_ns: int) -> None:
-        """Note that a message from cloud has arrived at `now_ns`."""
+        """Store the time `now_ns` at which a message from cloud has arrived."""
         self._heard_ns = now_ns
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
@@ -271,7 +271,7 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """Mission that an earlier process stopped, until telemetry arrives; else None."""
+        """Mission that an earlier process stopped; None if none, or once telemetry has arrived."""
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 

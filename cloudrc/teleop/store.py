@@ -130,7 +130,7 @@ class ConflictError(CloudrcError):
 
 
 APPLICATION, VERSION = 0x43524A32, 1
-"""Numbers in the file's header: one for the program cloudrc, and the version of the tables."""
+"""Numbers in the file's header: the first marks files of cloudrc, the second is the version."""
 SCHEMA = f"""
 BEGIN;
 CREATE TABLE mission (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL);
@@ -232,8 +232,8 @@ class MissionStore:
     def __init__(self, db: sqlite3.Connection, salt: bytes, notice: str = "") -> None:
         """Read all missions of `db`; if that fails, close `db` and raise DatabaseError.
 
-        The ids of every new file begin with "m1". The random bytes `salt` make the numbers under
-        which the robot stores progress differ from those of an earlier file.
+        The ids of every new file begin with "m1". The robot stores progress by mission number;
+        the random bytes `salt` make these numbers differ from those of an earlier file.
         """
         self._db, self._salt, self.notice = db, salt, notice
         self.missions: dict[str, Mission] = {}

@@ -17,8 +17,8 @@ from cloudrc.report.figures import marks, save, style
 from cloudrc.report.figures.style import dots, legend_above, new_figure, panel
 
 RUNS_SHOWN = 20
-"""Largest number of packets lost in a row in the figure; a longer run counts as one of this
-length."""
+"""Largest number of packets lost in a row in the figure; a longer run is shown as a run
+of this length."""
 BLACKOUT = "#f7dccb"
 """Colour of blackouts: the colour of losses, but lighter."""
 DOTS = 6000

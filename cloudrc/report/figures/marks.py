@@ -31,7 +31,7 @@ SAME_CHANGE = 0.05
 SAME_CAUSE = 1.0
 """Records of uplink and downlink describe the same change if they are at most this apart [s]."""
 ROW_HEIGHT, ROWS = 8, 8
-"""Distance between two rows for the numbers of changes [points], and number of rows. Successive
+"""Distance between two rows for the labels of changes [points], and number of rows. Successive
 numbers are in different rows, so that they do not overlap."""
 LEGEND = (
     " Behind the curves: red, the guard was in HOLD; hatched, a blackout of the link; dotted, a "

@@ -29,7 +29,7 @@ CAPTION = (
 LETTERS = "abcdef"
 """The letters of the panels, one per snapshot."""
 MOVING = 0.05
-"""Horizontal distance flown in one second below which the robot counts as hovering [m]."""
+"""A robot that flies less than this distance horizontally in one second [m] counts as hovering."""
 REACH = 1.0
 """Half the width of a panel, which shows the robot in its centre [m]."""
 ELEVATION, AZIMUTH = np.radians(28.0), np.radians(118.0)
@@ -138,13 +138,13 @@ class _View:
                 self._axes.plot(*self.project(np.array(ends)).T, color=LIGHT, lw=0.4, zorder=0)
 
     def draw_path(self, path: Array) -> None:
-        """Draw the part of `path` since the robot last entered the region of the panel."""
+        """Draw the part of `path` flown since the robot last entered the region of the panel."""
         far = np.flatnonzero(np.linalg.norm(path - self.centre, axis=1) > 1.5 * REACH)
         seen = self.project(path[far[-1] if len(far) else 0 :])
         self._axes.plot(*seen.T, color=BLUE, lw=1.0, zorder=2)
 
     def draw_faces(self, faces: list[Face], zorder: int) -> None:
-        """Draw faces from back to front; brighter if the light meets them at a right angle."""
+        """Draw faces from back to front; brightest where light meets a face at a right angle."""
         polygons, colours = [], []
         light = (self.towards + self._sides[:, 1]) / np.sqrt(2)
         for face in sorted(faces, key=lambda face: float((face.corners @ self.towards).mean())):
@@ -175,7 +175,7 @@ def draw(subject: Subject) -> Figure:
 
 
 def _instants(subject: Subject) -> Array:
-    """Choose six rows of the true states at equal distances flown, or in a hover at equal times."""
+    """Choose six true states: at equal distances flown or, if the robot hovers, at equal times."""
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]
     if touch is not None:

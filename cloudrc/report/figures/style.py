@@ -84,7 +84,7 @@ def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1
 
 @dataclass(frozen=True)
 class Subject:
-    """A flight, and the link profile at its start, by direction."""
+    """A flight, and the link profile of each direction at the start of the flight."""
 
     flight: Flight
     uplink: Direction
