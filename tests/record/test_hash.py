@@ -26,8 +26,9 @@ def test_the_bytes_are_those_that_the_module_promises():
     arrival = rec.Arrival(6, True, 7, 8, 0.25, False)
     data += b"\x07Arrival" + struct.pack("<q?2qd?", 6, True, 7, 8, 0.25, False)
     vectors = [tuple(float(10 * n + axis) for axis in range(3 + (n == 1))) for n in range(5)]
-    truth = rec.GroundTruth(9, Odometry(10, *vectors[:4]), 0.125, vectors[4])
-    data += b"\x0bGroundTruth" + struct.pack("<2qd16d", 9, 10, 0.125, *sum(vectors, ()))
+    truth = rec.GroundTruth(9, Odometry(10, *vectors[:4]), 0.5, 0.75, 0.125, vectors[4])
+    data += b"\x0bGroundTruth" + struct.pack("<2q3d", 9, 10, 0.5, 0.75, 0.125)
+    data += struct.pack("<16d", *sum(vectors, ()))
     assert digest(applied, change, arrival, truth) == hashlib.sha256(data).hexdigest()
 
 

@@ -37,7 +37,7 @@ def test_rows_are_converted_to_the_conventions_of_ros():
     predicted = standard("/estimated_odometry", 0, values[:3]).twist.twist
     assert math.isnan(predicted.angular.z), "it is not predicted"
     fault = TOPICS["/fault"]
-    assert decode(fault, encode(fault, 0, ("bad_name", "file \udcff")))[1][1] == "file ?"
+    assert decode(fault, encode(fault, 0, ("bad_name", "file \udcff", "")))[1][1] == "file ?"
     twist = standard("/cmd_vel", 1, ((1.0, 2.0, 3.0), 0.4)).twist
     assert (xyz(twist.linear), xyz(twist.angular)) == ((1.0, 2.0, 3.0), (0.0, 0.0, 0.4))
 
