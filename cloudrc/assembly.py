@@ -108,6 +108,8 @@ def build_cloud(
         lambda: build_plugin("estimators", cloud.estimator),
         build_plugin("predictors", cloud.predictor),
         build_plugin("controllers", cloud.controller),
+        horizon_max=cloud.horizon_max_s,
+        freeze_after=cloud.freeze_after_s,
     )
     start_ns = clock()
     if teleop is None:

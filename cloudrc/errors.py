@@ -27,6 +27,16 @@ class MissingPrerequisiteError(CloudrcError):
     exit_code = 3
 
 
+class DiskFullError(MissingPrerequisiteError):
+    """The disk is full, so that the recording or the report is not complete."""
+
+    def __init__(self, where: str) -> None:
+        """Name the file or folder on the full disk."""
+        super().__init__(
+            f"disk_full: {where}: free some space, or choose another folder with --out"
+        )
+
+
 class InvalidRunError(CloudrcError):
     """The run is invalid: it did not keep real time, or one of its processes failed."""
 

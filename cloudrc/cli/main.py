@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from cloudrc.cli.output import discard_output, escape
 from cloudrc.cli.parser import build_parser
-from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
+from cloudrc.errors import BadInputError, CloudrcError, DiskFullError, InterruptedRunError
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
@@ -52,9 +52,10 @@ def _explain(error: Exception) -> tuple[str, int]:
         return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        remedy = "check the path, and whether you have access to it ('--debug' shows where)"
         if error.errno == errno.ENOSPC:
-            remedy = "free some space or choose another disk"
+            full = DiskFullError(str(error.filename or "this folder"))
+            return str(full), full.exit_code
+        remedy = "check the path, and whether you have access to it ('--debug' shows where)"
         return f"{where}{error.strerror or error}; {remedy}", BadInputError.exit_code
     kind, text = type(error).__name__, " ".join(str(error).split())
     return f"internal error: {kind}: {text}; '--debug' shows where, please report it", INTERNAL

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from cloudrc.cli.advice import warn
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.extras import MODES, missing, require
 from cloudrc.cli.find_run import RUNS
@@ -24,7 +26,7 @@ from cloudrc.cli.output import (
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cli.report import print_traceback, summary
-from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
+from cloudrc.errors import BadInputError, CloudrcError, DiskFullError, InterruptedRunError
 
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import CloudEndpoint
@@ -40,6 +42,8 @@ Flight = Callable[[Path], dict[str, Any]]
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
 
+DISK_FULL = errno.ENOSPC, errno.EDQUOT
+"""Numbers of the errors of a full disk and of a used-up quota."""
 GRACE = 30.0
 """If the mission goes on for this time after its time limit [s], this program stops the flight."""
 CLOCK = bytes(16)
@@ -109,6 +113,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     from cloudrc.metrics.verdict import EXIT_CODES
 
     experiment = load(options.experiment, options.set, options.seed)
+    warn(experiment)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
     mission = experiment.mission
@@ -119,7 +124,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     else:
         flight = _local_flight(experiment, mode, stream, count)
     name = f"{experiment.name}-{mode}-seed{experiment.seed}"
-    folder = new_folder(options.out, name, latest=not in_cluster)
+    folder = new_folder(options.out, name, "" if in_cluster else "latest")
     if not for_programs:
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
         waypoints = "1 waypoint" if count == 1 else f"{count} waypoints"
@@ -137,18 +142,20 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
         raise
     finally:
         if in_cluster and options.out is None and folder.exists():
-            point_latest_to(folder)
+            point_to(folder, "latest")
     print_traceback(options, report)
     print_or_drop(
         format_document(report, options.output) if for_programs else summary(report, folder)
     )
+    if any(failure["code"] == "disk_full" for failure in report["failures"]):
+        raise DiskFullError(str(folder))
     return EXIT_CODES[report["verdict"]]
 
 
-def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
+def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
     """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
-    With `latest` and without `out`, point the symbolic link `runs/latest` to the new folder.
+    Without `out`, point the symbolic link `runs/<link>` to the new folder; "" for no link.
 
     Raises:
         BadInputError: If `out` exists and is not an empty folder, or if no folder can be made.
@@ -166,8 +173,8 @@ def new_folder(out: Path | None, name: str, *, latest: bool = True) -> Path:
         where = f"--out {out}" if out else f"{RUNS}/ in the working folder"
         remedy = "name another folder" if out else "name a writable folder with --out"
         raise BadInputError(f"{where}: cannot be made: {error.strerror}; {remedy}") from error
-    if latest:
-        point_latest_to(folder)
+    if link:
+        point_to(folder, link)
     return folder
 
 
@@ -181,9 +188,9 @@ def _next_folder(name: str) -> Path:
     return folder
 
 
-def point_latest_to(folder: Path) -> None:
-    """Point the link `runs/latest` to `folder`, if the file system supports symbolic links."""
-    latest = folder.parent / "latest"
+def point_to(folder: Path, link: str) -> None:
+    """Point the link beside `folder` to `folder`, if the file system supports symbolic links."""
+    latest = folder.parent / link
     with contextlib.suppress(OSError):
         if latest.is_symlink():
             latest.unlink()
@@ -250,8 +257,10 @@ def fly(
         with record(experiment, folder, see) as (recording, run):
             return write_report(folder, recording, experiment, run, own=own, page=page)
     except OSError as error:
-        where, remedy = error.filename or folder, "free some space or choose another folder: --out"
-        raise CloudrcError(f"{where}: {error.strerror or error}; {remedy}") from error
+        where = str(error.filename or folder)
+        if error.errno in DISK_FULL:
+            raise DiskFullError(where) from error
+        raise CloudrcError(f"{where}: {error.strerror or error}; choose another folder") from error
 
 
 def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:

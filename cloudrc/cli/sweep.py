@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from cloudrc.cli.advice import warn
 from cloudrc.cli.output import escape, format_document, format_number, print_or_drop, table
 from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.cli.report import print_traceback
@@ -87,8 +88,10 @@ def fly_seeds(options: argparse.Namespace) -> int:
     If Ctrl-C or a killed worker ends the command early, the table shows the finished seeds only.
     """
     # Load the experiment here too, so that a mistake is reported once, not N times.
-    name = load(options.experiment, options.set).name
-    folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds")
+    experiment = load(options.experiment, options.set)
+    warn(experiment)
+    name = experiment.name
+    folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds", "latest-sweep")
     work = [(options.experiment, options.set, folder, n + 1) for n in range(options.seeds)]
     for_people, reports = options.output == "table", list[dict[str, Any]]()
 
@@ -110,6 +113,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
         print_or_drop(text, sys.stderr)
     document = {
         **{"schemaVersion": 1, "experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
+        "overrides": list(options.set),
         **summarise(reports),
         "runs": [
             {"seed": r["seed"], "verdict": r["verdict"], "folder": f"seed-{r['seed']}"}

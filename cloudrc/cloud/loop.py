@@ -28,12 +28,10 @@ from cloudrc.errors import describe_error, locate_error
 from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
 from cloudrc.records import Control, Fault
 
-HORIZON_MAX = 1.0
-"""Longest horizon of a prediction [s]. Source: docs/reference/control.md, "Predictors"."""
-FREEZE_NS = 400_000_000
-"""The loop freezes if telemetry has shown no new command as applied for the horizon plus this time
-[ns].
-Source: docs/reference/plant.md, "Frozen reference"."""
+# Defaults. Source: docs/reference/control.md, "Predictors"; docs/reference/plant.md, "Frozen
+# reference". The experiment's keys cloud.horizon_max_s and cloud.freeze_after_s replace them.
+HORIZON_MAX, FREEZE_AFTER = 1.0, 0.4
+"""Longest horizon, and the time without a new echo, beyond the horizon, until a freeze [s]."""
 FRESH_ECHO_NS = 50_000_000
 """Longest hold time of an echo that is a delay sample [ns]: five command periods. While no commands
 arrive at world, the hold time grows although the delay of the link does not change."""
@@ -67,9 +65,9 @@ class DelayMeter:
             clock.
     """
 
-    def __init__(self, estimator: Estimator, counts: Counter[str]) -> None:
-        """Use `estimator`, and count horizons outside of 0 to 1 s in `counts`."""
-        self._estimator, self._counts = estimator, counts
+    def __init__(self, estimator: Estimator, counts: Counter[str], horizon_max: float) -> None:
+        """Use `estimator`, and count horizons outside of 0 to `horizon_max` [s] in `counts`."""
+        self._estimator, self._counts, self._horizon_max = estimator, counts, horizon_max
         self._stamp_ns, self.newest_echo_ns = 0, NEVER_NS
         self._echoes: deque[int] = deque(maxlen=ECHOES)
         self.rtt = self.loop_delay = nan
@@ -106,18 +104,18 @@ class DelayMeter:
         self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
 
     def horizon(self, now_ns: int) -> float:
-        """Return the horizon for a command that leaves at `now_ns` [ns], limited to 0 to 1 s.
+        """Return the horizon for a command that leaves at `now_ns` [ns], within the limits.
 
         Raises:
             InvalidResultError: If the estimator's horizon is not finite.
         """
         horizon = float(self._estimator.horizon((now_ns - self._stamp_ns) * 1e-9))
-        if 0.0 <= horizon <= HORIZON_MAX:
+        if 0.0 <= horizon <= self._horizon_max:
             return horizon
         if not isfinite(horizon):
             raise InvalidResultError(f"its horizon is {horizon}")
         self._counts["horizon_clamped"] += 1
-        return min(max(horizon, 0.0), HORIZON_MAX)
+        return min(max(horizon, 0.0), self._horizon_max)
 
 
 class ControlLoop:
@@ -133,13 +131,20 @@ class ControlLoop:
         build_estimator: Callable[[], Estimator],
         predictor: Predictor,
         controller: Controller,
+        *,
+        horizon_max: float = HORIZON_MAX,
+        freeze_after: float = FREEZE_AFTER,
     ) -> None:
         """Connect three plug-ins; every session gets a new estimator.
+
+        `horizon_max` is the longest horizon [s]. The loop freezes if no new echo arrives for the
+        horizon and `freeze_after` [s].
 
         An exception of a plug-in is not caught here, because nothing flies yet.
         """
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
+        self._horizon_max, self._freeze_after_ns = horizon_max, freeze_after * 1e9
         self.faults: list[Fault] = []
         self.counts: Counter[str] = Counter()
         self._undated: list[Fault] = []
@@ -160,7 +165,7 @@ class ControlLoop:
         self._begin(estimator)
 
     def _begin(self, estimator: Estimator) -> None:
-        self._delays = DelayMeter(estimator, self.counts)
+        self._delays = DelayMeter(estimator, self.counts, self._horizon_max)
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
         self._horizon, self._echoed_ns = 0.0, NEVER_NS
@@ -289,12 +294,12 @@ class ControlLoop:
             return STAND_STILL
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether the robot has followed no new command for the `horizon` [s] plus FREEZE_NS."""
+        """Whether no new echo has come for the `horizon` [s] and `freeze_after`."""
         if self._echoed_ns < self._delays.newest_echo_ns:
             self._echoed_ns = self._delays.newest_echo_ns
         elif self._echoed_ns == NEVER_NS:
             self._echoed_ns = now_ns
-        return now_ns - self._echoed_ns > horizon * 1e9 + FREEZE_NS
+        return now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns
 
     def _note(self, kind: str, error: BaseException, now_ns: int, instead: str = "") -> None:
         """Count a failure of a plug-in; report the first failure of each kind of plug-in.

@@ -39,6 +39,7 @@ from cloudrc.config.schema import (
     Direction,
     Experiment,
     Guard,
+    Horizon,
     Mission,
     PlugIn,
     Profile,
@@ -49,6 +50,10 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.link.traces import read_table, read_trace
 
+HORIZON_MAX_S = 1.0
+"""Default of cloud.horizon_max_s [s]. Source: docs/reference/control.md, "Predictors"."""
+FREEZE_AFTER_S = 0.4
+"""Default of cloud.freeze_after_s [s]. Source: docs/reference/plant.md, "Frozen reference"."""
 COMMAND_AGE_MAX_MS = 250.0
 """Default of guard.command_age_max_ms if experiment and link profile give no value [ms].
 Source: docs/reference/plant.md, "Command age"."""
@@ -97,6 +102,8 @@ class ResolvedCloud(Cloud):
     estimator: PlugIn
     predictor: PlugIn
     controller: PlugIn
+    horizon_max_s: Horizon = HORIZON_MAX_S
+    freeze_after_s: Horizon = FREEZE_AFTER_S
 
 
 class ResolvedExperiment(Experiment):
@@ -259,8 +266,17 @@ def _inline_profile(document: Document) -> None:
                 if key[:1] == (way,) and not (own and key[1:2] and key[1] in own)
             }
             document.sources = inserted | document.sources
-    age_max = profile.command_age_max_ms or COMMAND_AGE_MAX_MS
-    _default(document, ("guard", "command_age_max_ms"), age_max)
+    for path, value in _implied(profile).items():
+        _default(document, path, value)
+
+
+def _implied(profile: Profile) -> dict[KeyPath, float]:
+    """Return the defaults of keys outside of the section `link` with a profile, by path."""
+    return {
+        ("guard", "command_age_max_ms"): profile.command_age_max_ms or COMMAND_AGE_MAX_MS,
+        ("cloud", "horizon_max_s"): profile.horizon_max_s or HORIZON_MAX_S,
+        ("cloud", "freeze_after_s"): profile.freeze_after_s or FREEZE_AFTER_S,
+    }
 
 
 def _has_all_values(document: Document) -> bool:
@@ -277,14 +293,14 @@ def _remove_profile_values(document: Document) -> None:
         return
     for way in DIRECTIONS:
         del document.tree["link"][way]
-    age_max = None
+    profile = Profile()
     with suppress(BadInputError):  # the profile's file may no longer exist
-        age_max = load_profile(str(document.get("link", "profile"))).command_age_max_ms
-    age_max = age_max or COMMAND_AGE_MAX_MS
-    implied = {"command_age_max_ms": age_max, "speed_max_mps": speed_cap(age_max)}
-    for key, value in implied.items():
-        if document.get("guard", key) == value:
-            del document.tree["guard"][key]
+        profile = load_profile(str(document.get("link", "profile")))
+    implied = _implied(profile)
+    implied["guard", "speed_max_mps"] = speed_cap(implied["guard", "command_age_max_ms"])
+    for path, value in implied.items():
+        if document.get(*path) == value:
+            del document.tree[path[0]][path[1]]
 
 
 def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:

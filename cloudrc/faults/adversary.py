@@ -48,9 +48,9 @@ status is the newest that cloud knows. The number of the request is not used."""
 class DishonestLoop(ControlLoop):
     """Computes honest commands, and changes them before they are sent."""
 
-    def __init__(self, lies: Sequence[Lie], *plugins: Any) -> None:
-        """Apply all `lies` in turn to each command; `plugins` are as for `ControlLoop`."""
-        super().__init__(*plugins)
+    def __init__(self, lies: Sequence[Lie], *plugins: Any, **limits: Any) -> None:
+        """Apply all `lies` in turn to each command; the others are as for `ControlLoop`."""
+        super().__init__(*plugins, **limits)
         self._lies = lies
 
     def command(

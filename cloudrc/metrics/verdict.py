@@ -106,7 +106,11 @@ def judge(evidence: Evidence) -> Verdict:
         key = f"criteria.contact_speed_max_mps {limit:g}"
         text = f"the tip met the board at {speed:.2f} m/s, not below {key}"
         violations = (Failure("contact_too_fast", text, *moment), *violations)
-    if evidence.ending.code in ("interrupted", "cancelled"):  # unmet goals are no failure
+    if evidence.ending.code in (
+        "interrupted",
+        "cancelled",
+        "disk_full",
+    ):  # unmet goals are no failure
         return Verdict("interrupted", (Failure(*evidence.ending, *evidence.end), *violations))
     codes = {failure.code for failure in violations}
     failures = [*violations, *(f for f in _unmet_goals(evidence) if f.code not in codes)]
@@ -191,6 +195,8 @@ def _ending(flight: Flight, interrupted: bool) -> Ending:
         return Ending(*flight.ending[1:])
     if interrupted and flight.end_ns is None:
         return Ending("interrupted", "the run was stopped before the mission started")
+    if "disk full" in flight.recording.note:
+        return Ending("disk_full", f"the recording is cut off: {flight.recording.note}")
     if interrupted:
         return Ending("interrupted", "the run ended before the mission")
     if flight.end_ns is None:

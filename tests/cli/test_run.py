@@ -92,6 +92,18 @@ def test_an_interrupt_while_the_report_is_written_names_the_remedy(monkeypatch, 
     assert main(["report", "here"]) == 0
 
 
+@pytest.mark.usefixtures("no_page")
+def test_a_full_disk_is_named_and_is_no_failed_mission(monkeypatch, capsys):
+    def full(*arguments, **options):
+        raise OSError(28, "No space left on device", "here/report.json")
+
+    with monkeypatch.context() as changed:
+        changed.setattr("cloudrc.report.write.write_json", full)
+        assert main([*FLY, "--out", "here"]) == 3
+    assert "disk_full: here/report.json: free some space" in capsys.readouterr().err
+    assert main(["report", "here"]) == 0
+
+
 @pytest.mark.parametrize(
     ("out", "said"),
     [

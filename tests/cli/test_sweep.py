@@ -49,6 +49,15 @@ def test_many_seeds_become_one_table(folder, capsys):
     document, rows = written(folder)
     assert ([run["seed"] for run in document["runs"]], rows) == ([1, 2], 2)
     assert (document["done"], document["count"], document["interrupted"]) == (0, 2, False)
+    assert document["overrides"][-1] == "criteria.contact=true"
+
+
+def test_the_newest_sweep_and_the_newest_run_have_their_own_link(folder, monkeypatch):
+    monkeypatch.setattr("cloudrc.cli.sweep._fly_one", lambda job: report(job[-1]))
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    assert main(["run", "steps", "--seeds", "1", *SHORT]) == 0
+    assert (folder / "runs/latest-sweep/sweep.json").is_file()
+    assert not (folder / "runs/latest").exists()
 
 
 @pytest.mark.process
