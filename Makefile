@@ -36,7 +36,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio websockets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types audit bench bench-link pictures docs images kind-load lock clean
+.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types audit bench bench-link pictures results docs images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -152,6 +152,9 @@ pictures: $(VENV)/all ## draw the README's picture of a flight
 	rm -rf build/pictures
 	$(bin)/cloudrc run paper --mode virtual --out build/pictures
 	cp build/pictures/figures/flight.png docs/flight.png
+
+results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
+	$(bin)/python -m tools.results
 
 docs: $(VENV)/dev ## write the generated pages of docs/, and the chart's values, schema and table
 	$(bin)/python -m tools.docs
