@@ -196,7 +196,8 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
         cloudrc_pid_output: Terms of the controller's output [m/s], in the newest period.
         cloudrc_command_velocity_meters_per_second: Commanded velocity, world frame.
         cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
-        cloudrc_horizon_clamped_total: Delay estimates above cloud.horizon_max_s or below 0, which were clamped.
+        cloudrc_horizon_clamped_total: Delay estimates above cloud.horizon_max_s or below 0, which
+            were clamped.
         cloudrc_commands_frozen_total: Zero-velocity commands sent because the robot confirmed no
             newer command.
         cloudrc_plugin_failures_total: Plug-in calls that raised an exception or returned a value
