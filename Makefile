@@ -78,8 +78,8 @@ coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and store is 
 # mutmut writes into its working folder. `mutmut show NAME` in build/mutants shows a mutant.
 mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that tests find
 	rm -rf build/mutants && mkdir -p build/mutants $(EVIDENCE)
-	cp -r charts cloudrc tests pyproject.toml build/mutants
-	find build/mutants/tests -name 'test_*.py' -delete && cp --parents $(CORE) build/mutants
+	cp -r cloudrc tests pyproject.toml build/mutants
+	find build/mutants/tests -name 'test_*.py' -delete && rm -r build/mutants/tests/chart && cp --parents $(CORE) build/mutants
 	cd build/mutants && $(abspath $(bin))/python -m mutmut run $(MUTANTS)
 	cd build/mutants && $(abspath $(bin))/python -m mutmut results --all true \
 		> $(CURDIR)/$(EVIDENCE)/mutants.txt
