@@ -81,3 +81,26 @@ def test_security_contexts_can_be_left_out_or_changed():
     for pod in pod_specs(render({"podSecurityContext": {"runAsUser": 12_345}})).values():
         assert pod["securityContext"]["runAsUser"] == 12_345
         assert pod["securityContext"]["runAsNonRoot"] is True
+
+
+def test_service_accounts_are_made_or_named():
+    def accounts(values=None):
+        objects = render(values)
+        made = {thing["metadata"]["name"] for thing in of_kind(objects, "ServiceAccount").values()}
+        return made, {pod["serviceAccountName"] for pod in pod_specs(objects).values()}
+
+    made, used = accounts()
+    assert made == used
+    named = {"serviceAccount": {"create": False, "name": "robots"}}
+    assert accounts(named) == (set(), {"robots"})
+
+
+def test_probes_use_the_metrics_port_and_liveness_needs_no_peer():
+    asked = {"startupProbe": "/healthz", "livenessProbe": "/healthz", "readinessProbe": "/readyz"}
+    for thing in of_kind(render(), "Deployment").values():
+        for part in containers(thing["spec"]["template"]["spec"]).values():
+            gets = {probe: part[probe]["httpGet"] for probe in asked}
+            assert {probe: get["path"] for probe, get in gets.items()} == asked
+            (port,) = {get["port"] for get in gets.values()}
+            assert port.endswith("metrics")
+            assert port in {each["name"] for each in part["ports"]}

@@ -11,7 +11,6 @@ HOVER = (
     "mission.waypoints=[{position_m: [0.5, 0, 0.8], dwell_s: 1}]",
     *("criteria.contact=false", "link.profile=ideal"),
 )
-FLOWING = (Kind.TELEMETRY, Kind.COMMAND)
 
 
 class Tapped(Flight):
@@ -34,9 +33,6 @@ class Tapped(Flight):
         names = ("used", "late", "repeated", "busy")
         inner = [end.inner for end in self.ends.values()]
         return [*(end.counts[name] for end in inner for name in names), *(e.epoch for e in inner)]
-
-    def greetings(self, kind, end):
-        return [data for data in self.heard[end] if peek(data)[0] == kind]
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.config.load import load_experiment
+from cloudrc.config.load import dump, load_experiment
 from cloudrc.record.columns import Recording
 from tests.flights.conftest import digest, records
 
@@ -33,6 +33,12 @@ def test_the_same_seed_gives_the_same_records_in_any_process():
     env = os.environ | {"PYTHONHASHSEED": "77", "PYTHONPATH": str(ROOT)}
     printed = subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
     assert printed.strip() == digest(short()) == digest(short()) != digest(short("seed=2"))
+
+
+def test_the_resolved_experiment_flies_the_same_run_again(tmp_path):
+    path, flown = tmp_path / "config.yaml", short("link.profile=lossy", "seed=5")
+    path.write_text(dump(flown))
+    assert digest(load_experiment(path)) == digest(flown)
 
 
 def test_the_clocks_of_the_ends_need_not_agree():

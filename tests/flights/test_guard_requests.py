@@ -90,6 +90,41 @@ def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
     assert len(talk.take(CommandApplied)) == applied + 1
 
 
+def test_contacts_are_reported_until_the_next_mission_starts(talk):
+    """Cloud may die right after the touch; the next cloud must learn of it."""
+    ask(talk, 2, Request.END)
+    talk.world._orders.pipes = 1
+    talk.wait(300)
+    talk.hello("another")
+    for number, mission_id, contacts in ((3, 0, 1), (4, 7, 0)):
+        talk.request(number, Request.START, Start.HERE, mission_id)
+        talk.wait(20)
+        assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == contacts
+
+
+def test_holds_are_counted_during_missions_only(talk):
+    talk.wait(3_000)
+    held = talk.counts()["held_seconds"]
+    assert 2 <= held <= 4
+    ask(talk, 2, Request.END)
+    talk.wait(4_000)
+    assert talk.counts()["held_seconds"] == held
+
+
+def test_commands_of_an_earlier_cloud_do_not_count(talk):
+    """Nine fresh commands of one cloud and one of another do not prove a link."""
+    fly(talk, 100)
+    talk.wait(1_000)
+    fly(talk, 9)
+    talk.wait(260)
+    assert talk.hello("another") > 0
+    fly(talk, 2)
+    assert talk.take(GuardChange)[-1].state is GuardState.HOLD
+    fly(talk, 8)
+    talk.wait(10)
+    assert talk.take(GuardChange)[-1].state is GuardState.TRACK
+
+
 ID = 2**62 + 5
 
 

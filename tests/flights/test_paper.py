@@ -49,6 +49,13 @@ def test_the_paper_flies_under_other_conditions_too(setting):
     assert fly("paper", setting).verdict.failures == ()
 
 
+@pytest.mark.parametrize(("limit", "low", "high"), [(0.10, 0.030, 0.034), (0.30, 0.0, 0.001)])
+def test_the_steady_error_is_that_of_the_integral_limit(limit, low, high):
+    n = numbers(fly("hover", f"world.low_level.integral_limit_xy={limit}"))
+    assert low <= n["steady_error_x"] <= high
+    assert max(n["steady_error_y"], n["steady_error_z"]) < 1e-4
+
+
 def prediction_error(predictor, seeds):
     settings = ("link.profile=paper-p3", f"cloud.predictor={predictor}")
     flights = [fly("steps", *settings, f"seed={seed}") for seed in seeds]

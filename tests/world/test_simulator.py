@@ -13,7 +13,6 @@ from cloudrc.world.readings import Readings
 from cloudrc.world.rotors import STOPPED, Rotors
 from cloudrc.world.simulator import Simulator, replay
 
-HOVER = 10.394996  # 1.06 kg * 9.8066 m/s^2
 AT_REST = Readings.of((*ZERO, *UPRIGHT), (*ZERO, *ZERO))
 
 
@@ -154,6 +153,18 @@ def test_the_peak_force_is_that_of_every_step_and_the_impulse_stops_the_tip(at_t
     assert max(peak for peak, _ in peaks) == max(every) > 10.0
     assert sum(impulse for _, impulse in peaks) == pytest.approx(sum(every) * simulator.dt)
     assert simulator.take_tip_force() == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("spawn", "reference", "found"),
+    [
+        ((-1.0, 0.0, 0.7), (0.5, 0.0, 0.0), ("pipe_1", True)),
+        ((5.66, -6.42, 0.7), (0.0, 0.5, 0.0), ("pipe_3", False)),
+    ],
+)
+def test_a_contact_names_the_touched_pipe(scene_at, spawn, reference, found):
+    touch = fly(Simulator("pelican", scene_at(*spawn)), LowLevel(), reference, 2.0)[0]
+    assert (touch.body, touch.tip) == found
 
 
 def test_the_floor_is_a_new_contact_only_after_a_flight():
