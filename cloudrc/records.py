@@ -251,7 +251,8 @@ class MissionEvent(NamedTuple):
     """Cloud: an event of the mission. Topic /mission.
 
     Attributes:
-        event: One of `UNDER_WAY`, or the outcome: "done", "cancelled" or one of `FAILURES`.
+        event: A word of the list `UNDER_WAY`; at the end of the mission "done", "cancelled" or a
+            word of the list `FAILURES`.
         waypoint: Index of the waypoint that the event is about; -1 if none.
         text: The event in words.
     """

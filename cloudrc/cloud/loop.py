@@ -33,8 +33,8 @@ from cloudrc.records import Control, Fault
 HORIZON_MAX, FREEZE_AFTER = 1.0, 0.4
 """Longest horizon, and the time without a new echo, beyond the horizon, until a freeze [s]."""
 FRESH_ECHO_NS = 50_000_000
-"""Longest hold time of an echo that is a delay sample [ns]: five command periods. While no commands
-arrive at world, the hold time grows although the delay of the link does not change."""
+"""An echo gives a delay sample only up to this hold time [ns]: five command periods. While no
+commands arrive at world, the hold time grows although the delay of the link does not change."""
 ECHOES = 32
 """Number of echoes that cloud remembers, so that `add_applied` is called once per command."""
 STAND_STILL = ControlOutput(ZERO, 0.0)

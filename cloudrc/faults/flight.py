@@ -40,7 +40,7 @@ SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
 def conditions(**changes: object) -> Shape:
-    """Return a `Shape` that replaces these fields of a direction's profile."""
+    """Return a `Shape` that makes these `changes` to the fields of a direction's profile."""
     return lambda profile: replace(profile, **changes)  # type: ignore[arg-type]
 
 

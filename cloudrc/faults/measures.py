@@ -26,7 +26,8 @@ from cloudrc.report.write import assess
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD
 
 AGE_MAX = 0.252 + 1e-9
-"""Largest age of a command's odometry when a HOLD begins [s]: `command_age_max` plus one tick."""
+"""When a HOLD begins, the odometry behind the newest command is at most this old [s]: the limit
+guard.command_age_max_ms plus one tick."""
 SOON = 5.0  # time within which a fault has to show in its metric [s]
 STANDS = 0.05  # speed up to which the robot stands [m/s]
 SAMPLE = 0.01  # time between two records of the ground truth [s]

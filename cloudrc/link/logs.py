@@ -96,7 +96,7 @@ class Log:
 
     Attributes:
         entries: The packets in the order of the log.
-        counts: Description of rows left out, merged or sorted -> number of these rows.
+        counts: What happened to rows (left out, merged, sorted), as text -> number of rows.
         unusable: For each row that cannot be used, the reason.
         gap: Shortest gap that is reported, as a multiple of the median time between packets [1].
     """

@@ -23,7 +23,7 @@ STATE_MAX = 1 << 16
 """Size limit of a state file that world or cloud reads [bytes]: room for a time line of about 800
 changes. Reading a file of 1 MiB could block the control loop for 2 s."""
 RELEASED_SUFFIX = ".released"
-"""Suffix of the file in which a relay reports how late datagrams left: JSON, name -> integer."""
+"""Suffix of the file in which a relay reports the lateness of datagrams: JSON, name -> integer."""
 RELEASED = frozenset(
     {"released", "released_early", "overflow", "stalled"}
     | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}

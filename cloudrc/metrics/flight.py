@@ -145,7 +145,7 @@ class Flight:
 
     @cached_property
     def applied(self) -> Columns:
-        """Commands that world applied during the flight, with the values of their control periods.
+        """Commands that world applied in the flight, with what cloud recorded when it sent them.
 
         `stamp_ns` is the time of application [ns], `position` the predicted position [m].
         """

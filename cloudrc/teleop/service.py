@@ -322,8 +322,8 @@ class MissionService:
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
         """Fly the first mission that has not ended; return the mission under way, if any.
 
-        A mission that has begun continues. A mission in the queue starts only with `queued`, and
-        only after the disk has stored its start.
+        A mission that has begun continues. A mission in the queue starts only if `queued` is
+        true, and only after the disk has stored that this mission starts.
         """
         waiting = self.book.open()
         if self._current is not None or not waiting:
