@@ -347,7 +347,7 @@ class Observations:
 
     @classmethod
     def begin(cls, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Begin with the first telemetry; `see` describes the arguments (speed in [m/s])."""
+        """Begin with the first telemetry; `see` describes `touch_speed` [m/s] and the others."""
         return cls(pipe_contacts, 0, finite_or_none(touch_speed), None, slip_ns, slip_ns)
 
     def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
