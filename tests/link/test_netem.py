@@ -160,10 +160,7 @@ def test_a_profile_is_put_into_tcs_words(profile, at, words):
     [
         (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 300.0))), "here 300000 ms"),
         (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 0.3), loop=True)), "a trace that begins a"),
-        (
-            DirectionProfile(changes=(Change(1.0, loss=GilbertElliott(0.1, 0.5, delay_bad=0.04)),)),
-            "loss.delay_bad_ms",
-        ),
+        (DirectionProfile(changes=(Change(1.0, loss=BURSTS),)), "loss.delay_bad_ms"),
         (DirectionProfile(rate=1e6, changes=(Change(1.0, jitter=0.1),)), "without keep_order"),
         (DirectionProfile(rate=4.0), "rate_kbit below 0.008"),
         (DirectionProfile(loss=GilbertElliott(0.1, 1e-11)), "a probability below 2**-32"),
@@ -250,6 +247,18 @@ def test_the_set_up_of_a_killed_process_is_taken_over():
     netem(kernel, DirectionProfile(0.07)).follow_peer(PEER)
     assert [line[:12] for line in kernel.said] == ["qdisc change", "filter add p", "filter del p"]
     assert len(kernel.filters) == 1
+
+
+def test_what_is_under_way_has_room_until_it_has_left():
+    kernel, shaper = shaped(DirectionProfile(1.0, rate=1e6, queue_packets=10))
+    small = DirectionProfile(0.02, rate=1e6, queue_packets=10)
+    for held, seconds, room in ((100, 1.5, limit(small) + 100), (3, 2.0, limit(small))):
+        kernel.held = held
+        shaper.follow_profile(small)
+        for _ in range(2):
+            shaper.step(seconds / 2)
+        assert f"limit {room} " in kernel.said[-1]
+    assert shaper.counts()["restored"] == 0, "its own changes are nobody else's"
 
 
 @pytest.mark.parametrize("delay", [300.0, 0.1])

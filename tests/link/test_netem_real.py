@@ -260,6 +260,18 @@ def test_a_change_in_flight_loses_nothing(shaped):
     assert shaped.counts()["lost"] == 0
 
 
+def test_a_bottleneck_has_its_rate(shaped):
+    shaped.follow_profile(DirectionProfile(rate=400e3, queue_packets=1000))
+
+    def off():
+        (flow := Flow()).send(100, 0.0)
+        flow.settle()
+        took = (flow.arrived[-1][1] - flow.arrived[0][1]) * 1e-9
+        return abs(99 * 200 * 8 / took / 400e3 - 1.0)  # 172 bytes and 28 of headers
+
+    assert least(off, 0.03) < 0.03
+
+
 def test_it_is_set_up_once_and_removed_without_a_trace(make):
     before = qdiscs()
     first = make(DirectionProfile(0.02))

@@ -1,6 +1,7 @@
 """The relay over real sockets on 127.0.0.1: in this process, as a process, and as a pod's link."""
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from cloudrc.drivers.realtime import free_ports
+from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link import relay as module
 from cloudrc.link.model import LinkDirection
@@ -221,9 +223,14 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
     (folder := tmp_path / "run").mkdir()
     end, listen, peer = (("127.0.0.1", port) for port in free_ports(3))
     words = ["link", "run", "--config=paper", f"--profile={profile}", "--direction=uplink"]
-    words += ["--mode=relay", f"--peer=localhost:{peer[1]}", f"--end=127.0.0.1:{end[1]}"]
-    words += [f"--listen=127.0.0.1:{listen[1]}", f"--route={folder / 'route'}"]
-    with subprocess.Popen([sys.executable, "-m", "cloudrc", *words], cwd=ROOT) as process:
+    words += [f"--peer=localhost:{peer[1]}", f"--end=127.0.0.1:{end[1]}"]
+    words += [f"--listen=127.0.0.1:{listen[1]}", f"--route={folder / 'route'}", "--mode"]
+    bare = ["setpriv", "--bounding-set=-net_admin", "--inh-caps=-net_admin"]
+    command = [*(bare if os.geteuid() == 0 else []), sys.executable, "-m", "cloudrc", *words]
+    refused = subprocess.run([*command, "netem"], cwd=ROOT, capture_output=True, text=True)
+    assert refused.returncode == MissingPrerequisiteError.exit_code
+    assert "no uid 0 with NET_ADMIN; give this container both" in refused.stderr
+    with subprocess.Popen([*command, "auto"], cwd=ROOT) as process:
         killer = Timer(PATIENCE, process.kill)  # where this test fails, the process ends, too
         killer.start()
         until((folder / "route").exists)
@@ -239,6 +246,8 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
         assert np.median([delays_ns[n] for n in range(280, 300)]) < 30 * MS
         state = json.loads((folder / "link.json").read_text())
         assert state["profile"]["description"] == "quick"
+        assert (state["shaper"], state["mode"]) == ("relay", "auto")
+        assert state["reason"] == "netem does not work here: no uid 0 with NET_ADMIN"
         process.terminate()
         assert until(lambda: process.poll() is not None) < 0.5
         assert process.returncode == 0

@@ -179,6 +179,8 @@ def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, found):
     assert (verdict.outcome, codes(verdict)) == ("invalid" if found else "success", found)
     # Virtual time does not depend on the machine.
     assert judged(flight).outcome == "success"
+    unproven = judged(flight, real_time=True)  # no rows of lateness
+    assert (unproven.outcome, codes(unproven)) == ("invalid", ["not_real_time"])
 
 
 def test_only_what_telemetry_shows_during_the_mission_counts():

@@ -91,6 +91,20 @@ def test_the_same_clock_is_left_as_it_is(tmp_path):
     assert merged.attachments == texts | {"report.json": b"{}"}
 
 
+def test_clocks_that_nothing_relates_begin_together_and_a_torn_end_is_merged(tmp_path):
+    cloud = [one for one in cloud_records(150, SECOND) if not isinstance(one, rec.Arrival)]
+    ends = files(tmp_path, world_records(150, 7 * SECOND), cloud, ("a", "b"))
+    noted = {"clock_offset_ns": str(6 * SECOND), "clock_offset_method": "first records"}
+    assert noted.items() <= merge(*ends).metadata.items()
+    ends[1].write_bytes(ends[1].read_bytes()[: ends[1].stat().st_size // 2])
+    (mission := merge(*ends)).write(tmp_path / "m.mcap")
+    recording = Recording.read(tmp_path / "m.mcap")
+    assert recording.note == mission.note
+    assert mission.note.startswith("cloud: cut short: ")
+    assert (recording.complete, len(recording["/odometry"])) == (False, 150)
+    assert 50 <= len(recording["/pid"]) == len(recording["/cmd_vel"]) < 150
+
+
 @pytest.mark.parametrize(("lost", "rows"), [("world", (0, 9)), ("cloud", (9, 0))])
 def test_one_end_alone_is_better_than_nothing(tmp_path, lost, rows):
     world, cloud = files(tmp_path, world_records(9), cloud_records(9), ("x", "y"))

@@ -153,6 +153,14 @@ def test_what_other_programs_changed_is_named(whole, path, options, said):
         assert recording.lacking in Recording.read(new).lacking, "a copy hides nothing"
 
 
+def test_a_torn_recording_that_others_ended_is_told(path):
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, clock="world")
+        writer.write(RECORDS)
+        writer._mcap.finish()
+    assert "another program has put an end to it" in Recording.read(path).lacking
+
+
 def write_foreign(path, topic, ros_type, text, data, channels=1, **options):
     """Write messages as another program that names the clock as cloudrc does."""
     with path.open("wb") as stream:
@@ -268,6 +276,15 @@ def test_a_recovery_says_what_is_kept_and_lost(path):
     assert Recording.read(path).lacking == "something follows its end"
     recovery = recover(path, new)
     assert (recovery.bytes_lost, recovery.share) == (len(WHOLE), pytest.approx(0.5))
+
+
+def test_a_number_without_its_one_definition_is_a_damage(path, tmp_path):
+    source = write(tmp_path / "w.mcap", world_records(5))
+    flat = rewrite(source, path, use_chunking=False).read_bytes()
+    channels = [start for code, start, _ in spans(flat) if code == Opcode.CHANNEL]
+    for at, byte in ((channels[3], b"\x90"), (channels[3] + 9, flat[channels[0] + 9 :][:1])):
+        path.write_bytes(flat[:at] + byte + flat[at + 1 :])
+        assert Recording.read(path).lacking.startswith("damaged: ")
 
 
 def test_nothing_is_offered_of_what_holds_nothing(path):

@@ -121,6 +121,15 @@ def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path):
     assert len(Recording.read(path)["/count"]) == 4
 
 
+def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path):
+    recorder = Recorder(path := tmp_path / "w.mcap", open_mcap, size_max=20_000)
+    record_all(recorder, world_records(1000), 200)
+    assert (said := "recording stopped: the file has reached its size limit") in recorder.error
+    assert recorder.dropped > 0
+    assert 20_000 <= path.stat().st_size < 100_000
+    assert Recording.read(path).note == said
+
+
 @pytest.mark.parametrize("error", [None, OSError(errno.EIO, "broken"), ValueError("closed file")])
 def test_a_sync_by_another_thread_reports_its_error_later(tmp_path, error):
     path, shelf = tmp_path / "w.mcap", failing("sync", error)

@@ -9,6 +9,7 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump
+from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.reader import recover
 from cloudrc.record.writer import McapWriter
@@ -146,3 +147,10 @@ def test_the_ends_are_merged_if_nobody_has(run):
         what(run / "mission.mcap")
         assert write_report(run, *read_run(run), page=False)["numbers"] == first
         assert Recording.read(run / "mission.mcap").complete
+
+
+def test_a_folder_without_a_run_is_refused(run):
+    for name in ("mission.mcap", "config.yaml"):
+        (run / name).unlink()
+        with pytest.raises(BadInputError, match=f"has no {name}"):
+            read_run(run)

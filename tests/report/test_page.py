@@ -11,7 +11,7 @@ from cloudrc.metrics import Number
 from cloudrc.metrics.verdict import Failure, Verdict
 from cloudrc.report.document import Run, environment_document
 from cloudrc.report.figures import FIGURES, Picture
-from cloudrc.report.page import render, summary
+from cloudrc.report.page import readable, render, summary
 from cloudrc.report.write import assess, write_report
 from tests.metrics.conftest import ONE_PIPE, flown, paper, touch
 
@@ -75,6 +75,19 @@ def test_failures_and_notes_are_escaped():
     assert "it hit, at 3.50 s, x 1.00, y -2.00, z 0.70 m <code>pipe_touched</code>" in page
     assert "<script>" not in page
     assert "metric &lt;b&gt; &amp;" in page
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "unit", "expected"),
+    [
+        ("rtt_mean", 0.069325, "s", ("69.33", "ms")),
+        ("min_clearance", 0.15179, "m", ("0.152", "m")),
+        ("hold_count", 3.0, "1", ("3", "")),
+        ("loss_uplink", 0.0123, "1", ("1.23", "%")),
+    ],
+)
+def test_numbers_have_readable_units(name, value, unit, expected):
+    assert readable(name, Number(value, unit, "")) == expected
 
 
 def test_the_summary_of_a_failed_flight():

@@ -1,7 +1,10 @@
 """What shapers and kernels report of themselves, read back: state, metrics, qdiscs."""
 
+import pytest
+
 from cloudrc.link.sidecar import Near, Told
-from cloudrc.link.verify.causes import Evidence, read_evidence, read_metrics
+from cloudrc.link.verify.causes import Evidence, Findings, find_causes, read_evidence, read_metrics
+from cloudrc.link.verify.judge import Row
 
 NETEM = {"kind": "netem", "handle": "7401:", "packets": 85, "drops": 15}
 METRICS = """
@@ -27,3 +30,19 @@ def test_metrics_report_lateness_counts_and_stops():
     assert read_evidence(told, {}, 5) == nothing, "without tools nothing is claimed"
     netem = Told("netem", "", None, Near("eth0", {"eth0": [NETEM]}))
     assert read_evidence(netem, {}, 100).passed == 100, "counted by the kernel"
+
+
+@pytest.mark.parametrize(
+    ("shaper", "netems", "code"),
+    [
+        ("netem", {"eth1": [NETEM]}, "wrong_interface"),
+        ("netem", {}, "no_qdisc"),
+        ("netem", {"eth0": [NETEM, NETEM]}, "shaped_twice"),
+        ("relay", {"lo": [NETEM]}, "shaped_twice"),
+        ("relay", {"eth1": [NETEM]}, "doubled_delay"),
+    ],
+)
+def test_qdiscs_on_the_way_of_the_flow_are_the_cause(shaper, netems, code):
+    known = read_evidence(Told(shaper, "", None, Near("eth0", netems)), {})
+    row = Row("mean", "s", 0.045, 0.09, 0.043, 0.047, "off")
+    assert [one.code for one in find_causes({"uplink": Findings([row], known)})] == [code]
