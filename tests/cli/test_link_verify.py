@@ -1,6 +1,8 @@
 """`cloudrc link verify` of a release, which `helm test` runs, over real HTTP."""
 
 from contextlib import ExitStack, closing
+from math import nan
+from unittest.mock import Mock
 
 import pytest
 
@@ -14,7 +16,7 @@ from cloudrc.link.sidecar import Near, Told, write_told
 from cloudrc.records import LinkChecked
 
 APPLIED = DirectionProfile(0.045, loss=0.02, duplicate=0.01, rate=3e6)
-MEASURED = {"ok": 0.0451, "off": 0.0902}
+MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}
 
 
 class Release:
@@ -27,15 +29,20 @@ class Release:
             link.shaped("relay", way, "auto")
             self.shapes(way, Told("relay", "", APPLIED, Near("eth0", {})))
 
-    def hears(self, **verdicts):
+    def hears(self, *, stamp_ns=5, **verdicts):
         """Give ends a verdict on the direction that they receive."""
         for end, verdict in verdicts.items():
             up, value = end == "cloud", MEASURED[verdict]
             rows = [
-                LinkChecked(5, up, "mean", 0.045, value, 0.043, 0.047, verdict, 3300),
-                LinkChecked(5, up, "loss", 0.0, 0.0, 0.0, 0.02, "ok", 3300),
+                LinkChecked(stamp_ns, up, "mean", 0.045, value, 0.043, 0.047, verdict, 3300),
+                LinkChecked(stamp_ns, up, "loss", 0.0, 0.0, 0.0, 0.02, "ok", 3300),
             ]
             self.ends[end].see(rows)
+
+    def tells(self, name, asked, measured=nan):
+        """Let cloud tell a row that it does not judge."""
+        row = LinkChecked(5, True, name, asked, measured, 0.0, 0.0, "told", 3300)
+        self.ends["cloud"].see([row])
 
     def shapes(self, way, told):
         self.links[way].link.tell = lambda: write_told(told)
@@ -91,6 +98,39 @@ def test_a_fault_names_its_direction(release):
         release.shapes(way, told)
     release.hears(cloud="off")
     assert causes(release.ask()) == [("shaped_twice", "both")], "qdiscs that the links find"
+
+
+def test_a_verdict_off_for_a_moment_does_not_end_the_wait(release, monkeypatch):
+    release.hears(world="off", cloud="open")
+    later = iter([{}, {}, {"stamp_ns": 6, "world": "ok"}, {}, {"stamp_ns": 6, "cloud": "ok"}])
+    monkeypatch.setattr(link_verify.time, "sleep", lambda seconds: release.hears(**next(later)))
+    assert release.ask()["verdict"] == "believed"
+
+
+def test_what_is_not_judged_is_noted(release, monkeypatch):
+    release.hears(world="ok")
+    release.tells("time_line", 1.0, 1.0)
+    with monkeypatch.context() as patch:  # nobody waits for a time line that loops
+        patch.setattr(link_verify.time, "sleep", Mock(side_effect=[None]))
+        said = release.ask()
+    assert said["verdict"] == "undecided"
+    assert "uplink: NOT JUDGED in flight: a time line loops" in as_text(said)
+    release.hears(cloud="ok")
+    release.tells("correlation", 0.9)
+    said = as_text(release.ask())
+    assert "uplink: correlation NOT JUDGED: netem realises" in said
+    assert said.endswith("except what is NOT JUDGED (above)")
+
+
+@pytest.mark.parametrize(
+    ("applied", "code"), [(3e6, None), (None, "rate_ignored"), (2e6, "slow"), (5e6, "rate_ignored")]
+)
+def test_a_shaper_that_reports_another_rate_is_not_believed(release, applied, code):
+    """Single datagrams do not measure the rate."""
+    release.shapes("uplink", Told("relay", "", DirectionProfile(0.045, rate=applied)))
+    release.hears(world="ok", cloud="ok")
+    release.tells("rate", 3e6)
+    assert causes(release.ask()) == ([(code, "uplink")] if code else [])
 
 
 def test_ends_that_do_not_answer_are_a_timeout(release):

@@ -132,6 +132,12 @@ def test_an_api_that_is_not_there_ends_with_4_or_5(capsys):
     assert captured.out.count("waiting") == 1
 
 
+def test_an_invalid_url_of_the_api_is_an_error(capsys):
+    for url in ("here", "unix:", "ftp://h:1", "http://me@h:1", "http://[::1", "http://h:x"):
+        assert main(["mission", "status", "--api", url]) == 2
+        assert f"--api {url}: give http://HOST:PORT or unix:PATH\n" in capsys.readouterr().err
+
+
 def test_the_operators_verbs(api, mission, capsys):
     assert mission("status") == 0
     assert "no mission is under way" in capsys.readouterr().out

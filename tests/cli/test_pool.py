@@ -73,6 +73,9 @@ def test_only_the_first_hang_up_interrupts():
     os.kill(os.getpid(), signal.SIGHUP)
     with pytest.raises(KeyboardInterrupt):  # a second request still counts
         os.kill(os.getpid(), signal.SIGTERM)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
+    interrupt_on_signals()
+    os.kill(os.getpid(), signal.SIGHUP)
 
 
 @pytest.mark.process

@@ -27,7 +27,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.record.columns import Recording
-from tests.record.conftest import counted, world_records
+from tests.record.conftest import MS, counted, world_records
 
 FREE = "127.0.0.1:9"
 ENDS = ("world", "cloud")
@@ -141,8 +141,22 @@ def test_sizes_are_read_as_in_kubernetes():
             read_size(text)
 
 
-def started(path):
-    return open_recorder(argparse.Namespace(record=path, record_max=None), "world", b"id")
+def started(path, size_max=None):
+    return open_recorder(argparse.Namespace(record=path, record_max=size_max), "world", b"id")
+
+
+def test_both_recordings_together_stay_within_the_limit(tmp_path):
+    for _ in range(3):
+        recorder = started(tmp_path / "world.mcap", 200_000)
+        for start in range(0, 30_000, 500):
+            recorder.put(world_records(50, start * MS))
+            while recorder.drain():
+                pass
+            recorder.flush(sync=False)
+        recorder.close()
+        assert "the file has reached its size limit" in recorder.error
+    sizes = [each.stat().st_size for each in tmp_path.iterdir()]
+    assert (len(sizes), sum(sizes) < 232_000) == (2, True), "each ends with its open chunk"
 
 
 def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):

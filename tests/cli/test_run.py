@@ -1,6 +1,7 @@
 """`cloudrc run` and `cloudrc report`: refused input, output, and the folder of a run."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -10,14 +11,8 @@ from cloudrc.cli.report import summary
 from cloudrc.cli.run import new_folder
 from cloudrc.errors import BadInputError
 
-SHORT = [
-    "--set",
-    "mission.steps.count=1",
-    "--set",
-    "mission.steps.period_s=1.0",
-    "--set",
-    "criteria.settle_m=null",
-]
+KEYS = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m=null"
+SHORT = [f"--set={key}" for key in KEYS]
 """Overrides of `steps` for one second of flight."""
 FLY = ["run", "steps", "--mode", "virtual", *SHORT]
 
@@ -90,6 +85,17 @@ def test_an_interrupt_while_the_report_is_written_names_the_remedy(monkeypatch, 
         assert main([*FLY, "--out", "here"]) == 130
     assert "'cloudrc report here' writes its report" in capsys.readouterr().err
     assert main(["report", "here"]) == 0
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_closed_pipe_does_not_end_the_run(folder, monkeypatch):
+    """As in `cloudrc run | head -1`; the exit code still follows the verdict, here 1."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as closed_pipe:
+        monkeypatch.setattr("sys.stdout", closed_pipe)
+        assert main([*FLY, "--out", "here", "--set", "criteria.contact=true"]) == 1
+    assert (folder / "here" / "report.json").is_file()
 
 
 @pytest.mark.usefixtures("no_page")

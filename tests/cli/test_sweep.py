@@ -16,14 +16,8 @@ from hypothesis import strategies as st
 from cloudrc.cli.main import main
 from cloudrc.cli.sweep import as_csv, as_table, interval, summarise
 
-SHORT = [
-    "--set",
-    "mission.steps.count=1",
-    "--set",
-    "mission.steps.period_s=1.0",
-    "--set",
-    "criteria.settle_m=null",
-]
+KEYS = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m=null"
+SHORT = [f"--set={key}" for key in KEYS]
 """Overrides of `steps` for one second of flight."""
 
 

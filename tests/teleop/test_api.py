@@ -20,7 +20,7 @@ from cloudrc.messages import GuardState
 from cloudrc.records import Counted
 from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
-from cloudrc.teleop.api import ApiServer
+from cloudrc.teleop.api import ApiServer, Bridge
 from cloudrc.teleop.auth import LOCAL
 from tests.teleop.conftest import DIRECT, OPERATOR, READER, A, B, C, connect, head, running
 
@@ -213,6 +213,18 @@ def test_a_stop_during_the_start_is_the_first_call_unless_another_teleop_flies(l
         else:
             api.bridge.open(api.flight.teleop)
             assert answer.result() == (200, {"id": None, "state": "stopping"})
+
+
+@emergency_stop
+def test_stop_and_hold_overtake_a_full_queue_of_calls():
+    bridge, made = Bridge(), []
+    bridge.open(object())
+    for what in (*range(100), "hold", "stop", "hold"):
+        urgent = what if isinstance(what, str) else ""
+        bridge.submit(lambda service, now_ns, what=what: made.append(what), urgent)
+    for call in (*bridge.take_stops(), *bridge.take()):
+        call(0)
+    assert made == ["stop", "hold", "hold", *range(100)]
 
 
 @pytest.mark.parametrize(

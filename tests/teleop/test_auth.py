@@ -164,7 +164,9 @@ def test_a_reader_may_look_and_nothing_else(idle):
 def test_commands_are_audited_with_caller_and_result():
     with running() as api:
         api.post("/v1/missions", {**A_MISSION, "key": "uid"})
-        api.post("/v1/missions", A_MISSION)
+        named = {"X-Forwarded-For": "203.0.113.7", "X-Forwarded-Proto": "https"}  # not believed
+        body = json.dumps(A_MISSION).encode()
+        api.send(api.request("/v1/missions", body, headers=named, method="POST"))
         api.post("/v1/hold", token=READER)
         api.get("/v1/state")
         api.post("/v1/estop/")

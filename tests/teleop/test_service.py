@@ -3,14 +3,18 @@
 import re
 from argparse import Namespace
 from math import inf, nan
+from unittest.mock import Mock
 
 import pytest
 
 from cloudrc.cli.teleop import _start
 from cloudrc.config.load import load_experiment
+from cloudrc.drivers.teleop import turn
 from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
-from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX
+from cloudrc.teleop import wire
+from cloudrc.teleop.api import Bridge
+from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, next_step
 from cloudrc.teleop.store import ConflictError, Order, UnavailableError
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
 from tests.teleop.conftest import (
@@ -274,6 +278,19 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
     assert [failure["code"] for failure in verdict["failures"]] == codes
 
 
+def test_after_a_stall_the_stop_belongs_to_the_stopped_mission():
+    """Teleop's loop saw the robot stopped first, and that was why the mission had failed."""
+    (flight, mission_id), bridge = service_flying(), Bridge()
+    bridge.open(flight.teleop)
+    stopped = bridge.submit(type(flight.teleop).stop_rotors, "stop")
+    flight.guard = ESTOP
+    cloud = Mock(receive=lambda: [wire.encode(flight.seen)])
+    how = {"stops": bridge.take_stops, "blind": 2, "late_ns": 0, "now_ns": flight.now_ns + 10**9}
+    turn(flight.teleop, cloud, wire.decode, bridge.take, **how)
+    assert stopped.result()["id"] == mission_id
+    assert flight.names(mission_id)[-1] == "emergency_stopped"
+
+
 # What is shown
 
 
@@ -302,6 +319,20 @@ def test_the_state_is_shown_with_cause_and_since_when_in_this_world():
     flight.guard = HOLD
     flight.step()
     assert shown(flight)["guard_for_s"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("guard", "mission", "said"),
+    [
+        (GROUND, None, "waits for a mission; it takes off, after a stop or a landing only when"),
+        (GROUND, "flying", "takes off with the mission's first commands, after a stop"),
+        (TRACK, "held", "cloudrc mission resume"),
+        (HOLD, None, "waits for a mission"),
+        (HOLD, "held", "continues by itself when they arrive"),
+    ],
+)
+def test_what_comes_next_follows_from_the_guard_and_the_mission(guard, mission, said):
+    assert said in next_step(guard, 0.0, 0.0, mission)
 
 
 def test_a_silent_robot_is_told_from_a_silent_cloud():
