@@ -6,6 +6,7 @@ import gc
 import json
 import os
 import signal
+import socket
 from math import isfinite, nan
 
 import pytest
@@ -19,6 +20,19 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 def nightly(*values: object) -> list[object]:
     """Mark values of a parametrized test as `full`: make nightly tries them, make test does not."""
     return [pytest.param(value, marks=pytest.mark.full) for value in values]
+
+
+def _has_ipv6() -> bool:
+    """Whether this machine has the address ::1; a container often has not."""
+    try:
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as one:
+            one.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
+
+
+needs_ipv6 = pytest.mark.skipif(not _has_ipv6(), reason="needs the IPv6 address ::1")
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

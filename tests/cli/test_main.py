@@ -30,15 +30,20 @@ def test_help_imports_nothing_heavy(command):
     assert subprocess.run(words, capture_output=True, text=True).stderr.strip() == "[]"
 
 
-def test_help_answers_within_150_ms():
-    """Measured in processor time, so that other load does not matter."""
+def processor_time(*words):
+    """Return the least processor time of a Python program in three runs [s]."""
     took = []
     for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run([sys.executable, "-m", "cloudrc", "--help"], check=True, capture_output=True)
+        subprocess.run([sys.executable, *words], check=True, capture_output=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         took.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    assert min(took) < 0.150
+    return min(took)
+
+
+def test_help_takes_no_longer_than_ten_starts_of_python():
+    """150 ms where Python starts in 15 ms; a loaded machine slows both."""
+    assert processor_time("-m", "cloudrc", "--help") < 10 * processor_time("-c", "pass")
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS, *(f"link {action}" for action in ACTIONS)])

@@ -35,6 +35,7 @@ from cloudrc.records import (
     MissionEvent,
     TelemetrySent,
 )
+from tests.conftest import needs_ipv6
 from tests.flights.conftest import records
 
 HOST = "127.0.0.1"
@@ -194,6 +195,7 @@ def test_a_loop_that_stands_still_is_not_alive(served, monkeypatch):
     assert get(port, "/healthz") == (503, "the loop has stood still for 61 s\n")
 
 
+@needs_ipv6
 def test_probes_of_both_address_families_are_answered():
     exporter = Exporter("link")
     port = exporter.serve(("::", 0))

@@ -11,12 +11,14 @@ import pytest
 
 from cloudrc.cli.client import Api
 from cloudrc.config.load import dump, load_experiment
+from tests.conftest import needs_ipv6
 from tests.drivers.conftest import LIMIT, TOKEN
 
 FILES = 256
 """Limit of open files that the process starts with."""
 
 
+@needs_ipv6
 @pytest.mark.process
 @pytest.mark.promise("emergency-stop-gets-through")
 def test_idle_connections_do_not_lock_a_stop_out(tmp_path):

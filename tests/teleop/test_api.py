@@ -22,6 +22,7 @@ from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
 from cloudrc.teleop.api import ApiServer, Bridge
 from cloudrc.teleop.auth import LOCAL
+from tests.conftest import needs_ipv6
 from tests.teleop.conftest import DIRECT, OPERATOR, READER, A, B, C, connect, head, running
 
 LEG = {"dwell_s": 0.0, "tolerance_m": 0.3}
@@ -298,6 +299,7 @@ def test_a_kept_connection_answers_like_a_fresh_one(api):
         assert took < median_of_answers(lambda: connect(api)) + 0.02
 
 
+@needs_ipv6
 def test_the_api_and_its_client_speak_both_address_families():
     with running(host="[::]") as api:
         assert api.url.startswith("http://[::]:")
