@@ -17,6 +17,7 @@ from cloudrc.drivers.realtime import (
     serve,
     split_address,
 )
+from tests.conftest import needs_ipv6
 from tests.flights.conftest import bare_world, ring
 
 HERE, THERE = ("127.0.0.1", 7401), ("10.1.2.3", 7400)
@@ -48,7 +49,6 @@ def write(path, text, moment_ns):
         lambda path: None,
     ],
 )
-from tests.conftest import needs_ipv6
 def test_what_is_no_route_changes_nothing(tmp_path, make):
     path = tmp_path / "route"
     write(path, "127.0.0.1:7401\n", 1)
@@ -86,7 +86,9 @@ def test_a_peer_follows_its_route_twice_a_second(tmp_path):
         assert there.recv(100) == b"hello"
 
 
-@pytest.mark.parametrize(("listen", "other"), [pytest.param("::", "::1", marks=needs_ipv6), ("::", "127.0.0.1")])
+@pytest.mark.parametrize(
+    ("listen", "other"), [pytest.param("::", "::1", marks=needs_ipv6), ("::", "127.0.0.1")]
+)
 def test_ends_meet_over_ipv6_and_at_both_families(listen, other):
     far = Peer.bind((other, 0), ("127.0.0.1", 9))
     own = Peer.bind((listen, 0), far.socket.getsockname()[:2])
