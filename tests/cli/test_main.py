@@ -41,9 +41,9 @@ def processor_time(*words):
     return min(took)
 
 
-def test_help_takes_no_longer_than_ten_starts_of_python():
-    """150 ms where Python starts in 15 ms; a loaded machine slows both."""
-    assert processor_time("-m", "cloudrc", "--help") < 10 * processor_time("-c", "pass")
+def test_help_takes_no_longer_than_fifteen_starts_of_python():
+    """A loaded machine slows both, a freshly installed one imports more slowly."""
+    assert processor_time("-m", "cloudrc", "--help") < 15 * processor_time("-c", "pass")
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS, *(f"link {action}" for action in ACTIONS)])
