@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import traceback
-from pathlib import Path
+import errno
 
+DISK_FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up"}
+"""Number of an error of a full disk -> words for it."""
 TEXT_MAX = 2000
 """Largest part of another program's text that is shown [characters]."""
 
@@ -70,11 +71,3 @@ def describe_error(error: BaseException) -> str:
         raise
     except BaseException:  # the exception's __str__ may raise, too
         return to_one_line(name)
-
-
-def locate_error(error: BaseException) -> str:
-    """Return where an exception was raised, as "FILE:LINE in FUNCTION" without folders."""
-    frames = traceback.extract_tb(error.__traceback__)
-    if not frames:
-        return ""
-    return f"{Path(frames[-1].filename).name}:{frames[-1].lineno} in {frames[-1].name}"

@@ -74,11 +74,12 @@ OPEN = {
 
 def outputs() -> dict[Path, str]:
     """Generate everything that `make docs` writes: file -> text."""
+    values = table("key | default | meaning", _values(ChartValues()))
     return {
         **_insert(ROOT / "docs" / "experiment.md", _experiment()),
         **_insert(ROOT / "docs" / "topics.md", _topics()),
         **_insert(ROOT / "docs" / "metrics.md", _metrics()),
-        **_insert(CHART / "README.md", f"\n{_chart()}"),
+        **_insert(CHART / "README.md", f"\n{values}"),
         CHART / "values.yaml": VALUES_HEAD + _values_text(ChartValues()),
         CHART / "values.schema.json": json.dumps(_chart_schema(), indent=2) + "\n",
         **{
@@ -279,11 +280,6 @@ def _metrics() -> str:
     ]
     head = "## Buckets\n\nUpper bounds of the buckets of each histogram [s]:\n"
     return f"\n{table('metric | type | from | meaning', rows)}\n{head}{''.join(buckets)}"
-
-
-def _chart() -> str:
-    """Write the table of all values of the chart."""
-    return table("key | default | meaning", _values(ChartValues()))
 
 
 VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import errno
 import sys
 from collections.abc import Sequence
 
 from cloudrc.cli.output import discard_output, escape
 from cloudrc.cli.parser import build_parser
-from cloudrc.errors import BadInputError, CloudrcError, DiskFullError, InterruptedRunError
+from cloudrc.errors import (
+    DISK_FULL,
+    BadInputError,
+    CloudrcError,
+    DiskFullError,
+    InterruptedRunError,
+)
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
@@ -52,7 +57,7 @@ def _explain(error: Exception) -> tuple[str, int]:
         return str(error).rstrip(), error.exit_code  # one line, or one per wrong key
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        if error.errno == errno.ENOSPC:
+        if error.errno in DISK_FULL:
             full = DiskFullError(str(error.filename or "this folder"))
             return str(full), full.exit_code
         remedy = "check the path, and whether you have access to it ('--debug' shows where)"

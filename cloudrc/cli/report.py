@@ -53,7 +53,7 @@ def execute(options: argparse.Namespace) -> int:
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
-    from cloudrc.metrics.verdict import EXIT_CODES
+    from cloudrc.metrics.verdict import exit_code
     from cloudrc.report.folder import read_run
     from cloudrc.report.write import write_report
 
@@ -68,7 +68,7 @@ def execute(options: argparse.Namespace) -> int:
     print(
         summary(document, options.run) if for_people else format_document(document, options.output)
     )
-    return EXIT_CODES[document["verdict"]]
+    return exit_code(document)
 
 
 def summary(report: Mapping[str, Any], folder: Path) -> str:

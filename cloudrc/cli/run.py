@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -26,7 +25,13 @@ from cloudrc.cli.output import (
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cli.report import print_traceback, summary
-from cloudrc.errors import BadInputError, CloudrcError, DiskFullError, InterruptedRunError
+from cloudrc.errors import (
+    DISK_FULL,
+    BadInputError,
+    CloudrcError,
+    DiskFullError,
+    InterruptedRunError,
+)
 
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import CloudEndpoint
@@ -42,8 +47,6 @@ Flight = Callable[[Path], dict[str, Any]]
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
 
-DISK_FULL = errno.ENOSPC, errno.EDQUOT
-"""Numbers of the errors of a full disk and of a used-up quota."""
 GRACE = 30.0
 """If the mission goes on for this time after its time limit [s], this program stops the flight."""
 CLOCK = bytes(16)
@@ -110,7 +113,7 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
 
 
 def _fly_once(options: argparse.Namespace, mode: str) -> int:
-    from cloudrc.metrics.verdict import EXIT_CODES
+    from cloudrc.metrics.verdict import exit_code
 
     experiment = load(options.experiment, options.set, options.seed)
     warn(experiment)
@@ -147,9 +150,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     print_or_drop(
         format_document(report, options.output) if for_programs else summary(report, folder)
     )
-    if any(failure["code"] == "disk_full" for failure in report["failures"]):
-        raise DiskFullError(str(folder))
-    return EXIT_CODES[report["verdict"]]
+    return exit_code(report)
 
 
 def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:

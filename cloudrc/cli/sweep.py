@@ -18,7 +18,7 @@ from cloudrc.cli.output import escape, format_document, format_number, print_or_
 from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import fly, load, new_folder
-from cloudrc.metrics.verdict import EXIT_CODES
+from cloudrc.metrics.verdict import exit_code
 
 Report: TypeAlias = Mapping[str, Any]
 """Content of a file report.json."""
@@ -124,7 +124,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
     (folder / "sweep.csv").write_text(as_csv(reports))
     shown = f"\n{as_table(document)}\n\n{folder / 'sweep.json'}"
     print_or_drop(shown if for_people else format_document(document, options.output))
-    return code or max(EXIT_CODES[report["verdict"]] for report in reports)
+    return code or max(map(exit_code, reports))
 
 
 def _fly_one(job: tuple[str, list[str], Path, int]) -> dict[str, Any]:

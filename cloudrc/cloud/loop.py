@@ -19,19 +19,16 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable
 from math import isfinite, nan
+from pathlib import Path
 from typing import NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.errors import describe_error, locate_error
+from cloudrc.errors import describe_error
 from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
 from cloudrc.records import Control, Fault
 
-# Defaults. Source: docs/reference/control.md, "Predictors"; docs/reference/plant.md, "Frozen
-# reference". The experiment's keys cloud.horizon_max_s and cloud.freeze_after_s replace them.
-HORIZON_MAX, FREEZE_AFTER = 1.0, 0.4
-"""Longest horizon, and the time without a new echo, beyond the horizon, until a freeze [s]."""
 FRESH_ECHO_NS = 50_000_000
 """An echo gives a delay sample only up to this hold time [ns]: five command periods. While no
 commands arrive at world, the hold time grows although the delay of the link does not change."""
@@ -132,8 +129,8 @@ class ControlLoop:
         predictor: Predictor,
         controller: Controller,
         *,
-        horizon_max: float = HORIZON_MAX,
-        freeze_after: float = FREEZE_AFTER,
+        horizon_max: float,
+        freeze_after: float,
     ) -> None:
         """Connect three plug-ins; every session gets a new estimator.
 
@@ -312,13 +309,19 @@ class ControlLoop:
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:
-            where = "" if isinstance(error, InvalidResultError) else f", {locate_error(error)}"
+            where = "" if isinstance(error, InvalidResultError) else f", {_locate(error)}"
             what = f"the {kind} failed ({describe_error(error)}{where})"
             text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
             frames = "".join(traceback.format_tb(error.__traceback__))[-TRACEBACK_MAX:]
             trace = frames.encode(errors="replace").decode() + describe_error(error)
             fault = Fault(now_ns, code, text, trace)
             (self._undated if now_ns == NEVER_NS else self.faults).append(fault)
+
+
+def _locate(error: BaseException) -> str:
+    """Return where a plug-in raised an exception, without folders."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{Path(frame.filename).name}:{frame.lineno} in {frame.name}"
 
 
 def _refuse(**values: tuple[float, ...]) -> NoReturn:

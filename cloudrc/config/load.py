@@ -35,16 +35,15 @@ from cloudrc.config.problems import Problem
 from cloudrc.config.schema import (
     Change,
     Cloud,
+    CloudTime,
     CommandAge,
     Direction,
     Experiment,
     Guard,
-    Horizon,
     Mission,
     PlugIn,
     Profile,
     Speed,
-    World,
 )
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
@@ -102,8 +101,8 @@ class ResolvedCloud(Cloud):
     estimator: PlugIn
     predictor: PlugIn
     controller: PlugIn
-    horizon_max_s: Horizon = HORIZON_MAX_S
-    freeze_after_s: Horizon = FREEZE_AFTER_S
+    horizon_max_s: CloudTime = HORIZON_MAX_S
+    freeze_after_s: CloudTime = FREEZE_AFTER_S
 
 
 class ResolvedExperiment(Experiment):
@@ -144,7 +143,7 @@ def load_experiment(
         _remove_profile_values(document)
     outer = {path: value for path, value in changes.items() if path not in inner}
     overrides.apply_overrides(document, outer)
-    for key in ("world", "guard", "link", "cloud", "criteria", "report"):
+    for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found: list[Problem] = []
     with _collect(found, ("mission",)):
@@ -156,12 +155,16 @@ def load_experiment(
         _default(document, ("cloud", key), getattr(Cloud(), key))
     found += overrides.resolve_plugins(document, build=build)
     found += _resolve_traces(document, ("link",)) + _resolve_files(document)
-    _default_contact(document)
     experiment = _validate(document, ResolvedExperiment, name, found)
-    wrong = check_mission(experiment.mission, load_scene(experiment.world.scene))
+    scene, mission = load_scene(experiment.world.scene), experiment.mission
+    wrong = check_mission(mission, scene)
     below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
     problems.raise_problems(document, below, name)
-    return experiment
+    criteria = experiment.criteria
+    if criteria.contact is None:
+        contact = scene.board is not None and mission.steps is None
+        criteria = criteria.model_copy(update={"contact": contact})
+    return experiment.model_copy(update={"criteria": criteria})
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
@@ -332,17 +335,6 @@ def _resolve_files(document: Document) -> list[Problem]:
             source = document.source(("report", "metrics", str(index)))
             names[index] = str(source.absolute(name))
     return found
-
-
-def _default_contact(document: Document) -> None:
-    """Require contact if the scene has a board and the mission is not one of random steps."""
-    scene, mission = document.get("world", "scene"), document.get("mission")
-    with suppress(
-        BadInputError, TypeError, AttributeError
-    ):  # the validation reports an invalid scene
-        has_board = load_scene(World().scene if scene is None else scene).board is not None
-        has_steps = isinstance(mission, dict) and bool(mission.get("steps"))
-        _default(document, ("criteria", "contact"), has_board and not has_steps)
 
 
 CHANGEABLE_KEYS = Change.model_fields.keys() - {"at_s"}

@@ -32,7 +32,7 @@ CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
 Speed = Annotated[float, Field(ge=0.01, le=10)]
 Acceleration = Annotated[float, Field(ge=0.1, le=100)]
 YawRate = Annotated[float, Field(ge=0.01, le=10)]
-Horizon = Annotated[float, Field(gt=0, le=10)]
+CloudTime = Annotated[float, Field(gt=0, le=10)]
 HoldTime = Annotated[float, Field(ge=0.1, le=3600)]
 DURATION_MAX = 1_000_000
 """Largest value of a time limit, or of a dwell time in a mission [s]: eleven days."""
@@ -180,9 +180,9 @@ class Profile(Section):
     """Conditions from cloud to world"""
     command_age_max_ms: CommandAge | None = None
     """Default of guard.command_age_max_ms with this profile [ms]; null: 250"""
-    horizon_max_s: Horizon | None = None
+    horizon_max_s: CloudTime | None = None
     """Default of cloud.horizon_max_s with this profile [s]; null: 1"""
-    freeze_after_s: Horizon | None = None
+    freeze_after_s: CloudTime | None = None
     """Default of cloud.freeze_after_s with this profile [s]; null: 0.4"""
 
 
@@ -343,9 +343,9 @@ class Cloud(Section):
     parameters"""
     controller: PlugInChoice = "pid"
     """Tracks the setpoint: a name, or a mapping with parameters"""
-    horizon_max_s: Horizon | None = None
+    horizon_max_s: CloudTime | None = None
     """Longest horizon of the prediction [s]. null: the link profile's value, else 1"""
-    freeze_after_s: Horizon | None = None
+    freeze_after_s: CloudTime | None = None
     """Time without the echo of a new command, beyond the horizon, after which cloud commands zero
     velocity [s]. null: the link profile's value, else 0.4"""
 

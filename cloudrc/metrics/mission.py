@@ -49,17 +49,21 @@ def holds(flight: Flight) -> list[tuple[int, int]]:
     ]
 
 
-def _waypoints_reached(flight: Flight) -> float | None:
-    """Count the waypoints that the operator reported and that the true position confirms."""
+def reported(flight: Flight) -> dict[int, int]:
+    """Return the waypoints that the operator reported as reached: index -> stamp [ns]."""
     mission = flight.during("/mission")
     rows = mission["event"] == "reached"
-    stamps = dict(zip(mission["waypoint"][rows], mission["stamp_ns"][rows], strict=True))
+    pairs = zip(mission["waypoint"][rows], mission["stamp_ns"][rows], strict=True)
+    return {int(waypoint): int(stamp_ns) for waypoint, stamp_ns in pairs}
+
+
+def _waypoints_reached(flight: Flight) -> float | None:
+    """Count the waypoints that the operator reported and that the true position confirms."""
+    stamps, points = reported(flight), flight.mission.waypoints
     if flight.mission.steps:  # a step ends after its time, wherever the robot is
         return flight.count(len(stamps))
-    points = enumerate(flight.mission.waypoints)
-    return flight.count(
-        sum(i in stamps and _was_at(flight, point, stamps[i]) for i, point in points)
-    )
+    known = (i for i in stamps if i < len(points))
+    return flight.count(sum(_was_at(flight, points[i], stamps[i]) for i in known))
 
 
 def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
@@ -92,7 +96,9 @@ def _peak_force(flight: Flight) -> float | None:
 
 
 def _impulse(flight: Flight) -> float | None:
-    """Integrate the force of the impact [N s]; the simulator's contact parameters do not change it.
+    """Integrate the force of the impact over time [N s].
+
+    Unlike the peak force, the impulse does not depend on the simulator's contact parameters.
 
     Source: docs/reference/plant.md, "Contact".
     """

@@ -23,7 +23,7 @@ BAND = 0.05
 RISE = 0.1, 0.9
 """Shares of the step between which the rise time is measured [1]."""
 GROWTH_MIN = 0.15
-"""Smallest amplitude of an unstable oscillation [m]: the default of criteria.settle_m."""
+"""Smallest amplitude of an unstable oscillation [m]; less may be noise."""
 
 
 class Step(NamedTuple):

@@ -22,9 +22,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import GuardState, Vector
 from cloudrc.metrics import Flight, Number
-from cloudrc.metrics.mission import first_touch
+from cloudrc.metrics.mission import first_touch, reported
 from cloudrc.metrics.response import steps
 from cloudrc.records import REAL_TIME_FACTOR_MIN
 
@@ -38,6 +39,13 @@ PLUGIN_FAILURES_MAX = 0.01
 ADVICE = "close other programs or give the run more cores"
 
 Outcome = Literal["success", "failure", "invalid", "interrupted"]
+
+
+def exit_code(report: Mapping[str, Any]) -> int:
+    """Return the exit code of a run from the content of its report.json."""
+    if any(failure["code"] == "disk_full" for failure in report["failures"]):
+        return DiskFullError.exit_code
+    return EXIT_CODES[report["verdict"]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +102,6 @@ class Evidence:
     time_limit: float = inf  # limit of the time of `end` [s]
     touch: tuple[float, Moment] | None = None  # speed of the first touch of the board [m/s]
     violations: tuple[Failure, ...] = ()  # other events that must not happen
-    judged_by: str = ""  # how it is known that a waypoint was reached
     slow: str = ""  # why the run failed to keep real time; "" if it did not fail
 
 
@@ -127,7 +134,7 @@ def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
     if ending.code == "not_started":
         return
     if evidence.reached < evidence.waypoints:
-        text = f"{evidence.reached} of {evidence.waypoints} waypoints reached{evidence.judged_by}"
+        text = f"{evidence.reached} of {evidence.waypoints} waypoints reached"
         yield Failure("waypoint_not_reached", text, *end)
     if evidence.contact and evidence.touch is None:
         text = "the arm never touched the board, which criteria.contact requires"
@@ -168,7 +175,6 @@ def flight_evidence(
     return Evidence(
         waypoints=flight.waypoints,
         reached=0 if reached is None else round(reached.value),
-        judged_by="" if flight.mission.steps else " by the true position",
         contact=bool(criteria.contact),
         contact_speed_max=criteria.contact_speed_max_mps,
         ending=_ending(flight, interrupted),
@@ -195,8 +201,9 @@ def _ending(flight: Flight, interrupted: bool) -> Ending:
         return Ending(*flight.ending[1:])
     if interrupted and flight.end_ns is None:
         return Ending("interrupted", "the run was stopped before the mission started")
-    if "disk full" in flight.recording.note:
-        return Ending("disk_full", f"the recording is cut off: {flight.recording.note}")
+    if any(words in flight.recording.note for words in DISK_FULL.values()):
+        text = f"the recording is cut off ({flight.recording.note}); free some space"
+        return Ending("disk_full", text)
     if interrupted:
         return Ending("interrupted", "the run ended before the mission")
     if flight.end_ns is None:
@@ -313,15 +320,16 @@ def _why_grounded(flight: Flight) -> str:
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
     """Judge a recorded mission with only what the operator knows when the mission ends.
 
-    Contacts that telemetry reports only after the end do not count. The operator does not know the
-    report's time limit, and judges timing only by the real-time factor. All other facts are those
-    of the report's `evidence`.
+    The operator judges waypoints by the measured position. Contacts that telemetry reports only
+    after the end do not count. The operator does not know the report's time limit, and judges
+    timing only by the real-time factor. All other facts are those of the report's `evidence`.
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0
     touch, factor = first_touch(flight), numbers.get("real_time_factor")
     seen = replace(
         evidence,
+        reached=len(reported(flight)),
         touch=evidence.touch if touch is not None and touch["stamp_ns"] <= seen_ns else None,
         violations=tuple(_pipes(flight, seen_ns)),
         time_limit=inf,

@@ -14,14 +14,14 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cloudrc.errors import DISK_FULL
 from cloudrc.records import Record
 
 if TYPE_CHECKING:
     from cloudrc.record.writer import McapWriter
 
 TROUBLE = {
-    errno.ENOSPC: "disk full",
-    errno.EDQUOT: "disk quota used up",
+    **DISK_FULL,
     errno.EROFS: "disk is read-only",
 }
 CAPACITY = 20_000

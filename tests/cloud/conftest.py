@@ -20,7 +20,8 @@ def telemetry(stamp_ms, echo_ms=None, hold_ms=0):
 
 def loop(estimator=running_mean, predictor=None, controller=None, heard_ms=None, echo_ms=None):
     """Return a loop, which has heard telemetry of 100 ms at `heard_ms`."""
-    made = ControlLoop(estimator, predictor or last_sample(), controller or pid())
+    parts = estimator, predictor or last_sample(), controller or pid()
+    made = ControlLoop(*parts, horizon_max=1.0, freeze_after=0.4)
     if heard_ms is not None:
         made.observe(telemetry(100, echo_ms), heard_ms * MS)
     return made

@@ -64,13 +64,14 @@ class Log:
             changed = [next(new) if isinstance(each, kind) else each for each in records]
             records[:] = [each for each in changed if each is not None]
 
-    def flight(self, scene=OPEN_AIR, *, contact=False, waypoints=1, time_limit=60.0):
-        criteria = Criteria(contact=contact, time_limit_s=time_limit)
-        mission = Mission(
-            waypoints=(Waypoint(position_m=(10.0, 0.0, 1.0), tolerance_m=10.0, dwell_s=0.0),)
-            * waypoints
+    def flight(self, scene=OPEN_AIR, *, waypoints=1, mission=None, time_limit=60.0, **criteria):
+        anywhere = Waypoint(position_m=(10.0, 0.0, 1.0), tolerance_m=10.0, dwell_s=0.0)
+        return Flight(
+            Recording.from_records(*self.ends()),
+            Criteria(time_limit_s=time_limit, **criteria),
+            mission or Mission(waypoints=(anywhere,) * waypoints),
+            scene,
         )
-        return Flight(Recording.from_records(*self.ends()), criteria, mission, scene)
 
     def ends(self):
         """Return the records of world and of cloud by stamp; equal stamps keep their order."""

@@ -252,6 +252,5 @@ def test_a_missing_topic_makes_no_metric_fail(lost):
 def test_a_waypoint_counts_if_the_true_position_confirms_it(x, tolerance, dwell, reached):
     """The operator reports it at 10 s; the robot flies at 1 m/s along x."""
     point = Waypoint(position_m=(x, 0.0, 1.0), tolerance_m=tolerance, dwell_s=dwell)
-    flight = flown().flight()
-    object.__setattr__(flight, "mission", Mission(waypoints=(point,)))
+    flight = flown().flight(mission=Mission(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached

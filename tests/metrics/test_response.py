@@ -4,7 +4,7 @@ from math import cos, exp, pi, sin, sqrt
 
 import pytest
 
-from cloudrc.config.schema import Steps
+from cloudrc.config.schema import Mission, Steps
 from cloudrc.metrics import SHIPPED
 from cloudrc.metrics.response import steps
 from cloudrc.metrics.verdict import flight_evidence, judge
@@ -28,13 +28,15 @@ def growing(t):
     return 1 - exp(0.1 * t) * cos(3 * t), 0.0, 1.0
 
 
-def flight(path, setpoint=lambda t: (1.0, 0.0, 1.0), **mission):
+def flight(path, setpoint=lambda t: (1.0, 0.0, 1.0), **conditions):
     log = flown(path)
     log.change(Control, lambda n, c: c._replace(setpoint=setpoint((c.stamp_ns - START) / SECOND)))
-    made = log.flight(time_limit=60.0)
-    if mission:
-        object.__setattr__(made, "mission", made.mission.model_copy(update=mission))
-    return made
+    return log.flight(**conditions)
+
+
+def judged(a_flight):
+    verdict = judge(flight_evidence(a_flight, {}, real_time=False, interrupted=False))
+    return {failure.code: failure.text for failure in verdict.failures}
 
 
 @pytest.mark.parametrize("damping", [0.2, 0.5, 0.8])
@@ -53,8 +55,7 @@ def test_a_step_of_a_second_order_system(damping):
 
 @pytest.mark.parametrize("path", [growing, second_order(0.0)])
 def test_an_oscillation_without_decay_is_unstable(path):
-    verdict = judge(flight_evidence(flight(path), {}, real_time=False, interrupted=False))
-    assert "unstable" in [failure.code for failure in verdict.failures]
+    assert "unstable" in judged(flight(path))
 
 
 def test_a_small_or_decaying_oscillation_is_stable():
@@ -74,11 +75,9 @@ def test_each_change_of_the_setpoint_begins_a_step_and_a_moving_reference_none()
 
 
 def test_random_steps_must_settle_and_null_switches_it_off():
-    far = flight(second_order(0.5), lambda t: (1.3, 0.0, 1.0), steps=Steps(count=1))
-    judged = judge(flight_evidence(far, {}, real_time=False, interrupted=False))
-    texts = {failure.code: failure.text for failure in judged.failures}
-    assert "in step 1 the robot was 0.30 m from the setpoint" in texts["not_settled"]
-    assert "criteria.settle_m 0.15 m" in texts["not_settled"]
-    object.__setattr__(far, "criteria", far.criteria.model_copy(update={"settle_m": None}))
-    judged = judge(flight_evidence(far, {}, real_time=False, interrupted=False))
-    assert "not_settled" not in [failure.code for failure in judged.failures]
+    far = second_order(0.5), lambda t: (1.3, 0.0, 1.0)
+    mission = Mission(steps=Steps(count=1))
+    text = judged(flight(*far, mission=mission))["not_settled"]
+    assert "in step 1 the robot was 0.30 m from the setpoint" in text
+    assert "criteria.settle_m 0.15 m" in text
+    assert "not_settled" not in judged(flight(*far, mission=mission, settle_m=None))

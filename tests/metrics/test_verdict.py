@@ -4,11 +4,14 @@ from math import nan
 
 import pytest
 
+from cloudrc.config.schema import Mission, Waypoint
+from cloudrc.errors import DISK_FULL
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Number
 from cloudrc.metrics.verdict import (
     SLIP_MAX,
     Observations,
+    exit_code,
     flight_evidence,
     judge,
     operator_verdict,
@@ -17,6 +20,8 @@ from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,
     Arrival,
     Control,
+    Counted,
+    Fault,
     GuardChange,
     MissionEvent,
     SessionOpened,
@@ -191,3 +196,35 @@ def test_only_what_telemetry_shows_during_the_mission_counts():
     assert after.slip_ns - after.slip_began_ns == 4
     assert Observations.begin(4, nan, 0).see(1, nan, 0).pipe_touches == 1, "it begins again at 0"
     assert [event for event, _ in after.news(seen, 1.0)] == ["pipe_touched", "board_touched"]
+
+
+@pytest.mark.parametrize(("failures", "found"), [(4, []), (5, ["plugin_failed"])])
+def test_a_plug_in_may_fail_in_one_percent_of_the_periods(failures, found):
+    """401 periods are recorded."""
+    log = good()
+    text = "the predictor failed (KeyError: 'oops', my.py:12 in predict)"
+    log.cloud.append(Fault(at(1), "predictor_failed", text))
+    log.cloud.append(Counted(at(2), "cloud", "predictor_failed", failures))
+    verdict = judged(log.flight(ONE_PIPE, contact=True))
+    assert codes(verdict) == found
+    assert all("failed in 1% of its periods" in each.text for each in verdict.failures)
+    assert all("my.py:12 in predict" in each.text for each in verdict.failures)
+
+
+def test_the_operator_counts_what_was_reported_the_report_what_was_true():
+    missed = Mission(waypoints=(Waypoint(position_m=(0.0, 5.0, 1.0)),))
+    flight = good().flight(ONE_PIPE, mission=missed)
+    numbers = measured(flight)
+    evidence = flight_evidence(flight, numbers, real_time=False, interrupted=False)
+    assert codes(judge(evidence)) == ["waypoint_not_reached"]
+    assert operator_verdict(flight, evidence, numbers).outcome == "success"
+
+
+@pytest.mark.parametrize("words", DISK_FULL.values())
+def test_a_recording_cut_off_by_a_full_disk_is_no_failed_mission(words):
+    flight = without_end(good()).flight(ONE_PIPE)
+    flight.recording.note = f"world: recording stopped: {words}"
+    verdict = judged(flight, interrupted=True)
+    assert codes(verdict)[0] == "disk_full"
+    report = {"verdict": verdict.outcome, "failures": [{"code": code} for code in codes(verdict)]}
+    assert exit_code(report) == 3
