@@ -41,9 +41,11 @@ def both(delay, jitter, **others):
 def test_what_does_not_fit_is_named_and_the_named_value_fits(settings, words):
     texts = list(advise(load_experiment("paper", settings)))
     assert any(all(word in text for word in words) for text in texts), texts
-    fits = re.findall(r"--set (\S+)", " ".join(texts))
+    fits = dict(re.findall(r"--set ([\w.]+)=(\S+)", " ".join(texts)))
     if fits:
-        assert list(advise(load_experiment("paper", [*settings, *fits]))) == []
+        others = [each for each in settings if each.partition("=")[0] not in fits]
+        changed = [*others, *(f"{key}={value}" for key, value in fits.items())]
+        assert list(advise(load_experiment("paper", changed))) == []
 
 
 @pytest.mark.parametrize("profile", shipped.names("profile"))

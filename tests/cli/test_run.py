@@ -98,6 +98,29 @@ def test_a_closed_pipe_does_not_end_the_run(folder, monkeypatch):
     assert (folder / "here" / "report.json").is_file()
 
 
+FAILING = """
+from cloudrc.cloud.predictors import Predictor
+class Bad(Predictor):
+    def predict(self, odometry, horizon):
+        raise KeyError("oops")
+def build() -> Bad:
+    return Bad()
+"""
+
+
+@pytest.mark.usefixtures("no_page")
+@pytest.mark.parametrize("how", [["--mode", "virtual"], ["--seeds", "1"]])
+def test_a_failing_plug_in_fails_the_run_and_debug_shows_where(how, folder, capsys):
+    (folder / "bad.py").write_text(FAILING)
+    line = ["run", "steps", *SHORT, *how, "--set", "cloud.predictor=./bad.py"]
+    assert main(line) == 1
+    shown = capsys.readouterr()
+    assert "KeyError: 'oops', bad.py:5 in predict" in shown.out
+    assert 'raise KeyError("oops")' not in shown.err
+    assert main([*line, "--debug"]) == 1
+    assert 'raise KeyError("oops")' in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("no_page")
 def test_a_full_disk_is_named_and_is_no_failed_mission(monkeypatch, capsys):
     def full(*arguments, **options):

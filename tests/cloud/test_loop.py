@@ -57,9 +57,11 @@ def test_each_applied_command_counts_once_also_in_late_telemetry():
     assert applied == [-900, -902, -896]
 
 
-@pytest.mark.parametrize(("horizon", "clamped"), [(3.0, 1.0), (-0.5, 0.0)])
-def test_a_horizon_out_of_range_is_clamped_and_counted(horizon, clamped):
-    a_loop = loop(estimator=returns(horizon), heard_ms=1090)
+@pytest.mark.parametrize(
+    ("horizon", "limit", "clamped"), [(3.0, 1.0, 1.0), (3.0, 2.0, 2.0), (-0.5, 1.0, 0.0)]
+)
+def test_a_horizon_out_of_range_is_clamped_and_counted(horizon, limit, clamped):
+    a_loop = loop(estimator=returns(horizon), heard_ms=1090, horizon_max=limit)
     assert command(a_loop, 1094)[1].horizon == clamped
     assert a_loop.counts == {"horizon_clamped": 1}
 
@@ -86,6 +88,11 @@ def test_a_silent_echo_freezes_after_horizon_plus_400_ms():
     assert command(a_loop, 1510)[0].velocity == ZERO
     a_loop.observe(telemetry(510, echo_ms=1420), 1520 * MS)
     assert command(a_loop, 1520)[0].velocity == ONE
+
+
+def test_a_longer_freeze_after_bears_a_longer_silence():
+    a_loop = loop(controller=Integrating(), heard_ms=1100, echo_ms=1000, freeze_after=0.8)
+    assert [command(a_loop, now_ms)[0].velocity for now_ms in (1900, 1901)] == [ONE, ZERO]
 
 
 def test_the_first_echo_has_as_much_time():

@@ -65,6 +65,32 @@ def test_the_age_limit_of_file_or_profile_sets_the_speed_cap(experiment, setting
     assert guard.speed_max_mps == pytest.approx(cap, abs=1e-5)
 
 
+def test_a_profile_sets_the_limits_of_cloud_and_another_profile_takes_them_back(tmp_path):
+    (tmp_path / "far.yaml").write_text("horizon_max_s: 2.0\nfreeze_after_s: 0.8\n")
+    far = load_experiment("paper", [f"link.profile={tmp_path}/far.yaml"])
+    assert (far.cloud.horizon_max_s, far.cloud.freeze_after_s) == (2.0, 0.8)
+    (tmp_path / "resolved.yaml").write_text(dump(far))
+    back = load_experiment(tmp_path / "resolved.yaml", ["link.profile=paper-p1"])
+    assert (back.cloud.horizon_max_s, back.cloud.freeze_after_s) == (1.0, 0.4)
+    own = load_experiment("paper", [f"link.profile={tmp_path}/far.yaml", "cloud.horizon_max_s=3"])
+    assert (own.cloud.horizon_max_s, own.cloud.freeze_after_s) == (3.0, 0.8)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "contact"),
+    [
+        ("paper", [], True),
+        ("paper", ["world.scene=empty", "mission=hover"], False),
+        ("steps", [], False),
+        ("hover", [], False),
+        ("hover", ["criteria.contact=true"], True),
+        ("paper", ["criteria.contact=false"], False),
+    ],
+)
+def test_contact_is_required_only_where_the_scene_has_a_board(name, settings, contact):
+    assert load_experiment(name, settings).criteria.contact is contact
+
+
 def test_single_values_override_the_profile(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("link: {profile: lossy, uplink: {delay_ms: 120}}\n")
