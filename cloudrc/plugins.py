@@ -102,7 +102,7 @@ def unknown_name_text(what: str, name: str, available: list[str]) -> str:
 
 
 def suggest_name(name: str, available: list[str]) -> str:
-    """Return an error text's end that suggests the most similar name; "" if no name is similar."""
+    """Return a suggestion of the most similar name, to append to an error text; or "" if none."""
     near = difflib.get_close_matches(name, available, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 

@@ -53,7 +53,7 @@ class WallClock:
         self._wall, self._boot = _read_clocks()
 
     def step(self) -> float:
-        """Return the step of the wall clock since the last call [s]; 0 if there was no step."""
+        """Return by how much the wall clock was set since the last call [s]; 0 if it was not."""
         wall, boot = _read_clocks()
         elapsed = boot - self._boot
         step = wall - self._wall - elapsed

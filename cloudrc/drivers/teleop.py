@@ -123,8 +123,8 @@ class RemoteTeleop:
     def handle_deadline(self, now_ns: int) -> None:
         """Receive teleop's outputs; report a fault if teleop does not answer telemetry for 1 s.
 
-        After a stall, drop outputs that start a mission or lead to a waypoint: teleop may have
-        withdrawn them in a datagram that was lost. Teleop repeats outputs that are still valid.
+        After a stall of cloud, ignore outputs that start a mission or lead to a waypoint: teleop
+        may have cancelled them, and the cancellation may be lost. Teleop repeats valid outputs.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS

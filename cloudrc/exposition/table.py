@@ -87,7 +87,7 @@ class Metric(NamedTuple):
         meaning: The HELP text, one or two sentences.
         roles: Processes that expose the metric.
         labels: Label name -> all possible values of the label.
-        buckets: Upper bounds of a histogram's buckets, in rising order and the metric's unit.
+        buckets: Upper bounds of a histogram's buckets, rising, in the unit of the metric.
     """
 
     name: str

@@ -415,7 +415,7 @@ def _no_unit(column: str) -> str:
 
 
 def _csv_time(row: Row, column: str, unit: str) -> float:
-    """Read a time in the column's unit; if the column names no unit, read date and time [s]."""
+    """Read a time in `unit`; without a unit, convert date and time to time since 1970 [s]."""
     text = row.text(column)
     if not unit:
         try:

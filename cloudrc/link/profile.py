@@ -199,7 +199,7 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
 
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
-    """Compute the conditions from the time `instant` [s] until the next change."""
+    """Return the conditions that hold from `instant` [s] until the next change."""
     delay, jitter, loss, rate = profile.delay, profile.jitter, profile.loss, profile.rate
     for change in profile.changes:
         if change.at > instant:

@@ -138,7 +138,7 @@ class Row(NamedTuple):
     Attributes:
         where: File and line of the row, for messages.
         cells: Column -> text without blanks at its ends; the last columns may be missing.
-        decimal: Decimal sign: "." or, if semicolons or tabs separate the cells, ",".
+        decimal: Decimal sign: "," if semicolons or tabs separate the cells, otherwise ".".
     """
 
     where: str

@@ -85,9 +85,9 @@ class Orders:
     def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
         """Carry out a request at `now_ns` [ns], world's clock; return whether a mission begins.
 
-        `waited` tells whether the request may have waited in the socket during a stall. For a
-        start, raise the DecodeError "stale" if the request waited or is too old, and "future" if
-        its odometry has a stamp later than `now_ns`.
+        `waited` tells whether the request may have waited in the socket during a stall. A
+        request to start a mission raises the DecodeError "stale" if `waited` is true or the request
+        is too old, and "future" if its odometry has a stamp later than `now_ns`.
         """
         kind, guard = request.request, self._guard
         starts = kind is Request.START

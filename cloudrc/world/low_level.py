@@ -40,8 +40,9 @@ _HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
 _TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
 
 NOSE_COSINE_MIN, YAW_SINE_MAX = 0.5, 0.3
-"""The cosine of the roll error and the sine of the yaw error up to which the controller uses the
-published formula of the attitude error. For larger errors the published formula is wrong."""
+"""The controller uses the published formula of the attitude error if the cosine of the roll error
+is at least the first value and the sine of the yaw error is at most the second. For larger errors
+the published formula is wrong."""
 
 
 class LowLevel:

@@ -13,8 +13,8 @@ from cloudrc.cloud.estimators import DelaySample, Estimator
 class RunningMean(Estimator):
     """Mean of the loop delays since the session began.
 
-    All delays have the same weight: after 60 s the mean needs another 60 s to follow half of a step
-    of the delay. A finite `count_max` makes the mean follow faster.
+    All delays have the same weight: if the delay jumps 60 s after the session began, the mean needs
+    another 60 s to cover half of the jump. A finite `count_max` makes the mean follow faster.
     """
 
     def __init__(self, count_max: float = inf) -> None:

@@ -62,8 +62,9 @@ def _check_no_effect(
 ) -> None:
     """Fly with and without hostile datagrams; both flights must be equal.
 
-    From `since` [s] on, the functions in `makes` make hostile datagrams: the first for world, the
-    second, if any, for cloud. World's counters `refusals` must rise.
+    Hostile datagrams are sent from `since` [s] on. The first function in `makes` makes those for
+    world, the second function, if there is one, those for cloud. World's counters
+    `refusals` must rise.
     """
     sender, clean, flight = HostileSender(), Flight(seed=seed).fly_mission(), Flight(seed=seed)
 

@@ -30,7 +30,7 @@ FIRST_PROBE = 1.0
 COUNT = 1500
 """Smallest number of probes, if the user does not specify a duration."""
 LONGEST, AFTER = 120.0, 5.0
-"""Longest duration of a measurement; duration after the last change of the conditions [s]."""
+"""Longest duration of a measurement; how long it goes on after the profile's last change [s]."""
 RATE, LINK_SHARE = 200.0, 0.4
 """Largest number of probes per second [1/s], halved for netem; largest share of a limited rate that
 single probes use, in [0, 1]."""
