@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.cli.main import main
-from cloudrc.cli.sweep import as_csv, as_table, interval, summarise
+from cloudrc.cli.seeds import as_csv, as_table, interval, summarise
 
 KEYS = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m=null"
 SHORT = [f"--set={key}" for key in KEYS]
@@ -47,7 +47,7 @@ def test_many_seeds_become_one_table(folder, capsys):
 
 
 def test_the_newest_sweep_and_the_newest_run_have_their_own_link(folder, monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.sweep._fly_one", lambda job: report(job[-1]))
+    monkeypatch.setattr("cloudrc.cli.seeds._fly_one", lambda job: report(job[-1]))
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     assert main(["run", "steps", "--seeds", "1", *SHORT]) == 0
     assert (folder / "runs/latest-sweep/sweep.json").is_file()
