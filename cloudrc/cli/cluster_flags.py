@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
@@ -15,8 +16,11 @@ READY_LIMIT = 300.0
 """Default time limit for the pods of a release to become ready [s]."""
 
 
-def release_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare `--context` and `--namespace`, as in kubectl, and `--release`."""
+def release_arguments(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
+    """Declare `--context` and `--namespace`, as in kubectl, and `--release`.
+
+    Return the function that adds an argument to their group.
+    """
     group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
     group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
     group.add_argument(
@@ -25,6 +29,7 @@ def release_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--release", metavar="NAME", help=f"Helm release (default: {DEFAULT_RELEASE})"
     )
+    return group.add_argument
 
 
 def timeout_argument(parser: argparse.ArgumentParser) -> None:

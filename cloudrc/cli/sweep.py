@@ -27,6 +27,7 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import input_file, read_count
 from cloudrc.cli.pool import interrupt_on_signals, map_as_done, take_each
+from cloudrc.cli.sweep_pods import cluster_arguments, print_rows, rows_from_pods
 from cloudrc.errors import BadInputError, InvalidRunError
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ ACTIONS = {
     "run": "fly all points of a grid, or those that are missing in --out",
     "status": "count the rows and the successful flights of a sweep",
     "fly": "fly one row again with a recording and a report, and compare the hashes",
+    "rows": "fly a file of flights and print the rows; the pods of --on kubernetes do this",
 }
 EPILOG = """\
 examples:
@@ -44,6 +46,7 @@ examples:
   cloudrc sweep run my-sweep.yaml --out runs/mine      again: continue where it ended
   cloudrc sweep status runs/latest-sweep
   cloudrc sweep fly runs/latest-sweep 73434426a8081810
+  cloudrc sweep run my-sweep.yaml --on kubernetes --shards 8 -n lab
 
 docs/sweeps.md describes the file of a sweep and the shards of a cluster."""
 VERDICTS = ("success", "failure", "error")
@@ -74,12 +77,16 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--record", choices=("failed", "all"), help=about)
     about = "fly only part I of N; 'auto' takes I and N from Slurm or Kubernetes"
     add("--shard", type=_shard, metavar="I/N", help=about)
+    cluster_arguments(parsers["run"])
+    add = parsers["rows"].add_argument
+    add("file", type=input_file, metavar="FILE", help="file of flights, from the Job's ConfigMap")
+    add("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
     for name in ("status", "fly"):
         about = "folder of a sweep"
         parsers[name].add_argument("folder", type=Path, metavar="DIR", help=about)
     parsers["fly"].add_argument("key", metavar="KEY", help="key of the row, or its first digits")
-    for each in parsers.values():
-        output_argument(each)
+    for name in ("run", "status", "fly"):
+        output_argument(parsers[name])
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -104,7 +111,8 @@ def execute(options: argparse.Namespace) -> int:
     if options.action is None:
         names = ", ".join(ACTIONS)
         raise BadInputError(f"an action is missing: {names}; see 'cloudrc sweep --help'")
-    return {"run": run, "status": print_status, "fly": fly_again}[options.action](options)
+    actions = {"run": run, "status": print_status, "fly": fly_again, "rows": print_rows}
+    return actions[options.action](options)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -114,7 +122,10 @@ def run(options: argparse.Namespace) -> int:
     from cloudrc.sweep.plan import read_plan
 
     interrupt_on_signals()
-    require("a sweep", MODES["virtual"] if options.record else ("world",))
+    if not options.on:
+        require("a sweep", MODES["virtual"] if options.record else ("world",))
+    elif options.record or options.shard:
+        raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
     if options.shard and options.out is None:
         raise BadInputError("--shard needs --out, the folder that all shards share")
     plan, folder, (shard, count) = read_plan(options.file), options.out, options.shard or (None, 1)
@@ -133,17 +144,22 @@ def run(options: argparse.Namespace) -> int:
             append(row)
             view.see(row)
 
-        stopped, code = take_each(map_as_done(fly_job, jobs, options.jobs), take)
-    rows = store.finish(folder, plan)
+        if options.on:
+            files = store.read_summary(folder)["files"]
+            rows = rows_from_pods(options, plan, [job[0] for job in jobs], [*files])
+        else:
+            rows = map_as_done(fly_job, jobs, options.jobs)
+        stopped, code = take_each(rows, take)
+    found = store.finish(folder, plan)
     if stopped:
-        again = f"cloudrc sweep run {options.file} --out {folder}"
-        print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
+        text = f"to continue, give the same command with --out {folder}"
+        print_line(f"cloudrc: {stopped}; {text}", sys.stderr)
     if options.output != "table":
         print_or_drop(format_document(store.read_summary(folder), options.output))
     else:
-        name = store.TABLE if len(rows) == len(plan.flights) else store.SUMMARY
-        print_or_drop(f"\n{_verdicts(rows)}\n\n{escape(str(folder / name))}")
-    return code or int(any(row["verdict"] != "success" for row in rows.values()))
+        name = store.TABLE if len(found) == len(plan.flights) else store.SUMMARY
+        print_or_drop(f"\n{_verdicts(found)}\n\n{escape(str(folder / name))}")
+    return code or int(any(row["verdict"] != "success" for row in found.values()))
 
 
 def _warn(plan: Plan) -> None:

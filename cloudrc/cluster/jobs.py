@@ -110,14 +110,14 @@ def run_job(
         "app.kubernetes.io/managed-by": "cloudrc",
     }
     deployment = find_deployment(release, "cloud")
-    owner = _owner("apps/v1", "Deployment", deployment)
+    owner = owner_of("apps/v1", "Deployment", deployment)
     job["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     deadline = deadline_of(limit, queue)
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
     job["spec"]["template"]["metadata"]["labels"] = labels
     _fill_pod(job["spec"]["template"]["spec"], release, deployment, name, queue)
     created = release.request("create", "jobs", body=job)
-    owner = _owner("batch/v1", "Job", created)
+    owner = owner_of("batch/v1", "Job", created)
     plan["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     plan["data"] = {FILE: json.dumps(mission, indent=2) + "\n"}
     try:
@@ -129,7 +129,7 @@ def run_job(
     return _status(created, None)
 
 
-def _owner(version: str, kind: str, owner: Any) -> dict[str, Any]:
+def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:
     """Build an owner reference: Kubernetes deletes an object when its owner is deleted."""
     metadata = owner.metadata
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
@@ -193,10 +193,10 @@ def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
     return None
 
 
-def delete_job(release: Release, name: str) -> None:
-    """Delete a Job with its pod and ConfigMap; before the pod ends, it cancels the mission."""
+def delete_job(release: Release, name: str, component: str = COMPONENT) -> None:
+    """Delete a Job with its pods and ConfigMap; the pod of a mission first cancels the mission."""
     release.request("delete", "jobs", name=name, propagation_policy="Foreground")
-    until, jobs = time.monotonic() + DELETE_LIMIT, partial(release.find, "jobs", COMPONENT)
+    until, jobs = time.monotonic() + DELETE_LIMIT, partial(release.find, "jobs", component)
     while any(job.metadata.name == name for job in retry(jobs, lambda text: None)):
         if time.monotonic() > until:
             raise TimedOutError(

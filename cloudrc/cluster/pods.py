@@ -249,8 +249,9 @@ def fetch_logs(release: Release, component: str) -> dict[str, str]:
     }
 
 
-def pod_log(release: Release, pod: str, container: str) -> str:
-    """Read the log of a container."""
-    return str(
-        release.request("get", "pods/log", name=pod, container=container, timeout=READ_LIMIT)
-    )
+def pod_log(release: Release, pod: str, container: str, last: int | None = None) -> str:
+    """Read the log of a container, or only that of the `last` seconds [s]."""
+    words: dict[str, Any] = {"name": pod, "container": container, "timeout": READ_LIMIT}
+    if last is not None:
+        words["since_seconds"] = last
+    return str(release.request("get", "pods/log", **words))

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain, product
 from pathlib import Path
@@ -104,13 +104,22 @@ def read_plan(path: Path) -> Plan:
         points.append(_resolve(experiment, chain(common, *(entries for _, entries in choices))))
         values = points[-1].model_dump(mode="json")
         for seed in seeds:
-            text = json.dumps(values | {"seed": seed}, sort_keys=True)
-            key = hashlib.sha256(text.encode()).hexdigest()[:16]
+            key = _key(values, seed)
             if key in flights:
                 raise BadInputError(f"{name}: {point} is the same as {flights[key].point}")
             flights[key] = Flight(key, point, seed, points[-1])
     labels = {axis: [label for label, _ in choices] for axis, choices in axes.items()}
     return Plan(document.tree | {"folder": str(folder)}, labels, seeds, points, flights)
+
+
+def flight_key(point: ResolvedExperiment, seed: int) -> str:
+    """Return the key of the flight of a resolved point with a seed."""
+    return _key(point.model_dump(mode="json"), seed)
+
+
+def _key(values: Mapping[str, Any], seed: int) -> str:
+    text = json.dumps({**values, "seed": seed}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _seeds(given: Any) -> tuple[int, ...]:

@@ -1,0 +1,97 @@
+"""`cloudrc sweep run --on kubernetes` flies a sweep in pods, which run `cloudrc sweep rows`."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Generator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from cloudrc import __version__
+from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
+from cloudrc.cli.output import print_line
+from cloudrc.cli.parser import read_count
+from cloudrc.cli.pool import interrupt_on_signals
+from cloudrc.errors import BadInputError
+
+if TYPE_CHECKING:
+    from cloudrc.sweep.plan import Flight, Plan
+    from cloudrc.sweep.store import Row
+
+IMAGE = f"cloudrc/world:{__version__}"
+
+
+def cluster_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the flags of a sweep on a cluster."""
+    add = release_arguments(parser)
+    about = "fly in the pods of a Job instead of on this machine"
+    add("--on", choices=("kubernetes",), help=about)
+    add("--shards", type=read_count, default=8, metavar="N", help="number of pods (default: 8)")
+    about = f"image of the pods (default: {IMAGE})"
+    add("--image", default=IMAGE, metavar="IMAGE", help=about)
+    add("--cpu", default="1", metavar="CPU", help="CPU request of a pod (default: 1)")
+    add("--queue", metavar="NAME", help="queue of Kueue that admits the Job")
+
+
+def rows_from_pods(
+    options: argparse.Namespace, plan: Plan, flights: Sequence[Flight], files: Sequence[str]
+) -> Generator[Row]:
+    """Fly flights on a cluster and yield each row once; `files` are local files of the sweep.
+
+    Raises:
+        BadInputError: If the sweep needs local files, which the pods do not have.
+        ClusterError: If the Job fails, or if a pod will never run.
+    """
+    from cloudrc.cluster import batch
+    from cloudrc.cluster.client import ClusterError
+    from cloudrc.sweep.parcel import pack
+
+    if files:
+        text = "the pods do not have this file; build it into an image, or fly without --on"
+        raise BadInputError(f"{files[0]}: {text}")
+    if not flights:
+        return
+
+    def tell(text: str) -> None:
+        print_line(f"  {text}", sys.stderr)
+
+    release = release_from_flags(options)
+    every = "".join(plan.flights).encode() + str(options.shards).encode()
+    name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
+    words = {"image": options.image, "cpu": options.cpu, "queue": options.queue}
+    batch.start(release, name, pack(flights), options.shards, **words)
+    tell(f"Job '{name}' {release.where}, {options.shards} pods; it goes on without this command")
+    missing = {flight.key for flight in flights}
+    for line in batch.read_lines(release, name, tell):
+        row = _parse(line)
+        if row is not None and row["key"] in missing:
+            missing.remove(row["key"])
+            yield row
+    if missing:
+        text = "the same command flies them; is the image of this version of cloudrc?"
+        raise ClusterError(f"the pods printed no row of {len(missing)} flights; {text}")
+
+
+def _parse(line: str) -> dict[str, Any] | None:
+    """Return the row that a line of a pod's log has; None for another line."""
+    try:
+        row = json.loads(line)
+        return row if isinstance(row["key"], str) and {*row} >= {"point", "verdict"} else None
+    except (ValueError, TypeError, KeyError):
+        return None
+
+
+def print_rows(options: argparse.Namespace) -> int:
+    """Fly a shard of a file of flights and print a row for each flight."""
+    from cloudrc.sweep.flight import fly_point
+    from cloudrc.sweep.parcel import unpack
+    from cloudrc.sweep.store import make_row
+
+    interrupt_on_signals()  # as the first process of a container, it would ignore them
+    shard, count = options.shard
+    for flight in unpack(options.file)[shard - 1 :: count]:
+        row = make_row(flight, fly_point(flight.experiment))
+        print(json.dumps(row, allow_nan=False), flush=True)
+    return 0

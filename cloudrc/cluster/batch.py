@@ -1,0 +1,201 @@
+"""Fly the flights of a sweep as an Indexed Job; their rows come back in the logs of the pods.
+
+No pod keeps a state: if a pod is lost, Kubernetes starts its index again, and the same flights give
+the same rows. So the cluster needs no volume, and nothing but the Job and a ConfigMap.
+"""
+
+from __future__ import annotations
+
+import base64
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any
+
+from cloudrc.cluster.client import ClusterError, Release, retry
+from cloudrc.cluster.jobs import delete_job, owner_of
+from cloudrc.cluster.pods import container_statuses, list_pods, one_line, pod_failure, pod_log
+from cloudrc.errors import CloudrcError
+
+COMPONENT = "sweep"
+"""Label `component` of the Jobs and pods of sweeps, and name of their container."""
+FILE = "flights.json.gz"
+SIZE_MAX = 700_000
+"""Largest size of the file of flights [bytes]; a ConfigMap has at most 1 MiB of base64."""
+RETRIES = 3
+"""Number of times that the pod of an index is started again after a failure of its own."""
+KEEP_FINISHED = 86_400
+"""Time for which Kubernetes keeps a finished Job and its logs [s], if nobody fetches the rows."""
+LOOK_PERIOD = 2.0
+"""Time between two looks at the pods [s]."""
+OVERLAP = 10
+"""Age of the oldest lines that are read again from the log of a running pod [s]."""
+UNSCHEDULED = "no node takes it"
+JOB_LABEL = "batch.kubernetes.io/job-name"
+
+
+def start(
+    release: Release,
+    name: str,
+    flights: bytes,
+    shards: int,
+    *,
+    image: str,
+    cpu: str,
+    queue: str | None,
+) -> None:
+    """Create the Job `name` of a file of flights, unless it flies already.
+
+    Args:
+        release: Namespace and login; the Job belongs to no Helm release.
+        name: Name of the Job; each sweep has its own.
+        flights: Content of the file of flights, from `cloudrc.sweep.parcel`.
+        shards: Number of pods.
+        image: Image of the world pod, which has the simulator.
+        cpu: CPU request of a pod, as in Kubernetes.
+        queue: Name of a queue of Kueue, which admits the Job; None without Kueue.
+
+    Raises:
+        ClusterError: If the cluster refuses the Job, or if the sweep is too large.
+    """
+    if len(flights) > SIZE_MAX:
+        text = f"the flights need {len(flights)} bytes, and a ConfigMap has {SIZE_MAX}"
+        raise ClusterError(f"{text}; split the file of the sweep")
+    for job in release.find("jobs", COMPONENT):
+        if job.metadata.name == name:
+            if not _ending(job):  # flies, or is complete
+                return
+            delete_job(release, name, COMPONENT)
+    labels = {**release.labels(COMPONENT), "app.kubernetes.io/part-of": "cloudrc"}
+    admission = {"kueue.x-k8s.io/queue-name": queue} if queue else {}
+    body = {
+        "metadata": {"name": name, "labels": {**labels, **admission}},
+        "spec": _job_spec(name, shards, image, cpu, labels),
+    }
+    owner = owner_of("batch/v1", "Job", release.request("create", "jobs", body=body))
+    data = {
+        "metadata": {"name": name, "labels": labels, "ownerReferences": [owner]},
+        "binaryData": {FILE: base64.b64encode(flights).decode()},
+    }
+    try:
+        release.request("create", "configmaps", body=data)
+    except BaseException:  # Ctrl-C too: without its flights the Job would wait forever
+        with suppress(CloudrcError):
+            delete_job(release, name, COMPONENT)
+        raise
+
+
+def _job_spec(name: str, shards: int, image: str, cpu: str, labels: dict[str, str]) -> Any:
+    container = {
+        "name": COMPONENT,
+        "image": image,
+        "imagePullPolicy": "IfNotPresent",
+        "args": ["sweep", "rows", f"/flights/{FILE}", f"--shard=auto/{shards}"],
+        "securityContext": {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        },
+        "resources": {"requests": {"cpu": cpu, "memory": "256Mi"}, "limits": {"memory": "512Mi"}},
+        "volumeMounts": [{"name": "flights", "mountPath": "/flights", "readOnly": True}],
+        "terminationMessagePolicy": "FallbackToLogsOnError",
+    }
+    pod = {
+        "restartPolicy": "Never",
+        "automountServiceAccountToken": False,
+        "enableServiceLinks": False,
+        "securityContext": {
+            **{"runAsNonRoot": True, "runAsUser": 10001, "runAsGroup": 10001},
+            "seccompProfile": {"type": "RuntimeDefault"},
+        },
+        "containers": [container],
+        "volumes": [{"name": "flights", "configMap": {"name": name}}],
+    }
+    disruption = {"type": "DisruptionTarget", "status": "True"}
+    codes = {"containerName": COMPONENT, "operator": "In", "values": [2, 3]}
+    return {
+        "completionMode": "Indexed",
+        **{"completions": shards, "parallelism": shards},
+        "backoffLimitPerIndex": RETRIES,
+        # A drained node costs no retry; bad input fails again however often it is tried.
+        "podFailurePolicy": {
+            "rules": [
+                {"action": "Ignore", "onPodConditions": [disruption]},
+                {"action": "FailIndex", "onExitCodes": codes},
+            ]
+        },
+        "ttlSecondsAfterFinished": KEEP_FINISHED,
+        "template": {"metadata": {"labels": labels}, "spec": pod},
+    }
+
+
+def _ending(job: Any) -> str | None:
+    """Return "" if a Job is complete, the cause if it has failed, None while it flies."""
+    for condition in job.status.conditions or []:
+        if condition.status == "True" and condition.type == "Complete":
+            return ""
+        if condition.status == "True" and condition.type == "Failed":
+            which = job.status.failed_indexes
+            where = f" (index {which})" if which else ""
+            return f"{condition.reason}: {condition.message}{where}"
+    return None
+
+
+def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[str]:
+    """Yield each line of the logs of a Job until it ends, some lines twice; then delete the Job.
+
+    `tell` receives sentences for the user. A Job that has failed is kept.
+
+    Raises:
+        ClusterError: If the Job fails, or if a pod will never run.
+    """
+    fetched, told = set[str](), set[str]()
+
+    def tell_once(text: str) -> None:
+        if text and text not in told:
+            told.add(text)
+            tell(text)
+
+    ending = None
+    while ending is None:
+        time.sleep(LOOK_PERIOD)
+        ending = _ending(retry(lambda: release.request("get", "jobs", name=name), tell_once))
+        for pod in retry(lambda: list_pods(release, COMPONENT), tell_once):
+            if (pod.metadata.labels or {}).get(JOB_LABEL) != name or pod.metadata.uid in fetched:
+                continue
+            if pod.status.phase == "Pending":
+                why = pod_failure(pod)
+                if why and not why.startswith(UNSCHEDULED):
+                    raise ClusterError(f"Job '{name}' cannot run: {why}; {_remedy(release, name)}")
+                tell_once(why and f"some pods wait: {why}")
+                continue
+            has_ended = pod.status.phase in ("Succeeded", "Failed")
+            if has_ended:
+                fetched.add(pod.metadata.uid)
+                tell_once(_failure(pod))
+            yield from _log(release, pod.metadata.name, None if has_ended else OVERLAP)
+    if ending:
+        raise ClusterError(f"Job '{name}' failed: {ending}; {_remedy(release, name)}")
+    delete_job(release, name, COMPONENT)
+
+
+def _log(release: Release, pod: str, last: int | None) -> list[str]:
+    try:
+        return retry(lambda: pod_log(release, pod, COMPONENT, last), lambda text: None).splitlines()
+    except ClusterError:  # the pod is gone; its successor flies the same flights
+        return []
+
+
+def _failure(pod: Any) -> str:
+    """Return how a pod failed, in one sentence; "" if it succeeded."""
+    for container in container_statuses(pod):
+        ended = container.state.terminated
+        if container.name == COMPONENT and ended and ended.exit_code:
+            words = one_line(ended.message) or ended.reason
+            return f"a pod failed with exit code {ended.exit_code}: {words}"
+    return ""
+
+
+def _remedy(release: Release, name: str) -> str:
+    flags = " ".join(release.flags)
+    return f"see: kubectl {flags} describe job {name}; the same command flies what is missing"

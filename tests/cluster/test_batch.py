@@ -1,0 +1,100 @@
+"""The Job of a sweep on the fake API server: made once, its lines read, its failures named."""
+
+import base64
+
+import pytest
+
+from cloudrc.cluster import batch
+from cloudrc.cluster.client import ClusterError
+from tests.cluster.conftest import pod, terminated
+
+WORDS = {"image": "cloudrc/world:0.1.0", "cpu": "1", "queue": None}
+
+
+@pytest.fixture(autouse=True)
+def no_pauses(monkeypatch):
+    monkeypatch.setattr(batch, "LOOK_PERIOD", 0.0)
+
+
+@pytest.fixture
+def started(api, release):
+    batch.start(release, "sweep-1", b"flights", 4, **WORDS)
+    return api
+
+
+def add_pod(api, name, phase, log="", **given):
+    labels = {batch.JOB_LABEL: "sweep-1"}
+    api.put("pods", pod(name, "sweep", labels=labels, phase=phase, **given))
+    api.logs[name] = log
+
+
+def lines(release):
+    told = []
+    return [*batch.read_lines(release, "sweep-1", told.append)], told
+
+
+def test_the_job_flies_each_index_with_its_flights(started, api):
+    job, data = api.get("jobs", "sweep-1"), api.get("configmaps", "sweep-1")
+    assert base64.b64decode(data["binaryData"]["flights.json.gz"]) == b"flights"
+    assert data["metadata"]["ownerReferences"][0]["uid"] == job["metadata"]["uid"]
+    spec = job["spec"]
+    assert (spec["completionMode"], spec["completions"], spec["parallelism"]) == ("Indexed", 4, 4)
+    (container,) = spec["template"]["spec"]["containers"]
+    assert container["args"] == ["sweep", "rows", "/flights/flights.json.gz", "--shard=auto/4"]
+    assert "kueue.x-k8s.io/queue-name" not in job["metadata"]["labels"]
+
+
+def test_a_queue_is_a_label_of_the_job(api, release):
+    batch.start(release, "sweep-1", b"flights", 4, **{**WORDS, "queue": "lab"})
+    assert api.get("jobs", "sweep-1")["metadata"]["labels"]["kueue.x-k8s.io/queue-name"] == "lab"
+
+
+def test_a_job_that_flies_is_found_again_and_a_failed_one_is_replaced(started, api, release):
+    first = api.get("jobs", "sweep-1")["metadata"]["uid"]
+    batch.start(release, "sweep-1", b"flights", 4, **WORDS)
+    assert api.get("jobs", "sweep-1")["metadata"]["uid"] == first
+    api.end("sweep-1", "Failed", reason="FailedIndexes", message="two")
+    batch.start(release, "sweep-1", b"flights", 4, **WORDS)
+    assert api.get("jobs", "sweep-1")["metadata"]["uid"] != first
+
+
+def test_too_many_flights_are_refused(api, release):
+    with pytest.raises(ClusterError, match="split the file"):
+        batch.start(release, "sweep-1", bytes(batch.SIZE_MAX + 1), 4, **WORDS)
+    assert api.jobs() == []
+
+
+def test_the_lines_of_lost_and_complete_pods_are_read(started, api, release):
+    add_pod(api, "a", "Running", "row 1\n")
+    add_pod(api, "b", "Failed", "row 2\n", state=terminated(137, ""))
+
+    def replace():
+        api.objects.pop(("pods", "a"))
+        add_pod(api, "c", "Succeeded", "row 1\nrow 3\n")
+        api.end("sweep-1", "Complete")
+
+    api.at_look(3, replace)
+    found, told = lines(release)
+    assert {*found} == {"row 1", "row 2", "row 3"}
+    assert found.count("row 2") == 1
+    assert "exit code 137" in told[0]
+    assert api.jobs() == []
+
+
+def test_a_failed_job_is_kept_and_named(started, api, release):
+    api.end("sweep-1", "Failed", reason="FailedIndexes", message="Job has failed indexes")
+    api.get("jobs", "sweep-1")["status"]["failedIndexes"] = "2,5"
+    with pytest.raises(ClusterError, match=r"failed indexes \(index 2,5\); see: kubectl"):
+        lines(release)
+    assert api.jobs()
+
+
+def test_pods_may_wait_for_a_node_but_not_for_an_image(started, api, release):
+    waits = {"type": "PodScheduled", "status": "False", "message": "0/1 nodes: Insufficient cpu"}
+    add_pod(api, "a", "Pending", conditions=[waits])
+    api.at_look(2, lambda: api.end("sweep-1", "Complete"))
+    assert "Insufficient cpu" in lines(release)[1][0]
+    batch.start(release, "sweep-1", b"flights", 4, **WORDS)
+    add_pod(api, "b", "Pending", state={"waiting": {"reason": "ImagePullBackOff"}})
+    with pytest.raises(ClusterError, match="cannot run"):
+        lines(release)

@@ -1,0 +1,40 @@
+"""A file of flights: the same flights in a pod that has none of the user's files."""
+
+import gzip
+
+import pytest
+
+from cloudrc.errors import BadInputError
+from cloudrc.sweep.parcel import pack, unpack
+from cloudrc.sweep.plan import read_plan
+
+
+@pytest.fixture
+def flights(tmp_path):
+    (tmp_path / "mine.yaml").write_text("mission: steps\nworld: {scene: empty}\n")
+    text = "experiment: ./mine.yaml\ngrid: {cloud.predictor: [last_sample, constant_velocity]}\n"
+    (tmp_path / "sweep.yaml").write_text(text + "seeds: [3, 1]\n")
+    return [*read_plan(tmp_path / "sweep.yaml").flights.values()]
+
+
+def test_the_flights_are_the_same_in_a_pod(flights, tmp_path):
+    (tmp_path / "flights").write_bytes(pack(flights))
+    (tmp_path / "mine.yaml").unlink()
+    assert unpack(tmp_path / "flights") == flights
+
+
+def test_some_of_the_flights_keep_their_keys(flights, tmp_path):
+    (tmp_path / "flights").write_bytes(pack(flights[1:3]))
+    assert [each.key for each in unpack(tmp_path / "flights")] == [f.key for f in flights[1:3]]
+
+
+def test_100_000_flights_fit_into_a_configmap(flights):
+    many = [flights[0]._replace(seed=seed) for seed in range(100_000)]
+    assert len(pack(many)) < 700_000
+
+
+@pytest.mark.parametrize("content", [b"", b"no gzip", gzip.compress(b'{"points": [[{}, {}]]}')])
+def test_another_file_is_refused(content, tmp_path):
+    (tmp_path / "flights").write_bytes(content)
+    with pytest.raises(BadInputError, match="use an image of the same version"):
+        unpack(tmp_path / "flights")
