@@ -85,7 +85,7 @@ def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
     if length < LENGTH_MIN:
         return None
     # Share of the way along the straight line from the start to the setpoint.
-    share = 1.0 - errors @ errors[0] / length**2
+    share = 1.0 - (errors * errors[0]).sum(axis=1) / length**2
     commands = (control["stamp_ns"] >= begin_ns) & (control["stamp_ns"] < end_ns)
     speeds = np.linalg.norm(control["command"][commands], axis=1)
     sent = (control["stamp_ns"][commands] - begin_ns) * 1e-9
@@ -106,8 +106,11 @@ def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
 
 
 def _integral(values: Array, times: Array) -> float:
-    """Integrate values over time [s] by the trapezoidal rule; `numpy.trapezoid` needs numpy 2."""
-    return float((values[1:] + values[:-1]) / 2 @ np.diff(times))
+    """Integrate values over time [s] by the trapezoidal rule; `numpy.trapezoid` needs numpy 2.
+
+    Not by the product `@` of vectors: its last bit depends on the place of the arrays in memory.
+    """
+    return float(((values[1:] + values[:-1]) / 2 * np.diff(times)).sum())
 
 
 def _rise_time(times: Array, share: Array) -> float | None:

@@ -1,0 +1,40 @@
+"""A sweep in pods gives the table of a sweep on this machine, even if pods are lost."""
+
+import subprocess
+import sys
+
+import yaml
+
+from tests.e2e.conftest import NAMESPACE, ROOT, eventually, kubectl, read
+
+SWEEP = {
+    "experiment": "steps",
+    "set": {"link.profile": "paper-p2", "mission.steps.count": 1},
+    "grid": {"cloud.predictor": ["last_sample", "constant_velocity"]},
+    "seeds": 16,
+}
+SHARDS = 8
+
+
+def running():
+    selector = "--selector=app.kubernetes.io/component=sweep"
+    found = read("pods", selector, "--field-selector=status.phase=Running")["items"]
+    return [f"pod/{each['metadata']['name']}" for each in found]
+
+
+def test_two_of_eight_pods_are_killed_and_the_table_is_the_same(release, tmp_path):
+    file = tmp_path / "sweep.yaml"
+    file.write_text(yaml.safe_dump(SWEEP))
+    words = [sys.executable, "-m", "cloudrc", "sweep", "run", str(file)]
+    pods = ["--on=kubernetes", f"--shards={SHARDS}", "--cpu=50m", "-n", NAMESPACE]
+    flight = subprocess.Popen([*words, f"--out={tmp_path}/pods", *pods], cwd=ROOT)
+    try:
+        eventually(lambda: len(running()) == SHARDS, "all pods fly", timeout=90.0)
+        kubectl("delete", "--grace-period=0", "--force", *running()[:2])
+        assert flight.wait(180) == 0
+    finally:
+        flight.kill()
+    subprocess.run([*words, f"--out={tmp_path}/here"], cwd=ROOT, check=True)
+    tables = [(tmp_path / name / "table.csv").read_bytes() for name in ("pods", "here")]
+    assert tables[0] == tables[1]
+    assert read("jobs", "--selector=app.kubernetes.io/component=sweep")["items"] == []
