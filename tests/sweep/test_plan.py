@@ -1,6 +1,7 @@
 """A grid becomes points with keys; problems are refused at their place, before any flight."""
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -90,6 +91,13 @@ def test_a_problem_is_refused_at_its_place(write_sweep, keys, reason):
     number = re.search(rf"{re.escape(str(path))}:(\d+)", str(caught.value))[1]
     key = list(keys.get("grid", keys))[-1]
     assert key in path.read_text().splitlines()[int(number) - 1]
+
+
+def test_the_file_of_the_page_is_a_sweep(tmp_path):
+    page = (Path(__file__).parents[2] / "docs/sweeps.md").read_text()
+    (tmp_path / "grid.yaml").write_text(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1])
+    plan = read_plan(tmp_path / "grid.yaml")
+    assert (len(plan.points), len(plan.flights)) == (12, 240)
 
 
 def test_equal_points_are_refused(write_sweep):
