@@ -22,7 +22,7 @@ def running():
     return [f"pod/{each['metadata']['name']}" for each in found]
 
 
-def test_two_of_eight_pods_are_killed_and_the_table_is_the_same(release, tmp_path):
+def test_two_of_eight_pods_are_killed_and_the_table_is_the_same(cluster, tmp_path):
     file = tmp_path / "sweep.yaml"
     file.write_text(yaml.safe_dump(SWEEP))
     words = [sys.executable, "-m", "cloudrc", "sweep", "run", str(file)]
