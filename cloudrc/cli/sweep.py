@@ -154,8 +154,9 @@ def run(options: argparse.Namespace) -> int:
         stopped, code = take_each(rows, take)
     found = store.finish(folder, plan)
     if stopped:
-        text = f"to continue, give the same command with --out {folder}"
-        print_line(f"cloudrc: {stopped}; {text}", sys.stderr)
+        flags = " --on kubernetes, and its other flags" if options.on else ""
+        again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
+        print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
     if options.output != "table":
         print_or_drop(format_document(store.read_summary(folder), options.output))
     else:
