@@ -1,0 +1,1 @@
+"""Fly many points of a grid, and answer questions with the results."""
