@@ -29,6 +29,7 @@ from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
+    from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.world.endpoint import WorldEndpoint
 
 MS_TO_NS = 1_000_000
@@ -41,8 +42,26 @@ LEG_FACTOR = 3.0
 Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
 """Mission number in a cloud that flies only one mission."""
+GRACE = 30.0
+"""A flight is stopped if its mission goes on for this time after its time limit [s]."""
+VIRTUAL_CLOCK = bytes(16)
+"""Identity of the virtual clock, which world and cloud share."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)
 """Length of the longest straight line inside the fence [m]."""
+
+
+def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
+    """Build world and cloud, and connect them for a flight in virtual time; do not fly yet."""
+    from cloudrc.drivers.virtual import VirtualRun
+
+    world = build_world(experiment, Identity(VIRTUAL_CLOCK, b"world".ljust(16)))
+    cloud = build_cloud(experiment, Identity(VIRTUAL_CLOCK, b"cloud".ljust(16)))
+    return world, cloud, VirtualRun(world, cloud, *build_links(experiment))
+
+
+def flight_limit(experiment: ResolvedExperiment) -> float:
+    """Return the time after which a flight is stopped [s]."""
+    return experiment.criteria.time_limit_s + GRACE
 
 
 def build_world(

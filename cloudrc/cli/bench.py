@@ -89,7 +89,7 @@ def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
     """
     import numpy as np
 
-    from cloudrc.cli.run import assemble
+    from cloudrc.assembly import assemble
     from cloudrc.world.simulator import replay
 
     world, cloud, run = assemble(experiment)
@@ -113,7 +113,7 @@ def _flight(
 
     `keep` is called with the records of the flight.
     """
-    from cloudrc.cli.run import assemble
+    from cloudrc.assembly import assemble
 
     _, cloud, run = assemble(experiment)
 

@@ -34,23 +34,16 @@ from cloudrc.errors import (
 )
 
 if TYPE_CHECKING:
-    from cloudrc.cloud.endpoint import CloudEndpoint
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.record.columns import Recording
     from cloudrc.records import Record
     from cloudrc.report.document import Run
-    from cloudrc.world.endpoint import WorldEndpoint
 
 Flight = Callable[[Path], dict[str, Any]]
 """Function that flies, writes all files of the run into a folder, and returns the report."""
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
 
-GRACE = 30.0
-"""If the mission goes on for this time after its time limit [s], this program stops the flight."""
-CLOCK = bytes(16)
-"""Identity of the virtual clock, which world and cloud share."""
 EPILOG = """\
 modes:
   local    real time: four processes, UDP on 127.0.0.1
@@ -95,9 +88,9 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
     require(f"mode {mode}", MODES[mode])
     if options.seeds:
-        from cloudrc.cli import sweep
+        from cloudrc.cli import seeds
 
-        return sweep.fly_seeds(options)
+        return seeds.fly_seeds(options)
     return _fly_once(options, mode)
 
 
@@ -264,17 +257,6 @@ def fly(
         raise CloudrcError(f"{where}: {error.strerror or error}; choose another folder") from error
 
 
-def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
-    """Build world and cloud, and connect them for a flight in virtual time; do not fly yet."""
-    from cloudrc import assembly
-    from cloudrc.drivers.virtual import VirtualRun
-    from cloudrc.tunnel.end import Identity
-
-    world = assembly.build_world(experiment, Identity(CLOCK, b"world".ljust(16)))
-    cloud = assembly.build_cloud(experiment, Identity(CLOCK, b"cloud".ljust(16)))
-    return world, cloud, VirtualRun(world, cloud, *assembly.build_links(experiment))
-
-
 @contextlib.contextmanager
 def _record_virtual(
     experiment: ResolvedExperiment, folder: Path, see: See
@@ -284,6 +266,7 @@ def _record_virtual(
     Use as a context manager, in whose block the caller writes the report. When the block ends, this
     function attaches the report to the file of the recording.
     """
+    from cloudrc import assembly
     from cloudrc.record.columns import Recording, merged
     from cloudrc.record.hash import RecordHash
     from cloudrc.record.writer import McapWriter
@@ -305,8 +288,8 @@ def _record_virtual(
                 see(new)
 
         try:
-            _, cloud, flight = assemble(experiment)
-            limit_ns = round((experiment.criteria.time_limit_s + GRACE) * 1e9)
+            _, cloud, flight = assembly.assemble(experiment)
+            limit_ns = round(assembly.flight_limit(experiment) * 1e9)
             flight.fly(lambda: cloud.mission_over, limit_ns, sink)
         except KeyboardInterrupt:
             interrupted = True
@@ -327,6 +310,7 @@ def _record_local(
     Use as a context manager, in whose block the caller writes the report. When the block ends, this
     function attaches the report to the file of the recording.
     """
+    from cloudrc.assembly import flight_limit
     from cloudrc.drivers.local import LocalRun
     from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
@@ -344,7 +328,7 @@ def _record_local(
     local, broken = LocalRun(folder, see, api=not absent), None
     interrupted = True
     try:
-        local.fly(experiment.criteria.time_limit_s + GRACE)
+        local.fly(flight_limit(experiment))
         interrupted = False
     except KeyboardInterrupt:
         pass

@@ -1,1 +1,1 @@
-"""Fly many points of a grid, and answer questions with the results."""
+"""Sweeps: fly the points of a grid with several seeds, and keep one row of numbers per flight."""

@@ -7,7 +7,7 @@ commands per second. The mission lasts from 10 s to 20 s on the shared clock of 
 from dataclasses import dataclass, field
 from functools import cache
 
-from cloudrc.cli.run import assemble
+from cloudrc.assembly import assemble
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Criteria, Mission, Waypoint
 from cloudrc.geometry.scene import Board, Pipe, Scene
