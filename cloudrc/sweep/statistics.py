@@ -70,7 +70,7 @@ def sign_test(less: int, more: int) -> float:
     """
     n, few = less + more, min(less, more)
     tail = sum(math.comb(n, i) for i in range(few + 1))
-    return min(1.0, 2 * tail / 2**n)
+    return min(1.0, float(2 * tail / 2**n))
 
 
 def signed_rank_test(differences: Sequence[float]) -> float:
@@ -197,4 +197,4 @@ def _pairs_needed(values: NDArray[Any], means: NDArray[Any]) -> int | None:
     if effect == 0:
         return None
     z = Z + NormalDist().inv_cdf(POWER)
-    return max(PAIRS_MIN, math.ceil(z * z / (3 * effect * effect)))
+    return max(PAIRS_MIN, math.ceil(float(z * z / (3 * effect * effect))))
