@@ -267,25 +267,21 @@ def _record_virtual(
     function attaches the report to the file of the recording.
     """
     from cloudrc import assembly
-    from cloudrc.record.columns import Recording, merged
-    from cloudrc.record.hash import RecordHash
+    from cloudrc.record.columns import RecordStore, merged
     from cloudrc.record.writer import McapWriter
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments
 
-    records: tuple[list[Record], list[Record]] = ([], [])
-    digest, interrupted = RecordHash(), False
+    store, interrupted = RecordStore(), False
     # Record during the flight, so that the recording is kept if the run or its report fails.
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
             for log_time_ns, row in merged(from_world, from_cloud):
                 writer.write_row(row, log_time_ns)
-            records[0].extend(from_world)
-            records[1].extend(from_cloud)
-            for new in (from_cloud, from_world):
-                digest.update(new)
-                see(new)
+            store.add(from_world, from_cloud)
+            see(from_cloud)
+            see(from_world)
 
         try:
             _, cloud, flight = assembly.assemble(experiment)
@@ -294,8 +290,8 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
-            yield Recording.from_records(*records), run
+            run = Run("virtual", "virtual", store.hexdigest(), interrupted)
+            yield store.recording(), run
         finally:
             for name, data in attachments(folder).items():
                 writer.attach(name, data)

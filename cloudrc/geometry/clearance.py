@@ -24,6 +24,8 @@ ROTOR_ARM, ROTOR_HEIGHT, ROTOR_RADIUS, ROTOR_HALF_THICKNESS = 0.21, 0.05, 0.128,
 ROD_RADIUS, ROD_BOTTOM, ROD_TOP = 0.05, 0.06, 0.18
 
 _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
+_STRIDE = 32  # distance of the first poses that `least_clearance` looks at
+_ROUNDING = 1e-9  # more than the rounding errors of a bound [m]
 
 
 class Spheres(NamedTuple):
@@ -123,6 +125,36 @@ def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) 
     distances = clearance_per_pipe(scene, positions, orientations_wxyz)
     nearest: Array = distances.min(axis=1, initial=np.inf)
     return nearest
+
+
+def least_clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) -> float:
+    """Compute the smallest `clearance` of n poses along a path [m]; infinite without poses.
+
+    The result is that of all poses, to the bit, but most poses are skipped. Between two poses no
+    point of the robot moves further than s = |dp| + 2 R |dq| (base position p, quaternion q, and
+    R the distance of the farthest point from the base), and the clearance changes by at most s. So
+    between poses with the clearances a and b it is at least (a + b - s) / 2. An interval is halved
+    only if this bound is below the smallest clearance found so far.
+    """
+    at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
+    facing = np.asarray(orientations_wxyz, dtype=np.float64).reshape(-1, 4)
+    if not len(at) or not scene.pipes:
+        return np.inf
+    reach = np.linalg.norm(key_points().positions, axis=1).max()
+    turned = np.linalg.norm(np.diff(facing, axis=0), axis=1)
+    moved = np.linalg.norm(np.diff(at, axis=0), axis=1) + 2 * reach * turned
+    path = np.concatenate(([0.0], np.cumsum(moved)))
+    found = np.full(len(at), np.inf)
+    new = np.unique(np.append(np.arange(0, len(at), _STRIDE), len(at) - 1))
+    starts, ends = new[:-1], new[1:]
+    while len(new):
+        found[new] = clearance(scene, at[new], facing[new])
+        bound = (found[starts] + found[ends] - (path[ends] - path[starts])) / 2
+        open_ = (ends - starts > 1) & (bound <= found.min() + _ROUNDING)
+        starts, ends = starts[open_], ends[open_]
+        new = (starts + ends) // 2
+        starts, ends = np.concatenate((starts, new)), np.concatenate((new, ends))
+    return float(found.min())
 
 
 def pipe_index(scene: Scene, positions: ArrayLike) -> NDArray[np.int64]:

@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial, reduce
+from math import isfinite
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.config.schema import Criteria, Mission
-from cloudrc.geometry.clearance import clearance, pipe_index
+from cloudrc.geometry.clearance import clearance, least_clearance, pipe_index
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording, Table
@@ -123,9 +124,7 @@ class Flight:
 
     @cached_property
     def inside(self) -> Array:
-        """Whether the robot's base is inside a pipe, per row of `truth`; empty without pipes."""
-        if not len(self.clearance):
-            return np.zeros(0, dtype=bool)
+        """Whether the robot's base is inside a pipe, per row of `truth`."""
         return pipe_index(self.scene, self.truth["position"]) >= 0
 
     def count(self, number: int) -> float | None:
@@ -223,8 +222,9 @@ def rms(errors: Array) -> float | None:
 
 
 def _least_clearance(flight: Flight, *, inside: bool) -> float | None:
-    found = flight.clearance[flight.inside] if inside else flight.clearance
-    return float(found.min()) if len(found) else None
+    truth, rows = flight.truth, flight.inside if inside else slice(None)
+    found = least_clearance(flight.scene, truth["position"][rows], truth["orientation_wxyz"][rows])
+    return found if isfinite(found) else None
 
 
 def _distance(flight: Flight) -> float | None:

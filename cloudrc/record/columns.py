@@ -4,7 +4,8 @@
     recording["/odometry"]["position"]  # shape (n, 3)
 
 A recording comes from a file or from records in memory; both give the same tables. A topic without
-records has a table without rows.
+records has a table without rows. A `RecordStore` keeps records as columns, which is the fastest
+way from a flight to its tables.
 
 The log time of a row is its stamp, or the previous row's log time if that is later. So log times
 never decrease within world's rows or within cloud's rows, which can then be merged.
@@ -13,8 +14,9 @@ never decrease within world's rows or within cloud's rows, which can then be mer
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Mapping
-from itertools import repeat
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import chain, repeat
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
@@ -22,8 +24,9 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from cloudrc.record.hash import Columns, RecordHash
 from cloudrc.record.topics import TOPICS, Kind, Row, Topic, Values, rows
-from cloudrc.records import Record
+from cloudrc.records import Arrival, Record
 
 if TYPE_CHECKING:
     from cloudrc.record.reader import Contents
@@ -69,13 +72,21 @@ class Table:
     object. The shape is (n, 3) for vectors, (n, 4) for quaternions, and (n,) for other columns.
     """
 
-    def __init__(self, topic: Topic, rows: list[tuple[int, Values]]) -> None:
-        """Convert rows, each with a stamp [ns] and values, to columns."""
-        columns = zip(*[values for _, values in rows], strict=True) if rows else repeat(())
-        self._columns = {"stamp_ns": _column("int", [stamp_ns for stamp_ns, _ in rows])}
-        for field, values in zip(topic.fields, columns, strict=False):
+    def __init__(self, topic: Topic, stamps_ns: Iterable[int], columns: Iterable[Any]) -> None:
+        """Store the rows' stamps [ns] and, for each field of the topic, the column of its values.
+
+        Without columns, the table has no rows.
+        """
+        self._columns = {"stamp_ns": _column("int", stamps_ns)}
+        for field, values in zip(topic.fields, chain(columns, repeat(())), strict=False):
             self._columns[field.name] = _column(field.kind, values)
         self.topic = topic
+
+    @classmethod
+    def from_rows(cls, topic: Topic, rows: list[tuple[int, Values]]) -> Self:
+        """Convert rows, each with a stamp [ns] and values."""
+        values = zip(*[values for _, values in rows], strict=True)
+        return cls(topic, [stamp_ns for stamp_ns, _ in rows], values)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -104,9 +115,11 @@ class Recording:
         remarks: What was ignored or sorted, as in `Contents`.
     """
 
-    def __init__(self, rows: _Rows, contents: Contents | None = None) -> None:
-        """Store rows by topic; most callers use `read` or `from_records`."""
-        self._rows = rows
+    def __init__(
+        self, make_table: Callable[[Topic], Table], contents: Contents | None = None
+    ) -> None:
+        """Set the function that makes a table; most callers use `read` or `from_records`."""
+        self._make_table = make_table
         self._tables: dict[str, Table] = {}
         self.metadata: Mapping[str, str] = contents.metadata if contents else {}
         self.attachments: Mapping[str, bytes] = contents.attachments if contents else {}
@@ -130,7 +143,7 @@ class Recording:
         rows: _Rows = {name: [] for name in TOPICS}
         for _, (topic, stamp_ns, values) in merged(world_records, cloud_records, offset_ns):
             rows[topic].append((stamp_ns, values))
-        return cls(rows)
+        return cls(lambda topic: Table.from_rows(topic, rows[topic.name]))
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -156,7 +169,7 @@ class Recording:
                 rows[topic].append(decode(TOPICS[topic], data))
             except Exception:  # rosbags may raise anything on malformed bytes
                 unreadable += 1
-        recording = cls(rows, contents)
+        recording = cls(lambda topic: Table.from_rows(topic, rows[topic.name]), contents)
         if unreadable:
             text = f"{unreadable} messages are not readable"
             recording.note = "; ".join(filter(None, [recording.note, text]))
@@ -167,10 +180,53 @@ class Recording:
         if topic not in self._tables:
             if topic not in TOPICS:
                 raise KeyError(f"no topic {topic!r}; there are: {', '.join(TOPICS)}")
-            self._tables[topic] = Table(TOPICS[topic], self._rows.get(topic, []))
+            self._tables[topic] = self._make_table(TOPICS[topic])
         return self._tables[topic]
 
 
 def _column(kind: Kind, values: Iterable[Any]) -> Column:
     dtype, shape = _TYPES[kind]
-    return np.array(values, dtype=dtype).reshape(-1, *shape)
+    return np.asarray(values, dtype=dtype).reshape(-1, *shape)
+
+
+class RecordStore(RecordHash):
+    """Keep the records of a flight as columns, and hash them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._blocks: defaultdict[type, list[Columns]] = defaultdict(list)
+
+    def take(self, kind: type, columns: Columns) -> None:
+        """Keep the columns of `BLOCK` records."""
+        self._blocks[kind].append(columns)
+
+    def add(self, from_world: Iterable[Record], from_cloud: Iterable[Record]) -> None:
+        """Add the new records of world and of cloud, each oldest first."""
+        self.update(from_world)
+        self.update(from_cloud)
+
+    def recording(self) -> Recording:
+        """Return a recording of the records so far, all on one clock."""
+        blocks = {kind: [*self._blocks[kind], self.rest(kind)] for kind in self.kinds}
+        return Recording(lambda topic: _table(topic, blocks.get(topic.source, [])))
+
+
+def _table(topic: Topic, blocks: list[Columns]) -> Table:
+    """Make the table of a topic from the columns of its records."""
+    if not blocks:
+        return Table(topic, (), ())
+    stamps_ns, *columns = (_joined(blocks, path) for path in (topic.stamp_path, *topic.paths()))
+    if topic.source is Arrival:
+        rows = _joined(blocks, "uplink") == (topic.end == "cloud")
+    elif topic.end == "either":  # in the order of time, world's row first
+        rows = np.argsort(stamps_ns, kind="stable")
+    else:
+        return Table(topic, stamps_ns, columns)
+    return Table(topic, stamps_ns[rows], [column[rows] for column in columns])
+
+
+def _joined(blocks: list[Columns], path: str) -> Column:
+    parts = [block[path] for block in blocks]
+    if isinstance(parts[0], tuple):  # of strings
+        return np.array([*chain.from_iterable(parts)], dtype=object)
+    return np.concatenate(parts)

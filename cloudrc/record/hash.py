@@ -1,48 +1,126 @@
 """Compute one SHA-256 over all records of a run, to compare runs.
 
-A record is hashed as little-endian bytes, equal in every process. They contain in this order:
-
-- the length and the name of the record's type;
-- the numbers: integers with 64 bits, floats as IEEE 754 doubles, truth values with one byte;
-- the vectors;
-- the strings as UTF-8, each after its 32-bit length.
-
-Within each group the order is that of the record's fields. A field that holds another record is
-replaced by the fields of that record.
+The records of each type are hashed in blocks of `BLOCK` records, in their order. A block is hashed
+column by column, in the order of the record's fields: integers as little-endian 64-bit numbers,
+floats as IEEE 754 doubles, truth values as one byte, and strings as UTF-8 after their 32-bit
+length. A field that holds another record is replaced by the fields of that record. The result is
+the hash over name, number of records and hash of each type, in the order of the names.
 """
 
 from __future__ import annotations
 
 import hashlib
-import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from functools import cache
-from itertools import chain
+from itertools import chain, repeat
 from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
 
-from cloudrc.record.topics import values_getter
 from cloudrc.records import Record
 
-_Pack: TypeAlias = Callable[[Any], bytes]
-_CODES = {int: "q", float: "d", bool: "?", str: "s"}
+Columns: TypeAlias = dict[str, Any]
+"""Dotted path of a plain value in a record -> its column: an array of shape (n,), for vectors of
+shape (n, k), or a tuple of n strings."""
+_Fields: TypeAlias = tuple[tuple[str, Any, int], ...]
+
+BLOCK = 1000
+"""Number of records that are converted to columns and hashed together."""
+_CODES = {int: "<i8", float: "<f8", bool: "?", str: "s"}
 
 
 class RecordHash:
-    """SHA-256 over records in their order, no matter how many records each `update` gets."""
+    """SHA-256 over records, no matter how many records each `update` gets."""
 
     def __init__(self) -> None:
-        self._sha256 = hashlib.sha256()
+        self._waiting: defaultdict[type, list[Record]] = defaultdict(list)
+        self._hashes: defaultdict[type, hashlib._Hash] = defaultdict(hashlib.sha256)
+        self._counts: defaultdict[type, int] = defaultdict(int)
 
     def update(self, records: Iterable[Record]) -> None:
         """Add records to the hash, oldest first."""
-        # mypy does not know that these classes are hashable.
-        packed = [_packer(type(record))(record) for record in records]  # type: ignore[arg-type]
-        self._sha256.update(b"".join(packed))
+        waiting = self._waiting
+        for record in records:
+            waiting[type(record)].append(record)
+        for kind, block in waiting.items():
+            while len(block) >= BLOCK:
+                columns = to_columns(kind, block[:BLOCK])
+                del block[:BLOCK]
+                self._counts[kind] += BLOCK
+                _add(self._hashes[kind], columns)
+                self.take(kind, columns)
+
+    def take(self, kind: type, columns: Columns) -> None:
+        """Take the columns of `BLOCK` records; a subclass may keep them."""
+
+    @property
+    def kinds(self) -> list[type]:
+        """Types of the records so far, sorted by name."""
+        return sorted(self._waiting, key=lambda kind: kind.__name__)
+
+    def rest(self, kind: type) -> Columns:
+        """Return the columns of the last records, which are fewer than `BLOCK`."""
+        return to_columns(kind, self._waiting[kind])
 
     def hexdigest(self) -> str:
         """Return the hash of all records so far, as 64 hexadecimal digits."""
-        return self._sha256.hexdigest()
+        total = hashlib.sha256()
+        for kind in self.kinds:
+            digest, count = self._hashes[kind].copy(), self._counts[kind] + len(self._waiting[kind])
+            _add(digest, self.rest(kind))
+            total.update(b"%s %d %s\n" % (kind.__name__.encode(), count, digest.digest()))
+        return total.hexdigest()
+
+
+def to_columns(kind: type, records: Sequence[Record]) -> Columns:
+    """Convert n records of one type, which may be 0, to columns in the order of their fields."""
+    found: Columns = {}
+    _convert(_fields(kind), "", records, found)
+    return found
+
+
+def _convert(
+    fields: _Fields, prefix: str, records: Sequence[tuple[Any, ...]], found: Columns
+) -> None:
+    import numpy as np  # not above: a process that only writes a file needs no numpy
+
+    count = len(records)
+    columns = zip(*records, strict=True) if count else repeat(())
+    for (name, kind, size), values in zip(fields, columns, strict=False):
+        if isinstance(kind, tuple):
+            _convert(kind, f"{prefix}{name}.", values, found)
+        elif size:
+            numbers = np.fromiter(chain.from_iterable(values), kind, size * count)
+            found[prefix + name] = numbers.reshape(count, size)
+        else:
+            found[prefix + name] = values if kind == "s" else np.fromiter(values, kind, count)
+
+
+@cache
+def _fields(cls: type) -> _Fields:
+    """List name, type and, for a vector, size of each field of a record or of a part of it."""
+    found = list[tuple[str, Any, int]]()
+    for name, kind in get_type_hints(cls).items():
+        if hasattr(kind, "_fields"):
+            found.append((name, _fields(kind), 0))
+        elif get_origin(kind) is tuple:
+            found.append((name, "<f8", len(get_args(kind))))
+        else:
+            found.append((name, "<i8" if issubclass(kind, IntEnum) else _CODES[kind], 0))
+    return tuple(found)
+
+
+def _add(digest: hashlib._Hash, columns: Columns) -> None:
+    for column in columns.values():
+        if isinstance(column, tuple):
+            digest.update(b"".join(map(_packed_string, column)))
+        else:
+            digest.update(column.data)
+
+
+def _packed_string(text: str) -> bytes:
+    data = text.encode("utf-8", "surrogatepass")
+    return len(data).to_bytes(4, "little") + data
 
 
 def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
@@ -60,37 +138,3 @@ def add_message(sha256: hashlib._Hash, topic: str, log_time_ns: int, data: bytes
     """Add one message to the hash of `messages_sha256`."""
     sha256.update(b"%s %d %d " % (topic.encode(), log_time_ns, len(data)))
     sha256.update(data)
-
-
-@cache
-def _packer(cls: type) -> _Pack:
-    leaves = list(_leaves(cls, ""))
-    numbers = values_getter([path for path, code in leaves if len(code) == 1 and code != "s"])
-    vectors = values_getter([path for path, code in leaves if len(code) > 1])
-    strings = values_getter([path for path, code in leaves if code == "s"])
-    codes = sorted((code for _, code in leaves if code != "s"), key=lambda code: len(code) > 1)
-    name = cls.__name__.encode()
-    size, pack = len(name), struct.Struct(f"<B{len(name)}s" + "".join(codes)).pack
-
-    def packed(record: Any) -> bytes:
-        fixed = pack(size, name, *numbers(record), *chain.from_iterable(vectors(record)))
-        return fixed + b"".join(map(_packed_string, strings(record)))
-
-    return packed
-
-
-def _leaves(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
-    """Yield the dotted path and the `struct` code of each plain value of a record."""
-    for name, kind in get_type_hints(cls).items():
-        path = prefix + name
-        if hasattr(kind, "_fields"):
-            yield from _leaves(kind, f"{path}.")
-        elif get_origin(kind) is tuple:
-            yield path, "d" * len(get_args(kind))
-        else:
-            yield path, "q" if issubclass(kind, IntEnum) else _CODES[kind]
-
-
-def _packed_string(text: str) -> bytes:
-    data = text.encode("utf-8", "surrogatepass")
-    return len(data).to_bytes(4, "little") + data

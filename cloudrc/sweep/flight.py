@@ -8,9 +8,7 @@ from cloudrc import assembly
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import describe_error
 from cloudrc.metrics import Number
-from cloudrc.record.columns import Recording
-from cloudrc.record.hash import RecordHash
-from cloudrc.records import Record
+from cloudrc.record.columns import RecordStore
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 
@@ -38,25 +36,17 @@ def fly_point(experiment: ResolvedExperiment) -> Outcome:
 
 
 def _fly(experiment: ResolvedExperiment) -> Outcome:
-    of_world, of_cloud, digest = list[Record](), list[Record](), RecordHash()
-
-    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-        of_world.extend(from_world)
-        of_cloud.extend(from_cloud)
-        digest.update(from_cloud)
-        digest.update(from_world)
-
+    store = RecordStore()
     _, cloud, flight = assembly.assemble(experiment)
     limit_ns = round(assembly.flight_limit(experiment) * 1e9)
-    flight.fly(lambda: cloud.mission_over, limit_ns, sink)
-    run = Run("virtual", "virtual", digest.hexdigest())
-    recording = Recording.from_records(of_world, of_cloud)
-    found = assess(recording, experiment, run, experiment.report.metrics)
+    flight.fly(lambda: cloud.mission_over, limit_ns, store.add)
+    run = Run("virtual", "virtual", store.hexdigest())
+    found = assess(store.recording(), experiment, run, experiment.report.metrics)
     failures = found.verdict.failures
     return Outcome(
         found.verdict.outcome,
         tuple(failure.code for failure in failures),
         found.numbers,
-        digest.hexdigest(),
+        run.records_sha256 or "",
         failures[0].text if failures else "",
     )

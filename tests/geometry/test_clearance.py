@@ -12,6 +12,7 @@ from cloudrc.geometry.clearance import (
     clearance_per_pipe,
     distance_to_pipe,
     key_points,
+    least_clearance,
     pipe_index,
     place_points,
     robot_points,
@@ -83,3 +84,15 @@ def test_inside_a_pipe_is_in_its_bore_and_between_its_ends():
     outside = [(-1, 2.501, 0.8), (-1, 0, 1.463), (0.5, 0, 0.7)]
     assert pipe_index(PIPES, [*inside, *outside]).tolist() == [0, 0, 2, -1, -1, -1]
     assert set(pipe_index(Scene("empty"), inside)) == {-1}
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 200), st.sampled_from([0.001, 0.02, 0.5]))
+def test_the_least_clearance_is_that_of_all_poses_to_the_bit(seed, count, step):
+    """Random walks along the pipes, slow and fast, that also turn."""
+    draw = np.random.default_rng(seed)
+    positions = draw.uniform((-4, -8, 0), (8, 1, 2)) + step * draw.normal(size=(count, 3)).cumsum(0)
+    facing = draw.normal(size=4) + step * draw.normal(size=(count, 4)).cumsum(0)
+    facing /= np.linalg.norm(facing, axis=1)[:, None]
+    every = clearance(PIPES, positions, facing)
+    assert least_clearance(PIPES, positions, facing) == every.min(initial=math.inf)

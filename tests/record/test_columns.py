@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.record.columns import Recording
+from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.record.topics import TOPICS
-from tests.record.conftest import any_record, assert_equal, write
+from tests.record.conftest import MS, any_record, assert_equal, cloud_records, world_records, write
 
 
 def test_a_topic_without_rows_is_an_empty_table_of_its_types():
@@ -38,3 +38,15 @@ def test_a_file_gives_what_memory_gives(tmp_path_factory, records):
     recording = Recording.read(path)
     assert recording.complete
     assert_equal(recording, Recording.from_records(records))
+
+
+def test_a_store_gives_the_tables_of_its_records(monkeypatch):
+    """In batches, across blocks; at equal times world's row comes first."""
+    monkeypatch.setattr("cloudrc.record.hash.BLOCK", 7)
+    ends = world_records(20), cloud_records(20)
+    store = RecordStore()
+    for end_ns in range(50 * MS, 400 * MS, 50 * MS):
+        batch = [[r for r in end if end_ns - 50 * MS <= r.stamp_ns < end_ns] for end in ends]
+        store.add(*batch)
+    assert_equal(store.recording(), Recording.from_records(*ends))
+    assert_equal(RecordStore().recording(), Recording.from_records([]))
