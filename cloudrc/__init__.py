@@ -1,3 +1,18 @@
 """cloudrc: a testbed for robots that are controlled from the cloud."""
 
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cloudrc.api import Result, fly
+
 __version__ = "0.1.0"
+__all__ = ["Result", "__version__", "fly"]
+
+
+def __getattr__(name: str) -> Any:
+    # Lazily, because the processes of a flight import cloudrc, too, and must start fast.
+    if name in __all__:
+        from cloudrc import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module 'cloudrc' has no attribute {name!r}")

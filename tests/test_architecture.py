@@ -37,10 +37,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cluster": {"config", "link", "record", "report"},
     "sweep": {"assembly", "config", "files", "metrics", "plugins", "record", "report"},
     "assembly": EVERYTHING,
+    "api": {"sweep", "config", "metrics", "record"},
     "faults": EVERYTHING,
     "cli": EVERYTHING,
     "__main__": {"cli"},
-    "__init__": set(),
+    "__init__": {"api"},
 }
 ALWAYS = {"errors", "messages", "records", "__version__"}
 

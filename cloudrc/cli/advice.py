@@ -31,13 +31,13 @@ def warn(experiment: ResolvedExperiment) -> None:
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Describe the settings of an experiment that do not fit together."""
-    ages, echoes = _simulate(experiment)
+    ages, echoes = simulate_ages(experiment)
     if ages:
         yield from _long_link(experiment, ages, echoes)
         yield from _control(experiment, sum(ages) / len(ages))
 
 
-def _simulate(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
+def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
     """Exchange telemetry and commands over the link, without its blackouts.
 
     Returns:

@@ -20,6 +20,8 @@ GROUPS: dict[str, dict[str, str]] = {
         "sweep": "fly a grid of settings with several seeds, on all cores",
         "report": "write the report of a recorded run again",
         "recover": "write a clean copy of a damaged recording",
+        "compare": "say whether a setting differs from another, and how sure that is",
+        "margin": "find the largest delay, or other value, that a flight bears",
         "bench": "measure how fast the simulation runs here",
         "faults": "inject faults and check that the system handles them",
     },

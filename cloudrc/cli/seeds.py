@@ -6,7 +6,6 @@ import argparse
 import csv
 import io
 import json
-import math
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
@@ -19,29 +18,11 @@ from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import fly, load, new_folder
 from cloudrc.metrics.verdict import exit_code
+from cloudrc.sweep.statistics import median_interval
 
 Report: TypeAlias = Mapping[str, Any]
 """Content of a file report.json."""
 METHOD = "95 % interval of the median, by order statistics"
-
-
-def interval(values: Sequence[float]) -> tuple[float, float] | None:
-    """Return the 95 % confidence interval of the median of `values`, for any distribution.
-
-    The k-th smallest and the k-th largest of n values enclose the median with probability
-    1 - 2 · sum_{i<k} C(n, i) / 2^n. The interval uses the largest k with a probability of at least
-    95 %. The function returns None for fewer than 6 values, because no k reaches 95 %.
-
-    Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, section 7.1.
-    """
-    ordered, n = sorted(values), len(values)
-    outside, k = 0.0, 0
-    while k < n // 2:
-        outside += 2 * math.comb(n, k) / 2**n
-        if 1 - outside < 0.95:
-            break
-        k += 1
-    return (ordered[k - 1], ordered[n - k]) if k else None
 
 
 def summarise(reports: Sequence[Report]) -> dict[str, Any]:
@@ -49,7 +30,7 @@ def summarise(reports: Sequence[Report]) -> dict[str, Any]:
     numbers = {}
     for name, unit in _units(reports).items():
         found = [r["numbers"][name]["value"] for r in reports if name in r["numbers"]]
-        middle = {"median": statistics.median(found), "interval": interval(found)}
+        middle = {"median": statistics.median(found), "interval": median_interval(found)}
         numbers[name] = {**middle, "unit": unit, "count": len(found)}
     done = sum(report["verdict"] == "success" for report in reports)
     return {"done": done, "count": len(reports), "method": METHOD, "numbers": numbers}

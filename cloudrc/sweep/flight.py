@@ -9,7 +9,7 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import describe_error
 from cloudrc.metrics import Number
 from cloudrc.record.columns import RecordStore
-from cloudrc.report.document import Run
+from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
 
 ERROR = "error"
@@ -36,17 +36,22 @@ def fly_point(experiment: ResolvedExperiment) -> Outcome:
 
 
 def _fly(experiment: ResolvedExperiment) -> Outcome:
-    store = RecordStore()
-    _, cloud, flight = assembly.assemble(experiment)
-    limit_ns = round(assembly.flight_limit(experiment) * 1e9)
-    flight.fly(lambda: cloud.mission_over, limit_ns, store.add)
-    run = Run("virtual", "virtual", store.hexdigest())
-    found = assess(store.recording(), experiment, run, experiment.report.metrics)
+    found = fly_in_memory(experiment)
     failures = found.verdict.failures
     return Outcome(
         found.verdict.outcome,
         tuple(failure.code for failure in failures),
         found.numbers,
-        run.records_sha256 or "",
+        found.run.records_sha256 or "",
         failures[0].text if failures else "",
     )
+
+
+def fly_in_memory(experiment: ResolvedExperiment) -> Assessment:
+    """Fly an experiment in virtual time, and measure and judge it, without any file."""
+    store = RecordStore()
+    _, cloud, flight = assembly.assemble(experiment)
+    limit_ns = round(assembly.flight_limit(experiment) * 1e9)
+    flight.fly(lambda: cloud.mission_over, limit_ns, store.add)
+    run = Run("virtual", "virtual", store.hexdigest())
+    return assess(store.recording(), experiment, run, experiment.report.metrics)

@@ -1,0 +1,200 @@
+"""Compute medians, paired differences and success rates, with exact intervals and tests.
+
+No function uses random numbers. docs/compare.md explains the choice of the methods.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEVEL = 0.05
+"""An effect is decided if the probability of a larger one by chance is below this value [1]."""
+POWER = 0.80
+"""Probability with which `pairs_needed` pairs decide [1]."""
+PAIRS_MIN = 6
+"""With fewer pairs no test at 5 % can decide: 2 / 2^5 is above 0.05."""
+EXACT_MAX = 200
+"""Largest number of pairs with an exact signed-rank test; above it, the normal approximation."""
+Z = NormalDist().inv_cdf(1 - LEVEL / 2)
+
+
+def median_interval(values: Sequence[float]) -> tuple[float, float] | None:
+    """Return the 95 % confidence interval of the median of `values`, for any distribution.
+
+    The k-th smallest and the k-th largest of n values enclose the median with probability
+    1 - 2 · sum_{i<k} C(n, i) / 2^n. The interval uses the largest k with a probability of at least
+    95 %. The function returns None for fewer than 6 values, because no k reaches 95 %.
+
+    Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, section 7.1.
+    """
+    ordered, n = sorted(values), len(values)
+    outside, k = 0.0, 0
+    while k < n // 2:
+        outside += 2 * math.comb(n, k) / 2**n
+        if 1 - outside < 1 - LEVEL:
+            break
+        k += 1
+    return (ordered[k - 1], ordered[n - k]) if k else None
+
+
+def wilson_interval(successes: int, count: int) -> tuple[float, float]:
+    """Return the 95 % confidence interval of a success rate, in [0, 1]; `count` is at least 1.
+
+    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    1927.
+    """
+    share, spread = successes / count, Z * Z / count
+    middle = share + spread / 2
+    half = math.sqrt(spread * (share * (1 - share) + spread / 4))
+    # The bounds of no and of all successes are exactly 0 and 1; rounding may miss them.
+    low = (middle - half) / (1 + spread) if successes else 0.0
+    high = (middle + half) / (1 + spread) if successes < count else 1.0
+    return low, high
+
+
+def sign_test(less: int, more: int) -> float:
+    """Return the exact two-sided p of `less` against `more` events of equal chance.
+
+    With the numbers of pairs in which B is below and above A, this is the sign test. With the
+    numbers of pairs in which only A and only B succeeded, it is the exact test of McNemar.
+
+    Source: Q. McNemar, "Note on the sampling error of the difference between correlated
+    proportions or percentages", 1947.
+    """
+    n, few = less + more, min(less, more)
+    tail = sum(math.comb(n, i) for i in range(few + 1))
+    return min(1.0, float(2 * tail / 2**n))
+
+
+def signed_rank_test(differences: Sequence[float]) -> float:
+    """Return the two-sided p of Wilcoxon's signed-rank test of paired differences, any unit.
+
+    Zeros are left out. Equal sizes get the mean of their ranks, and p is exact for these ranks.
+    With more than 200 pairs p is the normal approximation with a correction for continuity.
+
+    Source: F. Wilcoxon, "Individual comparisons by ranking methods", 1945.
+    """
+    values = np.array([value for value in differences if value], dtype=float)
+    if not len(values):
+        return 1.0
+    _, kinds, counts = np.unique(np.abs(values), return_inverse=True, return_counts=True)
+    doubled = (2 * np.cumsum(counts) - counts + 1)[kinds]  # twice the rank: a whole number
+    total = int(doubled[values > 0].sum())
+    smaller = min(total, int(doubled.sum()) - total)
+    return min(1.0, 2 * _chance_at_most(smaller, doubled))
+
+
+def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
+    """Return the probability that the sum of the positive ranks, times 2, is at most `total`.
+
+    Each rank is positive with probability 1/2. `doubled` has the ranks times 2, shape (n,).
+    """
+    if len(doubled) > EXACT_MAX:
+        spread = math.sqrt(float((doubled.astype(float) ** 2).sum()) / 4)
+        return NormalDist().cdf((total + 1 - doubled.sum() / 2) / spread)
+    return float(_sums(doubled)[: total + 1].sum())
+
+
+def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
+    """Return the probability of each sum of positive ranks, times 2; shape (sum of all + 1,)."""
+    chances = np.zeros(int(doubled.sum()) + 1)
+    chances[0] = 1.0
+    for rank in doubled:
+        chances /= 2
+        chances[rank:] += chances[:-rank].copy()
+    return chances
+
+
+@dataclass(frozen=True, slots=True)
+class Paired:
+    """What paired differences B - A of one number prove; all values have the number's unit.
+
+    Attributes:
+        count: Number of pairs.
+        lower: Number of pairs in which B is below A.
+        higher: Number of pairs in which B is above A.
+        difference: Estimate of Hodges and Lehmann: the median of the means of all two differences
+            [unit of the number].
+        interval: 95 % interval of the difference [likewise]; None with fewer than 6 pairs.
+        p_wilcoxon: p of the signed-rank test [1].
+        p_sign: p of the sign test [1].
+        decided: Whether the interval excludes 0 and p_wilcoxon is below 5 %.
+        pairs_needed: Number of pairs that decide with a probability of 80 %, if the true
+            differences are as the observed ones; None if these show no effect.
+    """
+
+    count: int
+    lower: int
+    higher: int
+    difference: float
+    interval: tuple[float, float] | None
+    p_wilcoxon: float
+    p_sign: float
+    decided: bool
+    pairs_needed: int | None
+
+
+def paired(differences: Sequence[float]) -> Paired:
+    """Evaluate at least one paired difference B - A, any unit.
+
+    The interval contains each shift that the signed-rank test of the differences minus the shift
+    does not refute. It assumes differences that are symmetric around their centre.
+
+    Source: J. L. Hodges, E. L. Lehmann, "Estimates of location based on rank tests", 1963;
+    M. Hollander, D. A. Wolfe, E. Chicken, Nonparametric Statistical Methods, 3rd ed., 2013,
+    section 3.3.
+    """
+    values = np.sort(np.asarray(differences, dtype=float))
+    n, lower, higher = len(values), int((values < 0).sum()), int((values > 0).sum())
+    means = np.sort(np.concatenate([(values[i:] + values[i]) / 2 for i in range(n)]))
+    cut = _cut(n)
+    interval = (float(means[cut]), float(means[-1 - cut])) if cut >= 0 else None
+    p = signed_rank_test(values.tolist())
+    decided = interval is not None and interval[0] * interval[1] > 0 and p < LEVEL
+    needed = _pairs_needed(values, means)
+    if needed is not None and not decided:
+        needed = max(needed, n + 1)
+    return Paired(
+        count=n,
+        lower=lower,
+        higher=higher,
+        difference=float(np.median(means)),
+        interval=interval,
+        p_wilcoxon=p,
+        p_sign=sign_test(lower, higher),
+        decided=decided,
+        pairs_needed=needed,
+    )
+
+
+def _cut(n: int) -> int:
+    """Return the largest sum of ranks that refutes a shift with `n` pairs; -1 if none does."""
+    if n > EXACT_MAX:
+        mean, spread = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)
+        return math.floor(mean - 0.5 - Z * spread)
+    chances = np.cumsum(_sums(np.arange(2, 2 * n + 1, 2))[::2])
+    return int(np.searchsorted(chances, LEVEL / 2, side="right")) - 1
+
+
+def _pairs_needed(values: NDArray[Any], means: NDArray[Any]) -> int | None:
+    """Return the number of pairs with which the signed-rank test decides with power 80 %.
+
+    Source: G. E. Noether, "Sample size determination for some common nonparametric tests", 1987.
+    """
+    n = len(values)
+    if n < 2:
+        return None
+    # Share of means of two different pairs that are above 0; a mean of 0 counts half.
+    above = np.sign(means).sum() - np.sign(values).sum()
+    effect = abs(above) / (n * (n - 1))  # = |share - 1/2|
+    if effect == 0:
+        return None
+    z = Z + NormalDist().inv_cdf(POWER)
+    return max(PAIRS_MIN, math.ceil(float(z * z / (3 * effect * effect))))

@@ -1,0 +1,129 @@
+"""Intervals and tests have the values of published tables, and cover what they promise."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.sweep import statistics
+from cloudrc.sweep.statistics import (
+    median_interval,
+    paired,
+    sign_test,
+    signed_rank_test,
+    wilson_interval,
+)
+
+MAIZE = [6, 8, 14, 16, 23, 24, 28, 29, 41, -48, 49, 56, 60, -67, 75]
+"""C. Darwin's pairs of maize plants, 1876; the example of scipy.stats.wilcoxon."""
+CRITICAL = {6: 0, 7: 2, 8: 3, 9: 5, 10: 8, 12: 13, 15: 25, 20: 52, 25: 89}
+"""Pairs -> largest sum of ranks with p <= .05: F. Wilcoxon and R. Wilcox, 1964."""
+
+
+@given(st.permutations(range(1, 21)))
+@settings(max_examples=20, deadline=None)
+def test_the_interval_of_the_median_has_the_bounds_of_textbooks(values):
+    """With 20 values 0.9586; the range of 5 values encloses it with 0.9375 only, that of 6 does."""
+    assert median_interval(values) == (6, 15)
+    assert median_interval(values[:5]) is None
+    assert median_interval(values[:6]) == (min(values[:6]), max(values[:6]))
+
+
+@pytest.mark.parametrize(
+    ("successes", "count", "low", "high"),
+    [(0, 10, 0, 0.2775), (5, 10, 0.2366, 0.7634), (10, 10, 0.7225, 1), (81, 263, 0.2553, 0.3662)],
+)
+def test_wilson_s_interval_has_published_values(successes, count, low, high):
+    """R. G. Newcombe, 1998, table I, method 3 has 81 of 263."""
+    assert wilson_interval(successes, count) == pytest.approx((low, high), abs=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("less", "more", "p"), [(0, 0, 1), (0, 10, 2 / 1024), (1, 9, 22 / 1024), (5, 5, 1)]
+)
+def test_the_sign_test_counts_the_binomial_tail(less, more, p):
+    assert sign_test(less, more) == sign_test(more, less) == pytest.approx(p)
+
+
+def test_the_signed_rank_test_has_the_p_of_a_known_example():
+    assert signed_rank_test(MAIZE) == pytest.approx(0.041259765625)
+    assert signed_rank_test([-d for d in MAIZE]) == pytest.approx(0.041259765625)
+
+
+@pytest.mark.parametrize(("n", "cut"), CRITICAL.items())
+def test_the_signed_rank_test_has_the_critical_values_of_tables(n, cut):
+    """Give the ranks that make up the sum a minus; one more makes p larger than 5 %."""
+
+    def p_of(total):
+        signs = dict.fromkeys(range(1, n + 1), 1)
+        for rank in range(n, 0, -1):
+            if rank <= total:
+                signs[rank], total = -1, total - rank
+        return signed_rank_test([rank * sign for rank, sign in signs.items()])
+
+    assert p_of(cut) <= 0.05 < p_of(cut + 1)
+
+
+def test_zeros_are_left_out_and_ties_share_their_ranks():
+    assert signed_rank_test([0, 0, 0]) == 1.0
+    assert signed_rank_test([*MAIZE, 0, 0]) == signed_rank_test(MAIZE)
+    # Ranks 1.5, 1.5, 3, 4: of the 16 choices of signs, 3 give a sum of at most 1.5.
+    assert signed_rank_test([1, -1, 2, 3]) == pytest.approx(2 * 3 / 16)
+
+
+def test_the_normal_approximation_continues_the_exact_test(monkeypatch):
+    rng = np.random.default_rng(1)
+    values = rng.normal(0.15, 1.0, 150).tolist()
+    exact, interval = signed_rank_test(values), paired(values).interval
+    monkeypatch.setattr(statistics, "EXACT_MAX", 0)
+    assert signed_rank_test(values) == pytest.approx(exact, rel=0.03)
+    assert paired(values).interval == pytest.approx(interval, abs=0.005)
+
+
+def test_the_interval_of_the_difference_has_published_values():
+    """M. Hollander, D. A. Wolfe, 1999, example 3.4: Hamilton's scale before and after a drug."""
+    before = [1.83, 0.50, 1.62, 2.48, 1.68, 1.88, 1.55, 3.06, 1.30]
+    after = [0.878, 0.647, 0.598, 2.05, 1.06, 1.29, 1.06, 3.14, 1.29]
+    found = paired([b - a for a, b in zip(before, after, strict=True)])
+    assert found.difference == pytest.approx(-0.46, abs=5e-4)
+    assert found.interval == pytest.approx((-0.786, -0.010), abs=5e-4)
+    assert found.p_wilcoxon == pytest.approx(0.0390625)
+    assert (found.lower, found.higher, found.decided) == (7, 2, True)
+
+
+@given(st.lists(st.floats(-9, 9).filter(lambda x: abs(x) > 1e-3), min_size=6, max_size=14,
+                unique_by=abs))  # fmt: skip
+@settings(max_examples=100, deadline=None)
+def test_interval_and_p_agree_without_ties(values):
+    found = paired(values)
+    assert (found.interval[0] * found.interval[1] > 0) == (found.p_wilcoxon < 0.05)
+    mirrored = paired([-value for value in values])
+    assert mirrored.difference == pytest.approx(-found.difference)
+    assert mirrored.pairs_needed == found.pairs_needed
+
+
+@pytest.mark.parametrize("draw", ["normal", "standard_t", "uniform"])
+def test_the_interval_of_the_difference_covers_95_percent(draw):
+    rng = np.random.default_rng(7)
+    arguments = {"normal": (), "standard_t": (3,), "uniform": (-1, 1)}[draw]
+    samples = getattr(rng, draw)(*arguments, size=(2000, 10))
+    intervals = [paired(sample.tolist()).interval for sample in samples]
+    covered = np.mean([low <= 0 <= high for low, high in intervals])
+    assert covered == pytest.approx(0.951, abs=0.015)  # 3 standard deviations of 2,000 draws
+
+
+def test_the_number_of_pairs_needed_has_power_80_percent():
+    """Half a standard deviation: the formula gives 39 from the true distribution."""
+    rng = np.random.default_rng(3)
+    needed = paired(rng.normal(0.5, 1.0, 2000).tolist()).pairs_needed
+    assert needed == pytest.approx(39, abs=4)
+    samples = rng.normal(0.5, 1.0, (500, needed))
+    power = np.mean([signed_rank_test(sample.tolist()) < 0.05 for sample in samples])
+    assert 0.77 <= power <= 0.88
+
+
+@pytest.mark.parametrize("values", [[1.0], [0.0] * 8, [1.0, 2.0, 3.0, 4.0, 5.0]])
+def test_few_pairs_or_no_effect_decide_nothing(values):
+    found = paired(values)
+    assert not found.decided
+    assert found.pairs_needed is None or found.pairs_needed > len(values)
