@@ -35,7 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "metrics": {"record", "config", "geometry", "plugins"},
     "report": {"record", "metrics", "config", "geometry", "link", "files"},
     "cluster": {"config", "link", "record", "report"},
-    "sweep": {"assembly", "config", "files", "metrics", "record", "report"},
+    "sweep": {"assembly", "config", "files", "metrics", "plugins", "record", "report"},
     "assembly": EVERYTHING,
     "faults": EVERYTHING,
     "cli": EVERYTHING,

@@ -93,3 +93,10 @@ def _success(pairs: Sequence[Pair]) -> dict[str, Any]:
 def _flight(flight: Outcome, names: Sequence[str]) -> dict[str, Any]:
     numbers = {name: flight.numbers[name].value for name in names if name in flight.numbers}
     return {"verdict": flight.verdict, "numbers": numbers}
+
+
+def scale(unit: str, largest: float) -> tuple[float, str]:
+    """Return factor and unit in which values up to `largest` [`unit`] are readable: mm, ms."""
+    if 0 < largest < {"m": 0.1, "s": 1.0}.get(unit, 0.0):
+        return 1e3, f"m{unit}"
+    return 1.0, "" if unit == "1" else unit
