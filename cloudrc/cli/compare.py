@@ -20,7 +20,6 @@ from cloudrc.cli.output import (
 from cloudrc.cli.parser import read_count
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
-from cloudrc.sweep.statistics import LEVEL
 
 if TYPE_CHECKING:
     from cloudrc.sweep.compare import Pair
@@ -171,7 +170,7 @@ def _needed(entry: Mapping[str, Any]) -> str:
 def _answer(document: Mapping[str, Any]) -> str:
     """Answer in one sentence: by success if it differs, else by the first number."""
     success = document["success"]
-    if success["p_mcnemar"] < LEVEL:
+    if success["decided"]:
         more, less = "ba" if success["b"] > success["a"] else "ab"
         return (
             f"{more.upper()} succeeds more often: in {success[more]} of {success['count']} flights,"

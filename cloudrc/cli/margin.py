@@ -14,9 +14,6 @@ from cloudrc.cli.compare import flight_arguments, fly_job
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import format_document, output_argument, print_or_drop
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order
-from cloudrc.config.document import child
-from cloudrc.config.load import COMMAND_AGE_MAX_MS, FREEZE_AFTER_S, HORIZON_MAX_S
-from cloudrc.config.schema import COMMAND_AGE_MS
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -132,6 +129,8 @@ def largest_stable(works: Callable[[int], bool], start: int, top: int) -> tuple[
 
 def _present(experiment: ResolvedExperiment, key: str) -> float:
     """Return the present value of a key; 0 if it is null or unknown, which the search refuses."""
+    from cloudrc.config.document import child
+
     value: Any = experiment.model_dump(mode="json")
     for name in key.replace("link.both.", "link.uplink.").split("."):
         value = child(value, name)
@@ -170,6 +169,9 @@ def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
 
 def _limits(experiment: ResolvedExperiment) -> list[str]:
     """Return settings of cloud and guard that bear the link, as far as the schema allows."""
+    from cloudrc.config.load import COMMAND_AGE_MAX_MS, FREEZE_AFTER_S, HORIZON_MAX_S
+    from cloudrc.config.schema import COMMAND_AGE_MS
+
     ages, echoes = simulate_ages(experiment)
     needed = math.ceil((max([*ages, *echoes], default=0.0) + SLACK) * 10) / 10
     needed = min(needed, COMMAND_AGE_MS[1] * 1e-3)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from cloudrc.errors import BadInputError
 from cloudrc.plugins import unknown_name_text
 from cloudrc.sweep.flight import Outcome
-from cloudrc.sweep.statistics import paired, sign_test, wilson_interval
+from cloudrc.sweep.statistics import LEVEL, paired, sign_test, wilson_interval
 
 NUMBERS = (
     *("prediction_error_rms", "tracking_error_p95", "iae_mean", "settling_time_mean"),
@@ -86,7 +86,7 @@ def _success(pairs: Sequence[Pair]) -> dict[str, Any]:
     return {
         **{"count": count, "a": a, "a_interval": wilson_interval(a, count)},
         **{"b": b, "b_interval": wilson_interval(b, count)},
-        **{"only_a": only_a, "only_b": only_b, "p_mcnemar": p},
+        **{"only_a": only_a, "only_b": only_b, "p_mcnemar": p, "decided": p < LEVEL},
     }
 
 
