@@ -54,7 +54,10 @@ RESERVED: dict[str, tuple[str, ...]] = {
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
     "struct": ("tunnel/codec", "record/", "world/simulator"),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/", "faults/schedule"),
-    "pydantic": (*("config/", "link/", "cli/", "teleop/", "report/folder"), "faults/schedule"),
+    "pydantic": (
+        *("config/", "link/", "cli/", "teleop/", "sweep/", "report/folder"),
+        "faults/schedule",
+    ),
     **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
     "fcntl": ("drivers/local",),
     "matplotlib": ("report/",),

@@ -158,6 +158,7 @@ class Source(NamedTuple):
 
     label: str  # "paper.yaml:12", "--set"
     folder: Path  # a relative path in the value starts here
+    is_setting: bool = False  # whether the value overrides that of a configuration file
 
     def absolute(self, path: str) -> Path:
         """Make `path`, a value in a configuration file, absolute; no file has to exist there."""
@@ -180,10 +181,10 @@ class Document:
     def source(self, path: KeyPath) -> Source:
         """Find the source of the value at `path`.
 
-        If `--set` has set the value or a part of it, the source is `--set`.
+        If a setting has set the value or a part of it, the source is that of the setting.
         """
         for key, source in self.sources.items():
-            if source.label == SET_LABEL and key[: len(path)] == path:
+            if source.is_setting and key[: len(path)] == path:
                 return source
         above = (self.sources.get(path[:length]) for length in range(len(path), -1, -1))
         return next(filter(None, above), Source("default", Path()))

@@ -31,6 +31,7 @@ from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.document import SET_LABEL, Document, KeyPath, write_yaml
 from cloudrc.config.mission_check import check_mission
+from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import (
     Change,
@@ -124,19 +125,19 @@ class ResolvedExperiment(Experiment):
 
 
 def load_experiment(
-    name: str | Path, settings: Iterable[str] = (), *, build: bool = True
+    name: str | Path, settings: Iterable[str] | Settings = (), *, build: bool = True
 ) -> ResolvedExperiment:
     """Load an experiment for a flight by name or path, and import the plug-ins that it names.
 
-    The texts `key=value` in `settings` override values of the file. Relative paths become absolute.
-    Without `build`, neither import nor check the plug-ins.
+    The `settings`, or their texts `key=value`, override values of the file. Relative paths become
+    absolute. Without `build`, neither import nor check the plug-ins.
 
     Raises:
         BadInputError: If the experiment has problems. The text lists each problem on its own line.
     """
     name = str(name)
     document = shipped.read("experiment", name, Path())
-    changes = overrides.parse_settings(settings)
+    changes = settings if isinstance(settings, dict) else overrides.parse_settings(settings)
     inner = {path: value for path, value in changes.items() if _is_inside_name(path)}
     _default(document, ("name",), Path(name).stem)
     if changes.keys() & {("link",), ("link", "profile")}:
@@ -155,7 +156,7 @@ def load_experiment(
         _default(document, ("cloud", key), getattr(Cloud(), key))
     found += overrides.resolve_plugins(document, build=build)
     found += _resolve_traces(document, ("link",)) + _resolve_files(document)
-    experiment = _validate(document, ResolvedExperiment, name, found)
+    experiment = validate(document, ResolvedExperiment, name, found)
     scene, mission = load_scene(experiment.world.scene), experiment.mission
     wrong = check_mission(mission, scene)
     below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
@@ -183,7 +184,7 @@ def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
 
 def check_profile(document: Document, name: str) -> Profile:
     """Check a link profile that was built in memory; raises BadInputError."""
-    return _validate(document, Profile, name, _resolve_traces(document, ()))
+    return validate(document, Profile, name, _resolve_traces(document, ()))
 
 
 def dump(experiment: ResolvedExperiment) -> str:
@@ -206,7 +207,7 @@ def _is_inside_name(path: KeyPath) -> bool:
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
 
-def _validate(
+def validate(
     document: Document, model: type[_Model], name: str, found: Sequence[Problem] = ()
 ) -> _Model:
     """Check a document against its model; raise an error about all problems, including `found`."""
@@ -243,7 +244,7 @@ def _inline_mission(document: Document) -> None:
     name = document.tree["mission"]
     if isinstance(name, str):
         file = shipped.read("mission", name, document.source(("mission",)).folder)
-        _validate(file, Mission, name)
+        validate(file, Mission, name)
         document.tree["mission"] = file.tree
         document.sources |= {("mission", *key): source for key, source in file.sources.items()}
 
@@ -256,7 +257,7 @@ def _inline_profile(document: Document) -> None:
         return
     source = document.source(("link", "profile"))
     file = shipped.read("profile", name, source.folder)
-    profile = _validate(file, Profile, name)
+    profile = validate(file, Profile, name)
     if shipped.is_path(name):
         document.set_value(("link", "profile"), str(source.absolute(name)), source)
     for way in DIRECTIONS:
@@ -375,12 +376,12 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
                 f"profile {profile} needs guard.command_age_max_ms={new.command_age_max_ms:g}; the "
                 "guard keeps the limit that it started with, so the robot may hold"
             )
-    changes: dict[KeyPath, Any] = {}
-    for path, value in overrides.parse_settings(settings).items():
+    changes: Settings = {}
+    for path, setting in overrides.parse_settings(settings).items():
         way, *keys = path[1:] if path[0] == "link" else path
         if not keys or way not in DIRECTIONS:
             raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")
-        changes[way, *keys] = value
+        changes[way, *keys] = setting
         restart |= keys[0] in TIME_LINE_KEYS
         notes += _drop_from_time_line(document, way, keys[0])
     overrides.apply_overrides(document, changes)

@@ -1,5 +1,6 @@
-"""Apply `--set key=value` to a document, and fill in the parameters of plug-ins.
+"""Apply settings to a document, such as `--set key=value`, and fill in the parameters of plug-ins.
 
+- A key of both directions of the link, `link.both.delay_ms`, sets the uplink and the downlink.
 - Keys with fewer parts are set first. Therefore the order of `mission=steps` and
   `mission.steps.count=3` does not matter.
 - A parameter turns the name of a plug-in into a mapping: if the file has `controller: pid`, then
@@ -14,10 +15,10 @@ from __future__ import annotations
 import copy
 import inspect
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
@@ -33,40 +34,71 @@ KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "co
 _DEFAULTS = Experiment().model_dump(mode="json")
 
 
-def parse_settings(texts: Iterable[str]) -> dict[KeyPath, Any]:
-    """Parse texts `key=value`; return path -> value, keys with fewer parts first.
+class Setting(NamedTuple):
+    """A value that overrides the value of a configuration file."""
+
+    value: Any
+    source: Source
+
+
+Settings: TypeAlias = dict[KeyPath, Setting]
+"""Path -> setting, keys with fewer parts first."""
+
+
+def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
+    """Collect settings from their keys, such as `link.both.delay_ms`, values and sources.
+
+    Raises:
+        BadInputError: If a key has an empty part or is set twice.
+    """
+    found: Settings = {}
+    for key, value, source in given:
+        path = tuple(part.strip() for part in key.split("."))
+        if not all(path):
+            raise BadInputError(f"{source.label}: {key!r}: is no key; one is cloud.predictor")
+        for each in _directions(path):
+            if each in found:
+                raise BadInputError(f"{source.label} {key}: is set twice; keep one of them")
+            found[each] = Setting(value, source._replace(is_setting=True))
+    return {path: found[path] for path in sorted(found, key=len)}
+
+
+def _directions(path: KeyPath) -> list[KeyPath]:
+    """Return the paths for uplink and downlink if `path` names both, else `path`."""
+    at = int(path[0] == "link")
+    if path[at : at + 1] != ("both",):
+        return [path]
+    return [(*path[:at], way, *path[at + 1 :]) for way in ("uplink", "downlink")]
+
+
+def parse_settings(texts: Iterable[str]) -> Settings:
+    """Parse texts `key=value`, in which a relative path starts at the working folder.
 
     Raises:
         BadInputError: If a text has no key or no `=`, if a key is set twice, or if a value is not
             YAML.
     """
-    found: dict[KeyPath, Any] = {}
+    given, source = list[tuple[str, Any, Source]](), Source(SET_LABEL, Path.cwd())
     for text in texts:
         key, equals, value = text.partition("=")
-        path = tuple(part.strip() for part in key.split("."))
-        if not equals or not all(path):
+        if not equals or not all(part.strip() for part in key.split(".")):
             raise BadInputError(
                 f"{SET_LABEL} {text}: must be key=value; for example cloud.predictor=last_sample"
             )
-        if path in found:
-            raise BadInputError(f"{SET_LABEL} {key}: is set twice; keep one of them")
-        found[path] = parse_value(value, f"{SET_LABEL} {key}")
-    return {path: found[path] for path in sorted(found, key=len)}
+        given.append((key, parse_value(value, f"{SET_LABEL} {key}"), source))
+    return collect_settings(given)
 
 
-def apply_overrides(document: Document, overrides: Mapping[KeyPath, Any]) -> None:
-    """Set values in a document, in the order of `overrides`.
-
-    A relative path in a value starts at the working folder.
+def apply_overrides(document: Document, settings: Settings) -> None:
+    """Set values in a document, in the order of `settings`.
 
     Raises:
         BadInputError: If an index is not a number or beyond the end of its list.
     """
-    source = Source(SET_LABEL, Path.cwd())
-    for path, value in overrides.items():
+    for path, (value, source) in settings.items():
         default: Any = _DEFAULTS
         for depth, (key, below) in enumerate(pairwise(path), start=1):
-            _check_index(document, path[:depth])
+            _check_index(document, path[:depth], source)
             default = child(default, key)
             present = document.get(*path[:depth])
             node = copy.deepcopy(default) if present is None else present
@@ -77,17 +109,17 @@ def apply_overrides(document: Document, overrides: Mapping[KeyPath, Any]) -> Non
                 document.set_value(path[:depth], [] if below == "0" else {}, source)
             elif present is None:
                 document.set_value(path[:depth], node, document.source(path[:depth]))
-        _check_index(document, path)
-        document.set_value(path, value, source)
+        _check_index(document, path, source)
+        document.set_value(path, copy.deepcopy(value), source)
 
 
-def _check_index(document: Document, path: KeyPath) -> None:
+def _check_index(document: Document, path: KeyPath, source: Source) -> None:
     node, key = document.get(*path[:-1]), path[-1]
     if isinstance(node, list) and not (key.isdecimal() and int(key) <= len(node)):
         parent = ".".join(path[:-1])
         entries = f"entries 0 to {len(node) - 1}" if node else "no entries"
         raise BadInputError(
-            f"{SET_LABEL}: {parent}.{key}: {parent} is a list with {entries}; "
+            f"{source.label}: {parent}.{key}: {parent} is a list with {entries}; "
             f"use one of these, or {len(node)} to append"
         )
 

@@ -24,7 +24,7 @@ Columns: TypeAlias = dict[str, Any]
 shape (n, k), or a tuple of n strings."""
 _Fields: TypeAlias = tuple[tuple[str, Any, int], ...]
 
-BLOCK = 1000
+BLOCK = 200
 """Number of records that are converted to columns and hashed together."""
 _CODES = {int: "<i8", float: "<f8", bool: "?", str: "s"}
 
