@@ -163,8 +163,8 @@ def _scaled(entry: Mapping[str, Any]) -> tuple[float, str]:
 def _needed(entry: Mapping[str, Any]) -> str:
     needed = entry["pairs_needed"]
     if needed is None:
-        return "no effect seen"
-    return f"about {needed} pairs" if needed <= 1000 else "above 1000 pairs"
+        return "more pairs needed" if entry["difference"] else "no effect seen"
+    return f"about {needed} pairs needed" if needed <= 1000 else "above 1000 pairs needed"
 
 
 def _answer(document: Mapping[str, Any]) -> str:
@@ -181,7 +181,7 @@ def _answer(document: Mapping[str, Any]) -> str:
     name, entry = next(iter(document["numbers"].items()))
     p, count = f"p = {entry['p_wilcoxon']:.2g}", entry["count"]
     if not entry["decided"]:
-        return f"Undecided: {name} after {count} pairs, {p}; to decide: {_needed(entry)}."
+        return f"Undecided: {name} after {count} pairs, {p}; {_needed(entry)}."
     sign, word = (1, "higher") if entry["difference"] > 0 else (-1, "lower")
     factor, unit = _scaled(entry)
     size, low, high = (

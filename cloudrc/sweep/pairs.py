@@ -12,7 +12,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.metrics import Number
 from cloudrc.sweep.compare import Pair
 from cloudrc.sweep.flight import Outcome
-from cloudrc.sweep.rows import read_rows
+from cloudrc.sweep.rows import read_flights
 
 IGNORED = ("seed", "name", "description", "report")
 """Keys of an experiment that do not affect the flight, and the seed."""
@@ -31,7 +31,7 @@ def of_sweep(folder: Path, a: str, b: str) -> tuple[list[Pair], str]:
     Raises:
         BadInputError: If not exactly one axis has both values, or if they are the same.
     """
-    rows = read_rows(folder)
+    rows = read_flights(folder)
     axes = {axis: list(dict.fromkeys(row.point[axis] for row in rows)) for axis in rows[0].point}
     sides = [
         [(axis, v) for axis in axes for v in axes[axis] if text in (f"{v}", f"{axis}={v}")]

@@ -54,7 +54,7 @@ def test_the_last_line_is_the_answer(monkeypatch, capsys):
 def test_an_answer_without_proof_says_how_many_pairs_decide(monkeypatch, capsys):
     fly_with(monkeypatch, lambda a, n: ("success", 0.01 + 0.0013 * n * ("last_sample" in a)))
     assert sentence(capsys, "--seeds", "5")[1] == (
-        "Undecided: prediction_error_rms after 5 pairs, p = 0.062; to decide: about 11 pairs."
+        "Undecided: prediction_error_rms after 5 pairs, p = 0.062; about 11 pairs needed."
     )
 
 
