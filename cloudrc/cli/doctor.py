@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 from cloudrc.cli.extras import EXTRAS, MODES, missing
 from cloudrc.cli.output import format_document, output_argument, paint, table
-from cloudrc.drivers.machine import interpreter
+from cloudrc.drivers.machine import interpreter, usable_cores
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 
 LOCAL, FLYING, CLUSTER = ("local",), ("local", "virtual"), ("cluster",)
@@ -120,8 +120,7 @@ def timer(rounds: int = 100) -> Check:
 
 
 def _cores() -> Check:
-    affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
-    count, load = len(affinity(0)) if affinity else os.cpu_count() or 1, os.getloadavg()[0]
+    count, load = usable_cores(), os.getloadavg()[0]
     fix = "real time needs two cores without other load: close programs, or use --mode virtual"
     return _check("cores", 2 <= count >= load, f"{count}, load {load:.1f}", fix)
 

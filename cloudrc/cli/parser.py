@@ -17,6 +17,7 @@ GROUPS: dict[str, dict[str, str]] = {
     "fly": {
         "run": "fly an experiment and write its report",
         "mission": "start, steer and stop missions, here or in a cluster",
+        "sweep": "fly a grid of settings with several seeds, on all cores",
         "report": "write the report of a recorded run again",
         "recover": "write a clean copy of a damaged recording",
         "compare": "say whether a setting differs from another, and how sure that is",

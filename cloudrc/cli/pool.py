@@ -7,12 +7,14 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
+from itertools import islice
 from types import FrameType
 from typing import Any, TypeVar
 
+from cloudrc.drivers.machine import usable_cores
 from cloudrc.errors import InterruptedRunError, InvalidRunError
 
 Work = TypeVar("Work")
@@ -78,19 +80,45 @@ def map_in_order(
     process makes all calls. The function has to be at module level: a worker imports the function.
     Ctrl-C or closing the generator kills the workers and drops all calls that have not ended.
     """
-    workers = min(jobs, len(work), os.cpu_count() or 1)
+    workers = min(jobs, len(work), usable_cores())
     if workers <= 1:
         yield from map(function, work)
         return
-    # Spawn, do not fork: libraries may have started threads in this process.
-    context = multiprocessing.get_context("spawn")
-    with _isolated_start():  # starts multiprocessing's resource tracker
-        pool = ProcessPoolExecutor(workers, context, _end_with_parent)
-    try:
+    with _workers(workers) as pool:
         with _isolated_start():  # submit() starts the workers
             futures = [pool.submit(function, each) for each in work]
         for future in futures:
             yield future.result()
+
+
+def map_as_done(
+    function: Callable[[Work], Result], work: Sequence[Work], jobs: int
+) -> Generator[Result]:
+    """Call a function as `map_in_order` does, but yield each result as soon as it is there."""
+    workers = min(jobs, len(work), usable_cores())
+    if workers <= 1:
+        yield from map(function, work)
+        return
+    rest = iter(work)
+    with _workers(workers) as pool:
+        with _isolated_start():
+            waiting = {pool.submit(function, each) for each in islice(rest, 2 * workers)}
+        while waiting:
+            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            waiting |= {pool.submit(function, each) for each in islice(rest, len(done))}
+            for future in done:
+                yield future.result()
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Provide a pool of worker processes; kill them if the block raises an exception."""
+    # Spawn, do not fork: libraries may have started threads in this process.
+    context = multiprocessing.get_context("spawn")
+    with _isolated_start():  # starts multiprocessing's resource tracker
+        pool = ProcessPoolExecutor(count, context, _end_with_parent)
+    try:
+        yield pool
     except BrokenProcessPool as error:
         text = "a worker was killed, perhaps by the kernel because memory ran out"
         raise WorkerDiedError(f"{text}; use fewer processes") from error

@@ -1,4 +1,4 @@
-"""Access to this machine: identity of its clock, time limits, and its Python interpreter."""
+"""Access to this machine: its clock, its cores, time limits, and its Python interpreter."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from math import ceil
 from pathlib import Path
 
 LINUX_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+CGROUP, CGROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
+"""File with the control groups of this process, and folder of all groups."""
 MACOS_BOOT_ID = ("sysctl", "-n", "kern.bootsessionuuid")
 
 
@@ -30,6 +34,30 @@ def _boot_id() -> str:
     if LINUX_BOOT_ID.exists():
         return LINUX_BOOT_ID.read_text()
     return subprocess.run(MACOS_BOOT_ID, capture_output=True, text=True, timeout=5).stdout
+
+
+def usable_cores() -> int:
+    """Return how many cores this process may use: by its affinity and by its CPU limit.
+
+    The CPU limit of a container is that of its control group (version 2) or of a group above.
+    """
+    affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    with suppress(OSError, StopIteration):
+        lines = CGROUP.read_text().splitlines()
+        group = next(line[3:].strip("/") for line in lines if line.startswith("0::"))
+        for folder in (CGROUPS / group, *(CGROUPS / group).parents):
+            if folder.is_relative_to(CGROUPS):
+                cores = min(cores, _quota(folder / "cpu.max"))
+    return cores
+
+
+def _quota(path: Path) -> int:
+    """Return the CPU limit of a control group in whole cores, rounded up."""
+    with suppress(OSError, ValueError):  # the root has no file; "max" means no limit
+        quota, period = path.read_text().split()
+        return max(1, ceil(int(quota) / int(period)))
+    return sys.maxsize
 
 
 def interpreter(*words: str) -> list[str]:

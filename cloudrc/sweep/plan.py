@@ -10,8 +10,7 @@
         fast: {cloud.controller.gain_p: [2, 2, 2]}
     seeds: 20                            # 1 to 20, or a list
 
-A point has one value of each axis. Every point is loaded and checked before the first flight. A
-flight is one point with one seed; its key is a hash of its resolved experiment with the seed.
+A point has one value of each axis. Every point is loaded and checked before the first flight.
 Relative paths start at the folder of the file, or at `folder` if the file gives it.
 """
 
@@ -19,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain, product
 from pathlib import Path
@@ -29,7 +28,7 @@ from pydantic import Field
 
 from cloudrc import metrics
 from cloudrc.config import problems, shipped
-from cloudrc.config.document import Document, KeyPath, Source, read_document
+from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, validate
 from cloudrc.config.overrides import collect_settings
 from cloudrc.config.problems import Problem
@@ -38,6 +37,8 @@ from cloudrc.errors import BadInputError
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
+_Entry: TypeAlias = tuple[str, Any, Source]
+"""A key, its value, and where both are from."""
 
 
 class SweepFile(Section):
@@ -58,9 +59,15 @@ class SweepFile(Section):
 class Flight(NamedTuple):
     """One point with one seed."""
 
-    key: str  # 16 hexadecimal digits
+    key: str  # hash of the resolved experiment with the seed, 16 hexadecimal digits
     point: dict[str, Any]  # axis -> value or name
-    experiment: ResolvedExperiment  # with the seed
+    seed: int
+    resolved: ResolvedExperiment  # of the point: with another seed
+
+    @property
+    def experiment(self) -> ResolvedExperiment:
+        """The experiment with the seed."""
+        return self.resolved.model_copy(update={"seed": self.seed})
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,27 +77,8 @@ class Plan:
     file: dict[str, Any]  # content of the file, with `folder`
     axes: dict[str, list[Any]]  # axis -> its values or names
     seeds: tuple[int, ...]
-    points: list[tuple[dict[str, Any], ResolvedExperiment]]
-    keys: list[str]  # of all flights: point by point, each with all seeds
-
-    @property
-    def experiment(self) -> ResolvedExperiment:
-        """The experiment of the first point."""
-        return self.points[0][1]
-
-    def flight(self, number: int) -> Flight:
-        """Return a flight by its place in `keys`."""
-        at, nth = divmod(number, len(self.seeds))
-        point, experiment = self.points[at]
-        return Flight(
-            self.keys[number], point, experiment.model_copy(update={"seed": self.seeds[nth]})
-        )
-
-
-_Entry: TypeAlias = tuple[str, Any, Source]
-"""A key, its value, and where both are from."""
-_Axis: TypeAlias = list[tuple[Any, list[_Entry]]]
-"""The choices of an axis: each a value or a name, and the settings."""
+    points: list[ResolvedExperiment]
+    flights: dict[str, Flight]  # by key: point by point, each with all seeds
 
 
 def read_plan(path: Path) -> Plan:
@@ -106,22 +94,23 @@ def read_plan(path: Path) -> Plan:
     if not seeds:
         text = f"must be a number of seeds, 1 to {SEEDS_MAX}, or a list of different seeds"
         found.append(Problem(("seeds",), problems.in_words(file.seeds), text))
-    common = _entries(document, folder, ("set",), file.set)
-    axes = {key: _axis(document, folder, key, choices, found) for key, choices in file.grid.items()}
+    common, axes = _entries(document, file, folder, found)
     problems.raise_problems(document, found, name)
     is_path = shipped.is_path(file.experiment)
     experiment = str(folder / file.experiment) if is_path else file.experiment
-    points, keys = list[tuple[dict[str, Any], ResolvedExperiment]](), dict[str, dict[str, Any]]()
+    points, flights = list[ResolvedExperiment](), dict[str, Flight]()
     for choices in product(*axes.values()):
-        point = {key: label for key, (label, _) in zip(axes, choices, strict=True)}
-        resolved = _resolve(experiment, [*common, *chain(*(entries for _, entries in choices))])
-        points.append((point, resolved))
-        for key in _keys(resolved, seeds):
-            if key in keys:
-                raise BadInputError(f"{name}: {point} is the same as {keys[key]}; remove one")
-            keys[key] = point
-    values = {key: [label for label, _ in choices] for key, choices in axes.items()}
-    return Plan(document.tree | {"folder": str(folder)}, values, seeds, points, [*keys])
+        point = {axis: label for axis, (label, _) in zip(axes, choices, strict=True)}
+        points.append(_resolve(experiment, chain(common, *(entries for _, entries in choices))))
+        values = points[-1].model_dump(mode="json")
+        for seed in seeds:
+            text = json.dumps(values | {"seed": seed}, sort_keys=True)
+            key = hashlib.sha256(text.encode()).hexdigest()[:16]
+            if key in flights:
+                raise BadInputError(f"{name}: {point} is the same as {flights[key].point}")
+            flights[key] = Flight(key, point, seed, points[-1])
+    labels = {axis: [label for label, _ in choices] for axis, choices in axes.items()}
+    return Plan(document.tree | {"folder": str(folder)}, labels, seeds, points, flights)
 
 
 def _seeds(given: Any) -> tuple[int, ...]:
@@ -133,38 +122,34 @@ def _seeds(given: Any) -> tuple[int, ...]:
     return tuple(values) if valid and len({*values}) == len(values) <= SEEDS_MAX else ()
 
 
-def _axis(document: Document, folder: Path, key: str, choices: Any, found: list[Problem]) -> _Axis:
-    """Return the choices of an axis, and add its problems to `found`."""
-    path = ("grid", key)
-    if not choices or not isinstance(choices, list | dict):
-        text = "must be a list of values, or a mapping of names to settings; give at least one"
-        found.append(Problem(path, "", text))
-        return []
-    if isinstance(choices, list):
-        sources = [document.source((*path, str(n))) for n in range(len(choices))]
-        sources = [source._replace(folder=folder) for source in sources]
-        pairs = zip(choices, sources, strict=True)
-        return [(value, [(key, value, source)]) for value, source in pairs]
-    wrong = [name for name, settings in choices.items() if not isinstance(settings, dict)]
-    text = "must be a mapping of keys to values"
-    found += [Problem((*path, name), problems.in_words(choices[name]), text) for name in wrong]
-    return [
-        (name, _entries(document, folder, (*path, name), settings))
-        for name, settings in choices.items()
-        if name not in wrong
-    ]
-
-
 def _entries(
-    document: Document, folder: Path, above: KeyPath, settings: dict[str, Any]
-) -> list[_Entry]:
-    return [
-        (key, value, document.source((*above, key))._replace(folder=folder))
-        for key, value in settings.items()
-    ]
+    document: Document, file: SweepFile, folder: Path, found: list[Problem]
+) -> tuple[list[_Entry], dict[str, list[tuple[Any, list[_Entry]]]]]:
+    """Return the settings of all points, and those of each choice of each axis.
+
+    Problems of the axes are added to `found`.
+    """
+
+    def entry(key: str, value: Any, *path: str) -> _Entry:
+        return key, value, document.source(path)._replace(folder=folder)
+
+    axes: dict[str, list[tuple[Any, list[_Entry]]]] = {}
+    for axis, given in file.grid.items():
+        above, choices = ("grid", axis), axes.setdefault(axis, [])
+        if isinstance(given, list):
+            for n, value in enumerate(given):
+                choices.append((value, [entry(axis, value, *above, str(n))]))
+        elif isinstance(given, dict) and all(isinstance(each, dict) for each in given.values()):
+            for name, each in given.items():
+                entries = [entry(key, value, *above, name, key) for key, value in each.items()]
+                choices.append((name, entries))
+        if not choices:
+            text = "must be a list of values, or names, each with a mapping of keys to values"
+            found.append(Problem(above, "", text))
+    return [entry(key, value, "set", key) for key, value in file.set.items()], axes
 
 
-def _resolve(experiment: str, entries: list[_Entry]) -> ResolvedExperiment:
+def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
     settings = collect_settings(entries)
     if ("seed",) in settings:
         source = settings["seed",].source
@@ -172,11 +157,3 @@ def _resolve(experiment: str, entries: list[_Entry]) -> ResolvedExperiment:
     resolved = load_experiment(experiment, settings)
     metrics.check(resolved.report.metrics)
     return resolved
-
-
-def _keys(experiment: ResolvedExperiment, seeds: Iterable[int]) -> Iterator[str]:
-    """Yield the keys of an experiment's flights: equal keys mean equal flights."""
-    values = experiment.model_dump(mode="json")
-    for seed in seeds:
-        text = json.dumps(values | {"seed": seed}, sort_keys=True)
-        yield hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -18,7 +18,7 @@ KILLED = 5
 
 @pytest.fixture(autouse=True)
 def two_cores_and_a_terminal(monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 2)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as in a terminal; tests/conftest.py restores it
     yield
     assert multiprocessing.active_children() == []

@@ -120,7 +120,7 @@ def test_a_worker_imports_nothing_from_there_either(run, trace, spy, monkeypatch
     (run / "pickle.py").write_text(spy)
     monkeypatch.chdir(run)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 2)
     assert list(map_in_order(abs, [-1, -2], 2)) == [1, 2]
     assert not trace.exists()
     assert not os.environ.get("PYTHONSAFEPATH")
