@@ -168,20 +168,20 @@ def _needed(entry: Mapping[str, Any]) -> str:
 
 
 def _answer(document: Mapping[str, Any]) -> str:
-    """Answer in one sentence: by success if it differs, else by the first number."""
-    success = document["success"]
+    """Answer in a sentence about the first number, after one about success if that differs."""
+    success, text = document["success"], ""
     if success["decided"]:
         more, less = "ba" if success["b"] > success["a"] else "ab"
-        return (
+        text = (
             f"{more.upper()} succeeds more often: in {success[more]} of {success['count']} flights,"
-            f" {less.upper()} in {success[less]}, p = {success['p_mcnemar']:.2g}."
+            f" {less.upper()} in {success[less]}, p = {success['p_mcnemar']:.2g}.\n"
         )
     if not document["numbers"]:
-        return "Undecided: no pair has one of the default numbers; name one with --number."
+        return f"{text}No pair has one of the default numbers; name one with --number."
     name, entry = next(iter(document["numbers"].items()))
     p, count = f"p = {entry['p_wilcoxon']:.2g}", entry["count"]
     if not entry["decided"]:
-        return f"Undecided: {name} after {count} pairs, {p}; {_needed(entry)}."
+        return f"{text}Undecided: {name} after {count} pairs, {p}; {_needed(entry)}."
     sign, word = (1, "higher") if entry["difference"] > 0 else (-1, "lower")
     factor, unit = _scaled(entry)
     size, low, high = (
@@ -189,6 +189,6 @@ def _answer(document: Mapping[str, Any]) -> str:
         for value in (entry["difference"], *entry["interval"][::sign])
     )
     return (
-        f"B has a {word} {name}: by {size}{unit and ' '}{unit} ({low} .. {high}), {p}, "
+        f"{text}B has a {word} {name}: by {size}{unit and ' '}{unit} ({low} .. {high}), {p}, "
         f"in {entry[word]} of {count} pairs."
     )

@@ -37,6 +37,7 @@ ACTIONS = {
     "run": "fly all points of a grid, or those that are missing in --out",
     "status": "count the rows and the successful flights of a sweep",
     "fly": "fly one row again with a recording and a report, and compare the hashes",
+    "figure": "draw metrics and success over an axis, as PDF, PNG and SVG",
 }
 EPILOG = """\
 examples:
@@ -44,6 +45,7 @@ examples:
   cloudrc sweep run my-sweep.yaml --out runs/mine      again: continue where it ended
   cloudrc sweep status runs/latest-sweep
   cloudrc sweep fly runs/latest-sweep 73434426a8081810
+  cloudrc sweep figure runs/latest-sweep --x link.both.delay_ms --by cloud.predictor
 
 docs/sweeps.md describes the file of a sweep and the shards of a cluster."""
 VERDICTS = ("success", "failure", "error")
@@ -74,12 +76,21 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--record", choices=("failed", "all"), help=about)
     about = "fly only part I of N; 'auto' takes I and N from Slurm or Kubernetes"
     add("--shard", type=_shard, metavar="I/N", help=about)
-    for name in ("status", "fly"):
+    for name in ("status", "fly", "figure"):
         about = "folder of a sweep"
         parsers[name].add_argument("folder", type=Path, metavar="DIR", help=about)
     parsers["fly"].add_argument("key", metavar="KEY", help="key of the row, or its first digits")
-    for each in parsers.values():
-        output_argument(each)
+    add = parsers["figure"].add_argument
+    about = "metric to draw; repeatable (default: three that matter first)"
+    add("--number", action="append", default=[], metavar="NAME", help=about)
+    about = "axis of the sweep along x (default: the first one with numbers)"
+    add("--x", metavar="AXIS", help=about)
+    about = "axis with one line per value (default: the first of the others)"
+    add("--by", metavar="AXIS", help=about)
+    about = "path of the files, with or without a suffix (default: DIR/figure)"
+    add("--out", type=Path, metavar="FILE", help=about)
+    for name in ("run", "status", "fly"):
+        output_argument(parsers[name])
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -104,7 +115,8 @@ def execute(options: argparse.Namespace) -> int:
     if options.action is None:
         names = ", ".join(ACTIONS)
         raise BadInputError(f"an action is missing: {names}; see 'cloudrc sweep --help'")
-    return {"run": run, "status": print_status, "fly": fly_again}[options.action](options)
+    actions = {"run": run, "status": print_status, "fly": fly_again, "figure": draw_figure}
+    return actions[options.action](options)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -221,6 +233,25 @@ def print_status(options: argparse.Namespace) -> int:
         counts = dict(Counter(row["verdict"] for row in rows.values()))
         document = {"schemaVersion": 1, "flights": summary["flights"], "counts": counts}
         print(format_document({**document, "axes": values}, options.output))
+    return 0
+
+
+def draw_figure(options: argparse.Namespace) -> int:
+    """Draw a sweep and write the figure as PDF, PNG and SVG; print the caption and the paths."""
+    require("a figure", ("report",))
+    from cloudrc.files import write_atomically
+    from cloudrc.sweep.figure import draw_sweep
+    from cloudrc.sweep.rows import read_flights
+
+    rows = read_flights(options.folder)
+    files, caption = draw_sweep(rows, options.number, options.x, options.by)
+    out = options.out or options.folder / "figure"
+    stem = out.stem if out.suffix.removeprefix(".") in files else out.name
+    print_or_drop(f"{caption}\n")
+    for kind, data in files.items():
+        path = out.with_name(f"{stem}.{kind}")
+        write_atomically(path, data)
+        print_or_drop(escape(str(path)))
     return 0
 
 

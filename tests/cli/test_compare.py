@@ -22,7 +22,7 @@ def fly_with(monkeypatch, measure):
         return Outcome(verdict, ("unstable",) * (verdict == "failure"), numbers)
 
     monkeypatch.setattr("cloudrc.cli.compare.fly_job", fly)
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
 
 
 def sentence(capsys, *arguments):
@@ -60,9 +60,12 @@ def test_an_answer_without_proof_says_how_many_pairs_decide(monkeypatch, capsys)
 
 def test_success_comes_before_every_number(monkeypatch, capsys):
     fly_with(monkeypatch, lambda a, n: ("failure" if "last_sample" in a else "success", 0.01))
-    assert sentence(capsys, "--seeds", "6") == (
-        0, "B succeeds more often: in 6 of 6 flights, A in 0, p = 0.031."
-    )  # fmt: skip
+    sides = "cloud.predictor=last_sample", "cloud.predictor=constant_velocity"
+    assert main(["compare", *sides, "--seeds", "6"]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "B succeeds more often: in 6 of 6 flights, A in 0, p = 0.031.",
+        "Undecided: prediction_error_rms after 6 pairs, p = 1; no effect seen.",
+    ]
 
 
 @pytest.mark.parametrize(
