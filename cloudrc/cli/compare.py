@@ -73,6 +73,8 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.sweep.compare import compare
 
     stopped, code, folders = "", 0, (Path(options.a), Path(options.b))
+    if options.set and (options.sweep or all(folder.is_dir() for folder in folders)):
+        raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
     if options.sweep:
         found, what = pairs.of_sweep(options.sweep, options.a, options.b)
     elif all(folder.is_dir() for folder in folders):
@@ -96,7 +98,9 @@ def _fly_both(options: argparse.Namespace) -> tuple[list[Pair], str, int]:
     """Fly A and B with each seed; return the pairs, and why and with which code it ended early."""
     from cloudrc.cli.advice import warn
     from cloudrc.cli.run import load
+    from cloudrc.cli.sweep import Progress
     from cloudrc.sweep.compare import Pair
+    from cloudrc.sweep.flight import ERROR
 
     interrupt_on_signals()
     require("compare", MODES["virtual"])
@@ -109,7 +113,16 @@ def _fly_both(options: argparse.Namespace) -> tuple[list[Pair], str, int]:
         warn(experiment)
     jobs = [(options.experiment, side, n + 1) for n in range(options.seeds) for side in sides]
     flights: list[Outcome] = []
-    stopped, code = take_each(map_in_order(fly_job, jobs, len(jobs)), flights.append)
+    head = f"{resolved[0].name}: A and B with {options.seeds} seeds"
+    view = Progress(options, f"{head}, {len(jobs)} flights", len(jobs), len(jobs))
+
+    def take(flight: Outcome) -> None:
+        flights.append(flight)
+        text = flight.text if flight.verdict == ERROR else ""
+        view.see({"key": "AB"[len(flights) % 2 - 1], "verdict": flight.verdict, "text": text})
+
+    stopped, code = take_each(map_in_order(fly_job, jobs, len(jobs)), take)
+    view.close()
     both = zip(flights[::2], flights[1::2], strict=False)
     return [Pair({"seed": n}, a, b) for n, (a, b) in enumerate(both, start=1)], stopped, code
 

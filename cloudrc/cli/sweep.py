@@ -45,7 +45,7 @@ examples:
   cloudrc sweep run my-sweep.yaml --out runs/mine      again: continue where it ended
   cloudrc sweep status runs/latest-sweep
   cloudrc sweep fly runs/latest-sweep 73434426a8081810
-  cloudrc sweep figure runs/latest-sweep --x link.both.delay_ms --by cloud.predictor
+  cloudrc sweep figure runs/latest-sweep --x link.both.delay_ms
 
 docs/sweeps.md describes the file of a sweep and the shards of a cluster."""
 VERDICTS = ("success", "failure", "error")

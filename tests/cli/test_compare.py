@@ -76,6 +76,7 @@ def test_success_comes_before_every_number(monkeypatch, capsys):
         (["link.profile=paper-p1", "link.profile=wifi", "--set", "link.profile=x"], "set twice"),
         (["last_sample", "nonsense"], "must be key=value"),
         (["a", "b", "--in", "nowhere"], "nowhere"),
+        (["a", "b", "--in", "nowhere", "--set", "seed=1"], "--set seed=1: these flights are"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(arguments, text, capsys):
