@@ -91,6 +91,7 @@ def _settings() -> Iterator[str]:
         for name in named[f"cloud.{key}"]:
             parameters = plugins.signature(kind, name).parameters
             keys |= {f"cloud.{key}.{parameter}" for parameter in parameters}
+    keys |= {key.replace("uplink", "both") for key in keys if key.startswith("link.uplink.")}
     yield from (f"{key}=" for key in sorted(keys - set(named)) if not key.endswith(".name"))
     yield from sorted(f"{key}={name}" for key, names in named.items() for name in names)
 

@@ -42,7 +42,7 @@ ACTIONS = {
 EPILOG = """\
 examples:
   cloudrc sweep run my-sweep.yaml
-  cloudrc sweep run my-sweep.yaml --out runs/mine      again: continue where it ended
+  cloudrc sweep run my-sweep.yaml --out runs/mine    again: fly what is missing
   cloudrc sweep status runs/latest-sweep
   cloudrc sweep fly runs/latest-sweep 73434426a8081810
   cloudrc sweep figure runs/latest-sweep --x link.both.delay_ms
@@ -103,6 +103,8 @@ def _shard(text: str) -> tuple[int, int]:
             raise argparse.ArgumentTypeError(f"auto needs {' or '.join(ARRAYS)}; give I/N")
         index, (of, begin) = os.environ[name], ARRAYS[name]
         count, first = count or os.environ.get(of, ""), os.environ.get(begin, "0")
+        if not count:
+            raise argparse.ArgumentTypeError(f"{of} is not set; give auto/N")
     valid = all(word.isdecimal() for word in (index, count, first))
     if not valid or not 0 <= int(index) - int(first) < int(count):
         text = f"'{text}' is not I/N with I from 1 to N, auto, or auto/N"

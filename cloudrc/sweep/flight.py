@@ -31,7 +31,7 @@ def fly_point(experiment: ResolvedExperiment) -> Outcome:
     """Fly an experiment in virtual time and measure it; an exception becomes the verdict ERROR."""
     try:
         return _fly(experiment)
-    except Exception as error:  # one point that cannot fly must not stop the others
+    except (Exception, SystemExit) as error:  # one point that cannot fly must not stop the others
         return Outcome(ERROR, (ERROR,), text=describe_error(error))
 
 

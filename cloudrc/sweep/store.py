@@ -18,7 +18,9 @@ import io
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -120,11 +122,9 @@ def finish(folder: Path, plan: Plan) -> dict[str, Row]:
             [heads, *zip(*columns.values(), strict=True)]
         )
         write_atomically(folder / TABLE, text.getvalue().encode())
-        with suppress(ImportError):
-            import pyarrow
-            import pyarrow.parquet
-
-            pyarrow.parquet.write_table(pyarrow.table(columns), folder / "table.parquet")
+        if find_spec("pyarrow"):
+            parquet, tables = import_module("pyarrow.parquet"), import_module("pyarrow")
+            parquet.write_table(tables.table(columns), folder / "table.parquet")
     return rows
 
 

@@ -25,6 +25,8 @@ def test_the_script_knows_commands_and_options(shell, capsys):
         (["link", "show", "satel"], ["satellite"]),
         (["run", "--set", "cloud.controller.gain_p"], ["cloud.controller.gain_p="]),
         (["link", "set", "uplink.dela"], ["uplink.delay_ms="]),
+        (["run", "--set", "link.both.dela"], ["link.both.delay_ms="]),
+        (["sweep", "sta"], ["status"]),
         # Bash splits at "=", and replaces only what follows it.
         (["run", "--set", "cloud.predictor", "=", "last"], ["last_sample"]),
     ],

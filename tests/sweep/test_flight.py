@@ -1,8 +1,6 @@
 """A point of a sweep flies without files and gives what `cloudrc run` gives."""
 
-import json
-
-from cloudrc.cli.main import main
+from cloudrc.cli.run import fly
 from cloudrc.config.load import load_experiment
 from cloudrc.sweep.flight import ERROR, fly_point
 
@@ -11,11 +9,9 @@ SHORT = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_
 
 
 def test_a_point_gives_the_numbers_of_the_report(tmp_path):
-    flags = [f"--set={text}" for text in SHORT]
-    run = ["run", "steps", "--mode=virtual", *flags, f"--out={tmp_path / 'run'}", "-o", "json"]
-    assert main(run) == 0
-    report = json.loads((tmp_path / "run/report.json").read_text())
-    flown = fly_point(load_experiment("steps", SHORT))
+    experiment = load_experiment("steps", SHORT)
+    report = fly(experiment, "virtual", tmp_path, page=False)
+    flown = fly_point(experiment)
     assert (flown.verdict, flown.failures, flown.text) == ("success", (), "")
     assert flown.records_sha256 == report["records_sha256"]
     numbers = {n: {"value": v.value, "unit": v.unit} for n, v in flown.numbers.items()}

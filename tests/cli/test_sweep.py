@@ -1,0 +1,156 @@
+"""`cloudrc sweep`: the same table whether interrupted, in shards or at once; rows fly again."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cloudrc.assembly import assemble
+from cloudrc.cli.main import main
+from cloudrc.cli.sweep import _shard
+from cloudrc.sweep.store import read_rows
+from tests.sweep.conftest import write_sweep
+
+__all__ = ["write_sweep"]
+ONE = {"cloud.predictor": ["constant_velocity"]}
+
+
+@pytest.fixture(autouse=True)
+def one_core(monkeypatch):
+    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
+
+
+def rows(folder):
+    return list(read_rows(Path(folder)).values())
+
+
+def test_shards_give_the_table_of_the_whole(write_sweep, capsys):
+    file = str(write_sweep())
+    assert main(["sweep", "run", file, "--out", "whole"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "steps: 4 points x 1 seeds: 4 flights"
+    assert lines[-3:] == ["4 success", "", "whole/table.csv"]
+    assert main(["sweep", "run", file, "--out", "parts", "--shard", "2/2"]) == 0
+    assert not Path("parts/table.csv").exists()
+    assert main(["sweep", "run", file, "--out", "parts", "--shard", "1/2"]) == 0
+    assert sorted(path.name for path in Path("parts").glob("rows*")) == [
+        "rows-1.jsonl",
+        "rows-2.jsonl",
+    ]
+    assert Path("parts/table.csv").read_bytes() == Path("whole/table.csv").read_bytes()
+    capsys.readouterr()
+    assert main(["sweep", "status", "parts"]) == 0
+    head, _, _, *cells = capsys.readouterr().out.splitlines()
+    assert head == "4 of 4 flights are done: 4 success"
+    assert [line.split() for line in cells][1] == ["cloud.predictor", "constant_velocity", "2/2"]
+    assert main(["sweep", "status", "parts", "-o", "json"]) == 0
+    assert json.loads(capsys.readouterr().out)["counts"] == {"success": 4}
+
+
+def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, capsys):
+    """An interrupted one says how to go on; flights with a row are not flown again."""
+    flown = []
+
+    def fly(job):
+        flown.append(job[0].seed)
+        if len(flown) == 2:
+            raise KeyboardInterrupt
+        return real(job)
+
+    from cloudrc.cli.sweep import fly_job as real
+
+    monkeypatch.setattr("cloudrc.cli.sweep.fly_job", fly)
+    file = str(write_sweep(ONE, seeds=3))
+    assert main(["sweep", "run", file]) == 130
+    said = capsys.readouterr()
+    assert said.out.endswith("runs/sweep-grid-1/sweep.json\n")
+    again = said.err.partition("to continue: cloudrc ")[2].split()
+    assert Path("runs/latest-sweep").resolve() == Path("runs/sweep-grid-1").resolve()
+    assert main(again) == 0
+    assert "1 points x 3 seeds: 3 flights, 1 done before" in capsys.readouterr().out
+    assert flown == [1, 2, 2, 3]
+
+
+def test_a_row_flies_again_to_the_same_hash(write_sweep, monkeypatch, capsys):
+    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)  # it is slow
+    main(["sweep", "run", str(write_sweep(ONE)), "--out", "grid"])
+    (row,) = rows("grid")
+    assert main(["sweep", "fly", "grid", row["key"][:4]]) == 0
+    assert "the flight is that of the sweep" in capsys.readouterr().err
+    report = json.loads(Path(f"grid/{row['key']}/report.json").read_text())
+    assert report["records_sha256"] == row["records_sha256"]
+    Path("grid/rows.jsonl").write_text(json.dumps(row | {"records_sha256": "f"}) + "\n")
+    assert main(["sweep", "fly", "grid", row["key"]]) == 6
+    assert main(["sweep", "fly", "grid", "x"]) == 2
+    assert main(["sweep", "fly", ".", row["key"]]) == 2
+
+
+def test_failed_flights_are_recorded_if_asked_for(write_sweep):
+    grid = {"criteria.contact": [False, True]}
+    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--record=failed"]) == 1
+    good, bad = rows("grid")
+    assert (good["verdict"], bad["verdict"]) == ("success", "failure")
+    assert bad["failures"] == ["board_not_touched"]
+    assert Path(f"grid/{bad['key']}/mission.mcap").is_file()
+    assert not Path(f"grid/{good['key']}").exists()
+
+
+def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, capsys):
+    def fly(experiment):
+        if experiment.seed == 2:
+            raise RuntimeError("no\x1b luck")
+        return assemble(experiment)
+
+    monkeypatch.setattr("cloudrc.assembly.assemble", fly)
+    assert main(["sweep", "run", str(write_sweep(ONE, seeds=[2, 1])), "--out", "grid"]) == 1
+    bad, good = rows("grid")
+    assert (bad["verdict"], bad["failures"], bad["numbers"]) == ("error", ["error"], {})
+    assert good["verdict"] == "success"
+    assert rf"{bad['key']}: error: RuntimeError: no\x1b luck" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "variables", "shard"),
+    [
+        ("2/3", {}, (2, 3)),
+        ("auto", {"SLURM_ARRAY_TASK_ID": "7", "SLURM_ARRAY_TASK_COUNT": "4",
+                  "SLURM_ARRAY_TASK_MIN": "5"}, (3, 4)),
+        ("auto", {"JOB_COMPLETION_INDEX": "0", "JOB_COMPLETIONS": "8"}, (1, 8)),
+        ("auto/4", {"JOB_COMPLETION_INDEX": "3"}, (4, 4)),
+        ("auto", {"JOB_COMPLETION_INDEX": "0"}, "JOB_COMPLETIONS is not set; give auto/N"),
+        ("auto", {}, "auto needs SLURM_ARRAY_TASK_ID or JOB_COMPLETION_INDEX"),
+        *((text, {}, f"'{text}' is not I/N") for text in ("0/3", "4/3", "1", "/3", "a/b", "-1/3")),
+    ],
+)  # fmt: skip
+def test_the_shard_is_given_or_that_of_an_array_job(text, variables, shard, monkeypatch):
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    if isinstance(shard, tuple):
+        assert _shard(text) == shard
+    else:
+        with pytest.raises(Exception, match=shard):
+            _shard(text)
+
+
+@pytest.mark.process
+def test_a_killed_sweep_continues_to_equal_bytes(write_sweep):
+    """SIGKILL to the command, whose workers end with it."""
+    file = str(write_sweep(seeds=4))
+    command = [sys.executable, "-m", "cloudrc", "sweep", "run", file, "--jobs", "2", "--out"]
+    with subprocess.Popen([*command, "killed"], stdout=subprocess.DEVNULL) as process:
+        until = time.monotonic() + 60.0
+        while not rows("killed"):
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        os.kill(process.pid, signal.SIGKILL)
+    assert 0 < len(rows("killed")) < 16
+    with Path("killed/rows.jsonl").open("ab") as torn:
+        torn.write(b'{"key": "73')
+    assert subprocess.run([*command, "killed"], check=False).returncode == 0
+    assert subprocess.run([*command, "whole"], check=False).returncode == 0
+    assert Path("killed/table.csv").read_bytes() == Path("whole/table.csv").read_bytes()

@@ -1,0 +1,30 @@
+"""The number of usable cores follows the affinity and the CPU limits of the control groups."""
+
+import os
+
+import pytest
+
+from cloudrc.drivers import machine
+
+
+@pytest.mark.parametrize(
+    ("group", "limits", "cores"),
+    [
+        ("0::/\n", {"": "200000 100000"}, 2),  # in a container
+        ("1:cpu:/x\n0::/a/b\n", {"a": "150000 100000", "a/b": "max 100000"}, 2),
+        ("0::/a/b\n", {"a": "800000 100000", "a/b": "300000 100000"}, 3),
+        ("0::/a\n", {"a": "5000 100000"}, 1),
+        ("0::/a\n", {"a": "max 100000"}, 4),
+        ("0::/a\n", {}, 4),
+        ("1:cpu:/x\n", {"": "200000 100000"}, 4),  # version 1
+    ],
+)
+def test_the_smallest_limit_counts(group, limits, cores, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(4), raising=False)
+    monkeypatch.setattr(machine, "CGROUP", tmp_path / "cgroup")
+    monkeypatch.setattr(machine, "CGROUPS", tmp_path / "groups")
+    (tmp_path / "cgroup").write_text(group)
+    for path, text in limits.items():
+        (tmp_path / "groups" / path).mkdir(parents=True, exist_ok=True)
+        (tmp_path / "groups" / path / "cpu.max").write_text(f"{text}\n")
+    assert machine.usable_cores() == cores

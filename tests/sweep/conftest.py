@@ -1,0 +1,26 @@
+"""Write the file of a short sweep."""
+
+import pytest
+
+from cloudrc.config.document import write_yaml
+
+SHORT = {
+    "mission.steps.count": 1,
+    "mission.steps.period_s": 1.0,
+    "criteria.settle_m": None,
+    "link.profile": "paper-p3",
+}
+"""Settings of `steps` for one second of flight."""
+GRID = {"cloud.predictor": ["last_sample", "constant_velocity"], "link.both.delay_ms": [40, 0]}
+
+
+@pytest.fixture
+def write_sweep(tmp_path):
+    """Return a function that writes the file of a sweep and returns its path."""
+
+    def write(grid=GRID, seeds=1, name="grid.yaml", **keys):
+        document = {"experiment": "steps", "set": SHORT, "grid": grid, "seeds": seeds, **keys}
+        (tmp_path / name).write_text(write_yaml(document))
+        return tmp_path / name
+
+    return write

@@ -1,0 +1,105 @@
+"""A grid becomes points with keys; problems are refused at their place, before any flight."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from cloudrc.assembly import build_links
+from cloudrc.errors import BadInputError
+from cloudrc.sweep.plan import read_plan
+from tests.sweep.conftest import SHORT
+
+
+def test_every_point_is_flown_with_every_seed(write_sweep):
+    plan = read_plan(write_sweep(seeds=[7, 3]))
+    assert (len(plan.points), len(plan.flights), plan.seeds) == (4, 8, (7, 3))
+    flights = list(plan.flights.values())
+    assert [(*each.point.values(), each.seed) for each in flights[:3]] == [
+        ("last_sample", 40, 7), ("last_sample", 40, 3), ("last_sample", 0, 7)
+    ]  # fmt: skip
+    last = flights[-1].experiment
+    assert (last.seed, last.cloud.predictor.name) == (3, "constant_velocity")
+    assert last.uplink.delay_ms == last.downlink.delay_ms == 0 < last.uplink.jitter_ms
+    assert read_plan(write_sweep(seeds=2)).seeds == (1, 2)
+
+
+def test_an_axis_may_have_named_settings(write_sweep):
+    grid = {"gains": {"low": {"cloud.controller.gain_p": [1, 1, 1]}, "default": {}}}
+    plan = read_plan(write_sweep(grid))
+    assert [each.point for each in plan.flights.values()] == [
+        {"gains": "low"},
+        {"gains": "default"},
+    ]
+    assert plan.points[0].cloud.controller.model_extra["gain_p"] == [1, 1, 1]
+    assert plan.points[1].cloud.controller.model_extra["gain_p"] != [1, 1, 1]
+    assert plan.axes == {"gains": ["low", "default"]}
+
+
+def test_equal_flights_have_equal_keys_however_they_are_written(write_sweep):
+    keys = list(read_plan(write_sweep({"link.both.delay_ms": [40, 0]}, seeds=2)).flights)
+    assert len({*keys}) == 4
+    assert all(len(key) == 16 for key in keys)
+    delays = {"far": {"link.uplink.delay_ms": 40, "link.downlink.delay_ms": 40.0}}
+    assert list(read_plan(write_sweep({"delay": delays}, seeds=2)).flights) == keys[:2]
+
+
+def test_points_with_one_seed_meet_the_same_draws(write_sweep):
+    def delays(experiment):
+        return [link.send(1, 2, n, 100, 0) for link in build_links(experiment) for n in range(300)]
+
+    one, two, _, _ = (delays(each.experiment) for each in read_plan(write_sweep()).flights.values())
+    grid = {"cloud.predictor": ["last_sample", "constant_velocity"]}
+    pair = read_plan(write_sweep(grid, seeds=2)).flights.values()
+    first, other, again, _ = (delays(each.experiment) for each in pair)
+    assert first == again != other
+    assert one != two
+
+
+def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
+    source = "def build():\n    return lambda state, horizon, command: state\n"
+    (tmp_path / "mine.py").write_text(source)
+    (tmp_path / "own.yaml").write_text("{world: {scene: empty}, mission: steps}\n")
+    monkeypatch.chdir("/")
+    path = write_sweep({"cloud.predictor": ["./mine.py"]}, experiment="./own.yaml", set={})
+    (point,) = read_plan(path).points
+    assert point.cloud.predictor.name == str(tmp_path / "mine.py")
+    assert read_plan(path).file["folder"] == str(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("keys", "reason"),
+    [
+        ({"grid": {"link.both.delayms": [1]}}, "link.uplink.delayms: unknown key; did you mean"),
+        ({"grid": {"link.both.delay_ms": [1, -3]}}, "link.downlink.delay_ms: -3: must be a number"),
+        ({"grid": {"link.both.delay_ms": []}}, "grid.link.both.delay_ms: must be a list of values"),
+        ({"grid": {"gains": {"low": 3}}}, "grid.gains: must be a list of values, or names"),
+        ({"grid": {"cloud.predictor": ["last_sampl"]}}, "did you mean last_sample?"),
+        ({"grid": {"seed": [1]}}, "seed: give the seeds with the key 'seeds'"),
+        ({"grid": {"link.uplink.x": [1], "link.both.x": [1]}}, "link.both.x: is set twice"),
+        ({"grid": {"..": [1]}}, "'..': is no key"),
+        ({"seeds": 0}, "seeds: 0: must be a number of seeds, 1 to 10000, or a list of different"),
+        ({"seeds": [1, 1]}, "seeds: [1, 1]: must be"),
+        ({"gird": {}}, "gird: unknown key; did you mean grid?"),
+    ],
+)
+def test_a_problem_is_refused_at_its_place(write_sweep, keys, reason):
+    path = write_sweep(**{"set": SHORT, **keys})
+    with pytest.raises(BadInputError) as caught:
+        read_plan(path)
+    assert reason in str(caught.value)
+    number = re.search(rf"{re.escape(str(path))}:(\d+)", str(caught.value))[1]
+    key = list(keys.get("grid", keys))[-1]
+    assert key in path.read_text().splitlines()[int(number) - 1]
+
+
+def test_the_file_of_the_page_is_a_sweep(tmp_path):
+    page = (Path(__file__).parents[2] / "docs/sweeps.md").read_text()
+    (tmp_path / "grid.yaml").write_text(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1])
+    plan = read_plan(tmp_path / "grid.yaml")
+    assert (len(plan.points), len(plan.flights)) == (12, 240)
+
+
+def test_equal_points_are_refused(write_sweep):
+    with pytest.raises(BadInputError, match=r"5\.0} is the same as"):
+        read_plan(write_sweep({"guard.hold_max_s": [5, 5.0]}))

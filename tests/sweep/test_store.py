@@ -1,0 +1,104 @@
+"""Rows survive a crash; a folder holds one sweep; tables do not depend on the order of flights."""
+
+import csv
+import json
+
+import pytest
+
+from cloudrc.errors import BadInputError
+from cloudrc.metrics import Number
+from cloudrc.sweep import store
+from cloudrc.sweep.flight import Outcome
+from cloudrc.sweep.plan import read_plan
+
+
+@pytest.fixture
+def plan(write_sweep):
+    return read_plan(write_sweep())
+
+
+@pytest.fixture
+def rows(plan):
+    """Four rows in the order of the grid; the last one lacks a number."""
+    numbers = [{"duration": Number(n + 0.1, "s", "")} for n in range(3)]
+    pairs = zip(plan.flights.values(), [*numbers, {}], strict=True)
+    return [store.make_row(flight, Outcome("success", (), found)) for flight, found in pairs]
+
+
+def write(folder, rows, shard=None):
+    with store.append_rows(folder, shard) as append:
+        for row in rows:
+            append(row)
+
+
+def test_the_table_has_the_order_of_the_grid(plan, rows, tmp_path):
+    tables = []
+    for order, shards in (([0, 1, 2, 3], (None, None)), ([3, 1, 0, 2], (1, 2))):
+        folder = tmp_path / str(shards[0])
+        folder.mkdir()
+        assert store.begin(folder, plan) == {}
+        write(folder, [rows[n] for n in order[:2]], shards[0])
+        assert len(store.finish(folder, plan)) == 2
+        assert not (folder / "table.csv").exists()
+        write(folder, [rows[n] for n in order[2:]], shards[1])
+        assert len(store.finish(folder, plan)) == 4
+        tables.append((folder / "table.csv").read_bytes())
+    assert tables[0] == tables[1]
+    head, first, *_, last = csv.reader(tables[0].decode().splitlines())
+    assert head[1:] == [*plan.axes, "seed", "verdict", "failures", "duration [s]"]
+    assert first == [rows[0]["key"], "last_sample", "40", "1", "success", "", "0.1"]
+    assert last[1:] == ["constant_velocity", "0", "1", "success", "", ""]
+    summary = store.read_summary(folder)
+    assert (summary["counts"], summary["flights"]) == ({"success": 4}, 4)
+    assert (summary["axes"], summary["seeds"]) == (plan.axes, [1])
+    assert "link.profile=paper-p3" in summary["overrides"]
+
+
+def test_half_a_line_is_dropped(rows, tmp_path):
+    write(tmp_path, rows[:2])
+    path = tmp_path / "rows.jsonl"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-5])
+    assert list(store.read_rows(tmp_path)) == [rows[0]["key"]]
+    write(tmp_path, rows[1:2])
+    assert path.read_bytes() == whole
+    assert list(store.read_rows(tmp_path).values()) == rows[:2]
+
+
+def test_a_line_that_is_no_row_is_named(rows, tmp_path):
+    write(tmp_path, rows[:1])
+    for line in ("{", "[]", "{}"):
+        (tmp_path / "rows-2.jsonl").write_text(f"{json.dumps(rows[1])}\n{line}\n")
+        with pytest.raises(BadInputError, match=r"rows-2.jsonl:2: is not a row of a sweep"):
+            store.read_rows(tmp_path)
+
+
+def test_a_folder_holds_one_sweep(plan, rows, write_sweep, tmp_path, monkeypatch):
+    store.begin(tmp_path, plan)
+    write(tmp_path, rows)
+    more = read_plan(write_sweep(seeds=2))  # more flights are no other sweep
+    assert list(store.begin(tmp_path, more).values()) == rows
+    other = read_plan(write_sweep({"link.both.delay_ms": [7]}))
+    with pytest.raises(BadInputError, match=r"has rows of another grid.*name a new folder"):
+        store.begin(tmp_path, other)
+    monkeypatch.setattr(store, "__version__", "9.9")
+    with pytest.raises(BadInputError, match=r"has rows of cloudrc .*; this is 9\.9"):
+        store.begin(tmp_path, plan)
+
+
+def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp_path):
+    mine = tmp_path / "mine.py"
+    source = "def build():\n    return lambda state, horizon, command: state\n"
+    mine.write_text(source)
+    plan = read_plan(write_sweep({"cloud.predictor": ["./mine.py"]}))
+    store.begin(tmp_path, plan)
+    write(tmp_path, [store.make_row(each, Outcome("failure")) for each in plan.flights.values()])
+    store.begin(tmp_path, plan)
+    mine.write_text(f"{source}# changed\n")
+    with pytest.raises(BadInputError, match=r"has rows of an older .*mine\.py"):
+        store.begin(tmp_path, plan)
+
+
+def test_another_folder_is_refused(tmp_path):
+    with pytest.raises(BadInputError, match="is not the folder of a sweep"):
+        store.read_summary(tmp_path)
