@@ -63,6 +63,7 @@ def execute(options: argparse.Namespace) -> int:
         "PROFILE": _candidates("profile", shipped.names("profile"), files=True),
         "KEY=VALUE of --set": _candidates("key", keys),
         "KEY=VALUE": _candidates("link", of_link),  # the arguments of `link set`
+        **dict.fromkeys("AB", _candidates("key", keys)),  # the arguments of `compare`
     }
     parser = build_parser(COMMANDS, for_completion=True)
     for action in _actions(parser):

@@ -38,6 +38,7 @@ ACTIONS = {
     "run": "fly all points of a grid, or those that are missing in --out",
     "status": "count the rows and the successful flights of a sweep",
     "fly": "fly one row again with a recording and a report, and compare the hashes",
+    "figure": "draw metrics and success over an axis, as PDF, PNG and SVG",
     "rows": "fly a file of flights and print the rows; the pods of --on kubernetes do this",
 }
 EPILOG = """\
@@ -46,6 +47,7 @@ examples:
   cloudrc sweep run my-sweep.yaml --out runs/mine    again: fly what is missing
   cloudrc sweep status runs/latest-sweep
   cloudrc sweep fly runs/latest-sweep 73434426a8081810
+  cloudrc sweep figure runs/latest-sweep --x link.both.delay_ms
   cloudrc sweep run my-sweep.yaml --on kubernetes --shards 8 -n lab
 
 docs/sweeps.md describes the file of a sweep and the shards of a cluster."""
@@ -81,10 +83,19 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add = parsers["rows"].add_argument
     add("file", type=input_file, metavar="FILE", help="file of flights, from the Job's ConfigMap")
     add("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
-    for name in ("status", "fly"):
+    for name in ("status", "fly", "figure"):
         about = "folder of a sweep"
         parsers[name].add_argument("folder", type=Path, metavar="DIR", help=about)
     parsers["fly"].add_argument("key", metavar="KEY", help="key of the row, or its first digits")
+    add = parsers["figure"].add_argument
+    about = "metric to draw; repeatable (default: three that matter first)"
+    add("--number", action="append", default=[], metavar="NAME", help=about)
+    about = "axis of the sweep along x (default: the first one with numbers)"
+    add("--x", metavar="AXIS", help=about)
+    about = "axis with one line per value (default: the first of the others)"
+    add("--by", metavar="AXIS", help=about)
+    about = "path of the files, with or without a suffix (default: DIR/figure)"
+    add("--out", type=Path, metavar="FILE", help=about)
     for name in ("run", "status", "fly"):
         output_argument(parsers[name])
 
@@ -113,7 +124,8 @@ def execute(options: argparse.Namespace) -> int:
     if options.action is None:
         names = ", ".join(ACTIONS)
         raise BadInputError(f"an action is missing: {names}; see 'cloudrc sweep --help'")
-    actions = {"run": run, "status": print_status, "fly": fly_again, "rows": print_rows}
+    actions = {"run": run, "status": print_status, "fly": fly_again, "figure": draw_figure}
+    actions["rows"] = print_rows
     return actions[options.action](options)
 
 
@@ -240,6 +252,25 @@ def print_status(options: argparse.Namespace) -> int:
         counts = dict(Counter(row["verdict"] for row in rows.values()))
         document = {"schemaVersion": 1, "flights": summary["flights"], "counts": counts}
         print(format_document({**document, "axes": values}, options.output))
+    return 0
+
+
+def draw_figure(options: argparse.Namespace) -> int:
+    """Draw a sweep and write the figure as PDF, PNG and SVG; print the caption and the paths."""
+    require("a figure", ("report",))
+    from cloudrc.files import write_atomically
+    from cloudrc.sweep.figure import draw_sweep
+    from cloudrc.sweep.rows import read_flights
+
+    rows = read_flights(options.folder)
+    files, caption = draw_sweep(rows, options.number, options.x, options.by)
+    out = options.out or options.folder / "figure"
+    stem = out.stem if out.suffix.removeprefix(".") in files else out.name
+    print_or_drop(f"{caption}\n")
+    for kind, data in files.items():
+        path = out.with_name(f"{stem}.{kind}")
+        write_atomically(path, data)
+        print_or_drop(escape(str(path)))
     return 0
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from cloudrc.errors import BadInputError
 from cloudrc.plugins import unknown_name_text
 from cloudrc.sweep.flight import Outcome
-from cloudrc.sweep.statistics import paired, sign_test, wilson_interval
+from cloudrc.sweep.statistics import LEVEL, paired, sign_test, wilson_interval
 
 NUMBERS = (
     *("prediction_error_rms", "tracking_error_p95", "iae_mean", "settling_time_mean"),
@@ -86,10 +86,17 @@ def _success(pairs: Sequence[Pair]) -> dict[str, Any]:
     return {
         **{"count": count, "a": a, "a_interval": wilson_interval(a, count)},
         **{"b": b, "b_interval": wilson_interval(b, count)},
-        **{"only_a": only_a, "only_b": only_b, "p_mcnemar": p},
+        **{"only_a": only_a, "only_b": only_b, "p_mcnemar": p, "decided": p < LEVEL},
     }
 
 
 def _flight(flight: Outcome, names: Sequence[str]) -> dict[str, Any]:
     numbers = {name: flight.numbers[name].value for name in names if name in flight.numbers}
     return {"verdict": flight.verdict, "numbers": numbers}
+
+
+def scale(unit: str, largest: float) -> tuple[float, str]:
+    """Return factor and unit in which values up to `largest` [`unit`] are readable: mm, ms."""
+    if 0 < largest < {"m": 0.1, "s": 1.0}.get(unit, 0.0):
+        return 1e3, f"m{unit}"
+    return 1.0, "" if unit == "1" else unit

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from cloudrc.config.document import parse_value, read_document
+from cloudrc.config.document import read_document
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import Number
 from cloudrc.sweep.compare import Pair
 from cloudrc.sweep.flight import Outcome
-from cloudrc.sweep.rows import read_rows
+from cloudrc.sweep.rows import read_flights
 
 IGNORED = ("seed", "name", "description", "report")
-"""Keys of an experiment that do not matter for a comparison."""
+"""Keys of an experiment that do not affect the flight, and the seed."""
 OF_LINK = (
     *("guard.command_age_max_ms", "guard.speed_max_mps"),
     *("cloud.horizon_max_s", "cloud.freeze_after_s"),
@@ -24,101 +24,81 @@ OF_LINK = (
 
 
 def of_sweep(folder: Path, a: str, b: str) -> tuple[list[Pair], str]:
-    """Pair the rows of a sweep in which one axis is `a` and `b`; return pairs and axis.
+    """Pair the rows with the values `a` and `b` of one axis that agree in all other axes and seed.
 
-    `a` and `b` are values, or AXIS=VALUE where several axes have such values.
+    `a` and `b` are values, or AXIS=VALUE. Also return a text that names the axis.
 
     Raises:
-        BadInputError: If the folder is no sweep, or if not exactly one axis has both values.
+        BadInputError: If not exactly one axis has both values, or if they are the same.
     """
-    rows = read_rows(folder)
-    axes: dict[str, list[Any]] = {}
-    for row in rows:
-        for axis, value in row.point.items():
-            if value not in axes.setdefault(axis, []):
-                axes[axis].append(value)
-    found = [
-        (axis, first, second)
-        for axis, values in axes.items()
-        for first in values if _is_meant(a, axis, first)
-        for second in values if _is_meant(b, axis, second)
-    ]  # fmt: skip
-    if len(found) != 1:
-        known = "; ".join(f"{axis}: {', '.join(map(str, axes[axis]))}" for axis in axes)
-        problem = "several axes have" if found else "no axis has"
+    rows = read_flights(folder)
+    axes = {axis: list(dict.fromkeys(row.point[axis] for row in rows)) for axis in rows[0].point}
+    sides = [
+        [(axis, v) for axis in axes for v in axes[axis] if text in (f"{v}", f"{axis}={v}")]
+        for text in (a, b)
+    ]
+    found = [(axis, x, y) for axis, x in sides[0] for other, y in sides[1] if axis == other]
+    if len(found) != 1 or a == b:
+        known = "; ".join(f"{axis}: {', '.join(map(str, values))}" for axis, values in axes.items())
         raise BadInputError(
-            f"{folder}: {problem} the values {a!r} and {b!r}; write AXIS=VALUE, there are {known}"
+            f"{folder}: A and B must be two values of one axis, VALUE or AXIS=VALUE; it has {known}"
         )
     axis, first, second = found[0]
-    if first == second:
-        raise BadInputError(f"A and B are both {a!r}; name two values of {axis}")
-    sides: tuple[dict[str, Any], ...] = ({}, {})
+    flown: dict[str, dict[Any, Outcome]] = {}
     for row in rows:
-        rest = {**row.point, "seed": row.seed}
-        value = rest.pop(axis)
-        if value in (first, second):
-            sides[value == second][json.dumps(rest)] = row.outcome
-    return [Pair(json.loads(rest), flown, sides[1][rest])
-            for rest, flown in sides[0].items() if rest in sides[1]], axis  # fmt: skip
+        rest = {name: value for name, value in row.point.items() if name != axis}
+        shared = json.dumps({**rest, "seed": row.seed})
+        flown.setdefault(shared, {})[row.point[axis]] = row.outcome
+    return [
+        Pair(json.loads(shared), each[first], each[second])
+        for shared, each in flown.items()
+        if first in each and second in each
+    ], f"{axis} in {folder}"
 
 
-def _is_meant(text: str, axis: str, value: Any) -> bool:
-    text = text.removeprefix(f"{axis}=")
-    return text == str(value) or bool(parse_value(text, "value") == value)
-
-
-def of_folders(a: Path, b: Path) -> tuple[list[Pair], list[str]]:
-    """Pair the runs of two folders by their seeds; return pairs and the keys that differ.
+def of_folders(a: Path, b: Path) -> tuple[list[Pair], str]:
+    """Pair the runs of two folders by their seeds; also return a text with the keys that differ.
 
     Raises:
         BadInputError: If no seed is in both, if nothing differs, or if keys of several sections
             differ: then nobody could tell which of them has an effect.
     """
-    runs = [_runs(folder) for folder in (a, b)]
-    seeds = sorted(runs[0].keys() & runs[1].keys())
+    first, second = _runs(a), _runs(b)
+    seeds = sorted(first.keys() & second.keys())
     if not seeds:
         raise BadInputError(f"{a} and {b} have no seed in common; fly both with the same --seeds")
-    pairs = [Pair({"seed": n}, *(_outcome(side[n][1]) for side in runs)) for n in seeds]
-    flown = [
-        {"mode": side[seeds[0]][1]["mode"]}
-        | dict(_leaves(read_document(path := side[seeds[0]][0] / "config.yaml", str(path)).tree))
-        for side in runs
-    ]
-    first, second = flown
-    keys = sorted(key for key in first | second if first.get(key) != second.get(key))
+    before, after = (dict(_leaves(side[seeds[0]][1])) for side in (first, second))
+    keys = sorted(key for key in before | after if before.get(key) != after.get(key))
     if any(key.startswith("link.") for key in keys):
         keys = [key for key in keys if key not in OF_LINK]
-    if not keys:
-        raise BadInputError(f"{a} and {b} are flights of the same experiment; change one of them")
-    if len({key.partition(".")[0] for key in keys}) > 1:
-        raise BadInputError(f"{a} and {b} differ in more than one section: {', '.join(keys)}; "
-                            "fly one of them again, with one change")  # fmt: skip
-    return pairs, keys
+    if len({key.partition(".")[0] for key in keys}) != 1:
+        problem = f"differ in several sections: {', '.join(keys)}" if keys else "are the same"
+        raise BadInputError(f"{a} and {b} {problem}; compare flights that differ in one section")
+    pairs = [Pair({"seed": seed}, first[seed][0], second[seed][0]) for seed in seeds]
+    return pairs, f"folders that differ in {', '.join(keys)}"
 
 
-def _runs(folder: Path) -> dict[int, tuple[Path, Mapping[str, Any]]]:
-    """Return the runs in a folder, which may be a run itself: seed -> folder and report."""
-    found = {}
+def _runs(folder: Path) -> dict[int, tuple[Outcome, Mapping[str, Any]]]:
+    """Read the runs in a folder, which may be a run: seed -> result, and mode with experiment."""
+    found = dict[int, tuple[Outcome, Mapping[str, Any]]]()
     for path in (folder / "report.json", *sorted(folder.glob("seed-*/report.json"))):
         if path.is_file():
             report = json.loads(path.read_bytes())
-            found[report["seed"]] = (path.parent, report)
+            numbers = {n: Number(e["value"], e["unit"], "") for n, e in report["numbers"].items()}
+            text = "; ".join(failure["text"] for failure in report["failures"])
+            config = read_document(path.with_name("config.yaml"), f"{path.parent}/config.yaml").tree
+            flown = {"mode": report["mode"], **config}
+            found[report["seed"]] = Outcome(report["verdict"], (), numbers, text=text), flown
     if not found:
         raise BadInputError(f"{folder}: has no report.json; name a folder of 'cloudrc run'")
     return found
 
 
-def _outcome(report: Mapping[str, Any]) -> Outcome:
-    numbers = {n: Number(e["value"], e["unit"], "") for n, e in report["numbers"].items()}
-    return Outcome(report["verdict"], numbers=numbers,
-                   text="; ".join(f["text"] for f in report["failures"][:1]))  # fmt: skip
-
-
-def _leaves(tree: Any, above: Sequence[str] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield the values of a configuration with their keys, such as "cloud.predictor.name"."""
-    if isinstance(tree, dict):
-        for key, value in tree.items():
-            if above or key not in IGNORED:
-                yield from _leaves(value, (*above, key))
-    else:
-        yield ".".join(above), tree
+def _leaves(tree: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Yield the keys of a configuration, such as "cloud.predictor.name", with their values."""
+    if not isinstance(tree, dict):
+        yield ".".join(path), tree
+        return
+    for key, value in tree.items():
+        if path or key not in IGNORED:
+            yield from _leaves(value, (*path, key))

@@ -114,31 +114,17 @@ def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Paired:
-    """What paired differences B - A of one number prove; all values have the number's unit.
-
-    Attributes:
-        count: Number of pairs.
-        lower: Number of pairs in which B is below A.
-        higher: Number of pairs in which B is above A.
-        difference: Estimate of Hodges and Lehmann: the median of the means of all two differences
-            [unit of the number].
-        interval: 95 % interval of the difference [likewise]; None with fewer than 6 pairs.
-        p_wilcoxon: p of the signed-rank test [1].
-        p_sign: p of the sign test [1].
-        decided: Whether the interval excludes 0 and p_wilcoxon is below 5 %.
-        pairs_needed: Number of pairs that decide with a probability of 80 %, if the true
-            differences are as the observed ones; None if these show no effect.
-    """
+    """What paired differences B - A of one number show; "u" is the unit of the number."""
 
     count: int
-    lower: int
-    higher: int
-    difference: float
-    interval: tuple[float, float] | None
-    p_wilcoxon: float
-    p_sign: float
-    decided: bool
-    pairs_needed: int | None
+    lower: int  # pairs in which B is below A
+    higher: int  # pairs in which B is above A
+    difference: float  # median of the means of any two differences [u]
+    interval: tuple[float, float] | None  # 95 % interval of the difference; None below 6 pairs
+    p_wilcoxon: float  # signed-rank test [1]
+    p_sign: float  # sign test [1]
+    decided: bool  # whether p_wilcoxon is below 5 % and the interval excludes 0
+    pairs_needed: int | None  # that decide with power 80 %; None if no effect is seen
 
 
 def paired(differences: Sequence[float]) -> Paired:
@@ -158,20 +144,9 @@ def paired(differences: Sequence[float]) -> Paired:
     interval = (float(means[cut]), float(means[-1 - cut])) if cut >= 0 else None
     p = signed_rank_test(values.tolist())
     decided = interval is not None and interval[0] * interval[1] > 0 and p < LEVEL
-    needed = _pairs_needed(values, means)
-    if needed is not None and not decided:
-        needed = max(needed, n + 1)
-    return Paired(
-        count=n,
-        lower=lower,
-        higher=higher,
-        difference=float(np.median(means)),
-        interval=interval,
-        p_wilcoxon=p,
-        p_sign=sign_test(lower, higher),
-        decided=decided,
-        pairs_needed=needed,
-    )
+    needed = _pairs_needed(values, means, PAIRS_MIN if decided else max(PAIRS_MIN, n + 1))
+    middle, p_sign = float(np.median(means)), sign_test(lower, higher)
+    return Paired(n, lower, higher, middle, interval, p, p_sign, decided, needed)
 
 
 def _cut(n: int) -> int:
@@ -183,18 +158,16 @@ def _cut(n: int) -> int:
     return int(np.searchsorted(chances, LEVEL / 2, side="right")) - 1
 
 
-def _pairs_needed(values: NDArray[Any], means: NDArray[Any]) -> int | None:
-    """Return the number of pairs with which the signed-rank test decides with power 80 %.
+def _pairs_needed(values: NDArray[Any], means: NDArray[Any], least: int) -> int | None:
+    """Return the number of pairs, at least `least`, for a power of 80 %; None without an effect.
 
     Source: G. E. Noether, "Sample size determination for some common nonparametric tests", 1987.
     """
     n = len(values)
-    if n < 2:
-        return None
     # Share of means of two different pairs that are above 0; a mean of 0 counts half.
     above = np.sign(means).sum() - np.sign(values).sum()
-    effect = abs(above) / (n * (n - 1))  # = |share - 1/2|
+    effect = abs(above) / max(n * (n - 1), 1)  # = |share - 1/2|
     if effect == 0:
         return None
     z = Z + NormalDist().inv_cdf(POWER)
-    return max(PAIRS_MIN, math.ceil(float(z * z / (3 * effect * effect))))
+    return max(least, math.ceil(float(z * z / (3 * effect * effect))))

@@ -1,0 +1,96 @@
+"""Draw the figure of a sweep: a panel per quantity, and a line with its band per setting."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+
+from cloudrc.report.figures import save, style
+from cloudrc.report.figures.style import RC, new_figure, panel
+
+COLUMN = 3.5
+"""Width of a column of a page [in]. Source: IEEE conference template."""
+TEXT: dict[Any, Any] = {"svg.fonttype": "none", "pdf.fonttype": 42}
+"""Settings with which text stays text in an SVG or PDF file."""
+UNITS = {"ms": "ms", "s": "s", "m": "m", "mps": "m/s", "kbit": "kbit/s", "deg": "deg"}
+"""End of a key -> unit."""
+LOOKS = (
+    *((style.BLUE, "o", "-"), (style.VERMILION, "s", "--"), (style.GREEN, "^", "-.")),
+    *((style.PURPLE, "D", ":"), (style.ORANGE, "v", "-"), (style.BLACK, "P", "--")),
+)
+"""Colour, marker and dashes of each line."""
+
+
+class Point(NamedTuple):
+    """A value with its interval; NaN if unknown."""
+
+    x: float  # any unit, or the index of a name
+    middle: float  # any unit
+    low: float  # likewise
+    high: float  # likewise
+    failed: bool  # whether some of its flights failed
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A quantity with its unit, and one line per setting."""
+
+    title: str
+    unit: str
+    lines: Mapping[str, Sequence[Point]]
+
+
+def draw(
+    panels: Sequence[Panel], x: str, x_names: Sequence[str], by: str | None
+) -> dict[str, bytes]:
+    """Draw panels below each other; return the contents of a PDF, a PNG and an SVG file by suffix.
+
+    `x` and `by` are the keys that change along x and between lines. With `x_names` the x axis has
+    names instead of numbers, and no line joins the points.
+    """
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update({**RC, **TEXT})
+        figure = new_figure(0.7 + 1.3 * len(panels), COLUMN)
+        column = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        for n, (axes, each) in enumerate(zip(column, panels, strict=True)):
+            _draw_panel(axes, each, named=bool(x_names))
+            panel(axes, chr(ord("a") + n), each.title + f" ({each.unit})" * bool(each.unit))
+        column[-1].set_xlabel(_label(x))
+        if x_names:
+            column[-1].set_xticks(range(len(x_names)), x_names)
+            column[-1].set_xlim(-0.5, len(x_names) - 0.5)
+        if by:
+            lines = column[0].get_legend_handles_labels()
+            look = {"ncols": 2, "alignment": "left", "title_fontsize": 8.0}
+            figure.legend(*lines, loc="outside upper left", title=_label(by), **look)
+        return {kind: save(figure, kind) for kind in ("pdf", "png", "svg")}
+
+
+def _draw_panel(axes: Axes, content: Panel, *, named: bool) -> None:
+    for index, (name, points) in enumerate(content.lines.items()):
+        colour, marker, dashes = LOOKS[index % len(LOOKS)]
+        look: dict[str, Any] = {"color": colour, "marker": marker, "ms": 4}
+        x, middle, low, high, failed = np.array(points, dtype=float).T
+        if named:  # side by side, so that no marker hides another
+            x = x + (index - (len(content.lines) - 1) / 2) * 0.12
+            bars = (middle - low, high - middle)
+            axes.errorbar(x, middle, bars, ls="none", capsize=2, label=name, **look)
+        else:
+            axes.fill_between(x, low, high, color=colour, alpha=0.18, lw=0)
+            axes.plot(x, middle, ls=dashes, label=name, **look)
+        bad = failed > 0
+        axes.plot(x[bad], middle[bad], ls="none", mfc="white", zorder=5, **look)
+    if content.unit == "%":
+        axes.set_ylim(-5.0, 105.0)
+
+
+def _label(key: str) -> str:
+    """Write the unit of a key in parentheses: "link.both.delay (ms)"."""
+    name, _, end = key.rpartition("_")
+    return f"{name} ({UNITS[end]})" if end in UNITS else key

@@ -1,0 +1,94 @@
+"""`cloudrc compare`: flights of A and B in pairs, a table and one sentence that answers."""
+
+import json
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.metrics import Number
+from cloudrc.sweep.flight import Outcome
+
+SHORT = ["--set=mission.steps.count=1", "--set=mission.steps.period_s=1.0",
+         "--set=criteria.settle_m=null"]  # fmt: skip
+
+
+def fly_with(monkeypatch, measure):
+    """Replace flights: `measure(settings, seed)` returns verdict and prediction error [m]."""
+
+    def fly(job):
+        _, settings, seed = job
+        verdict, error = measure(",".join(settings), seed)
+        numbers = {"prediction_error_rms": Number(error, "m", "")}
+        return Outcome(verdict, ("unstable",) * (verdict == "failure"), numbers)
+
+    monkeypatch.setattr("cloudrc.cli.compare.fly_job", fly)
+    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
+
+
+def sentence(capsys, *arguments):
+    """Return exit code and last line of `compare last_sample constant_velocity`."""
+    sides = "cloud.predictor=last_sample", "cloud.predictor=constant_velocity"
+    code = main(["compare", *sides, *arguments])
+    return code, capsys.readouterr().out.splitlines()[-1]
+
+
+def test_short_flights_are_compared_for_real(capsys):
+    sides = "cloud.predictor=last_sample", "cloud.predictor=constant_velocity,cloud.estimator=split"
+    assert main(["compare", *sides, "--seeds", "1", *SHORT, "-o", "json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["a"], document["b"], document["pairs"]) == (*sides, 1)
+    number = document["numbers"]["prediction_error_rms"]
+    assert number["b_median"] < number["a_median"]
+    assert (number["interval"], number["decided"]) == (None, False)
+
+
+def test_the_last_line_is_the_answer(monkeypatch, capsys):
+    fly_with(monkeypatch, lambda a, n: ("success", 0.01 + 0.0013 * n * ("last_sample" in a)))
+    assert sentence(capsys, "--seeds", "8") == (
+        0,
+        "B has a lower prediction_error_rms: by 5.850 mm (2.600 .. 9.100), p = 0.0078, in 8 of 8 "
+        "pairs.",
+    )
+
+
+def test_an_answer_without_proof_says_how_many_pairs_decide(monkeypatch, capsys):
+    fly_with(monkeypatch, lambda a, n: ("success", 0.01 + 0.0013 * n * ("last_sample" in a)))
+    assert sentence(capsys, "--seeds", "5")[1] == (
+        "Undecided: prediction_error_rms after 5 pairs, p = 0.062; about 11 pairs needed."
+    )
+
+
+def test_success_comes_before_every_number(monkeypatch, capsys):
+    fly_with(monkeypatch, lambda a, n: ("failure" if "last_sample" in a else "success", 0.01))
+    sides = "cloud.predictor=last_sample", "cloud.predictor=constant_velocity"
+    assert main(["compare", *sides, "--seeds", "6"]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "B succeeds more often: in 6 of 6 flights, A in 0, p = 0.031.",
+        "Undecided: prediction_error_rms after 6 pairs, p = 1; no effect seen.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["seed=1", "seed=1"], "A and B are the same experiment"),
+        (["cloud.predictor=last_sample", "cloud.predicter=kalman"], "cloud.predicter"),
+        (["link.profile=paper-p1", "link.profile=wifi", "--set", "link.profile=x"], "set twice"),
+        (["last_sample", "nonsense"], "must be key=value"),
+        (["a", "b", "--in", "nowhere"], "nowhere"),
+        (["a", "b", "--in", "nowhere", "--set", "seed=1"], "--set seed=1: these flights are"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(arguments, text, capsys):
+    assert main(["compare", *arguments]) == 2
+    assert text in capsys.readouterr().err
+
+
+def test_ctrl_c_compares_the_finished_pairs(monkeypatch, capsys):
+    def measure(settings, seed):
+        if seed == 3:
+            raise KeyboardInterrupt
+        return "success", 0.01
+
+    fly_with(monkeypatch, measure)
+    assert sentence(capsys, "--seeds", "9", "-o", "json")[0] == 130

@@ -1,0 +1,106 @@
+"""The figure of a sweep: its axes, its bands, and pairs from the same rows."""
+
+import json
+
+import pytest
+
+from cloudrc.cli.main import main
+from cloudrc.errors import BadInputError
+from cloudrc.metrics import Number
+from cloudrc.sweep.figure import draw_sweep
+from cloudrc.sweep.flight import Outcome
+from cloudrc.sweep.pairs import of_sweep
+from cloudrc.sweep.rows import Row, read_flights
+
+AXES = {"delay_ms": [20, 5, 10], "predictor": ["none", "kalman"], "gain": [[1, 2], [3, 4]]}
+
+
+def sweep(folder, rows=None):
+    """Write the rows of a sweep in an order that is not that of its grid; 10 and 20 ms fail."""
+    points = [(d, p, g, seed) for seed in (2, 1) for g in AXES["gain"] for d in (5, 10, 20)
+              for p in ("kalman", "none")]  # fmt: skip
+    lines = [
+        {"key": str(n), "point": {"delay_ms": d, "predictor": p, "gain": g}, "seed": seed,
+         "verdict": "success" if d == 5 else "failure", "failures": [],
+         "numbers": {"iae_mean": d + seed + 0.5 * (p == "none")}}
+        for n, (d, p, g, seed) in enumerate(points)
+    ]  # fmt: skip
+    folder.mkdir()
+    summary = {"axes": AXES, "units": {"iae_mean": "m s"}, "files": {}, "flights": 24}
+    (folder / "sweep.json").write_text(json.dumps(summary))
+    (folder / "rows.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines[:rows]))
+    return folder
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Keep what would be drawn."""
+    kept = []
+    monkeypatch.setattr("cloudrc.sweep.figure.draw", lambda *what: kept.extend(what) or {})
+    return kept
+
+
+def test_numbers_go_along_x_in_order_and_failures_get_a_panel(tmp_path, drawn):
+    _, caption = draw_sweep(read_flights(sweep(tmp_path / "s")))
+    (iae, success), x, names, by = drawn
+    assert (iae.title, iae.unit, x, names, by) == ("iae mean", "m s", "delay_ms", [], "predictor")
+    assert [point.x for point in iae.lines["kalman"]] == [5, 10, 20]
+    assert [point.middle for point in iae.lines["none"]] == [7.0, 12.0, 22.0]
+    assert [point.failed for point in iae.lines["none"]] == [False, True, True]
+    assert [point.middle for point in success.lines["kalman"]] == [100, 0, 0]
+    assert caption.endswith("Each point pools all values of gain.")
+
+
+def test_names_along_x_keep_the_order_of_the_grid(tmp_path, drawn):
+    draw_sweep(read_flights(sweep(tmp_path / "s")), x="predictor", by="gain")
+    assert drawn[1:] == ["predictor", ["none", "kalman"], "gain"]
+    assert [*drawn[0][0].lines] == ["[1, 2]", "[3, 4]"]
+
+
+def test_a_band_needs_six_values(drawn):
+    rows = [Row({"a": a}, seed, Outcome("success", (), {"iae_mean": Number(seed, "m s", "")}))
+            for a in (1, 2) for seed in range(1, 6 + a - 1)]  # fmt: skip
+    draw_sweep(rows)
+    five, six = drawn[0][0].lines["a"]
+    assert five.low != five.low  # NaN
+    assert (six.low, six.middle, six.high) == (1, 3.5, 6)
+
+
+def test_a_figure_is_three_files_whose_text_is_text(tmp_path, capsys):
+    folder = sweep(tmp_path / "s")
+    assert main(["sweep", "figure", str(folder), "--out", str(tmp_path / "one.png")]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "one.svg")
+    assert (tmp_path / "one.pdf").read_bytes().startswith(b"%PDF")
+    assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
+    assert ">delay (ms)</text>" in (tmp_path / "one.svg").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [(["--x", "delay"], "no axis named 'delay'"), (["--by", "x"], "no axis named 'x'"),
+     (["--number", "iea"], "no number named 'iea'")],
+)  # fmt: skip
+def test_a_figure_of_unknown_names_is_refused(arguments, text, tmp_path, capsys):
+    assert main(["sweep", "figure", str(sweep(tmp_path / "s")), *arguments]) == 2
+    assert text in capsys.readouterr().err
+
+
+def test_a_sweep_without_axes_or_rows_has_no_figure(tmp_path):
+    with pytest.raises(BadInputError, match="no axis"):
+        draw_sweep([Row({}, 1, Outcome("success"))])
+    with pytest.raises(BadInputError, match="has no rows"):
+        read_flights(sweep(tmp_path / "s", rows=0))
+
+
+def test_values_of_an_axis_are_paired_over_the_others(tmp_path):
+    found, what = of_sweep(sweep(tmp_path / "s"), "predictor=none", "kalman")
+    assert what == f"predictor in {tmp_path / 's'}"
+    assert len(found) == 12
+    assert found[0].label == {"delay_ms": 20, "gain": "[1, 2]", "seed": 1}
+    assert {a.numbers["iae_mean"].value - b.numbers["iae_mean"].value for _, a, b in found} == {0.5}
+
+
+@pytest.mark.parametrize("sides", [("none", "none"), ("none", "5"), ("none", "last_sample")])
+def test_values_that_make_no_pairs_are_refused(sides, tmp_path):
+    with pytest.raises(BadInputError, match=r"must be two values of one axis.*delay_ms: 20, 5"):
+        of_sweep(sweep(tmp_path / "s"), *sides)
