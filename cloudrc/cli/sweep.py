@@ -243,7 +243,7 @@ def draw_figure(options: argparse.Namespace) -> int:
     require("a figure", ("report",))
     from cloudrc.files import write_atomically
     from cloudrc.sweep.figure import draw_sweep
-    from cloudrc.sweep.rows import read_flights
+    from cloudrc.sweep.pairs import read_flights
 
     rows = read_flights(options.folder)
     files, caption = draw_sweep(rows, options.number, options.x, options.by)
