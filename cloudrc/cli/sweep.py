@@ -228,11 +228,13 @@ class Progress:
         self._stream, self._total, self._before = stream, total, total - missing
         self._done, self._failed, self._began = 0, 0, monotonic()
         self._printed, self._error = self._began, ""
-        print_or_drop(
-            f"{escape(head)}{f', {self._before} done before' * (missing < total)}", stream
-        )
-        self._status = Console(file=stream).status("") if is_live(stream) else None
-        if self._status:
+        done = f", {self._before} done before" if self._before else ""
+        print_or_drop(escape(head) + done, stream)
+        self._status = None
+        if is_live(stream):
+            from rich.console import Console
+
+            self._status = Console(file=stream).status("")
             self._status.start()
 
     def see(self, row: Row) -> None:
