@@ -136,7 +136,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
             return summary
     except (OSError, ValueError, AttributeError):
         pass
-    raise BadInputError(f"{folder}: is not the folder of a sweep; name one: runs/latest-sweep")
+    raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
 
 
 def _write_summary(folder: Path, plan: Plan, rows: Mapping[str, Row]) -> dict[str, str]:

@@ -97,5 +97,5 @@ def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp
 
 
 def test_another_folder_is_refused(tmp_path):
-    with pytest.raises(BadInputError, match="is not the folder of a sweep"):
+    with pytest.raises(BadInputError, match="is not a folder of"):
         store.read_summary(tmp_path)
