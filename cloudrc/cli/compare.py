@@ -114,7 +114,8 @@ def _fly_both(options: argparse.Namespace) -> tuple[list[Pair], str, int]:
     jobs = [(options.experiment, side, n + 1) for n in range(options.seeds) for side in sides]
     flights: list[Outcome] = []
     head = f"{resolved[0].name}: A and B with {options.seeds} seeds"
-    view = Progress(sys.stderr, f"{head}, {len(jobs)} flights", len(jobs), len(jobs))
+    stream = sys.stdout if options.output == "table" else sys.stderr
+    view = Progress(stream, f"{head}, {len(jobs)} flights", len(jobs), len(jobs))
 
     def take(flight: Outcome) -> None:
         flights.append(flight)
