@@ -128,7 +128,9 @@ def run(options: argparse.Namespace) -> int:
     plan, folder, (shard, count) = read_plan(options.file), options.out, options.shard or (None, 1)
     for text in dict.fromkeys(text for point in plan.points for text in advise(point)):
         print_line(f"cloudrc: warning: {text}", sys.stderr)
-    if folder is None or not (folder / store.FILE).is_file():
+    if options.shard:
+        folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
+    elif folder is None or not (folder / store.FILE).is_file():
         folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
     before, code, stopped = store.begin(folder, plan), 0, ""
     mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
@@ -146,7 +148,9 @@ def run(options: argparse.Namespace) -> int:
         for first in range(0, len(jobs), COUNT_MAX):
             work = jobs[first : first + COUNT_MAX]
             flights = map_in_order(fly_job, work, options.jobs, in_order=False)
-            stopped, code = take_each(flights, take) if not stopped else (stopped, code)
+            stopped, code = take_each(flights, take)
+            if stopped:
+                break
     rows = store.finish(folder, plan)
     if stopped:
         again = f"cloudrc sweep run {options.file} --out {folder}"
@@ -156,7 +160,7 @@ def run(options: argparse.Namespace) -> int:
         print_or_drop(f"\n{_verdicts(rows.values())}\n\n{escape(str(folder / name))}")
     else:
         print_or_drop(format_document(store.read_summary(folder), options.output))
-    return code or int(any(row["verdict"] != "success" for row in rows.values()))
+    return code or int(any(rows[each.key]["verdict"] != "success" for each in mine))
 
 
 def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
