@@ -114,12 +114,13 @@ def _fly_both(options: argparse.Namespace) -> tuple[list[Pair], str, int]:
     jobs = [(options.experiment, side, n + 1) for n in range(options.seeds) for side in sides]
     flights: list[Outcome] = []
     head = f"{resolved[0].name}: A and B with {options.seeds} seeds"
-    view = Progress(options, f"{head}, {len(jobs)} flights", len(jobs), len(jobs))
+    stream = sys.stdout if options.output == "table" else sys.stderr
+    view = Progress(stream, f"{head}, {len(jobs)} flights", len(jobs), len(jobs))
 
     def take(flight: Outcome) -> None:
         flights.append(flight)
-        text = flight.text if flight.verdict == ERROR else ""
-        view.see({"key": "AB"[len(flights) % 2 - 1], "verdict": flight.verdict, "text": text})
+        error = {"text": flight.text} if flight.verdict == ERROR else {}
+        view.see({"key": "AB"[len(flights) % 2 - 1], "verdict": flight.verdict, **error})
 
     stopped, code = take_each(map_in_order(fly_job, jobs, len(jobs)), take)
     view.close()

@@ -6,8 +6,7 @@ import argparse
 import math
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from cloudrc.cli.advice import simulate_ages
 from cloudrc.cli.compare import flight_arguments, fly_job
@@ -34,17 +33,9 @@ STEPS_MAX = 100
 """Default of --max, as a multiple of the first value."""
 
 
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """The flights with one value."""
-
-    value: float  # in the unit of the key, which is the end of its name, such as [ms]
-    stable: bool
-    code: str = ""  # of the first failure, or "refused"
-    text: str = ""  # the same in words
-    seed: int | None = None  # of the flight that failed
-    rtt_ms: float | None = None  # sum of the mean one-way delays [ms], for a delay of the link
-    speed_max_mps: float | None = None  # the guard's cap, which falls with longer delays [m/s]
+Trial: TypeAlias = dict[str, Any]
+"""The flights with one value, for JSON: `value`, `stable`; of the first failure `code` (or
+"refused"), `text` and `seed`; `rtt_ms` for a delay of the link, and the guard's `speed_max_mps`."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,19 +44,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("key", metavar="KEY", help="key of the experiment whose value is a number")
     flight_arguments(parser, seeds=3)
     about = "largest value to try (default: 100 times the first, which is the present one)"
-    add("--max", type=_positive, metavar="X", help=about)
+    add("--max", type=float, metavar="X", help=about)
     about = "try multiples of R (default: 10 for a key in ms, else 0.01)"
-    add("--resolution", type=_positive, metavar="R", help=about)
+    add("--resolution", type=float, metavar="R", help=about)
     output_argument(parser)
-
-
-def _positive(text: str) -> float:
-    try:
-        if 0 < float(text) < math.inf:
-            return float(text)
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"'{text}' is not a number above 0")
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -74,11 +56,12 @@ def execute(options: argparse.Namespace) -> int:
 
     interrupt_on_signals()
     require("margin", MODES["virtual"])
-    key, size = options.key, options.resolution or (10 if options.key.endswith("_ms") else 0.01)
-    first = max(1, round(_present(load(options.experiment, options.set), key) / size))
-    top = math.floor(options.max / size + 1e-9) if options.max else STEPS_MAX * first
-    if top < 1:
-        raise BadInputError(f"--max {options.max:g}: is below --resolution {size:g}; raise it")
+    key, size = options.key, options.resolution or (10.0 if options.key.endswith("_ms") else 0.01)
+    first = max(1, round(_present(load(options.experiment, options.set), key) / abs(size)))
+    limit = options.max or STEPS_MAX * first * size
+    if not 0 < size <= limit < math.inf:
+        raise BadInputError(f"--resolution {size:g} must be above 0, --max {limit:g} not below it")
+    top = math.floor(limit / size + 1e-9)
     tried: dict[int, Trial] = {}
 
     def works(step: int) -> bool:
@@ -86,7 +69,7 @@ def execute(options: argparse.Namespace) -> int:
             tried[step] = _try(options, round(step * size, 9), first=not tried)
             if options.output == "table":
                 print_or_drop(f"{_value(key, tried[step]):<26}{_result(tried[step])}")
-        return tried[step].stable
+        return bool(tried[step]["stable"])
 
     low, high = largest_stable(works, min(first, top), top)
     # The search assumes that all smaller values are stable: check two of them.
@@ -94,32 +77,30 @@ def execute(options: argparse.Namespace) -> int:
     document = {
         **{"schemaVersion": 1, "key": key, "experiment": options.experiment},
         **{"overrides": options.set, "seeds": options.seeds, "resolution": size},
-        "stable_up_to": tried[low].value if low else None,
-        "fails_at": None if high is None else tried[high].value,
-        "fails_below": [tried[step].value for step in odd],
-        "trials": [asdict(tried[step]) for step in sorted(tried)],
+        "stable_up_to": tried[low]["value"] if low else None,
+        "fails_at": tried[high]["value"] if high else None,
+        "fails_below": [tried[step]["value"] for step in odd],
+        "trials": [tried[step] for step in sorted(tried)],
     }
     answer = f"stable up to {_value(key, tried[low])}" if low else "no value is stable"
-    if high is None:
+    if not high:
         answer += ", the largest value tried; raise --max"
-    for step in [*([] if high is None else [high]), *odd]:
+    for step in [*([high] if high else []), *odd]:
         answer += f"; fails at {_value(key, tried[step])}: {_result(tried[step])}"
     for_people = options.output == "table"
     print_or_drop(f"\n{answer}" if for_people else format_document(document, options.output))
     return 0 if low else 1
 
 
-def largest_stable(works: Callable[[int], bool], start: int, top: int) -> tuple[int, int | None]:
+def largest_stable(works: Callable[[int], bool], start: int, top: int) -> tuple[int, int]:
     """Double a step from `start` until it fails, then bisect; a step is a number from 1 to `top`.
 
-    Returns:
-        The largest step that works, 0 if none does; and the next step, which fails, or None if
-        `top` works.
+    Return the largest step that works and the next one, which fails; 0 stands for none.
     """
     low, high = 0, start
     while works(high):
         if high == top:
-            return top, None
+            return top, 0
         low, high = high, min(2 * high, top)
     while high - low > 1:
         middle = (low + high) // 2
@@ -143,27 +124,29 @@ def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
     """Fly the seeds with one value of the key until one fails."""
     from cloudrc.cli.run import load
 
-    settings, rtt_ms = [*options.set, f"{options.key}={value:g}"], None
+    settings = [*options.set, f"{options.key}={value:g}"]
     try:
         experiment = load(options.experiment, settings)
     except BadInputError as error:
         if first:  # the key is wrong, not its size
             raise
-        return Trial(value, False, "refused", str(error))
+        return {"value": value, "stable": False, "code": "refused", "text": str(error)}
+    trial: Trial = {"value": value, "stable": True}
     if options.key.startswith("link."):
         given = {text.partition("=")[0].strip() for text in options.set}
         settings += [text for text in _limits(experiment) if text.partition("=")[0] not in given]
         experiment = load(options.experiment, settings)
         if options.key.endswith("delay_ms"):
-            rtt_ms = experiment.uplink.delay_ms + experiment.downlink.delay_ms
-    trial = Trial(value, True, rtt_ms=rtt_ms, speed_max_mps=experiment.guard.speed_max_mps)
+            trial["rtt_ms"] = experiment.uplink.delay_ms + experiment.downlink.delay_ms
+    trial["speed_max_mps"] = experiment.guard.speed_max_mps
     jobs = [(options.experiment, settings, seed + 1) for seed in range(options.seeds)]
     # A worker takes as long to start as three flights of `steps`.
     with closing(map_in_order(fly_job, jobs, len(jobs) // 4)) as flights:
         for seed, flight in enumerate(flights, start=1):
             if flight.verdict != "success":
                 code = (*flight.failures, flight.verdict)[0]
-                return replace(trial, stable=False, code=code, text=flight.text, seed=seed)
+                failed = {"stable": False, "code": code, "text": flight.text, "seed": seed}
+                return trial | failed
     return trial
 
 
@@ -183,11 +166,12 @@ def _limits(experiment: ResolvedExperiment) -> list[str]:
 
 
 def _value(key: str, trial: Trial) -> str:
-    unit = " ms" if key.endswith("_ms") else ""
-    rtt = "" if trial.rtt_ms is None else f" (RTT {trial.rtt_ms:g} ms)"
-    return f"{trial.value:g}{unit}{rtt}"
+    rtt = f" (RTT {trial['rtt_ms']:g} ms)" if "rtt_ms" in trial else ""
+    return f"{trial['value']:g}{' ms' if key.endswith('_ms') else ''}{rtt}"
 
 
 def _result(trial: Trial) -> str:
-    where = "" if trial.seed is None else f", seed {trial.seed}"
-    return "stable" if trial.stable else f"{trial.code}{where}: {trial.text.partition(';')[0]}"
+    if trial["stable"]:
+        return "stable"
+    where = f", seed {trial['seed']}" if "seed" in trial else ""
+    return f"{trial['code']}{where}: {trial['text'].partition(';')[0]}"

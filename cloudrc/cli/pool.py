@@ -7,10 +7,9 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
-from itertools import islice
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -72,53 +71,28 @@ def _isolated_start() -> Iterator[None]:
 
 
 def map_in_order(
-    function: Callable[[Work], Result], work: Sequence[Work], jobs: int
+    function: Callable[[Work], Result], work: Sequence[Work], jobs: int, *, in_order: bool = True
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    At most `jobs` worker processes run, and at most one per core. Instead of a single worker, this
-    process makes all calls. The function has to be at module level: a worker imports the function.
-    Ctrl-C or closing the generator kills the workers and drops all calls that have not ended.
+    With `in_order` False, each result is yielded as soon as it is there. At most `jobs` worker
+    processes run, and at most one per core. Instead of a single worker, this process makes all
+    calls. The function has to be at module level: a worker imports the function. Ctrl-C or closing
+    the generator kills the workers and drops all calls that have not ended.
     """
     workers = min(jobs, len(work), usable_cores())
     if workers <= 1:
         yield from map(function, work)
         return
-    with _workers(workers) as pool:
-        with _isolated_start():  # submit() starts the workers
-            futures = [pool.submit(function, each) for each in work]
-        for future in futures:
-            yield future.result()
-
-
-def map_as_done(
-    function: Callable[[Work], Result], work: Sequence[Work], jobs: int
-) -> Generator[Result]:
-    """Call a function as `map_in_order` does, but yield each result as soon as it is there."""
-    workers = min(jobs, len(work), usable_cores())
-    if workers <= 1:
-        yield from map(function, work)
-        return
-    rest = iter(work)
-    with _workers(workers) as pool:
-        with _isolated_start():
-            waiting = {pool.submit(function, each) for each in islice(rest, 2 * workers)}
-        while waiting:
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            waiting |= {pool.submit(function, each) for each in islice(rest, len(done))}
-            for future in done:
-                yield future.result()
-
-
-@contextmanager
-def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Provide a pool of worker processes; kill them if the block raises an exception."""
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
     with _isolated_start():  # starts multiprocessing's resource tracker
-        pool = ProcessPoolExecutor(count, context, _end_with_parent)
+        pool = ProcessPoolExecutor(workers, context, _end_with_parent)
     try:
-        yield pool
+        with _isolated_start():  # submit() starts the workers
+            futures = [pool.submit(function, each) for each in work]
+        for future in futures if in_order else as_completed(futures):
+            yield future.result()
     except BrokenProcessPool as error:
         text = "a worker was killed, perhaps by the kernel because memory ran out"
         raise WorkerDiedError(f"{text}; use fewer processes") from error

@@ -6,13 +6,11 @@ import argparse
 import os
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Generator, Iterable
 from contextlib import closing
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any
-
-from rich.console import Console
+from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.cli.advice import advise
 from cloudrc.cli.extras import MODES, require
@@ -25,8 +23,8 @@ from cloudrc.cli.output import (
     print_or_drop,
     table,
 )
-from cloudrc.cli.parser import input_file, read_count
-from cloudrc.cli.pool import interrupt_on_signals, map_as_done, take_each
+from cloudrc.cli.parser import COUNT_MAX, input_file, read_count
+from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.cli.sweep_pods import cluster_arguments, print_rows, rows_from_pods
 from cloudrc.errors import BadInputError, InvalidRunError
 
@@ -43,21 +41,20 @@ ACTIONS = {
 }
 EPILOG = """\
 examples:
-  cloudrc sweep run my-sweep.yaml
-  cloudrc sweep run my-sweep.yaml --out runs/mine    again: fly what is missing
+  cloudrc sweep run grid.yaml
+  cloudrc sweep run grid.yaml --out runs/mine    again: fly what is missing
   cloudrc sweep status runs/latest-sweep
   cloudrc sweep fly runs/latest-sweep 73434426a8081810
   cloudrc sweep figure runs/latest-sweep --x link.both.delay_ms
-  cloudrc sweep run my-sweep.yaml --on kubernetes --shards 8 -n lab
+  cloudrc sweep run grid.yaml --on kubernetes --shards 8 -n lab
 
 docs/sweeps.md describes the file of a sweep and the shards of a cluster."""
-VERDICTS = ("success", "failure", "error")
 ARRAYS = {
     "SLURM_ARRAY_TASK_ID": ("SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"),
     "JOB_COMPLETION_INDEX": ("JOB_COMPLETIONS", ""),
 }
-"""Variable with the index of this process -> variables with the number of processes, and with the
-first index, which is 0 without a variable."""
+"""Variable with the index of a process -> variables with the number of processes and with the first
+index, which is 0 without a variable."""
 PLAIN_PERIOD = 30.0
 """Time between two lines of progress that is not shown on a terminal [s]."""
 
@@ -65,29 +62,28 @@ PLAIN_PERIOD = 30.0
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
-    parsers = {
-        name: actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+    run, status, fly, figure, rows = (
+        actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         for name, text in ACTIONS.items()
-    }
-    add = parsers["run"].add_argument
-    add("file", type=input_file, metavar="FILE", help="file of the sweep (.yaml)")
+    )
+    run.add_argument("file", type=input_file, metavar="FILE", help="file of the sweep (.yaml)")
     about = "folder of the sweep (default: a new one in runs/); if it has rows, fly the others"
-    add("--out", type=Path, metavar="DIR", help=about)
+    run.add_argument("--out", type=Path, metavar="DIR", help=about)
     about = "number of parallel processes (default: one per usable core)"
-    add("--jobs", type=read_count, default=10_000, metavar="N", help=about)
+    run.add_argument("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
     about = "fly the failed or all flights again with a recording, into DIR/KEY"
-    add("--record", choices=("failed", "all"), help=about)
+    run.add_argument("--record", choices=("failed", "all"), help=about)
     about = "fly only part I of N; 'auto' takes I and N from Slurm or Kubernetes"
-    add("--shard", type=_shard, metavar="I/N", help=about)
-    cluster_arguments(parsers["run"])
-    add = parsers["rows"].add_argument
-    add("file", type=input_file, metavar="FILE", help="file of flights, from the Job's ConfigMap")
-    add("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
-    for name in ("status", "fly", "figure"):
-        about = "folder of a sweep"
-        parsers[name].add_argument("folder", type=Path, metavar="DIR", help=about)
-    parsers["fly"].add_argument("key", metavar="KEY", help="key of the row, or its first digits")
-    add = parsers["figure"].add_argument
+    run.add_argument("--shard", type=_shard, metavar="I/N", help=about)
+    cluster_arguments(run)
+    rows.add_argument("file", type=input_file, metavar="FILE", help="file of flights, of a Job")
+    rows.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
+    for each in (status, fly, figure):
+        each.add_argument("folder", type=Path, metavar="DIR", help="folder of a sweep")
+    fly.add_argument("key", metavar="KEY", help="key of the row, or its first digits")
+    output_argument(run)
+    output_argument(status)
+    add = figure.add_argument
     about = "metric to draw; repeatable (default: three that matter first)"
     add("--number", action="append", default=[], metavar="NAME", help=about)
     about = "axis of the sweep along x (default: the first one with numbers)"
@@ -96,12 +92,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--by", metavar="AXIS", help=about)
     about = "path of the files, with or without a suffix (default: DIR/figure)"
     add("--out", type=Path, metavar="FILE", help=about)
-    for name in ("run", "status", "fly"):
-        output_argument(parsers[name])
 
 
 def _shard(text: str) -> tuple[int, int]:
-    """Parse I/N, auto or auto/N to the number of the shard, from 1 on, and that of all shards."""
+    """Parse I/N, auto or auto/N: number of the shard, from 1 on, and number of shards."""
     index, _, count = text.partition("/")
     first = "1"
     if index == "auto":
@@ -114,8 +108,7 @@ def _shard(text: str) -> tuple[int, int]:
             raise argparse.ArgumentTypeError(f"{of} is not set; give auto/N")
     valid = all(word.isdecimal() for word in (index, count, first))
     if not valid or not 0 <= int(index) - int(first) < int(count):
-        text = f"'{text}' is not I/N with I from 1 to N, auto, or auto/N"
-        raise argparse.ArgumentTypeError(text)
+        raise argparse.ArgumentTypeError(f"'{text}' is not I/N with I from 1 to N, or auto")
     return int(index) - int(first) + 1, int(count)
 
 
@@ -143,44 +136,49 @@ def run(options: argparse.Namespace) -> int:
     if options.shard and options.out is None:
         raise BadInputError("--shard needs --out, the folder that all shards share")
     plan, folder, (shard, count) = read_plan(options.file), options.out, options.shard or (None, 1)
-    _warn(plan)
-    if folder is None or not (folder / store.FILE).is_file():
+    for text in dict.fromkeys(text for point in plan.points for text in advise(point)):
+        print_line(f"cloudrc: warning: {text}", sys.stderr)
+    if options.shard:
+        folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
+    elif folder is None or not (folder / store.FILE).is_file():
         folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
     before = store.begin(folder, plan)
     mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
     jobs = [(each, options.record, folder) for each in mine if each.key not in before]
     part = f", shard {shard} of {count}" if shard else ""
     head = f"{len(plan.points)} points x {len(plan.seeds)} seeds{part}: {len(mine)} flights"
-    view = Progress(options, f"{plan.points[0].name}: {head}", len(mine), len(jobs))
+    stream = sys.stdout if options.output == "table" else sys.stderr
+    view = Progress(stream, f"{plan.points[0].name}: {head}", len(mine), len(jobs))
     with store.append_rows(folder, shard) as append, closing(view):
 
         def take(row: Row) -> None:
             append(row)
             view.see(row)
 
-        if options.on:
-            files = store.read_summary(folder)["files"]
-            rows = rows_from_pods(options, plan, [job[0] for job in jobs], [*files])
-        else:
-            rows = map_as_done(fly_job, jobs, options.jobs)
-        stopped, code = take_each(rows, take)
-    found = store.finish(folder, plan)
+        stopped, code = take_each(_rows(options, plan, jobs), take)
+    rows = store.finish(folder, plan)
     if stopped:
         flags = " --on kubernetes, and its other flags" if options.on else ""
         again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
         print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
-    if options.output != "table":
-        print_or_drop(format_document(store.read_summary(folder), options.output))
+    if options.output == "table":
+        name = store.TABLE if len(rows) == len(plan.flights) else store.SUMMARY
+        print_or_drop(f"\n{_verdicts(rows.values())}\n\n{escape(str(folder / name))}")
     else:
-        name = store.TABLE if len(found) == len(plan.flights) else store.SUMMARY
-        print_or_drop(f"\n{_verdicts(found)}\n\n{escape(str(folder / name))}")
-    return code or int(any(row["verdict"] != "success" for row in found.values()))
+        print_or_drop(format_document(store.read_summary(folder), options.output))
+    return code or int(any(rows[each.key]["verdict"] != "success" for each in mine))
 
 
-def _warn(plan: Plan) -> None:
-    """Print each warning about the points of a sweep once."""
-    for text in dict.fromkeys(text for point in plan.points for text in advise(point)):
-        print_line(f"cloudrc: warning: {text}", sys.stderr)
+def _rows(
+    options: argparse.Namespace, plan: Plan, jobs: list[tuple[Flight, str | None, Path]]
+) -> Generator[Row]:
+    """Fly here or in pods, and yield each row as soon as it is there."""
+    if options.on:
+        yield from rows_from_pods(options, plan, [flight for flight, _, _ in jobs])
+        return
+    for first in range(0, len(jobs), COUNT_MAX):
+        work = jobs[first : first + COUNT_MAX]
+        yield from map_in_order(fly_job, work, options.jobs, in_order=False)
 
 
 def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
@@ -211,22 +209,20 @@ def fly_again(options: argparse.Namespace) -> int:
 
     require("a report", MODES["virtual"])
     store.read_summary(options.folder)
-    plan, rows = read_plan(options.folder / store.FILE), store.read_rows(options.folder)
-    found = [key for key in rows if key.startswith(options.key)]
-    if len(found) != 1 or found[0] not in plan.flights:
-        text = "no single row has this key; the keys are in the rows"
+    rows = [row for key, row in store.read_rows(options.folder).items()
+            if key.startswith(options.key)]  # fmt: skip
+    if len(rows) != 1:
+        text = f"{len(rows)} rows have a key that begins like this; give one key"
         raise BadInputError(f"{options.folder}: {options.key}: {text}")
-    flight, folder = plan.flights[found[0]], options.folder / found[0]
-    report = _fly_into(folder, flight, page=True)
-    if options.output == "table":
-        print_or_drop(escape(f"{flight.point or 'the experiment'}, seed {flight.seed}"))
-        print_or_drop(summary(report, folder))
-    else:
-        print_or_drop(format_document(report, options.output))
-    if rows[flight.key]["records_sha256"] != report["records_sha256"]:
-        text = "a file of the sweep, a package or the processor has changed; fly the sweep again"
-        raise InvalidRunError(f"{flight.key}: this flight differs from that of the sweep: {text}")
-    print_or_drop("\nthe flight is that of the sweep: equal records", sys.stderr)
+    key, flights = rows[0]["key"], read_plan(options.folder / store.FILE).flights
+    changed = f"{key}: a plug-in, the processor or a package has changed since; fly the sweep again"
+    if key not in flights:
+        raise InvalidRunError(changed)
+    report = _fly_into(options.folder / key, flights[key], page=True)
+    print_or_drop(summary(report, options.folder / key))
+    if rows[0]["records_sha256"] != report["records_sha256"]:
+        raise InvalidRunError(changed)
+    print_or_drop("\nthe records are those of the sweep", sys.stderr)
     return 0
 
 
@@ -234,24 +230,22 @@ def print_status(options: argparse.Namespace) -> int:
     """Print how many flights of a sweep are done, and the success of each value of each axis."""
     from cloudrc.sweep import store
 
-    summary, rows = store.read_summary(options.folder), store.read_rows(options.folder)
-    values = []
+    summary = store.read_summary(options.folder)
+    rows, values = store.read_rows(options.folder).values(), []
     for axis, choices in summary["axes"].items():
         for value in choices:
-            found = [row["verdict"] for row in rows.values() if row["point"][axis] == value]
+            found = [row["verdict"] for row in rows if row["point"][axis] == value]
             counts = {"flights": len(found), "success": found.count("success")}
             values.append({"axis": axis, "value": value, **counts})
-    if options.output == "table":
-        print(f"{len(rows)} of {summary['flights']} flights are done: {_verdicts(rows)}")
-        cells = [("axis", "value", "success")]
-        for each in values:
-            share = f"{each['success']}/{each['flights']}"
-            cells.append((each["axis"], store.as_text(each["value"]), share))
-        print(f"\n{table(cells, right=(2,))}" if values else "", end="\n" * bool(values))
-    else:
-        counts = dict(Counter(row["verdict"] for row in rows.values()))
-        document = {"schemaVersion": 1, "flights": summary["flights"], "counts": counts}
+    if options.output != "table":
+        document = {"schemaVersion": 1, "flights": summary["flights"], "rows": len(rows)}
         print(format_document({**document, "axes": values}, options.output))
+        return 0
+    print(f"{len(rows)} of {summary['flights']} flights are done: {_verdicts(rows)}")
+    cells = [(each["axis"], store.as_text(each["value"]), f"{each['success']}/{each['flights']}")
+             for each in values]  # fmt: skip
+    if cells:
+        print(f"\n{table([('axis', 'value', 'success'), *cells], right=(2,))}")
     return 0
 
 
@@ -260,7 +254,7 @@ def draw_figure(options: argparse.Namespace) -> int:
     require("a figure", ("report",))
     from cloudrc.files import write_atomically
     from cloudrc.sweep.figure import draw_sweep
-    from cloudrc.sweep.rows import read_flights
+    from cloudrc.sweep.pairs import read_flights
 
     rows = read_flights(options.folder)
     files, caption = draw_sweep(rows, options.number, options.x, options.by)
@@ -274,46 +268,45 @@ def draw_figure(options: argparse.Namespace) -> int:
     return 0
 
 
-def _verdicts(rows: Mapping[str, Row]) -> str:
-    counts = Counter(row["verdict"] for row in rows.values())
-    return ", ".join(f"{counts[name]} {name}" for name in VERDICTS if counts[name]) or "none"
+def _verdicts(rows: Iterable[Row]) -> str:
+    counts = Counter(row["verdict"] for row in rows)
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items())[::-1]) or "none"
 
 
 class Progress:
     """Shows how many flights are done: in a line on a terminal, else in a line every 30 s."""
 
-    def __init__(self, options: argparse.Namespace, head: str, total: int, missing: int) -> None:
+    def __init__(self, stream: TextIO, head: str, total: int, missing: int) -> None:
         """Print `head`; set the number of flights, and of those that have no row yet."""
-        self._stream = sys.stdout if options.output == "table" else sys.stderr
-        self._total, self._missing, self._done, self._failed = total, missing, 0, 0
-        self._began = self._printed = monotonic()
-        self._told = set[str]()
-        done = total - missing
-        print_or_drop(escape(f"{head}, {done} done before" if done else head), self._stream)
-        self._status = Console(file=self._stream).status("") if is_live(self._stream) else None
-        if self._status:
+        self._stream, self._total, self._before = stream, total, total - missing
+        self._done, self._failed, self._began = 0, 0, monotonic()
+        self._printed, self._error = self._began, ""
+        done = f", {self._before} done before" if self._before else ""
+        print_or_drop(escape(head) + done, stream)
+        self._status = None
+        if is_live(stream):
+            from rich.console import Console
+
+            self._status = Console(file=stream).status("")
             self._status.start()
 
     def see(self, row: Row) -> None:
-        """Count a new row; print each kind of error once."""
+        """Count a new row; print the first error."""
         self._done += 1
         self._failed += row["verdict"] != "success"
-        if row.get("text", "") not in ("", *self._told):
-            self._told.add(row["text"])
-            print_or_drop(escape(f"{row['key']}: error: {row['text']}"), self._stream)
+        if "text" in row and not self._error:
+            self._error = f"{row['key']}: error: {row['text']}"
+            print_or_drop(escape(self._error), self._stream)
+        rate = self._done / max(monotonic() - self._began, 1e-3)
+        left = (self._total - self._before - self._done) / rate
+        time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
+        line = f"{self._before + self._done}/{self._total}  {rate:.1f} flights/s, {time} left"
+        line += f", {self._failed} failed" if self._failed else ""
         if self._status:
-            self._status.update(self._line())
+            self._status.update(line)
         elif monotonic() - self._printed >= PLAIN_PERIOD:
             self._printed = monotonic()
-            print_or_drop(self._line(), self._stream)
-
-    def _line(self) -> str:
-        rate = self._done / max(monotonic() - self._began, 1e-3)
-        left = (self._missing - self._done) / rate
-        done = self._total - self._missing + self._done
-        time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
-        failed = f", {self._failed} failed" if self._failed else ""
-        return f"{done}/{self._total}  {rate:.1f} flights/s, {time} left{failed}"
+            print_or_drop(line, self._stream)
 
     def close(self) -> None:
         """Erase the line on a terminal."""

@@ -36,9 +36,9 @@ def cluster_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def rows_from_pods(
-    options: argparse.Namespace, plan: Plan, flights: Sequence[Flight], files: Sequence[str]
+    options: argparse.Namespace, plan: Plan, flights: Sequence[Flight]
 ) -> Generator[Row]:
-    """Fly flights on a cluster and yield each row once; `files` are local files of the sweep.
+    """Fly flights of a plan on a cluster, and yield each row once.
 
     Raises:
         BadInputError: If the sweep needs local files, which the pods do not have.
@@ -47,10 +47,12 @@ def rows_from_pods(
     from cloudrc.cluster import batch
     from cloudrc.cluster.client import ClusterError
     from cloudrc.sweep.parcel import pack
+    from cloudrc.sweep.plan import local_files
 
-    if files:
-        text = "the pods do not have this file; build it into an image, or fly without --on"
-        raise BadInputError(f"{files[0]}: {text}")
+    for point in plan.points:
+        for file in local_files(point.model_dump(mode="json")):
+            text = "the pods do not have this file; build it into an image, or fly without --on"
+            raise BadInputError(f"{file}: {text}")
     if not flights:
         return
 

@@ -45,19 +45,12 @@ def usable_cores() -> int:
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
     with suppress(OSError, StopIteration):
         lines = CGROUP.read_text().splitlines()
-        group = next(line[3:].strip("/") for line in lines if line.startswith("0::"))
-        for folder in (CGROUPS / group, *(CGROUPS / group).parents):
-            if folder.is_relative_to(CGROUPS):
-                cores = min(cores, _quota(folder / "cpu.max"))
+        group = CGROUPS / next(line[3:].strip("/") for line in lines if line.startswith("0::"))
+        for folder in (group, *group.parents):
+            with suppress(OSError, ValueError):  # no file here, or "max": no limit
+                quota, period = (folder / "cpu.max").read_text().split()
+                cores = min(cores, max(1, ceil(int(quota) / int(period))))
     return cores
-
-
-def _quota(path: Path) -> int:
-    """Return the CPU limit of a control group in whole cores, rounded up."""
-    with suppress(OSError, ValueError):  # the root has no file; "max" means no limit
-        quota, period = path.read_text().split()
-        return max(1, ceil(int(quota) / int(period)))
-    return sys.maxsize
 
 
 def interpreter(*words: str) -> list[str]:

@@ -14,7 +14,6 @@ never decrease within world's rows or within cloud's rows, which can then be mer
 from __future__ import annotations
 
 import heapq
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import chain, repeat
 from operator import itemgetter
@@ -192,14 +191,6 @@ def _column(kind: Kind, values: Iterable[Any]) -> Column:
 class RecordStore(RecordHash):
     """Keep the records of a flight as columns, and hash them."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._blocks: defaultdict[type, list[Columns]] = defaultdict(list)
-
-    def take(self, kind: type, columns: Columns) -> None:
-        """Keep the columns of `BLOCK` records."""
-        self._blocks[kind].append(columns)
-
     def add(self, from_world: Iterable[Record], from_cloud: Iterable[Record]) -> None:
         """Add the new records of world and of cloud, each oldest first."""
         self.update(from_world)
@@ -207,7 +198,7 @@ class RecordStore(RecordHash):
 
     def recording(self) -> Recording:
         """Return a recording of the records so far, all on one clock."""
-        blocks = {kind: [*self._blocks[kind], self.rest(kind)] for kind in self.kinds}
+        blocks = self.blocks()
         return Recording(lambda topic: _table(topic, blocks.get(topic.source, [])))
 
 

@@ -30,44 +30,37 @@ _CODES = {int: "<i8", float: "<f8", bool: "?", str: "s"}
 
 
 class RecordHash:
-    """SHA-256 over records, no matter how many records each `update` gets."""
+    """Records as columns, and their SHA-256, no matter how many records each `update` gets."""
 
     def __init__(self) -> None:
         self._waiting: defaultdict[type, list[Record]] = defaultdict(list)
-        self._hashes: defaultdict[type, hashlib._Hash] = defaultdict(hashlib.sha256)
-        self._counts: defaultdict[type, int] = defaultdict(int)
+        self._blocks: defaultdict[type, list[Columns]] = defaultdict(list)
 
     def update(self, records: Iterable[Record]) -> None:
-        """Add records to the hash, oldest first."""
+        """Add records, oldest first."""
         waiting = self._waiting
         for record in records:
             waiting[type(record)].append(record)
         for kind, block in waiting.items():
             while len(block) >= BLOCK:
-                columns = to_columns(kind, block[:BLOCK])
+                self._blocks[kind].append(to_columns(kind, block[:BLOCK]))
                 del block[:BLOCK]
-                self._counts[kind] += BLOCK
-                _add(self._hashes[kind], columns)
-                self.take(kind, columns)
 
-    def take(self, kind: type, columns: Columns) -> None:
-        """Take the columns of `BLOCK` records; a subclass may keep them."""
-
-    @property
-    def kinds(self) -> list[type]:
-        """Types of the records so far, sorted by name."""
-        return sorted(self._waiting, key=lambda kind: kind.__name__)
-
-    def rest(self, kind: type) -> Columns:
-        """Return the columns of the last records, which are fewer than `BLOCK`."""
-        return to_columns(kind, self._waiting[kind])
+    def blocks(self) -> dict[type, list[Columns]]:
+        """Return the columns of each block; the last block may be empty."""
+        kinds = sorted(self._waiting, key=lambda kind: kind.__name__)
+        return {kind: [*self._blocks[kind], to_columns(kind, self._waiting[kind])]
+                for kind in kinds}  # fmt: skip
 
     def hexdigest(self) -> str:
         """Return the hash of all records so far, as 64 hexadecimal digits."""
         total = hashlib.sha256()
-        for kind in self.kinds:
-            digest, count = self._hashes[kind].copy(), self._counts[kind] + len(self._waiting[kind])
-            _add(digest, self.rest(kind))
+        for kind, blocks in self.blocks().items():
+            digest = hashlib.sha256()
+            for column in chain.from_iterable(block.values() for block in blocks):
+                is_text = isinstance(column, tuple)
+                digest.update(b"".join(map(_packed_string, column)) if is_text else column.data)
+            count = sum(len(block["stamp_ns"]) for block in blocks)
             total.update(b"%s %d %s\n" % (kind.__name__.encode(), count, digest.digest()))
         return total.hexdigest()
 
@@ -108,14 +101,6 @@ def _fields(cls: type) -> _Fields:
         else:
             found.append((name, "<i8" if issubclass(kind, IntEnum) else _CODES[kind], 0))
     return tuple(found)
-
-
-def _add(digest: hashlib._Hash, columns: Columns) -> None:
-    for column in columns.values():
-        if isinstance(column, tuple):
-            digest.update(b"".join(map(_packed_string, column)))
-        else:
-            digest.update(column.data)
 
 
 def _packed_string(text: str) -> bytes:

@@ -12,7 +12,7 @@ from cloudrc.plugins import unknown_name_text
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.sweep.compare import NUMBERS, scale
 from cloudrc.sweep.flight import Outcome
-from cloudrc.sweep.rows import Row
+from cloudrc.sweep.pairs import Row
 from cloudrc.sweep.statistics import median_interval, wilson_interval
 
 SHOWN = 3

@@ -1,18 +1,18 @@
-"""Find pairs of finished flights: in the rows of a sweep, or in two folders of runs."""
+"""Read finished flights, of a sweep or of two folders of runs, and pair them."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cloudrc.config.document import read_document
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import Number
+from cloudrc.sweep import store
 from cloudrc.sweep.compare import Pair
 from cloudrc.sweep.flight import Outcome
-from cloudrc.sweep.rows import read_flights
 
 IGNORED = ("seed", "name", "description", "report")
 """Keys of an experiment that do not affect the flight, and the seed."""
@@ -21,6 +21,33 @@ OF_LINK = (
     *("cloud.horizon_max_s", "cloud.freeze_after_s"),
 )
 """Keys whose defaults depend on the link profile."""
+
+
+class Row(NamedTuple):
+    """A flight of a sweep."""
+
+    point: dict[str, Any]  # axis -> value, name, or a list as text
+    seed: int
+    outcome: Outcome
+
+
+def read_flights(folder: Path) -> list[Row]:
+    """Read the rows of a sweep in the order of its grid; raise a BadInputError if it has none."""
+    summary, found = store.read_summary(folder), list[Row]()
+    axes, units = summary["axes"], summary["units"]
+
+    def place(row: store.Row) -> list[int]:
+        return [*(axes[axis].index(value) for axis, value in row["point"].items()), row["seed"]]
+
+    for row in sorted(store.read_rows(folder).values(), key=place):
+        point = {axis: value if type(value) in (str, int, float) else json.dumps(value)
+                 for axis, value in row["point"].items()}  # fmt: skip
+        numbers = {name: Number(value, units[name], "") for name, value in row["numbers"].items()}
+        text = row.get("text", "")
+        found.append(Row(point, row["seed"], Outcome(row["verdict"], (), numbers, text=text)))
+    if not found:
+        raise BadInputError(f"{folder}: has no rows; run the sweep again with this --out")
+    return found
 
 
 def of_sweep(folder: Path, a: str, b: str) -> tuple[list[Pair], str]:

@@ -1,17 +1,7 @@
 """Read the file of a sweep: a grid of settings of an experiment, flown with several seeds.
 
-    experiment: steps                    # name, or path of a file
-    set: {link.profile: paper-p3}        # settings of all points
-    grid:
-      cloud.predictor: [constant_velocity, constant_acceleration]
-      link.both.delay_ms: [0, 20, 40]    # an axis: a key and its values
-      tuning:                            # an axis of named settings
-        slow: {cloud.controller.gain_p: [1, 1, 1]}
-        fast: {cloud.controller.gain_p: [2, 2, 2]}
-    seeds: 20                            # 1 to 20, or a list
-
-A point has one value of each axis. Every point is loaded and checked before the first flight.
-Relative paths start at the folder of the file, or at `folder` if the file gives it.
+docs/sweeps.md describes the file. A *point* has one value of each axis. Every point is loaded and
+checked before the first flight.
 """
 
 from __future__ import annotations
@@ -26,7 +16,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import Field
 
-from cloudrc import metrics
+from cloudrc import __version__, metrics
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, validate
@@ -59,7 +49,7 @@ class SweepFile(Section):
 class Flight(NamedTuple):
     """One point with one seed."""
 
-    key: str  # hash of the resolved experiment with the seed, 16 hexadecimal digits
+    key: str  # 16 hexadecimal digits; equal keys mean equal flights
     point: dict[str, Any]  # axis -> value or name
     seed: int
     resolved: ResolvedExperiment  # of the point: with another seed
@@ -102,9 +92,9 @@ def read_plan(path: Path) -> Plan:
     for choices in product(*axes.values()):
         point = {axis: label for axis, (label, _) in zip(axes, choices, strict=True)}
         points.append(_resolve(experiment, chain(common, *(entries for _, entries in choices))))
-        values = points[-1].model_dump(mode="json")
+        everything = _everything(points[-1])
         for seed in seeds:
-            key = _key(values, seed)
+            key = _key(everything, seed)
             if key in flights:
                 raise BadInputError(f"{name}: {point} is the same as {flights[key].point}")
             flights[key] = Flight(key, point, seed, points[-1])
@@ -114,11 +104,16 @@ def read_plan(path: Path) -> Plan:
 
 def flight_key(point: ResolvedExperiment, seed: int) -> str:
     """Return the key of the flight of a resolved point with a seed."""
-    return _key(point.model_dump(mode="json"), seed)
+    return _key(_everything(point), seed)
 
 
-def _key(values: Mapping[str, Any], seed: int) -> str:
-    text = json.dumps({**values, "seed": seed}, sort_keys=True)
+def _everything(point: ResolvedExperiment) -> dict[str, Any]:
+    values = point.model_dump(mode="json")
+    return {**values, "cloudrc": __version__, "files": local_files(values)}
+
+
+def _key(everything: Mapping[str, Any], seed: int) -> str:
+    text = json.dumps({**everything, "seed": seed}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -166,3 +161,13 @@ def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
     resolved = load_experiment(experiment, settings)
     metrics.check(resolved.report.metrics)
     return resolved
+
+
+def local_files(value: Any) -> dict[str, str]:
+    """Return the files that a resolved experiment names, such as plug-ins: path -> SHA-256."""
+    if isinstance(value, str):
+        is_file = value.startswith("/") and Path(value).is_file()
+        return {value: hashlib.sha256(Path(value).read_bytes()).hexdigest()} if is_file else {}
+    inner = value.values() if isinstance(value, dict) else value
+    parts = [local_files(each) for each in inner] if isinstance(value, dict | list) else []
+    return {name: digest for part in parts for name, digest in part.items()}

@@ -1,19 +1,12 @@
 """Keep a sweep in a folder: one line of JSON per flight, and tables of all flights.
 
-| file | content |
-|---|---|
-| `sweep.yaml` | the file of the sweep; flying it again with this folder continues the sweep |
-| `sweep.json` | axes, seeds, counts of verdicts, units of the numbers |
-| `rows.jsonl`, `rows-I.jsonl` | one row per flight, in the order of their ends; I is the shard |
-| `table.csv`, `table.parquet` | all rows, in the order of the grid, once all flights are done |
-
-A row has no times of the machine: equal flights give equal rows.
+docs/sweeps.md describes the files. A row has no times of the machine: equal flights give equal
+rows.
 """
 
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import json
 from collections import Counter
@@ -89,38 +82,27 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
     """Write the description of a sweep into its folder, and return the rows that it has.
 
     Raises:
-        BadInputError: If the folder has rows of another sweep, of another version of cloudrc, or
-            of files that have changed since.
+        BadInputError: If the folder has rows that are not of this sweep.
     """
-    rows, new = read_rows(folder), _summary(plan)
-    if rows:
-        old, points = read_summary(folder), {key: each.point for key, each in plan.flights.items()}
-        changed = [path for path, digest in old["files"].items()
-                   if new["files"].get(path, digest) != digest]  # fmt: skip
-        why = f"of an older {changed[0]}" if changed else ""
-        if any(points.get(key) != row["point"] for key, row in rows.items()):
-            why = "of another grid, other seeds or another experiment"
-        elif old["cloudrc"] != __version__:
-            why = f"of cloudrc {old['cloudrc']}; this is {__version__}"
-        if why:
-            raise BadInputError(f"--out {folder}: has rows {why}; name a new folder")
+    rows, points = read_rows(folder), {key: each.point for key, each in plan.flights.items()}
+    if any(points.get(key) != row["point"] for key, row in rows.items()):
+        text = "rows of another grid, of other seeds, of changed plug-ins or another version"
+        raise BadInputError(f"--out {folder}: has {text}; name a new folder")
     write_atomically(folder / FILE, write_yaml(plan.file).encode())
-    _write_summary(folder, new, rows)
+    _write_summary(folder, plan, rows)
     return rows
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
     """Count the rows; once all flights are done, write their tables. Return the rows."""
-    rows, summary = read_rows(folder), _summary(plan)
-    _write_summary(folder, summary, rows)
+    rows = read_rows(folder)
+    units = _write_summary(folder, plan, rows)
     if len(rows) == len(plan.flights):
         columns = _columns([rows[key] for key in plan.flights], plan)
-        heads = [f"{name} [{summary['units'][name]}]" if name in summary["units"] else name
-                 for name in columns]  # fmt: skip
+        head = [f"{name} [{units[name]}]" if name in units else name for name in columns]
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows(
-            [heads, *zip(*columns.values(), strict=True)]
-        )
+        cells = [head, *zip(*columns.values(), strict=True)]
+        csv.writer(text, lineterminator="\n").writerows(cells)
         write_atomically(folder / TABLE, text.getvalue().encode())
         if find_spec("pyarrow"):
             parquet, tables = import_module("pyarrow.parquet"), import_module("pyarrow")
@@ -150,17 +132,19 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """Read the description of a sweep; raise a BadInputError if `folder` is not that of a sweep."""
     try:
         summary: dict[str, Any] = json.loads((folder / SUMMARY).read_bytes())
-        if summary.keys() >= {"axes", "files", "flights"}:
+        if {"axes", "flights"} <= summary.keys():
             return summary
     except (OSError, ValueError, AttributeError):
         pass
-    raise BadInputError(f"{folder}: is not the folder of a sweep; name one: runs/latest-sweep")
+    raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
 
 
-def _summary(plan: Plan) -> dict[str, Any]:
+def _write_summary(folder: Path, plan: Plan, rows: Mapping[str, Row]) -> dict[str, str]:
+    """Write the description of a sweep; return the units of all metrics."""
     own = {choice for point in plan.points for choice in point.report.metrics}
     found = [metrics.find(name) for name in (*metrics.SHIPPED, *plugins.names("metrics"), *own)]
-    return {
+    units = {metric.name: metric.unit for metric in found}
+    summary = {
         "schemaVersion": 1,
         "experiment": plan.points[0].name,
         "cloudrc": __version__,
@@ -168,22 +152,8 @@ def _summary(plan: Plan) -> dict[str, Any]:
         "axes": plan.axes,
         "seeds": plan.seeds,
         "flights": len(plan.flights),
-        "units": {metric.name: metric.unit for metric in found},
-        "files": _files([point.model_dump(mode="json") for point in plan.points]),
+        "counts": dict(sorted(Counter(row["verdict"] for row in rows.values()).items())),
+        "units": units,
     }
-
-
-def _files(value: Any) -> dict[str, str]:
-    """Return the files that a resolved experiment names, such as plug-ins: path -> SHA-256."""
-    if isinstance(value, str):
-        is_file = value.startswith("/") and Path(value).is_file()
-        return {value: hashlib.sha256(Path(value).read_bytes()).hexdigest()} if is_file else {}
-    inner = value.values() if isinstance(value, dict) else value
-    parts = [_files(each) for each in inner] if isinstance(value, dict | list) else []
-    return {name: digest for part in parts for name, digest in part.items()}
-
-
-def _write_summary(folder: Path, summary: Mapping[str, Any], rows: Mapping[str, Row]) -> None:
-    counts = dict(sorted(Counter(row["verdict"] for row in rows.values()).items()))
-    text = json.dumps({**summary, "counts": counts}, indent=2)
-    write_atomically(folder / SUMMARY, f"{text}\n".encode())
+    write_atomically(folder / SUMMARY, f"{json.dumps(summary, indent=2)}\n".encode())
+    return units

@@ -92,3 +92,12 @@ def test_ctrl_c_compares_the_finished_pairs(monkeypatch, capsys):
 
     fly_with(monkeypatch, measure)
     assert sentence(capsys, "--seeds", "9", "-o", "json")[0] == 130
+
+
+@pytest.mark.full
+def test_ten_pairs_decide_between_two_predictors(capsys, figure):
+    sides = "cloud.predictor=constant_velocity", "cloud.predictor=constant_acceleration"
+    assert main(["compare", *sides, "--set=link.profile=paper-p3", "-o", "json"]) == 0
+    found = json.loads(capsys.readouterr().out)["numbers"]["prediction_error_rms"]
+    figure("p of 10 pairs", found["p_wilcoxon"], "<=", 0.01)
+    figure("pairs in which eq. (3) predicts worse", found["lower"], "==", 10)

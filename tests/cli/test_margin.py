@@ -32,7 +32,7 @@ def margin(capsys, *arguments):
 @pytest.mark.parametrize("limit", [0, 1, 6, 7, 63, 64, 99])
 def test_the_search_finds_each_border(start, limit):
     assert largest_stable(lambda step: step <= limit, start, 100) == (limit, limit + 1)
-    assert largest_stable(lambda step: True, start, 100) == (100, None)
+    assert largest_stable(lambda step: True, start, 100) == (100, 0)
 
 
 def test_the_border_is_a_multiple_of_the_resolution(monkeypatch, capsys):
@@ -85,8 +85,9 @@ def test_a_value_that_the_schema_refuses_is_a_border(monkeypatch, capsys):
     [
         (["link.uplink.delay"], "unknown key; did you mean delay_ms"),
         (["link.profile"], "is no number; name a key such as"),
-        ([KEY, "--max", "5"], "--max 5: is below --resolution 10"),
-        ([KEY, "--resolution", "-1"], "'-1' is not a number above 0"),
+        ([KEY, "--max", "5"], "--resolution 10 must be above 0, --max 5 not below it"),
+        ([KEY, "--resolution", "-1"], "--resolution -1 must be above 0"),
+        ([KEY, "--max", "nan"], "--max nan"),
     ],
 )
 def test_a_search_that_cannot_begin_is_refused(arguments, text, capsys):

@@ -9,8 +9,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.metrics import Number
 from cloudrc.sweep.figure import draw_sweep
 from cloudrc.sweep.flight import Outcome
-from cloudrc.sweep.pairs import of_sweep
-from cloudrc.sweep.rows import Row, read_flights
+from cloudrc.sweep.pairs import Row, of_sweep, read_flights
 
 AXES = {"delay_ms": [20, 5, 10], "predictor": ["none", "kalman"], "gain": [[1, 2], [3, 4]]}
 
