@@ -27,6 +27,8 @@ from cloudrc.errors import BadInputError
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
+COLUMNS = ("key", "seed", "verdict", "failures")
+"""Columns of the table besides the axes and the numbers."""
 _Entry: TypeAlias = tuple[str, Any, Source]
 """A key, its value, and where both are from."""
 
@@ -150,6 +152,8 @@ def _entries(
         if not choices:
             text = "must be a list of values, or names, each with a mapping of keys to values"
             found.append(Problem(above, "", text))
+        if axis in {*COLUMNS, *metrics.SHIPPED}:
+            found.append(Problem(above, "", "is the name of another column; rename the axis"))
     return [entry(key, value, "set", key) for key, value in file.set.items()], axes
 
 
