@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cloudrc.cloud.compute import ComputeTime
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from cloudrc.world.endpoint import WorldEndpoint
 
 MS_TO_NS = 1_000_000
+SECOND_NS = 1_000_000_000
 CRUISE_SPEED = 1.0
 """Expected speed between two waypoints, if the guard allows this speed [m/s]."""
 SETTLE_TIME = 4.0
@@ -57,8 +59,9 @@ def build_world(
     from cloudrc.world.guard.limits import Limits
     from cloudrc.world.guard.state import Guard
     from cloudrc.world.low_level import LowLevel
+    from cloudrc.world.plant import Plant, Wind
     from cloudrc.world.robot import Robot
-    from cloudrc.world.sensors import Sensors
+    from cloudrc.world.sensors import Errors, Sensors
     from cloudrc.world.simulator import Simulator
 
     world, guard = experiment.world, experiment.guard
@@ -71,17 +74,35 @@ def build_world(
         yaw_rate_max=guard.yaw_rate_max_radps,
         hold_max_ns=round(guard.hold_max_s * 1e9),
     )
-    robot = Robot(
-        Simulator(world.robot, world.scene), LowLevel(**world.low_level.model_dump()), Guard(limits)
+    plant, air, seen = world.plant, world.wind, world.sensors
+    true = Plant(
+        plant.mass_factor,
+        plant.inertia_factor,
+        plant.payload_kg,
+        plant.payload_offset_m,
+        plant.thrust_factor,
     )
-    noise = np.random.Generator(np.random.PCG64([experiment.seed, _stream("odometry noise")]))
-    sensors = Sensors(world.sensors.position_noise_m, world.sensors.velocity_noise_mps, noise)
+    wind = None
+    if any(air.velocity_mps) or air.gust_mps:
+        wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(experiment, "wind"))
+    simulator = Simulator(world.robot, world.scene, true, wind)
+    robot = Robot(simulator, LowLevel(**world.low_level.model_dump()), Guard(limits))
+    roll, pitch, yaw = map(radians, seen.attitude_bias_deg)
+    sensors = Sensors(
+        seen.position_noise_m,
+        seen.velocity_noise_mps,
+        _generator(experiment, "odometry noise"),
+        attitude=Errors(radians(seen.attitude_noise_deg), (roll, pitch, yaw)),
+        rate=Errors(seen.rate_noise_radps, seen.rate_bias_radps),
+        turn_rng=_generator(experiment, "attitude noise"),
+    )
     return WorldEndpoint(
         robot,
         sensors,
         identity,
         newest_wins=experiment.tunnel.order == "newest",
         command_age_max_ns=limits.command_age_max_ns,
+        odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
         start_ns=clock(),
     )
 
@@ -92,6 +113,7 @@ def build_cloud(
     clock: Callable[[], int] = lambda: 0,
     teleop: Operator | None = None,
     *,
+    cpu_clock: Callable[[], int] | None = None,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
 ) -> CloudEndpoint:
     """Build cloud: plug-ins, teleoperation, and cloud's end of the tunnel.
@@ -101,6 +123,8 @@ def build_cloud(
         identity: Identity of cloud's clock and process in the tunnel, with the keys.
         clock: Cloud's monotonic clock [ns].
         teleop: Source of setpoints. None: a new `Teleop`, which flies the mission at once.
+        cpu_clock: Clock of the processor time of this thread [ns], for `cloud.compute_measured`.
+            None in real time, where the computation takes its time anyway.
         make_loop: Makes the control loop from the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud
@@ -110,13 +134,22 @@ def build_cloud(
         build_plugin("controllers", cloud.controller),
         horizon_max=cloud.horizon_max_s,
         freeze_after=cloud.freeze_after_s,
+        period_ns=round(SECOND_NS / cloud.command_rate_hz),
     )
+    cpu_clock = cpu_clock if cloud.compute_measured else None
+    compute = None
+    if cloud.compute_ms or cpu_clock:
+        rng = _generator(experiment, "compute time")
+        times = cloud.compute_ms * MS_TO_NS, cloud.compute_deviation_ms * MS_TO_NS
+        compute = ComputeTime(*times, rng, cpu_clock)
     start_ns = clock()
     if teleop is None:
         teleop = Teleop()
         teleop.start(start_ns, build_plan(experiment), ONLY_MISSION)
     newest_wins = experiment.tunnel.order == "newest"
-    return CloudEndpoint(loop, teleop, identity, newest_wins=newest_wins, start_ns=start_ns)
+    return CloudEndpoint(
+        loop, teleop, identity, newest_wins=newest_wins, compute=compute, start_ns=start_ns
+    )
 
 
 def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:
@@ -215,6 +248,11 @@ def _loss(loss: float | schema.GilbertElliott) -> Loss:
 
 def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else value * factor
+
+
+def _generator(experiment: ResolvedExperiment, stream: str) -> np.random.Generator:
+    """Make the generator of an experiment's random numbers for one purpose."""
+    return np.random.Generator(np.random.PCG64([experiment.seed, _stream(stream)]))
 
 
 def _stream(name: str) -> int:

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import itertools
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -36,7 +37,7 @@ from cloudrc.errors import (
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import CloudEndpoint
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.drivers.virtual import Clock, VirtualRun
     from cloudrc.record.columns import Recording
     from cloudrc.records import Record
     from cloudrc.report.document import Run
@@ -49,8 +50,9 @@ See = Callable[["list[Record]"], None]
 
 GRACE = 30.0
 """If the mission goes on for this time after its time limit [s], this program stops the flight."""
-CLOCK = bytes(16)
-"""Identity of the virtual clock, which world and cloud share."""
+CLOCK, CLOUD_CLOCK = bytes(16), b"cloud".ljust(16)
+"""Identity of the virtual clock, and of cloud's clock if it is another one."""
+MEASURED = "Not repeatable: cloud.compute_measured uses the processor time of this machine."
 EPILOG = """\
 modes:
   local    real time: four processes, UDP on 127.0.0.1
@@ -116,6 +118,11 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     from cloudrc.metrics.verdict import exit_code
 
     experiment = load(options.experiment, options.set, options.seed)
+    if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
+        raise BadInputError(
+            "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
+            "the machine's clock counts; use --mode virtual, or leave them out"
+        )
     warn(experiment)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
@@ -264,15 +271,28 @@ def fly(
         raise CloudrcError(f"{where}: {error.strerror or error}; choose another folder") from error
 
 
+def cloud_clock(experiment: ResolvedExperiment) -> Clock:
+    """Return cloud's clock in virtual time; world's clock is virtual time itself."""
+    from cloudrc.drivers.virtual import Clock
+
+    cloud = experiment.cloud
+    return Clock(round(cloud.clock_offset_s * 1e9), cloud.clock_drift_ppm)
+
+
 def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
     """Build world and cloud, and connect them for a flight in virtual time; do not fly yet."""
     from cloudrc import assembly
-    from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.drivers.virtual import Clock, VirtualRun
     from cloudrc.tunnel.end import Identity
 
+    own = cloud_clock(experiment)
+    identity = Identity(CLOCK if own == Clock() else CLOUD_CLOCK, b"cloud".ljust(16))
     world = assembly.build_world(experiment, Identity(CLOCK, b"world".ljust(16)))
-    cloud = assembly.build_cloud(experiment, Identity(CLOCK, b"cloud".ljust(16)))
-    return world, cloud, VirtualRun(world, cloud, *assembly.build_links(experiment))
+    cloud = assembly.build_cloud(
+        experiment, identity, lambda: own.at(0), cpu_clock=time.thread_time_ns
+    )
+    links = assembly.build_links(experiment)
+    return world, cloud, VirtualRun(world, cloud, *links, cloud_clock=own)
 
 
 @contextlib.contextmanager
@@ -284,6 +304,7 @@ def _record_virtual(
     Use as a context manager, in whose block the caller writes the report. When the block ends, this
     function attaches the report to the file of the recording.
     """
+    from cloudrc.drivers.virtual import Clock
     from cloudrc.record.columns import Recording, merged
     from cloudrc.record.hash import RecordHash
     from cloudrc.record.writer import McapWriter
@@ -291,11 +312,14 @@ def _record_virtual(
     from cloudrc.report.write import attachments
 
     records: tuple[list[Record], list[Record]] = ([], [])
-    digest, interrupted = RecordHash(), False
+    digest, interrupted, clock = RecordHash(), False, cloud_clock(experiment)
+    is_other = clock != Clock()
     # Record during the flight, so that the recording is kept if the run or its report fails.
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+            if is_other:
+                from_cloud = [row._replace(stamp_ns=clock.when(row.stamp_ns)) for row in from_cloud]
             for log_time_ns, row in merged(from_world, from_cloud):
                 writer.write_row(row, log_time_ns)
             records[0].extend(from_world)
@@ -311,7 +335,8 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
+            notes = (MEASURED,) if experiment.cloud.compute_measured else ()
+            run = Run("virtual", "virtual", digest.hexdigest(), interrupted, notes)
             yield Recording.from_records(*records), run
         finally:
             for name, data in attachments(folder).items():
