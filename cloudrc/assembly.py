@@ -59,7 +59,7 @@ def build_world(
     from cloudrc.world.guard.limits import Limits
     from cloudrc.world.guard.state import Guard
     from cloudrc.world.low_level import LowLevel
-    from cloudrc.world.plant import Plant, Wind
+    from cloudrc.world.plant import Wind
     from cloudrc.world.robot import Robot
     from cloudrc.world.sensors import Errors, Sensors
     from cloudrc.world.simulator import Simulator
@@ -74,18 +74,10 @@ def build_world(
         yaw_rate_max=guard.yaw_rate_max_radps,
         hold_max_ns=round(guard.hold_max_s * 1e9),
     )
-    plant, air, seen = world.plant, world.wind, world.sensors
-    true = Plant(
-        plant.mass_factor,
-        plant.inertia_factor,
-        plant.payload_kg,
-        plant.payload_offset_m,
-        plant.thrust_factor,
-    )
-    wind = None
+    air, seen, wind = world.wind, world.sensors, None
     if any(air.velocity_mps) or air.gust_mps:
         wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(experiment, "wind"))
-    simulator = Simulator(world.robot, world.scene, true, wind)
+    simulator = Simulator(world.robot, world.scene, world.plant, wind)
     robot = Robot(simulator, LowLevel(**world.low_level.model_dump()), Guard(limits))
     roll, pitch, yaw = map(radians, seen.attitude_bias_deg)
     sensors = Sensors(

@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 DURATION_NS = 20_000_000_000
 """Length of the simulation [ns]."""
 SAG_MAX = 0.1
-"""Largest error of the height that needs no warning [m]."""
+"""Largest steady error of the position that needs no warning [m]."""
+WIND_FORCE = 0.24
+"""Force against which a hovering robot has to fly, per wind speed [N s/m]: two thirds are the drag
+of the rotors, one third comes from the tilt by which this drag turns the robot."""
 
 
 def warn(experiment: ResolvedExperiment) -> None:
@@ -32,7 +35,7 @@ def warn(experiment: ResolvedExperiment) -> None:
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Describe the settings of an experiment that do not fit together."""
-    yield from _weight(experiment)
+    yield from _hover(experiment)
     ages, echoes = _simulate(experiment)
     if ages:
         yield from _long_link(experiment, ages, echoes)
@@ -81,32 +84,33 @@ def _simulate(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]
             period, early_ns = divmod(now_ns, periods_ns[way])
             if early_ns == 0:
                 datagram = now_ns, -1 if last is None else last[0]
-                for at_ns in links[way].send(
-                    1, kind, period, SIZES[kind], now_ns + way * compute_ns
-                ):
+                leaves_ns = now_ns + way * compute_ns
+                for at_ns in links[way].send(1, kind, period, SIZES[kind], leaves_ns):
                     heappush(pending, (at_ns, way, datagram))
     return ages, echoes
 
 
-def _weight(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Compare the thrust that a hover lacks with the largest integral of the velocity loop."""
+def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Compare the force that a hover lacks with the largest integral of the velocity loop."""
     from cloudrc.config.schema import GRAVITY_MPS2, MASS_KG
     from cloudrc.world.low_level import GRAVITY, MASS
 
-    plant, loop = experiment.world.plant, experiment.world.low_level
+    plant, loop, wind = experiment.world.plant, experiment.world.low_level, experiment.world.wind
     weight = (MASS_KG * plant.mass_factor + plant.payload_kg) * GRAVITY_MPS2
-    lacks = abs(weight * 4 / sum(plant.thrust_factor) - MASS * GRAVITY)
+    heavy = abs(weight * 4 / sum(plant.thrust_factor) - MASS * GRAVITY)
+    drag = WIND_FORCE * max(map(abs, wind.velocity_mps))
     controller = experiment.cloud.controller
-    values: dict[str, Any] = controller.model_extra or {}
-    gain = loop.gain_p[2] * values["gain_p"][2] if controller.name == "pid" else 0.0
-    rest = lacks - loop.gain_i[2] * loop.integral_limit_z
-    if rest > SAG_MAX * gain > 0.0 and loop.gain_i[2]:
-        fits = _round_up(lacks / loop.gain_i[2], 0.1)
-        yield (
-            f"the onboard controller does not know world.plant, so the robot hovers "
-            f"{rest / gain:.2f} m from the height of its setpoint; a value that fits: "
-            f"--set world.low_level.integral_limit_z={fits:g}"
-        )
+    gains = (controller.model_extra or {})["gain_p"] if controller.name == "pid" else (0.0, 0, 0.0)
+    for name, axis, force in (("wind", 0, drag), ("plant", 2, heavy)):
+        key = "integral_limit_z" if axis else "integral_limit_xy"
+        gain, gain_i = loop.gain_p[axis] * gains[axis], loop.gain_i[axis]
+        rest = force - gain_i * getattr(loop, key)
+        if rest > SAG_MAX * gain > 0.0 and gain_i:
+            yield (
+                f"the onboard controller does not know world.{name}, so the robot hovers about "
+                f"{rest / gain:.2f} m from its setpoint; a value that fits: "
+                f"--set world.low_level.{key}={_round_up(force / gain_i, 0.1):g}"
+            )
 
 
 def _long_link(

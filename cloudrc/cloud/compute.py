@@ -8,9 +8,9 @@ import numpy as np
 
 
 class ComputeTime:
-    """Say how long each command is computed; the time is given, drawn or measured.
+    """Say how long a command is computed: a constant, a random or a measured time.
 
-    A drawn time has a gamma distribution, because it is never negative and sometimes long.
+    A random time has a gamma distribution, because it is never negative and sometimes long.
     """
 
     def __init__(
@@ -20,10 +20,9 @@ class ComputeTime:
         rng: np.random.Generator,
         cpu_clock: Callable[[], int] | None = None,
     ) -> None:
-        """Set mean and standard deviation [ns]; the deviation is 0 if the mean is 0.
+        """Set the mean `mean_ns` [ns] and the standard deviation `deviation_ns` [ns].
 
-        If `cpu_clock` is given, the processor time on this clock [ns] between `begin` and `end` is
-        added.
+        If `cpu_clock` is given, its time [ns] between `begin` and `end` is added.
         """
         self._mean_ns, self._deviation_ns, self._rng = mean_ns, deviation_ns, rng
         self._cpu_clock, self._began_ns = cpu_clock, 0
@@ -35,10 +34,10 @@ class ComputeTime:
 
     def end(self) -> int:
         """Return how long the computation since `begin` takes [ns]."""
-        time_ns, mean_ns, deviation_ns = self._mean_ns, self._mean_ns, self._deviation_ns
-        if deviation_ns:
-            shape = (mean_ns / deviation_ns) ** 2
-            time_ns = self._rng.gamma(shape, mean_ns / shape)
+        time_ns = self._mean_ns
+        if self._deviation_ns:
+            shape = (self._mean_ns / self._deviation_ns) ** 2
+            time_ns = self._rng.gamma(shape, self._mean_ns / shape)
         if self._cpu_clock is not None:
             time_ns += self._cpu_clock() - self._began_ns
         return round(time_ns)

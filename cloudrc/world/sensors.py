@@ -14,16 +14,16 @@ from cloudrc.world.scene import mujoco
 
 
 class Errors(NamedTuple):
-    """Errors of a vector: a constant `bias`, and white Gaussian noise, independent per axis.
+    """Errors of a vector in any unit: white Gaussian noise and a constant bias, shape (3,).
 
-    `bias`, shape (3,), and the standard deviation `noise` have the unit of the vector.
+    `noise` is the standard deviation per axis; `bias` and `noise` have the unit of the vector.
     """
 
     noise: float = 0.0
     bias: Vector = ZERO
 
     def add(self, true: Vector, rng: np.random.Generator) -> Vector:
-        """Return the vector `true` with its errors, shape (3,)."""
+        """Return the vector `true` with its errors, shape (3,), any unit."""
         if self == NONE:
             return true
         (x, y, z), (bias_x, bias_y, bias_z) = true, self.bias

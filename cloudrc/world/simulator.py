@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cloudrc.config.schema import Plant
 from cloudrc.messages import Vector
 from cloudrc.records import Contact
-from cloudrc.world.plant import Plant, Wind
+from cloudrc.world.plant import Wind, apply_plant
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import STOPPED, Controls, Rotors
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
@@ -62,7 +63,7 @@ class Simulator:
         """
         self.model = model = compile_model(robot, scene)
         if plant is not None:
-            plant.apply(model)
+            apply_plant(plant, model)
         self._wind = wind
         self.dt: float = model.opt.timestep
         self.tape: list[Controls] | None = None
