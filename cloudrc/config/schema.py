@@ -432,7 +432,8 @@ class Cloud(Section):
     10 commands within 500 ms"""
     compute_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Mean time that cloud computes before each command leaves [ms], in real time in addition to
-    the true time. While cloud computes, it begins no other command"""
+    the true time. While cloud computes, it begins no other command. Reports count this time in
+    the delay of the downlink"""
     compute_deviation_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Standard deviation of this time [ms], which then has a gamma distribution; needs compute_ms
     above 0"""
