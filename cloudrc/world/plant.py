@@ -3,39 +3,45 @@
 from __future__ import annotations
 
 from math import exp, sqrt
-from typing import Any
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cloudrc.config.schema import Plant
 from cloudrc.world.readings import Readings
-from cloudrc.world.scene import mujoco
+
+Array: TypeAlias = NDArray[np.float64]
 
 
-def apply_plant(plant: Plant, model: Any) -> None:
-    """Change a compiled `MjModel`, whose only moving body is the robot's base.
+class Inertia(NamedTuple):
+    """The inertia of a robot in its body frame."""
 
-    The payload adds m (d · d 1 - d d') to the inertia about the common centre of mass, with
-    m = m1 m2/(m1 + m2) and the vector d between both centres.
+    mass: float  # [kg]
+    centre: Array  # centre of mass [m], shape (3,)
+    moments: Array  # inertia about the centre of mass [kg m^2], shape (3, 3)
+
+
+def point_inertia(mass: float, place: Array) -> Array:
+    """Return the inertia m (d · d 1 - d d') of a point [kg m^2], shape (3, 3).
+
+    `mass` is m [kg]; `place` is d [m], shape (3,).
     """
-    if plant == Plant():
-        return  # the model stays equal bit by bit
-    base, payload = model.jnt_bodyid[0], plant.payload_kg
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.body_iquat[base])
-    axes = turn.reshape(3, 3)
-    mass = model.body_mass[base] * plant.mass_factor
-    inertia = axes @ np.diag(model.body_inertia[base] * plant.inertia_factor) @ axes.T
-    apart = np.subtract(plant.payload_offset_m, model.body_ipos[base])
-    shared = mass * payload / (mass + payload)
-    inertia += shared * (apart @ apart * np.eye(3) - np.outer(apart, apart))
-    model.body_inertia[base], axes = np.linalg.eigh(inertia)
-    axes[:, 0] *= np.linalg.det(axes)  # a rotation, not a mirror image
-    mujoco.mju_mat2Quat(model.body_iquat[base], axes.ravel())
-    model.body_mass[base] = mass + payload
-    model.body_ipos[base] += apart * payload / (mass + payload)
-    model.actuator_gainprm[:, 0] *= plant.thrust_factor
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return mass * (place @ place * np.eye(3) - np.outer(place, place))
+
+
+def true_inertia(plant: Plant, mass: float, centre: Array, moments: Array) -> Inertia:
+    """Return the inertia of the true robot.
+
+    Robot and payload have the inertia of the robot and that of a point of mass m1 m2/(m1 + m2) at
+    the distance between both centres. `mass` [kg], `centre` [m] and `moments` [kg m^2] are those
+    of the model, as in `Inertia`.
+    """
+    mass, apart = mass * plant.mass_factor, plant.payload_offset_m - centre
+    total = mass + plant.payload_kg
+    shared = point_inertia(mass * plant.payload_kg / total, apart)
+    centre = centre + apart * plant.payload_kg / total
+    return Inertia(total, centre, moments * plant.inertia_factor + shared)
 
 
 class Wind:

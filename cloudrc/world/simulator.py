@@ -16,7 +16,7 @@ import numpy.typing as npt
 from cloudrc.config.schema import Plant
 from cloudrc.messages import Vector
 from cloudrc.records import Contact
-from cloudrc.world.plant import Wind, apply_plant
+from cloudrc.world.plant import Wind
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import STOPPED, Controls, Rotors
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
@@ -61,9 +61,7 @@ class Simulator:
         Without `plant`, the true robot equals the model. Raise a BadInputError if a file is missing
         or does not fit the onboard controller.
         """
-        self.model = model = compile_model(robot, scene)
-        if plant is not None:
-            apply_plant(plant, model)
+        self.model = model = compile_model(robot, scene, plant)
         self._wind = wind
         self.dt: float = model.opt.timestep
         self.tape: list[Controls] | None = None

@@ -5,55 +5,59 @@ import pytest
 
 from cloudrc.config.schema import Plant
 from cloudrc.messages import UPRIGHT, ZERO
-from cloudrc.world.plant import Wind, apply_plant
+from cloudrc.world.plant import Inertia, Wind, point_inertia
 from cloudrc.world.readings import Readings
-from cloudrc.world.scene import compile_model, mujoco
-
-SPHERE = 0.5, (0.1, -0.2, -0.3)
-"""Mass [kg] and place [m] of a body that MuJoCo itself adds to a robot."""
+from cloudrc.world.scene import FOLDER, compile_model, mujoco, rotation
+from cloudrc.world.simulator import Simulator
 
 
 def model(**keys):
-    made = compile_model("pelican", "empty")
-    apply_plant(Plant(**keys), made)
-    return made
+    return compile_model("pelican", "empty", Plant(**keys))
 
 
 def inertia(one):
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, one.body_iquat[1])
-    axes = turn.reshape(3, 3)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
-    return axes @ np.diag(one.body_inertia[1]) @ axes.T
+    axes = rotation(one.body_iquat[1])
+    return Inertia(one.body_mass[1], one.body_ipos[1], axes @ np.diag(one.body_inertia[1]) @ axes.T)
 
 
 def test_factors_scale_mass_and_inertia_apart():
-    as_it_is, heavy = model(), model(mass_factor=1.2, inertia_factor=1.5)
-    assert heavy.body_mass[1] == pytest.approx(1.2 * 1.06)
-    assert inertia(heavy) == pytest.approx(1.5 * inertia(as_it_is))
-    assert heavy.body_subtreemass[0] == pytest.approx(1.2 * 1.06), "constants are computed anew"
-    assert np.array_equal(as_it_is.body_iquat, compile_model("pelican", "empty").body_iquat)
+    as_it_is = inertia(model())
+    heavy = model(mass_factor=1.2, inertia_factor=1.5)
+    assert heavy.body_mass[1] == heavy.body_subtreemass[0] == pytest.approx(1.2 * 1.06)
+    assert inertia(heavy).moments == pytest.approx(1.5 * as_it_is.moments)
+    assert inertia(heavy).centre == pytest.approx(as_it_is.centre)
 
 
 def test_a_payload_is_what_mujoco_makes_of_a_second_body():
-    mass, place = SPHERE
-    text = (
-        "<mujoco><worldbody><body><freejoint/>"
-        '<inertial pos=".004 0 .005" mass="1.06" fullinertia=".012 .011 .020 0 -.0003 0"/>'
-        '<geom size=".01" mass="0"/>{}</body></worldbody></mujoco>'
-    )
-    point = '<inertial pos="0 0 0" mass="{}" diaginertia="1e-9 1e-9 1e-9"/>'
-    body = f'<body pos="{{}} {{}} {{}}">{point}</body>'
-    both = mujoco.MjSpec.from_string(text.format(body.format(*place, mass)))
-    both.compiler.fusestatic = True
-    wanted = both.compile()
-    found = mujoco.MjModel.from_xml_string(text.format(""))
-    without_rotors = Plant(payload_kg=mass, payload_offset_m=place)
-    apply_plant(without_rotors.model_copy(update={"thrust_factor": ()}), found)
-    assert wanted.nbody == found.nbody == 2
-    assert found.body_mass[1] == pytest.approx(wanted.body_mass[1])
-    assert found.body_ipos[1] == pytest.approx(wanted.body_ipos[1])
-    assert inertia(found) == pytest.approx(inertia(wanted), abs=1e-8)
+    mass, place = 0.5, (0.1, -0.2, -0.3)
+    spec = mujoco.MjSpec.from_file(str(FOLDER / "robots" / "pelican.xml"))
+    point = {"mass": mass, "inertia": [1e-9] * 3, "ipos": [0.0] * 3, "explicitinertial": True}
+    spec.body("base").add_body(name="payload", pos=place, **point)
+    data = mujoco.MjData(whole := spec.compile())
+    mujoco.mj_forward(whole, data)
+    found = inertia(model(payload_kg=mass, payload_offset_m=place))
+    assert found.mass == pytest.approx(whole.body_subtreemass[1]) == pytest.approx(1.56)
+    assert found.centre == pytest.approx(data.subtree_com[1])
+    places = data.xipos[1:] - found.centre
+    parts = [
+        turn.reshape(3, 3) @ np.diag(moments) @ turn.reshape(3, 3).T + point_inertia(m, place)
+        for turn, moments, m, place in zip(
+            data.ximat[1:], whole.body_inertia[1:], whole.body_mass[1:], places, strict=True
+        )
+    ]
+    assert found.moments == pytest.approx(sum(parts), abs=1e-8)
+
+
+def test_a_changed_robot_touches_what_the_model_touches(scene_at):
+    """MuJoCo's boxes around the robot lie in the frame of its inertia."""
+    plant = Plant(payload_kg=0.5, payload_offset_m=(0.3, 0.2, -0.3))
+    robots = [Simulator("pelican", scene_at(-1.0, 0.0, 0.8), one) for one in (None, plant)]
+    for robot in robots:
+        for _ in range(400):
+            robot.step((0.0,) * 4)
+    first, second = ([(touch.body, touch.tip) for touch in one.touches] for one in robots)
+    assert first[0] == second[0] == ("pipe_1", False)
+    assert robots[1].readings.position[2] > 0.2, "it lies in the pipe"
 
 
 def test_a_weak_rotor_has_less_thrust_and_less_torque():
