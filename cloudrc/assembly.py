@@ -84,9 +84,9 @@ def build_world(
         seen.position_noise_m,
         seen.velocity_noise_mps,
         _generator(experiment, "odometry noise"),
-        attitude=Errors(radians(seen.attitude_noise_deg), (roll, pitch, yaw)),
-        rate=Errors(seen.rate_noise_radps, seen.rate_bias_radps),
-        turn_rng=_generator(experiment, "attitude noise"),
+        Errors(radians(seen.attitude_noise_deg), (roll, pitch, yaw)),
+        Errors(seen.rate_noise_radps, seen.rate_bias_radps),
+        _generator(experiment, "attitude noise"),
     )
     return WorldEndpoint(
         robot,

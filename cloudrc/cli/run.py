@@ -37,7 +37,7 @@ from cloudrc.errors import (
 if TYPE_CHECKING:
     from cloudrc.cloud.endpoint import CloudEndpoint
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.drivers.virtual import Clock, VirtualRun
+    from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.record.columns import Recording
     from cloudrc.records import Record
     from cloudrc.report.document import Run
@@ -271,21 +271,13 @@ def fly(
         raise CloudrcError(f"{where}: {error.strerror or error}; choose another folder") from error
 
 
-def cloud_clock(experiment: ResolvedExperiment) -> Clock:
-    """Return cloud's clock in virtual time; world's clock is virtual time itself."""
-    from cloudrc.drivers.virtual import Clock
-
-    cloud = experiment.cloud
-    return Clock(round(cloud.clock_offset_s * 1e9), cloud.clock_drift_ppm)
-
-
 def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
     """Build world and cloud, and connect them for a flight in virtual time; do not fly yet."""
     from cloudrc import assembly
     from cloudrc.drivers.virtual import Clock, VirtualRun
     from cloudrc.tunnel.end import Identity
 
-    own = cloud_clock(experiment)
+    own = Clock(round(experiment.cloud.clock_offset_s * 1e9), experiment.cloud.clock_drift_ppm)
     identity = Identity(CLOCK if own == Clock() else CLOUD_CLOCK, b"cloud".ljust(16))
     world = assembly.build_world(experiment, Identity(CLOCK, b"world".ljust(16)))
     cloud = assembly.build_cloud(
@@ -312,14 +304,14 @@ def _record_virtual(
     from cloudrc.report.write import attachments
 
     records: tuple[list[Record], list[Record]] = ([], [])
-    digest, interrupted, clock = RecordHash(), False, cloud_clock(experiment)
-    is_other = clock != Clock()
+    digest, interrupted = RecordHash(), False
     # Record during the flight, so that the recording is kept if the run or its report fails.
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-            if is_other:
-                from_cloud = [row._replace(stamp_ns=clock.when(row.stamp_ns)) for row in from_cloud]
+            if flight.cloud_clock != Clock():
+                when = flight.cloud_clock.when
+                from_cloud = [row._replace(stamp_ns=when(row.stamp_ns)) for row in from_cloud]
             for log_time_ns, row in merged(from_world, from_cloud):
                 writer.write_row(row, log_time_ns)
             records[0].extend(from_world)

@@ -43,7 +43,10 @@ class Clock:
 
 
 class VirtualRun:
-    """Runs world, cloud and both directions of the link, in virtual time that starts at 0."""
+    """Runs world, cloud and both directions of the link, in virtual time that starts at 0.
+
+    World's clock is virtual time, and so is `cloud_clock` by default.
+    """
 
     def __init__(
         self,
@@ -52,12 +55,11 @@ class VirtualRun:
         uplink: LinkDirection,
         downlink: LinkDirection,
         *,
-        cloud_clock: Clock | None = None,
+        cloud_clock: Clock = Clock(),
     ) -> None:
-        """Connect the parts; world's clock is virtual time, and so is cloud's by default."""
         self._world, self._cloud = world, cloud
         self._uplink, self._downlink = uplink, downlink
-        self._clock = cloud_clock or Clock()
+        self.cloud_clock = cloud_clock
         self._arrivals: list[tuple[int, int, bool, bytes]] = []
         self._sent = 0
         self.now_ns = 0
@@ -82,7 +84,7 @@ class VirtualRun:
     def _advance(self, end_ns: int) -> None:
         """Handle all events up to and including `end_ns` [ns]."""
         world, cloud, arrivals = self._world, self._cloud, self._arrivals
-        at, when = self._clock.at, self._clock.when
+        at, when = self.cloud_clock.at, self.cloud_clock.when
         world_ns, cloud_ns = world.next_deadline_ns(), when(cloud.next_deadline_ns())
         while True:
             deadline_ns = world_ns if world_ns <= cloud_ns else cloud_ns

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import exp, sqrt
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,9 @@ from cloudrc.world.readings import Readings
 Array: TypeAlias = NDArray[np.float64]
 
 
-class Inertia(NamedTuple):
-    """The inertia of a robot in its body frame."""
-
-    mass: float  # [kg]
-    centre: Array  # centre of mass [m], shape (3,)
-    moments: Array  # inertia about the centre of mass [kg m^2], shape (3, 3)
+Inertia: TypeAlias = tuple[float, Array, Array]
+"""Mass [kg], centre of mass [m], shape (3,), and inertia about this centre [kg m^2], shape (3, 3),
+of a robot in its body frame."""
 
 
 def point_inertia(mass: float, place: Array) -> Array:
@@ -30,18 +27,18 @@ def point_inertia(mass: float, place: Array) -> Array:
     return mass * (place @ place * np.eye(3) - np.outer(place, place))
 
 
-def true_inertia(plant: Plant, mass: float, centre: Array, moments: Array) -> Inertia:
-    """Return the inertia of the true robot.
+def true_inertia(plant: Plant, model: Inertia) -> Inertia:
+    """Return the inertia of the true robot, given that of its model.
 
     Robot and payload have the inertia of the robot and that of a point of mass m1 m2/(m1 + m2) at
-    the distance between both centres. `mass` [kg], `centre` [m] and `moments` [kg m^2] are those
-    of the model, as in `Inertia`.
+    the distance between both centres.
     """
+    mass, centre, inertia = model
     mass, apart = mass * plant.mass_factor, plant.payload_offset_m - centre
     total = mass + plant.payload_kg
     shared = point_inertia(mass * plant.payload_kg / total, apart)
     centre = centre + apart * plant.payload_kg / total
-    return Inertia(total, centre, moments * plant.inertia_factor + shared)
+    return total, centre, inertia * plant.inertia_factor + shared
 
 
 class Wind:

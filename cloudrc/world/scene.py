@@ -94,7 +94,7 @@ def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
         model = _compile(*paths, _inertia(_compile(*paths, fuse=False)))
     _check_numbers(model, *paths)
     if plant is not None and plant != Plant():
-        model = _compile(*paths, true_inertia(plant, *_inertia(model)))
+        model = _compile(*paths, true_inertia(plant, _inertia(model)))
         model.actuator_gainprm[:, 0] *= plant.thrust_factor
     return model
 
@@ -135,7 +135,7 @@ def _inertia(model: Any) -> Inertia:
         axes = frame.T @ data.ximat[body].reshape(3, 3)
         inertia += axes @ np.diag(model.body_inertia[body]) @ axes.T
         inertia += point_inertia(mass, place - centre)
-    return Inertia(masses.sum(), centre, inertia)
+    return masses.sum(), centre, inertia
 
 
 def _set_inertia(base: Any, mass: float, centre: Array, inertia: Array) -> None:

@@ -42,16 +42,14 @@ class Sensors:
         position_noise: float,
         velocity_noise: float,
         rng: np.random.Generator,
-        *,
         attitude: Errors = NONE,
         rate: Errors = NONE,
         turn_rng: np.random.Generator | None = None,
     ) -> None:
-        """Set the errors of each quantity.
+        """Set standard deviations per axis, `position_noise` [m] and `velocity_noise` [m/s].
 
-        `position_noise` [m] and `velocity_noise` [m/s] are standard deviations per axis. The
-        attitude's error is a rotation about the body's axes. `rng` makes the noise of position and
-        velocity, `turn_rng` that of attitude and rate: thus neither changes the other.
+        The error of the `attitude` is a rotation about the body's axes. Attitude and rate have
+        their own `turn_rng`, so that their noise does not change that of position and velocity.
         """
         self._position, self._velocity = Errors(position_noise), Errors(velocity_noise)
         self._attitude, self._rate = attitude, rate
@@ -63,17 +61,18 @@ class Sensors:
         if self._exact:
             return truth
         turn = self._attitude.add(ZERO, self._turn_rng)
-        return Odometry(
-            truth.stamp_ns,
-            self._position.add(truth.position, self._rng),
-            _turned(truth.orientation_wxyz, turn) if turn != ZERO else truth.orientation_wxyz,
-            self._velocity.add(truth.velocity, self._rng),
-            self._rate.add(truth.angular_velocity_body, self._turn_rng),
+        return truth._replace(
+            position=self._position.add(truth.position, self._rng),
+            velocity=self._velocity.add(truth.velocity, self._rng),
+            orientation_wxyz=_turned(truth.orientation_wxyz, turn),
+            angular_velocity_body=self._rate.add(truth.angular_velocity_body, self._turn_rng),
         )
 
 
 def _turned(orientation_wxyz: Quaternion, turn: Vector) -> Quaternion:
     """Turn an orientation by the rotation vector `turn` [rad], body frame, shape (3,)."""
+    if turn == ZERO:
+        return orientation_wxyz
     quaternion = np.array(orientation_wxyz)
     mujoco.mju_quatIntegrate(quaternion, np.array(turn), 1.0)
     w, x, y, z = quaternion.tolist()
