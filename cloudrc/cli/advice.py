@@ -110,6 +110,7 @@ def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
                 f"the onboard controller does not know world.{name}, so the robot hovers about "
                 f"{rest / gain:.2f} m from its setpoint; a value that fits: "
                 f"--set world.low_level.{key}={_round_up(force / gain_i, 0.1):g}"
+                + ("" if axis else " (above 0.3 a hostile cloud can leave the fence)")
             )
 
 

@@ -91,11 +91,8 @@ class LinkMonitor:
     def follow(self, asked: Asked | None) -> None:
         """Replace the requested profiles; None means unknown, so nothing is judged."""
         if asked != self._asked:
-            self._asked, self._fresh, sent = (
-                asked,
-                True,
-                np.arange(float(RUN_LENGTH)) * self._period,
-            )
+            self._asked, self._fresh = asked, True
+            sent = np.arange(float(RUN_LENGTH)) * self._period
             ways = () if asked is None else asked if self._uplink else asked[::-1]
             self._plans = [
                 Plan(settled(profile), self._flow, sent, pause=self._pause) for profile in ways
