@@ -64,7 +64,7 @@ def build_world(
     from cloudrc.world.sensors import Errors, Sensors
     from cloudrc.world.simulator import Simulator
 
-    world, guard = experiment.world, experiment.guard
+    world, guard, seed = experiment.world, experiment.guard, experiment.seed
     limits = Limits(
         fence_low=fence.LOW,
         fence_high=fence.HIGH,
@@ -76,17 +76,17 @@ def build_world(
     )
     air, seen, wind = world.wind, world.sensors, None
     if any(air.velocity_mps) or air.gust_mps:
-        wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(experiment, "wind"))
+        wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(seed, "wind"))
     simulator = Simulator(world.robot, world.scene, world.plant, wind)
     robot = Robot(simulator, LowLevel(**world.low_level.model_dump()), Guard(limits))
     roll, pitch, yaw = map(radians, seen.attitude_bias_deg)
     sensors = Sensors(
         seen.position_noise_m,
         seen.velocity_noise_mps,
-        _generator(experiment, "odometry noise"),
+        _generator(seed, "odometry noise"),
         Errors(radians(seen.attitude_noise_deg), (roll, pitch, yaw)),
         Errors(seen.rate_noise_radps, seen.rate_bias_radps),
-        _generator(experiment, "attitude noise"),
+        _generator(seed, "attitude noise"),
     )
     return WorldEndpoint(
         robot,
@@ -131,7 +131,7 @@ def build_cloud(
     cpu_clock = cpu_clock if cloud.compute_measured else None
     compute = None
     if cloud.compute_ms or cpu_clock:
-        rng = _generator(experiment, "compute time")
+        rng = _generator(experiment.seed, "compute time")
         times = cloud.compute_ms * MS_TO_NS, cloud.compute_deviation_ms * MS_TO_NS
         compute = ComputeTime(*times, rng, cpu_clock)
     start_ns = clock()
@@ -212,7 +212,7 @@ def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: fl
 
 def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:
     """Make random setpoints. Each lasts one period, even if the robot does not arrive."""
-    rng = np.random.Generator(np.random.PCG64([seed, _stream("steps")]))
+    rng = _generator(seed, "steps")
     offsets = rng.uniform(-1.0, 1.0, (steps.count, 3)) * steps.range_m + steps.centre_m
     limit = 10 * steps.period_s
     return tuple(
@@ -242,11 +242,6 @@ def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else value * factor
 
 
-def _generator(experiment: ResolvedExperiment, stream: str) -> np.random.Generator:
-    """Make the generator of an experiment's random numbers for one purpose."""
-    return np.random.Generator(np.random.PCG64([experiment.seed, _stream(stream)]))
-
-
-def _stream(name: str) -> int:
-    """Return the number of the stream of random numbers with this name."""
-    return int.from_bytes(name.encode(), "little")
+def _generator(seed: int, stream: str) -> np.random.Generator:
+    """Make the generator of the stream of random numbers with this name."""
+    return np.random.Generator(np.random.PCG64([seed, int.from_bytes(stream.encode(), "little")]))

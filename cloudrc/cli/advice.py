@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 DURATION_NS = 20_000_000_000
 """Length of the simulation [ns]."""
-SAG_MAX = 0.1
+SAG_MAX = 0.05
 """Largest steady error of the position that needs no warning [m]."""
 WIND_FORCE = 0.24
 """Force against which a hovering robot has to fly, per wind speed [N s/m]: two thirds are the drag

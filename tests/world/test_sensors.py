@@ -40,7 +40,7 @@ def test_attitude_and_rate_have_their_bias_about_the_body_axes():
     assert (biased.position, biased.velocity) == same
 
 
-def test_noise_of_attitude_and_rate_leaves_the_other_noise_alone():
+def test_noise_of_attitude_and_rate_changes_no_other_noise():
     def sensors(**errors):
         first, second = np.random.default_rng(1), np.random.default_rng(2)
         return Sensors(0.005, 0.02, first, turn_rng=second, **errors)
